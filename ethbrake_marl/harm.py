@@ -1,0 +1,87 @@
+"""The harm ledger: who was hurt how much, under both counting rules.
+
+Harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2/s2), shared by mass (the paper's
+eq. harm): ``H_i = m_{i+1} / (m_i + m_{i+1}) w^2`` and ``H_{i+1} = w^2 - H_i``, so the shares add up exactly.
+
+*First-impact harm* counts each pair's first impact only (the paper's protocol); *total harm* counts every impact.
+The first can be gamed (a light early touch makes the later, harder impact free), so both are always kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ethbrake_marl.physics.advance import Impacts
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
+
+HarmCount = Literal["first", "total"]
+
+_INJURY_SLOPE = 0.177  # per m/s of speed change
+_INJURY_OFFSET = {"front": -4.457, "rear": -4.888}  # side of the car that is hit
+
+
+@dataclass(frozen=True, slots=True)
+class Ledger:
+    """Harm of ``n`` worlds so far, by pair."""
+
+    first_impact_harm: Floats  # [n, P] m2/s2
+    total_harm: Floats  # [n, P] m2/s2
+    count: Ints  # [n, P] impacts
+    mass_t: Floats  # [n, N]
+
+    def add(self, impacts: Impacts) -> Ledger:
+        """The ledger after a further segment."""
+        return Ledger(
+            self.first_impact_harm + impacts.first_impact_harm,
+            self.total_harm + impacts.total_harm,
+            self.count + impacts.count,
+            self.mass_t,
+        )
+
+    def pair_harm(self, count: HarmCount) -> Floats:
+        """Harm of each pair under a counting rule, [n, P]."""
+        return self.first_impact_harm if count == "first" else self.total_harm
+
+    def vehicle_harm(self, count: HarmCount) -> Floats:
+        """Harm of each vehicle, from both its pairs, [n, N]; see ``split``."""
+        return split(self.pair_harm(count), self.mass_t)
+
+    def world_harm(self, count: HarmCount) -> Floats:
+        """Harm of all vehicles of a world together, [n]."""
+        harm: Floats = self.pair_harm(count).sum(axis=1)
+        return harm
+
+    @property
+    def collided(self) -> Bools:
+        """Whether any impact happened, [n]."""
+        hit: Bools = self.count.sum(axis=1) > 0
+        return hit
+
+
+def empty_ledger(worlds: Worlds) -> Ledger:
+    """The ledger at the alert: no harm yet."""
+    shape = worlds.gaps_m.shape
+    return Ledger(np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64), worlds.vehicles.mass_t)
+
+
+def split(pair_harm: Floats, mass_t: Floats) -> Floats:
+    """Share each pair's harm [n, P] between its two vehicles by mass (the lighter one bears more), [n, N]."""
+    front_share = mass_t[:, 1:] / (mass_t[:, :-1] + mass_t[:, 1:]) * pair_harm
+    harm = np.zeros(mass_t.shape)
+    harm[:, :-1] += front_share
+    harm[:, 1:] += pair_harm - front_share
+    return harm
+
+
+def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"]) -> Floats:
+    """Probability of a severe injury (MAIS3+) in a rear-end collision from one occupant's change of speed.
+
+    ``P = 1 / (1 + exp(-c0 - c1 dv))`` with c1 = 0.177 per m/s and c0 = -4.457 where the car is hit in front
+    (the striking car), -4.888 at its rear (the struck car). Source: Geisslinger et al. 2023.
+    """
+    dv = np.abs(speed_change_mps)
+    probability: Floats = 1.0 / (1.0 + np.exp(-_INJURY_OFFSET[side] - _INJURY_SLOPE * dv))
+    return probability

@@ -1,0 +1,17 @@
+"""Exact physics of a line of vehicles: compiled and pure. No YAML, no random numbers, no torch."""
+
+from ethbrake_marl.physics.advance import ImpactRows, Impacts, advance
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, concatenate, make_worlds
+
+__all__ = [
+    "Bools",
+    "Floats",
+    "ImpactRows",
+    "Impacts",
+    "Ints",
+    "Vehicles",
+    "Worlds",
+    "advance",
+    "concatenate",
+    "make_worlds",
+]

@@ -1,0 +1,49 @@
+"""The one way in which this package compiles a kernel: strict floating point, cached safely.
+
+numba keys its cache on a function's own file, so editing a *callee* in another file would silently keep the
+stale machine code. Here the cache folder carries a hash of every kernel source and of the numba version.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+_PACKAGE = Path(__file__).resolve().parents[1]
+_MARK = b"@compiled"
+
+
+@cache
+def cache_folder() -> Path:
+    """Folder of the compiled kernels: the user's cache, or a temporary one where that cannot be written."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for source in sorted(_PACKAGE.rglob("*.py")):
+        text = source.read_bytes()
+        if _MARK in text:
+            digest.update(text)
+    home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(home) / "ethbrake_marl" / digest.hexdigest()[:16]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        return Path(tempfile.mkdtemp(prefix="ethbrake_marl-"))
+
+
+def compiled(function: Function) -> Function:
+    """Compile ``function`` with numba: no fast-math, no bounds checks, releases the GIL, cached on disk."""
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(cache_folder())
+    try:
+        return numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+    finally:
+        numba.config.CACHE_DIR = before

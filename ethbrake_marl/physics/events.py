@@ -1,0 +1,102 @@
+"""Closed-form times of the events that end a segment of constant acceleration.
+
+Between events every quantity is a quadratic in time, so the first event is found exactly and none is missed.
+Only + - * / and sqrt are used: the same world gives the same bits in any batch.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.physics.compiled import compiled
+
+TOUCH_SPEED_MPS = 1e-5  # a contact at or below this closing speed is a touch: no impact, no harm
+PLASTIC_SPEED_MPS = 0.05  # a cluster whose largest closing speed is below this does not bounce
+
+
+@compiled
+def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
+    """Time to the first contact of a pair and the closing speed there, or ``(inf, 0)`` when there is none.
+
+    With gap ``g >= 0``, closing speed ``w`` and closing acceleration ``b``: ``D = w^2 + 2 b g``;
+    ``w > 0``: none if ``D < 0``, else ``t = 2 g / (w + sqrt D)``; ``w <= 0``: only if ``b > 0``,
+    ``t = (-w + sqrt D) / b``. The closing speed at contact is ``sqrt D``; ``w + b t`` would cancel. [m, m/s, m/s2]
+    """
+    if closing > 0.0:
+        squared = closing * closing + 2.0 * pressing * gap
+        if squared < 0.0:
+            return math.inf, 0.0
+        speed = math.sqrt(squared)
+        return 2.0 * gap / (closing + speed), speed
+    if pressing > 0.0:
+        speed = math.sqrt(closing * closing + 2.0 * pressing * gap)
+        return (speed - closing) / pressing, speed
+    return math.inf, 0.0
+
+
+@compiled
+def no_contact_within(gap: float, closing: float, pressing: float, duration: float) -> bool:
+    """Cheap sufficient test: even the larger of each term, held all along, does not close the gap."""
+    reach = 0.0
+    if closing > 0.0:
+        reach = closing * duration
+    if pressing > 0.0:
+        reach += 0.5 * pressing * duration * duration
+    return reach < gap
+
+
+@compiled
+def drift(gap: float, closing: float, pressing: float, duration: float) -> float:
+    """Gap after ``duration`` of constant closing acceleration: ``g - (w + b t / 2) t``. [m]"""
+    return gap - (closing + 0.5 * pressing * duration) * duration
+
+
+@compiled
+def speed_event(speed: float, acceleration: float, command: float, limit: float) -> tuple[float, float]:
+    """Time until the speed next reaches a value where the forces change, and that value; ``(inf, 0)`` if never.
+
+    These values are standstill (brakes then hold) and, for a driving vehicle, its speed limit.
+    """
+    if acceleration == 0.0:
+        return math.inf, 0.0
+    time = math.inf
+    value = 0.0
+    if (speed > 0.0) == (acceleration < 0.0) and speed != 0.0:
+        time = -speed / acceleration
+    if command > 0.0 and speed != limit and (speed < limit) == (acceleration > 0.0):
+        reach = (limit - speed) / acceleration
+        if reach < time:
+            time = reach
+            value = limit
+    return time, value
+
+
+@compiled
+def force_range(speed: float, command: float, limit: float) -> tuple[float, float]:
+    """Acceleration this vehicle's own forces give when it moves forward, and when it moves backward.
+
+    The two differ where the force is set-valued: brakes at standstill hold against a push from either side,
+    and a driving vehicle at its speed limit gives only as much drive as keeps it there.
+    """
+    if command < 0.0:
+        if speed > 0.0:
+            return command, command
+        if speed < 0.0:
+            return -command, -command
+        return command, -command
+    if command > 0.0:
+        if speed < limit:
+            return command, command
+        if speed == limit:
+            return 0.0, command
+    return 0.0, 0.0
+
+
+@compiled
+def settle(low: float, high: float) -> float:
+    """Acceleration of a free body whose forces range over ``[low, high]``: the value nearest to rest."""
+    if low > 0.0:
+        return low
+    if high < 0.0:
+        return high
+    return 0.0

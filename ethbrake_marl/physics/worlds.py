@@ -1,0 +1,144 @@
+"""State and parameters of ``n`` independent lines of ``N`` vehicles.
+
+Shape letters, used everywhere in this package:
+
+===  =========================================================
+n    worlds, advanced together and independent of each other
+N    vehicles in a line, index 0 = ``vehicle_1`` = the front one
+P    pairs, ``P = N - 1``; pair p is (vehicle p, vehicle p + 1)
+L    learners
+F    features of an observation
+===  =========================================================
+
+Only gaps and speeds are stored: absolute positions would lose digits as the line moves on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ethbrake_marl.errors import InvalidInput
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicles:
+    """What does not change during an episode."""
+
+    braking_capacity_mps2: Floats  # [n, N] largest deceleration, > 0
+    driving_capacity_mps2: Floats  # [n, N] largest forward acceleration, >= 0
+    latency_s: Floats  # [n, N] commands are ignored before this time, >= 0
+    mass_t: Floats  # [n, N] > 0
+    speed_limit_mps: Floats  # [n, N] driving stops here, > 0
+    restitution: Floats  # [n] in [0, 1]
+
+    def take(self, rows: ArrayLike) -> Vehicles:
+        """Select worlds by index or mask (always a copy)."""
+        index = np.asarray(rows)
+        return Vehicles(*(np.ascontiguousarray(getattr(self, f.name)[index]) for f in fields(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class Worlds:
+    """The state of ``n`` worlds at their times ``time_s``."""
+
+    vehicles: Vehicles
+    gaps_m: Floats  # [n, P] bumper to bumper, >= 0
+    speeds_mps: Floats  # [n, N] forward positive; negative only after a bounce-back
+    time_s: Floats  # [n] since Vehicle 1 began to brake
+    pair_hit: Bools  # [n, P] this pair has had an impact
+
+    @property
+    def n(self) -> int:
+        """Number of worlds."""
+        return int(self.speeds_mps.shape[0])
+
+    @property
+    def N(self) -> int:
+        """Number of vehicles in each line."""
+        return int(self.speeds_mps.shape[1])
+
+    def take(self, rows: ArrayLike) -> Worlds:
+        """Select worlds by index or mask (always a copy)."""
+        index = np.asarray(rows)
+        return Worlds(
+            self.vehicles.take(index),
+            *(np.ascontiguousarray(getattr(self, f.name)[index]) for f in fields(self)[1:]),
+        )
+
+
+def concatenate(parts: Sequence[Worlds]) -> Worlds:
+    """Join worlds with the same number of vehicles into one batch."""
+    vehicles = Vehicles(*(np.concatenate([getattr(w.vehicles, f.name) for w in parts]) for f in fields(Vehicles)))
+    return Worlds(vehicles, *(np.concatenate([getattr(w, f.name) for w in parts]) for f in fields(Worlds)[1:]))
+
+
+def make_worlds(
+    gaps_m: ArrayLike,
+    speeds_mps: ArrayLike,
+    *,
+    braking_capacity_mps2: ArrayLike,
+    driving_capacity_mps2: ArrayLike,
+    latency_s: ArrayLike,
+    mass_t: ArrayLike,
+    restitution: ArrayLike,
+    speed_limit_mps: ArrayLike = 40.0,
+) -> Worlds:
+    """Build checked worlds at ``t = 0``; every parameter broadcasts to its full shape.
+
+    ``speeds_mps`` is [n, N] or [N]; ``gaps_m`` is [n, P], [P] or a scalar; vehicle parameters broadcast to
+    [n, N]; ``restitution`` to [n]. Raises ``InvalidInput`` naming the field, the first bad entry and its range.
+    """
+    speeds = np.atleast_2d(np.asarray(speeds_mps, dtype=np.float64))
+    if speeds.ndim != 2 or speeds.shape[1] < 2:
+        raise InvalidInput(f"speeds_mps: shape {speeds.shape}; a line needs at least 2 vehicles, as [n, N]")
+    gaps = np.asarray(gaps_m, dtype=np.float64)
+    n = speeds.shape[0] if gaps.ndim < 2 else max(speeds.shape[0], gaps.shape[0])
+    N = speeds.shape[1]
+    restitution_ = _full("restitution", restitution, (n,), 0.0, 1.0)
+    vehicles = Vehicles(
+        _full("braking_capacity_mps2", braking_capacity_mps2, (n, N), 0.0, np.inf, open_low=True),
+        _full("driving_capacity_mps2", driving_capacity_mps2, (n, N), 0.0, np.inf),
+        _full("latency_s", latency_s, (n, N), 0.0, np.inf),
+        _full("mass_t", mass_t, (n, N), 0.0, np.inf, open_low=True),
+        _full("speed_limit_mps", speed_limit_mps, (n, N), 0.0, np.inf, open_low=True),
+        restitution_,
+    )
+    speeds = _full("speeds_mps", speeds, (n, N), 0.0, np.inf)
+    if not np.all(speeds <= vehicles.speed_limit_mps):
+        world, vehicle = np.argwhere(~(speeds <= vehicles.speed_limit_mps))[0]
+        raise InvalidInput(
+            f"speeds_mps[{world}, {vehicle}] = {speeds[world, vehicle]:g}: above this vehicle's"
+            f" speed_limit_mps {vehicles.speed_limit_mps[world, vehicle]:g}"
+        )
+    return Worlds(
+        vehicles,
+        _full("gaps_m", gaps, (n, N - 1), 0.0, np.inf),
+        speeds,
+        np.zeros(n),
+        np.zeros((n, N - 1), dtype=np.bool_),
+    )
+
+
+def _full(
+    name: str, value: ArrayLike, shape: tuple[int, ...], low: float, high: float, *, open_low: bool = False
+) -> Floats:
+    """Broadcast ``value`` to ``shape`` in its own memory and check that it is finite and in range."""
+    given = np.asarray(value, dtype=np.float64)
+    try:
+        full = np.array(np.broadcast_to(given, shape), dtype=np.float64, order="C")
+    except ValueError:
+        raise InvalidInput(f"{name}: shape {given.shape} does not fit {shape}") from None
+    good = np.isfinite(full) & (full <= high) & ((full > low) if open_low else (full >= low))
+    if not good.all():
+        at = tuple(int(k) for k in np.argwhere(~good)[0])
+        bracket = "(" if open_low else "["
+        raise InvalidInput(f"{name}{list(at)} = {full[at]:g}: must be finite and in {bracket}{low:g}, {high:g}]")
+    return full
