@@ -68,11 +68,16 @@ def empty_ledger(worlds: Worlds) -> Ledger:
 
 
 def split(pair_harm: Floats, mass_t: Floats) -> Floats:
-    """Share each pair's harm [n, P] between its two vehicles by mass (the lighter one bears more), [n, N]."""
-    front_share = mass_t[:, 1:] / (mass_t[:, :-1] + mass_t[:, 1:]) * pair_harm
+    """Share each pair's harm [n, P] between its two vehicles by mass (the lighter one bears more), [n, N].
+
+    The larger share is computed and the smaller one is the rest, an exact subtraction: the two add up to the last bit.
+    """
+    front, rear = mass_t[:, :-1], mass_t[:, 1:]
+    larger = np.maximum(front, rear) / (front + rear) * pair_harm
+    front_is_lighter = front <= rear
     harm = np.zeros(mass_t.shape)
-    harm[:, :-1] += front_share
-    harm[:, 1:] += pair_harm - front_share
+    harm[:, :-1] += np.where(front_is_lighter, larger, pair_harm - larger)
+    harm[:, 1:] += np.where(front_is_lighter, pair_harm - larger, larger)
     return harm
 
 

@@ -1,7 +1,7 @@
 """Exact physics of a line of vehicles: compiled and pure. No YAML, no random numbers, no torch."""
 
 from ethbrake_marl.physics.advance import ImpactRows, Impacts, advance
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, concatenate, make_worlds
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, assign, concatenate, make_worlds
 
 __all__ = [
     "Bools",
@@ -12,6 +12,7 @@ __all__ = [
     "Vehicles",
     "Worlds",
     "advance",
+    "assign",
     "concatenate",
     "make_worlds",
 ]

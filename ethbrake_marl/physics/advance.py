@@ -272,7 +272,8 @@ def advance(
             break
         capacity = recorded
     kept = _impact_rows(rows[:recorded]) if record else None
-    return Worlds(vehicles, gaps, speeds, time, hit), Impacts(first_harm, total_harm, count, kept)
+    in_force = np.where(vehicles.latency_s <= time[:, np.newaxis], command, 0.0)
+    return Worlds(vehicles, gaps, speeds, time, hit, in_force), Impacts(first_harm, total_harm, count, kept)
 
 
 def _checked_command(worlds: Worlds, command_mps2: ArrayLike) -> Floats:

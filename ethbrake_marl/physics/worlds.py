@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,6 +55,7 @@ class Worlds:
     speeds_mps: Floats  # [n, N] forward positive; negative only after a bounce-back
     time_s: Floats  # [n] since Vehicle 1 began to brake
     pair_hit: Bools  # [n, P] this pair has had an impact
+    command_mps2: Floats  # [n, N] signed acceleration in force at this time; 0 before the latency has elapsed
 
     @property
     def n(self) -> int:
@@ -78,6 +80,21 @@ def concatenate(parts: Sequence[Worlds]) -> Worlds:
     """Join worlds with the same number of vehicles into one batch."""
     vehicles = Vehicles(*(np.concatenate([getattr(w.vehicles, f.name) for w in parts]) for f in fields(Vehicles)))
     return Worlds(vehicles, *(np.concatenate([getattr(w, f.name) for w in parts]) for f in fields(Worlds)[1:]))
+
+
+def assign(worlds: Worlds, rows: Ints, fresh: Worlds) -> Worlds:
+    """The batch with ``rows`` replaced by the worlds of ``fresh`` (len(rows) of them); nothing is changed in place."""
+    vehicles = Vehicles(
+        *(_assigned(getattr(worlds.vehicles, f.name), rows, getattr(fresh.vehicles, f.name)) for f in fields(Vehicles))
+    )
+    state = (_assigned(getattr(worlds, f.name), rows, getattr(fresh, f.name)) for f in fields(Worlds)[1:])
+    return Worlds(vehicles, *state)
+
+
+def _assigned(whole: NDArray[Any], rows: Ints, part: NDArray[Any]) -> NDArray[Any]:
+    copy = whole.copy()
+    copy[rows] = part
+    return copy
 
 
 def make_worlds(
@@ -124,6 +141,7 @@ def make_worlds(
         speeds,
         np.zeros(n),
         np.zeros((n, N - 1), dtype=np.bool_),
+        np.zeros((n, N)),
     )
 
 

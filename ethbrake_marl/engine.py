@@ -1,0 +1,202 @@
+"""Episodes of ``n`` worlds at once: reset, step, roles, latency gates, episode ends.
+
+Every face of the environment, every evaluation and every search is a thin layer on this. An episode starts at t = 0,
+when Vehicle 1 brakes; ``reset`` moves exactly to the first moment at which a learner's latency has elapsed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from ethbrake_marl.actions import action_to_command, checked_action
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import Ledger, empty_ledger
+from ethbrake_marl.observations import Observations, ObservationSpec, observe
+from ethbrake_marl.physics import Bools, Floats, Impacts, Ints, Worlds, advance, assign
+from ethbrake_marl.rewards import RewardParams, reward_params, reward_terms, weighted_sum
+from ethbrake_marl.scenario import Scenario
+
+_SAMPLED_AT_ONCE = 1024  # training worlds are drawn in blocks of at least this many
+
+
+class Script(Protocol):
+    """What drives a vehicle that does not learn (see ``agents.protocol``)."""
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """New episodes start in these rows of the batch; ``worlds`` holds those rows only, at the alert."""
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Wanted signed acceleration in every world of the batch, [n] m/s2."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What one step brought, for every world of the batch."""
+
+    reward: Floats  # [n, N]
+    terms: dict[str, Floats]  # unweighted reward terms, each [n, N]
+    terminated: Bools  # [n] everything at rest, no command that would move it
+    truncated: Bools  # [n] the horizon was reached
+    impacts: Impacts
+    command_mps2: Floats  # [n, N] wanted by each vehicle in this step
+
+    @property
+    def ended(self) -> Bools:
+        """Episodes that ended with this step, [n]."""
+        return self.terminated | self.truncated
+
+
+class Engine:
+    """A batch of ``n`` running episodes of one scenario.
+
+    ``learners`` are vehicle indices (0 = front); every other vehicle needs an entry in ``scripts``. Worlds come from
+    the scenario's training stream of ``seed`` unless ``reset`` is given some. With no learner, steps start at t = 0.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        n: int,
+        *,
+        learners: Sequence[int],
+        scripts: Mapping[int, Script],
+        reward: str | RewardParams = "harm",
+        observation: ObservationSpec | None = None,
+        seed: int = 0,
+    ) -> None:
+        if not n >= 1:
+            raise InvalidInput(f"engine: n = {n} worlds; at least 1 is needed")
+        self.scenario = scenario
+        self.n = n
+        self.learners = tuple(learners)
+        self.scripts = dict(scripts)
+        unassigned = set(range(scenario.vehicles)) - set(self.learners) - set(self.scripts)
+        if unassigned or set(self.learners) & set(self.scripts):
+            raise InvalidInput(
+                f"engine: learners {self.learners} and scripts {tuple(self.scripts)} must name each of the"
+                f" {scenario.vehicles} vehicles exactly once"
+            )
+        self.reward = reward_params(reward)
+        self.observation = observation or ObservationSpec()
+        self.seed = seed
+        self.rejected = 0  # draws refused so far because of an impact before anybody could act
+        self._drawn = 0
+        self._pool: Worlds | None = None
+        self._pool_next = 0
+        self.reset()
+
+    def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
+        """Start new episodes in all rows: the given worlds (at t = 0), or the next ones of the training stream.
+
+        With ``seed`` the stream starts again from its beginning.
+        """
+        if seed is not None:
+            self.seed, self._drawn, self._pool, self.rejected = seed, 0, None, 0
+        if worlds is None:
+            worlds = self._next_worlds(self.n)
+        elif (worlds.n, worlds.N) != (self.n, self.scenario.vehicles):
+            raise InvalidInput(
+                f"reset: {worlds.n} worlds of {worlds.N} vehicles given; {self.n} of {self.scenario.vehicles} needed"
+            )
+        self.worlds = worlds
+        self.ledger = empty_ledger(worlds)
+        self.ended: Bools = np.zeros(self.n, np.bool_)
+        self._start_s = np.zeros(self.n)
+        self._step_index = np.zeros(self.n, np.int64)
+        self._last_step = np.zeros(self.n, np.int64)
+        self._begin(np.arange(self.n), worlds)
+
+    def renew(self, rows: Ints) -> None:
+        """Start new episodes of the training stream in these rows (autoreset)."""
+        if len(rows):
+            self._begin(rows, self._next_worlds(len(rows)))
+
+    def observe(self, vehicle: int) -> Observations:
+        """Current observation of one vehicle, [n, F]."""
+        return observe(self.worlds, vehicle, self.observation)
+
+    def step(self, actions: Mapping[int, Floats] | Floats) -> Step:
+        """Advance every running episode by one time step.
+
+        ``actions``: for each learner (by vehicle index, or as columns [n, L] in the order of ``learners``) a number in
+        [-1, 1] per world. Rows whose episode has ended stay as they are until ``renew`` or ``reset``.
+        """
+        command = self._commands(actions)
+        before, running = self.worlds, ~self.ended
+        self._step_index += running
+        last = self._step_index >= self._last_step
+        horizon = self.scenario.horizon_s
+        until = np.where(last, horizon, self._start_s + self._step_index * self.scenario.time_step_s)
+        until = np.where(running, until, before.time_s)
+        after, impacts = advance(before, command, until_s=until)
+        self.worlds, self.ledger = after, self.ledger.add(impacts)
+        at_rest = (after.speeds_mps == 0.0).all(axis=1) & (command <= 0.0).all(axis=1)
+        terminated = running & at_rest
+        truncated = running & last & ~at_rest
+        self.ended = self.ended | terminated | truncated
+        safe_end = (terminated | truncated) & ~self.ledger.collided
+        terms = reward_terms(self.reward, before, after, impacts, safe_end, self.scenario.time_step_s)
+        reward = weighted_sum(self.reward, terms, command.shape) * running[:, np.newaxis]
+        return Step(reward, terms, terminated, truncated, impacts, command)
+
+    def _commands(self, actions: Mapping[int, Floats] | Floats) -> Floats:
+        command = np.empty(self.worlds.speeds_mps.shape)
+        for vehicle, script in self.scripts.items():
+            command[:, vehicle] = script.act(self.worlds, vehicle)
+        if not isinstance(actions, Mapping):
+            columns = checked_action(actions, (self.n, len(self.learners)), "the learners")
+            actions = {vehicle: columns[:, k] for k, vehicle in enumerate(self.learners)}
+        for vehicle in self.learners:
+            if vehicle not in actions:
+                raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
+            action = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
+            command[:, vehicle] = action_to_command(action, self.worlds.vehicles, vehicle)
+        return command
+
+    def _begin(self, rows: Ints, fresh: Worlds) -> None:
+        """Put ``fresh`` worlds (at t = 0) into ``rows`` and move them to their first decision."""
+        self.worlds = assign(self.worlds, rows, fresh)
+        command = np.zeros(fresh.speeds_mps.shape)
+        for vehicle, script in self.scripts.items():
+            script.begin(fresh, vehicle, rows)
+            command[:, vehicle] = script.act(self.worlds, vehicle)[rows]
+        start = np.zeros(len(rows))
+        if self.learners:
+            start = fresh.vehicles.latency_s[:, list(self.learners)].min(axis=1)
+        step, horizon = self.scenario.time_step_s, self.scenario.horizon_s
+        if not (start < horizon).all():
+            late = float(start.max())
+            raise InvalidInput(f"reset: no learner may act before the horizon ({late:g} s >= {horizon:g} s)")
+        moved, impacts = advance(fresh, command, until_s=start)
+        self.worlds = assign(self.worlds, rows, moved)
+        self.ledger = _assign_ledger(self.ledger, rows, empty_ledger(fresh).add(impacts))
+        self.ended[rows] = False
+        self._start_s[rows] = start
+        self._step_index[rows] = 0
+        self._last_step[rows] = np.ceil((horizon - start) / step - 1e-9).astype(np.int64)
+
+    def _next_worlds(self, count: int) -> Worlds:
+        if self._pool is None or self._pool_next + count > self._pool.n:
+            size = max(count, _SAMPLED_AT_ONCE)
+            kept = 0 if self._pool is None else self._pool.n - self._pool_next
+            first = self._drawn - kept
+            sample = self.scenario.sample(size, self.seed, first=first, channel="training")
+            self.rejected += sample.rejected
+            self._pool, self._pool_next, self._drawn = sample.worlds, 0, first + size
+        rows = np.arange(self._pool_next, self._pool_next + count)
+        self._pool_next += count
+        return self._pool.take(rows)
+
+
+def _assign_ledger(ledger: Ledger, rows: Ints, fresh: Ledger) -> Ledger:
+    """The ledger with ``rows`` replaced."""
+    first, total, count, mass = (
+        a.copy() for a in (ledger.first_impact_harm, ledger.total_harm, ledger.count, ledger.mass_t)
+    )
+    first[rows], total[rows] = fresh.first_impact_harm, fresh.total_harm
+    count[rows], mass[rows] = fresh.count, fresh.mass_t
+    return replace(ledger, first_impact_harm=first, total_harm=total, count=count, mass_t=mass)

@@ -1,0 +1,117 @@
+"""Reward: a weighted sum of named terms, all computed from the ledger and the state that are also reported.
+
+Terms, for vehicle i and one step (the paper's section on the reward, with its printed defects repaired):
+
+=========  =======================================================================================================
+harm       minus the harm of the whole line in this step, each impact once (``harm_count``: first | total)
+collision  the paper's r_collision: minus ``sum_p k_energy w_p^2`` over every impact of the step
+risk       the paper's r_risk over the vehicle's own pairs: ``-sigma(-TTC / tau) - sigma(k_d (d_target - d))``; an
+           opening pair has TTC = infinity (first part 0) and ``d - d_safe`` is not negative
+jerk       the paper's r_jerk: minus the squared rate of change of the own command
+terminal   the paper's r_terminal: 1 when an episode ends without any collision
+=========  =======================================================================================================
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.special import expit
+
+from ethbrake_marl.errors import unknown_name
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import Bools, Floats, Impacts, Worlds
+
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class RewardParams(BaseModel):
+    """Weights of the terms and their constants; a weight of 0 switches a term off."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    harm: NonNegative = 1.0
+    harm_count: HarmCount = "first"
+    collision: NonNegative = 0.0
+    risk: NonNegative = 0.0
+    jerk: NonNegative = 0.0
+    terminal: NonNegative = 0.0
+    k_energy: NonNegative = 1.0
+    ttc_scale_s: Positive = 1.0
+    safety_buffer_m: NonNegative = 1.0
+    target_gap_m: NonNegative = 3.0
+    distance_slope_per_m: Positive = 1.0
+
+
+REWARDS = {
+    "harm": RewardParams(),
+    "total-harm": RewardParams(harm_count="total"),
+    "paper": RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
+}
+
+
+def reward_params(reward: str | RewardParams) -> RewardParams:
+    """Look up a named reward, or pass one through."""
+    if isinstance(reward, RewardParams):
+        return reward
+    if reward not in REWARDS:
+        raise unknown_name("reward", reward, REWARDS)
+    return REWARDS[reward]
+
+
+def reward_terms(
+    params: RewardParams, before: Worlds, after: Worlds, impacts: Impacts, safe_end: Bools, time_step_s: float
+) -> dict[str, Floats]:
+    """Unweighted terms of one step, each [n, N]; only those with a weight above 0.
+
+    ``safe_end`` [n] marks worlds whose episode ends with this step without any collision.
+    """
+    shape = after.speeds_mps.shape
+    terms: dict[str, Floats] = {}
+    if params.harm > 0.0:
+        harm = impacts.first_impact_harm if params.harm_count == "first" else impacts.total_harm
+        terms["harm"] = _shared(-harm.sum(axis=1), shape)
+    if params.collision > 0.0:
+        terms["collision"] = _shared(-params.k_energy * impacts.total_harm.sum(axis=1), shape)
+    if params.risk > 0.0:
+        terms["risk"] = _risk(params, after)
+    if params.jerk > 0.0:
+        terms["jerk"] = _jerk(before, after, time_step_s)
+    if params.terminal > 0.0:
+        terms["terminal"] = _shared(safe_end.astype(np.float64), shape)
+    return terms
+
+
+def weighted_sum(params: RewardParams, terms: dict[str, Floats], shape: tuple[int, ...]) -> Floats:
+    """Reward of every vehicle, [n, N]."""
+    total = np.zeros(shape)
+    for name, term in terms.items():
+        total += getattr(params, name) * term
+    return total
+
+
+def _shared(world_value: Floats, shape: tuple[int, ...]) -> Floats:
+    return np.repeat(world_value[:, np.newaxis], shape[1], axis=1)
+
+
+def _risk(params: RewardParams, worlds: Worlds) -> Floats:
+    closing = worlds.speeds_mps[:, 1:] - worlds.speeds_mps[:, :-1]
+    room = np.maximum(worlds.gaps_m - params.safety_buffer_m, 0.0)
+    approaching = closing > 0.0
+    time_to_collision = room / np.where(approaching, closing, 1.0)
+    urgency = np.where(approaching, expit(-time_to_collision / params.ttc_scale_s), 0.0)
+    nearness = expit(params.distance_slope_per_m * (params.target_gap_m - worlds.gaps_m))
+    pair_risk = -(urgency + nearness)
+    risk = np.zeros(worlds.speeds_mps.shape)
+    risk[:, :-1] += pair_risk
+    risk[:, 1:] += pair_risk
+    return risk
+
+
+def _jerk(before: Worlds, after: Worlds, time_step_s: float) -> Floats:
+    rate = (after.command_mps2 - before.command_mps2) / time_step_s
+    penalty: Floats = -rate * rate
+    return penalty
