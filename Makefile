@@ -1,0 +1,84 @@
+# Everything runs in the project's own environment, .venv, made from Python >= 3.11 and this file alone.
+# TORCH_INDEX: index of CPU builds of torch, e.g. make run TORCH_INDEX=https://download.pytorch.org/whl/cpu
+# PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
+# ARGS:        passed on by `make run` (to `ethbrake run`) and `make test` (to pytest).
+
+SHELL := /bin/sh
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+TORCH_INDEX ?=
+PYTHON ?=
+ARGS ?=
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: help venv run test lint check clean
+
+help:
+	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
+	@echo "make test [ARGS=...]  the test suite, without the tests marked long"
+	@echo "make lint             ruff, ruff format --check, mypy --strict"
+	@echo "make check            lint and test"
+	@echo "make venv             the environment alone: $(VENV)"
+	@echo "make clean            remove $(VENV), caches and builds (runs/ stays)"
+	@echo "TORCH_INDEX=URL       take torch from this index (CPU builds: https://download.pytorch.org/whl/cpu)"
+
+venv: $(STAMP)
+
+# The stamp holds the folder it was made in: an environment copied or moved along would run the code of the old folder.
+MADE_IN := $(shell cat $(STAMP) 2>/dev/null)
+ifneq ($(MADE_IN),$(CURDIR))
+.PHONY: $(STAMP)
+REASON := $(if $(MADE_IN),made in $(MADE_IN),not installed yet)
+else
+REASON := pyproject.toml or constraints.txt changed
+endif
+
+$(STAMP): pyproject.toml constraints.txt
+	@echo "== Making the environment $(VENV) ($(REASON))"
+	@found=; \
+	for candidate in $(if $(PYTHON),"$(PYTHON)",python3 python3.11 python3.12 python3.13 python3.14 python); do \
+	  if "$$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then \
+	    found="$$candidate"; break; \
+	  fi; \
+	done; \
+	if [ -z "$$found" ]; then \
+	  echo "error: needs Python 3.11 or newer; $(or $(PYTHON),python3) gives: $$("$(or $(PYTHON),python3)" --version 2>&1)" >&2; \
+	  echo "       Install one, or name it: make $(firstword $(MAKECMDGOALS)) PYTHON=/path/to/python3.11" >&2; \
+	  exit 1; \
+	fi; \
+	echo "== Using $$("$$found" --version) ($$(command -v "$$found"))"; \
+	if ! "$$found" -m venv $(if $(MADE_IN),$(if $(filter $(MADE_IN),$(CURDIR)),,--clear)) $(VENV); then \
+	  echo "error: $$found cannot make a virtual environment (on Debian: apt install python3-venv)" >&2; \
+	  exit 1; \
+	fi
+	@echo "== Installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX))"
+	@$(PIP_INSTALL) --no-deps $(if $(TORCH_INDEX),--index-url "$(TORCH_INDEX)") torch
+	@echo "== Installing ethbrake_marl and its dependencies, at the versions of constraints.txt"
+	@$(PIP_INSTALL) -e ".[dev]"
+	@echo "$(CURDIR)" > $@
+	@echo "== Environment ready"
+
+run: $(STAMP)
+	@echo "== ethbrake run $(ARGS)"
+	@$(BIN)/ethbrake run $(ARGS)
+
+test: $(STAMP)
+	@echo "== pytest"
+	@$(BIN)/python -m pytest -q $(ARGS)
+
+lint: $(STAMP)
+	@echo "== ruff check"
+	@$(BIN)/python -m ruff check .
+	@echo "== ruff format --check"
+	@$(BIN)/python -m ruff format --check .
+	@echo "== mypy --strict"
+	@$(BIN)/python -m mypy --strict ethbrake_marl
+
+check: lint
+	@$(MAKE) --no-print-directory test
+
+clean:
+	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist
+	find ethbrake_marl tests train -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,29 @@
+"""What holds for every test: one thread, no display, the same examples in every run."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import pytest
+from hypothesis import settings
+
+# Before the first numerical import: each pool reads its variable once.
+for _pool in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ[_pool] = "1"
+os.environ["MPLBACKEND"] = "Agg"
+os.environ["SDL_VIDEODRIVER"] = "dummy"
+os.environ["SDL_AUDIODRIVER"] = "dummy"
+os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
+
+# No deadline: the first example of a property pays for the kernel's compilation.
+settings.register_profile("deterministic", derandomize=True, deadline=None, database=None, print_blob=True)
+settings.load_profile("deterministic")
+
+
+@pytest.fixture(autouse=True)
+def _one_torch_thread() -> None:
+    """Torch on one thread, for tests that loaded it; the others never pay for its import."""
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.get_num_threads() != 1:
+        torch.set_num_threads(1)

@@ -1,0 +1,217 @@
+"""The rooms import one way, and importing the package stays light."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "ethbrake_marl"
+
+# From the bottom up. A room imports lower levels; inside a level one room may import another, but not both ways.
+LEVELS: tuple[tuple[str, ...], ...] = (
+    ("errors",),
+    ("physics",),
+    ("harm",),
+    ("scenario", "v2x"),
+    ("actions", "observations", "rewards"),
+    ("engine",),
+    ("agents",),
+    ("envs",),
+    ("ethbrake_v0",),
+    ("analysis", "shield"),
+    ("learning", "evaluation"),
+    ("viewer",),
+    ("__init__",),
+    ("cli", "__main__"),
+)
+LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
+
+TORCH = ("torch", "torchrl", "tensordict", "safetensors.torch")
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """One import: the room and line that import, and the dotted name that is imported."""
+
+    room: str
+    where: str
+    target: str
+
+    @property
+    def target_room(self) -> str | None:
+        """The package's room that is imported, or None for another distribution."""
+        top, *rest = self.target.split(".")
+        return (rest[0] if rest else "__init__") if top == PACKAGE else None
+
+
+def modules(package: Path) -> Iterator[tuple[str, Path]]:
+    """(room, file) of every module of the package."""
+    for path in sorted(package.rglob("*.py")):
+        yield path.relative_to(package).parts[0].removesuffix(".py"), path
+
+
+def imported_names(tree: ast.AST, parent: tuple[str, ...]) -> Iterator[tuple[int, str, tuple[str, ...]]]:
+    """(line, module, names taken from it) of every import, at any depth, `import_module("...")` included."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name, ()
+        elif isinstance(node, ast.ImportFrom):
+            base = parent[: len(parent) - node.level + 1] if node.level else ()
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            yield node.lineno, module, tuple(alias.name for alias in node.names)
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            function = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+            if function in ("import_module", "__import__") and isinstance(node.args[0].value, str):
+                yield node.lineno, node.args[0].value, ()
+
+
+def arrows(package: Path) -> list[Arrow]:
+    """Every import of every module; `from package import room` points at the room."""
+    found = []
+    rooms = {room for room, _ in modules(package)}
+    for room, path in modules(package):
+        parent = (PACKAGE, *path.relative_to(package).parent.parts)
+        for line, module, names in imported_names(ast.parse(path.read_text("utf-8")), parent):
+            where = f"{path.relative_to(package)}:{line}"
+            targets = [f"{module}.{name}" for name in names] or [module]
+            if module == PACKAGE:
+                targets = [target if target.split(".")[-1] in rooms else PACKAGE for target in targets]
+            found += [Arrow(room, where, target) for target in targets]
+    return found
+
+
+def upward(found: list[Arrow]) -> list[str]:
+    """The arrows that point up, or both ways inside one level."""
+    inside = [(a, a.target_room) for a in found if a.target_room is not None and a.target_room != a.room]
+    pairs = {(a.room, target) for a, target in inside}
+    return [
+        f"{arrow.where}: {arrow.room} imports {arrow.target}"
+        for arrow, target in inside
+        if LEVEL[target] > LEVEL[arrow.room] or (LEVEL[target] == LEVEL[arrow.room] and (target, arrow.room) in pairs)
+    ]
+
+
+def misplaced_torch(found: list[Arrow]) -> list[str]:
+    """The arrows to torch from outside learning/ and agents/learned.py."""
+    return [
+        f"{arrow.where}: {arrow.target}"
+        for arrow in found
+        if any(arrow.target == name or arrow.target.startswith(f"{name}.") for name in TORCH)
+        and arrow.room != "learning"
+        and not arrow.where.startswith("agents/learned.py:")
+    ]
+
+
+def planted(folder: Path, files: dict[str, str]) -> list[Arrow]:
+    """The arrows of a small package written for one test."""
+    for name, source in files.items():
+        path = folder / PACKAGE / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(source, "utf-8")
+    return arrows(folder / PACKAGE)
+
+
+def test_import_order__every_module_stands_in_a_known_room() -> None:
+    rooms = {room for room, _ in modules(ROOT / PACKAGE)}
+    assert "physics" in rooms
+    assert rooms <= set(LEVEL), f"give these a level in LEVELS: {sorted(rooms - set(LEVEL))}"
+
+
+def test_import_order__no_arrow_points_up() -> None:
+    found = arrows(ROOT / PACKAGE)
+    assert any(arrow.target_room == "physics" for arrow in found)
+    assert upward(found) == []
+
+
+def test_torch__is_imported_only_where_policies_live() -> None:
+    assert misplaced_torch(arrows(ROOT / PACKAGE)) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("physics/advance.py", "from ethbrake_marl.harm import Ledger"),
+        ("physics/advance.py", "from ..harm import Ledger"),
+        ("physics/advance.py", "from .. import harm"),
+        ("physics/deep/events.py", "from ...harm import Ledger"),
+        ("physics/__init__.py", "from ..harm import Ledger"),
+        ("physics/advance.py", "import ethbrake_marl.harm as ledger"),
+        ("physics/advance.py", "from ethbrake_marl import harm"),
+        ("physics/advance.py", "from ethbrake_marl import load_scenario"),
+        ("physics/advance.py", "import ethbrake_marl"),
+        ("physics/advance.py", "def later():\n    from ethbrake_marl.harm import Ledger"),
+        ("physics/advance.py", "if TYPE_CHECKING:\n    from ethbrake_marl.harm import Ledger"),
+        ("physics/advance.py", "importlib.import_module('ethbrake_marl.harm')"),
+        ("errors.py", "from ethbrake_marl.physics import advance"),
+        ("engine.py", "from ethbrake_marl.cli import main"),
+    ],
+)
+def test_import_order__finds_a_planted_upward_arrow(tmp_path: Path, name: str, source: str) -> None:
+    found = planted(tmp_path, {"harm.py": "", "cli.py": "", name: source})
+    assert len(upward(found)) == 1
+    assert upward(found)[0].startswith(f"{name}:")
+
+
+def test_import_order__accepts_what_points_down_or_stays_in_the_room(tmp_path: Path) -> None:
+    files = {
+        "harm.py": "import numpy\nfrom ethbrake_marl.physics.worlds import Worlds\nfrom ethbrake_marl import physics",
+        "physics/advance.py": "from ethbrake_marl.physics.worlds import Worlds\nfrom .impact import collide",
+        "evaluation/rollout.py": "from ethbrake_marl.learning import policy",
+        "cli.py": "from ethbrake_marl import load_scenario",
+    }
+    assert upward(planted(tmp_path, files)) == []
+
+
+def test_import_order__one_level_may_not_import_itself_both_ways(tmp_path: Path) -> None:
+    files = {
+        "evaluation/rollout.py": "from ethbrake_marl.learning import policy",
+        "learning/ppo.py": "from ethbrake_marl import evaluation",
+    }
+    assert len(upward(planted(tmp_path, files))) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "misplaced"),
+    [
+        ("engine.py", "import torch", True),
+        ("envs/sb3.py", "def step():\n    from torch.nn import Linear", True),
+        ("agents/constant.py", "from safetensors import torch", True),
+        ("agents/constant.py", "from safetensors.numpy import load_file", False),
+        ("engine.py", "import torchlight", False),
+        ("learning/ppo.py", "import torch", False),
+        ("agents/learned.py", "import torch.nn as nn", False),
+    ],
+)
+def test_torch__a_planted_import_is_judged_by_its_place(
+    tmp_path: Path, name: str, source: str, misplaced: bool
+) -> None:
+    assert len(misplaced_torch(planted(tmp_path, {name: source}))) == misplaced
+
+
+@pytest.mark.parametrize(
+    ("module", "heavy"),
+    [
+        ("ethbrake_marl", ("torch", "matplotlib", "stable_baselines3")),
+        ("ethbrake_marl.cli", ("torch", "stable_baselines3")),
+    ],
+)
+def test_import__loads_nothing_heavy_and_says_nothing(module: str, heavy: tuple[str, ...]) -> None:
+    program = f"import sys, {module}; sys.exit(', '.join(sorted(set({heavy!r}) & set(sys.modules))) or None)"
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
