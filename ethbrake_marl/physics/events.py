@@ -35,17 +35,6 @@ def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
 
 
 @compiled
-def no_contact_within(gap: float, closing: float, pressing: float, duration: float) -> bool:
-    """Cheap sufficient test: even the larger of each term, held all along, does not close the gap."""
-    reach = 0.0
-    if closing > 0.0:
-        reach = closing * duration
-    if pressing > 0.0:
-        reach += 0.5 * pressing * duration * duration
-    return reach < gap
-
-
-@compiled
 def drift(gap: float, closing: float, pressing: float, duration: float) -> float:
     """Gap after ``duration`` of constant closing acceleration: ``g - (w + b t / 2) t``. [m]"""
     return gap - (closing + 0.5 * pressing * duration) * duration
@@ -100,3 +89,28 @@ def settle(low: float, high: float) -> float:
     if high < 0.0:
         return high
     return 0.0
+
+
+@compiled
+def solo_motion(speed: float, command: float, onset: float, limit: float, duration: float) -> tuple[float, float]:
+    """Speed and way after ``duration`` of a vehicle on its own: coast until ``onset``, then brake or drive.
+
+    Braking ends at standstill, driving at the speed limit; ``speed >= 0``. [m/s, m]
+    """
+    way = 0.0
+    if onset > 0.0:
+        if onset >= duration or command == 0.0:
+            return speed, speed * duration
+        way = speed * onset
+        duration -= onset
+    after = speed + command * duration
+    if command < 0.0:
+        if after <= 0.0:
+            return 0.0, way - speed * speed / (2.0 * command)
+    elif command > 0.0:
+        if speed >= limit:
+            return speed, way + speed * duration
+        if after >= limit:
+            driving = (limit - speed) / command
+            return limit, way + 0.5 * (speed + limit) * driving + limit * (duration - driving)
+    return after, way + (speed + 0.5 * command * duration) * duration

@@ -13,9 +13,21 @@ Vehicles are ordered front to rear; feasible means that no vehicle is faster tha
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.events import PLASTIC_SPEED_MPS, TOUCH_SPEED_MPS, settle
 from ethbrake_marl.physics.worlds import Floats, Ints
+
+
+class Cluster(NamedTuple):
+    """Working memory for the impacts of one world, and their outcome."""
+
+    closing: Floats  # [P] closing speed before, 0 where the pair does not touch
+    before: Floats  # [N] speeds before
+    work: Floats  # [2, N]
+    block: Floats  # [4, N]
+    struck: Ints  # [P] 1 where the pair had an impact (not a touch)
 
 
 @compiled
@@ -49,71 +61,59 @@ def pool(low: Floats, high: Floats, mass: Floats, first: int, last: int, out: Fl
 
 
 @compiled
-def resolve_cluster(
-    speed: Floats, closing: Floats, mass: Floats, restitution: float, first: int, last: int, work: Floats, block: Floats
-) -> None:
+def resolve_cluster(speed: Floats, mass: Floats, restitution: float, first: int, last: int, cluster: Cluster) -> None:
     """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact, in place.
 
-    ``closing[p]`` is the closing speed of pair p; ``work`` is scratch [2, N]. One restitution holds per world, so
-    clusters never mix two; the cluster is plastic when its largest closing speed is below ``PLASTIC_SPEED_MPS``.
-    Speeds are taken relative to the front vehicle, which keeps the digits of small closing speeds.
+    One restitution holds per world, so clusters never mix two; the cluster is plastic when its largest closing speed
+    is below ``PLASTIC_SPEED_MPS``. Speeds are taken relative to the front vehicle, which keeps the digits of small
+    closing speeds.
     """
     largest = 0.0
     for p in range(first, last):
-        largest = max(largest, closing[p])
+        largest = max(largest, cluster.closing[p])
     bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0
     reference = speed[first]
+    relative, pooled = cluster.work[0], cluster.work[1]
     for i in range(first, last + 1):
-        work[0, i] = speed[i] - reference
-    pool(work[0], work[0], mass, first, last, work[1], block)
+        relative[i] = speed[i] - reference
+    pool(relative, relative, mass, first, last, pooled, cluster.block)
     for i in range(first, last + 1):
-        pooled = work[1, i]
-        speed[i] = reference + (pooled + bounce * (pooled - work[0, i]))
+        speed[i] = reference + (pooled[i] + bounce * (pooled[i] - relative[i]))
 
 
 @compiled
 def resolve_impacts(
-    gap: Floats,
-    speed: Floats,
-    contact_speed: Floats,
-    mass: Floats,
-    restitution: float,
-    closing: Floats,
-    before: Floats,
-    work: Floats,
-    block: Floats,
-    struck: Ints,
-) -> int:
-    """One round of impacts of one world: every cluster that holds an approaching pair, once. Returns their number.
+    gap: Floats, speed: Floats, contact_speed: Floats, mass: Floats, restitution: float, cluster: Cluster
+) -> bool:
+    """One round of impacts of one world: every cluster that holds an approaching pair, once. False if there is none.
 
     ``contact_speed[p] > 0`` is the exact closing speed of a pair that has just met (else 0: the difference of the
-    speeds counts). On return ``closing[p]`` is each pair's closing speed before, ``before`` the speeds before,
-    ``struck[p]`` 1 where this was an impact (not a touch) and ``speed`` the speeds after.
+    speeds counts). ``cluster`` receives each pair's closing speed and the speeds before, and which pairs struck.
     """
     pairs = gap.shape[0]
-    clusters = 0
-    for i in range(pairs + 1):
-        before[i] = speed[i]
+    touching = False
     for p in range(pairs):
-        struck[p] = 0
-        closing[p] = 0.0
+        touching = touching or gap[p] <= 0.0
+    if not touching:
+        return False
+    cluster.before[:] = speed
+    for p in range(pairs):
+        cluster.struck[p] = 0
+        cluster.closing[p] = 0.0
         if gap[p] <= 0.0:
-            closing[p] = contact_speed[p] if contact_speed[p] > 0.0 else speed[p + 1] - speed[p]
+            cluster.closing[p] = contact_speed[p] if contact_speed[p] > 0.0 else speed[p + 1] - speed[p]
+    resolved = False
     p = 0
     while p < pairs:
-        if gap[p] > 0.0:
-            p += 1
-            continue
         last = p
         approaching = False
         while last < pairs and gap[last] <= 0.0:
-            approaching = approaching or closing[last] > 0.0
+            approaching = approaching or cluster.closing[last] > 0.0
             last += 1
         if approaching:
-            clusters += 1
-            resolve_cluster(speed, closing, mass, restitution, p, last, work, block)
+            resolved = True
+            resolve_cluster(speed, mass, restitution, p, last, cluster)
             for q in range(p, last):
-                if closing[q] > TOUCH_SPEED_MPS:
-                    struck[q] = 1
-        p = last
-    return clusters
+                cluster.struck[q] = 1 if cluster.closing[q] > TOUCH_SPEED_MPS else 0
+        p = last + 1
+    return resolved
