@@ -15,16 +15,20 @@ from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.impact import BEFORE, CLOSING, GAP, MASS, SPEED, STRUCK
 from ethbrake_marl.physics.segment import (
+    COMMAND,
     DONE,
+    IMPACT,
+    LIMIT,
     MOST_EVENTS,
+    ONSET,
     PENETRATED,
     STUCK,
-    Line,
-    Tally,
-    make_scratch,
+    TABLE_ROWS,
     move_apart,
-    move_by_events,
+    start_events,
+    to_next_impact,
 )
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
 
@@ -60,13 +64,13 @@ def advance_worlds(
     braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats, restitution: Floats,
     first_harm: Floats, total_harm: Floats, count: Ints, rows: Floats,
 ) -> tuple[int, int, int]:  # fmt: skip
-    """Advance every world to its ``until``, in place (first six arrays and the harm).
+    """Advance every world to its ``until``, in place (the first five arrays and the harm).
 
     ``rows`` [capacity, 7] receives the impacts that fit. Returns their whole number, the world where a check failed
     (or -1) and its status.
     """
     n, vehicles = speeds.shape
-    scratch = make_scratch(vehicles)
+    table = np.zeros((TABLE_ROWS, vehicles))
     recorded = 0
     for k in range(n):
         duration = until[k] - time[k]
@@ -76,16 +80,70 @@ def advance_worlds(
             wanted = command[k, i]
             if not -braking[k, i] <= wanted <= driving[k, i]:
                 return recorded, k, _BAD_COMMAND
-            scratch.onset[i] = latency[k, i] - time[k]
+            table[COMMAND, i] = wanted
+            table[SPEED, i] = speeds[k, i]
+            table[MASS, i] = mass[k, i]
+            table[LIMIT, i] = limit[k, i]
+            table[ONSET, i] = latency[k, i] - time[k]
             in_force[k, i] = wanted if latency[k, i] <= until[k] else 0.0
-        line = Line(gaps[k], speeds[k], command[k], scratch.onset, mass[k], limit[k], restitution[k])
-        if not move_apart(gaps, speeds, k, line, duration, scratch):
-            tally = Tally(hit[k], first_harm[k], total_harm[k], count[k], rows)
-            recorded, status = move_by_events(line, duration, time[k], k, tally, recorded, scratch)
+        for p in range(vehicles - 1):
+            table[GAP, p] = gaps[k, p]
+        if not move_apart(table, duration):
+            recorded, status = advance_near(
+                table, k, time[k], duration, restitution[k], hit, first_harm, total_harm, count, rows, recorded
+            )
             if status != DONE:
                 return recorded, k, status
         time[k] = until[k]
+        for i in range(vehicles):
+            speeds[k, i] = table[SPEED, i]
+        for p in range(vehicles - 1):
+            gaps[k, p] = table[GAP, p]
     return recorded, -1, DONE
+
+
+@compiled
+def advance_near(
+    table: Floats, k: int, time_s: float, duration: float, restitution: float, hit: Bools, first_harm: Floats,
+    total_harm: Floats, count: Ints, rows: Floats, recorded: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Take world ``k``, whose vehicles may meet, through its segment and record its impacts."""
+    start_events(table)
+    now = 0.0
+    for _ in range(MOST_EVENTS):
+        status, now = to_next_impact(table, restitution, now, duration)
+        if status != IMPACT:
+            return recorded, status
+        recorded = record_impacts(table, k, time_s + now, hit, first_harm, total_harm, count, rows, recorded)
+    return recorded, STUCK
+
+
+@compiled
+def record_impacts(
+    table: Floats, k: int, time_s: float, hit: Bools, first_harm: Floats, total_harm: Floats, count: Ints, rows: Floats,
+    recorded: int,
+) -> int:  # fmt: skip
+    """Write the last round of impacts of world ``k`` to the ledger; rows beyond their capacity are only counted."""
+    for p in range(table.shape[1] - 1):
+        if table[STRUCK, p] == 0.0:
+            continue
+        closing = table[CLOSING, p]
+        harm = closing * closing
+        if recorded < rows.shape[0]:
+            rows[recorded, 0] = k
+            rows[recorded, 1] = p
+            rows[recorded, 2] = time_s
+            rows[recorded, 3] = closing
+            rows[recorded, 4] = 0.0 if hit[k, p] else 1.0
+            rows[recorded, 5] = table[SPEED, p] - table[BEFORE, p]
+            rows[recorded, 6] = table[SPEED, p + 1] - table[BEFORE, p + 1]
+        recorded += 1
+        total_harm[k, p] += harm
+        count[k, p] += 1
+        if not hit[k, p]:
+            hit[k, p] = True
+            first_harm[k, p] += harm
+    return recorded
 
 
 def advance(

@@ -9,60 +9,72 @@ vehicles is resolved at once by a mass-weighted isotonic regression ``P`` (pool 
   pushed harder than its braked members hold.
 
 Vehicles are ordered front to rear; feasible means that no vehicle is faster than the one before it.
+
+The kernels work on one table of floats for one world, ``table[row, vehicle or pair]``; the rows are named here. (One
+array is cheap to hand from function to function; twenty small ones cost more than the physics.)
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.events import PLASTIC_SPEED_MPS, TOUCH_SPEED_MPS, settle
-from ethbrake_marl.physics.worlds import Floats, Ints
+from ethbrake_marl.physics.worlds import Floats
 
-
-class Cluster(NamedTuple):
-    """Working memory for the impacts of one world, and their outcome."""
-
-    closing: Floats  # [P] closing speed before, 0 where the pair does not touch
-    before: Floats  # [N] speeds before
-    work: Floats  # [2, N]
-    block: Floats  # [4, N]
-    struck: Ints  # [P] 1 where the pair had an impact (not a touch)
+# per vehicle
+SPEED = 0
+MASS = 1
+BEFORE = 2  # speed before an impact
+RELATIVE = 3  # speed before an impact, relative to the front vehicle of its cluster
+POOLED = 4
+# per pair
+GAP = 5
+CLOSING = 6  # closing speed before an impact, 0 where the pair does not touch
+CONTACT_SPEED = 7  # exact closing speed of a pair that has just met, else 0
+STRUCK = 8  # 1 where the last round was an impact (not a touch)
+# per pooled block
+BLOCK_MASS = 9
+BLOCK_LOW = 10
+BLOCK_HIGH = 11
+BLOCK_FIRST = 12
+IMPACT_ROWS = 13
 
 
 @compiled
-def pool(low: Floats, high: Floats, mass: Floats, first: int, last: int, out: Floats, block: Floats) -> None:
-    """Mass-weighted isotonic regression of vehicles ``first..last`` (inclusive), written to ``out``.
+def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> None:
+    """Mass-weighted isotonic regression of vehicles ``first..last`` (inclusive) into row ``out``.
 
-    ``block`` is scratch [4, N]: mass, force low, force high and first vehicle of each pooled block. All members of a
+    Rows ``low`` and ``high`` bound each vehicle's own value (equal for an ordinary one). All members of a pooled
     block get the same bits.
     """
     count = 0
     for i in range(first, last + 1):
-        block[0, count] = mass[i]
-        block[1, count] = mass[i] * low[i]
-        block[2, count] = mass[i] * high[i]
-        block[3, count] = i
-        out[count + first] = settle(low[i], high[i])
-        while count > 0 and out[count + first] > out[count + first - 1]:
+        mass = table[MASS, i]
+        table[BLOCK_MASS, count] = mass
+        table[BLOCK_LOW, count] = mass * table[low, i]
+        table[BLOCK_HIGH, count] = mass * table[high, i]
+        table[BLOCK_FIRST, count] = i
+        top = count + first
+        table[out, top] = settle(table[low, i], table[high, i])
+        while count > 0 and table[out, top] > table[out, top - 1]:
             count -= 1
-            block[0, count] += block[0, count + 1]
-            block[1, count] += block[1, count + 1]
-            block[2, count] += block[2, count + 1]
-            out[count + first] = settle(block[1, count] / block[0, count], block[2, count] / block[0, count])
+            top -= 1
+            table[BLOCK_MASS, count] += table[BLOCK_MASS, count + 1]
+            table[BLOCK_LOW, count] += table[BLOCK_LOW, count + 1]
+            table[BLOCK_HIGH, count] += table[BLOCK_HIGH, count + 1]
+            mass = table[BLOCK_MASS, count]
+            table[out, top] = settle(table[BLOCK_LOW, count] / mass, table[BLOCK_HIGH, count] / mass)
         count += 1
-    last_member = last
+    member = last
     for k in range(count - 1, -1, -1):
-        value = out[k + first]
-        start = int(block[3, k])
-        for i in range(last_member, start - 1, -1):
-            out[i] = value
-        last_member = start - 1
+        value = table[out, k + first]
+        while member >= table[BLOCK_FIRST, k]:
+            table[out, member] = value
+            member -= 1
 
 
 @compiled
-def resolve_cluster(speed: Floats, mass: Floats, restitution: float, first: int, last: int, cluster: Cluster) -> None:
-    """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact, in place.
+def resolve_cluster(table: Floats, restitution: float, first: int, last: int) -> None:
+    """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
 
     One restitution holds per world, so clusters never mix two; the cluster is plastic when its largest closing speed
     is below ``PLASTIC_SPEED_MPS``. Speeds are taken relative to the front vehicle, which keeps the digits of small
@@ -70,50 +82,48 @@ def resolve_cluster(speed: Floats, mass: Floats, restitution: float, first: int,
     """
     largest = 0.0
     for p in range(first, last):
-        largest = max(largest, cluster.closing[p])
+        largest = max(largest, table[CLOSING, p])
     bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0
-    reference = speed[first]
-    relative, pooled = cluster.work[0], cluster.work[1]
+    reference = table[SPEED, first]
     for i in range(first, last + 1):
-        relative[i] = speed[i] - reference
-    pool(relative, relative, mass, first, last, pooled, cluster.block)
+        table[RELATIVE, i] = table[SPEED, i] - reference
+    pool(table, RELATIVE, RELATIVE, first, last, POOLED)
     for i in range(first, last + 1):
-        speed[i] = reference + (pooled[i] + bounce * (pooled[i] - relative[i]))
+        pooled = table[POOLED, i]
+        table[SPEED, i] = reference + (pooled + bounce * (pooled - table[RELATIVE, i]))
 
 
 @compiled
-def resolve_impacts(
-    gap: Floats, speed: Floats, contact_speed: Floats, mass: Floats, restitution: float, cluster: Cluster
-) -> bool:
+def resolve_impacts(table: Floats, restitution: float) -> bool:
     """One round of impacts of one world: every cluster that holds an approaching pair, once. False if there is none.
 
-    ``contact_speed[p] > 0`` is the exact closing speed of a pair that has just met (else 0: the difference of the
-    speeds counts). ``cluster`` receives each pair's closing speed and the speeds before, and which pairs struck.
+    Rows CLOSING, BEFORE and STRUCK tell what happened. CONTACT_SPEED is used up.
     """
-    pairs = gap.shape[0]
-    touching = False
+    pairs = table.shape[1] - 1
+    approaching = False
     for p in range(pairs):
-        touching = touching or gap[p] <= 0.0
-    if not touching:
+        closing = 0.0
+        if table[GAP, p] <= 0.0:
+            closing = table[CONTACT_SPEED, p]
+            if closing == 0.0:
+                closing = table[SPEED, p + 1] - table[SPEED, p]
+        table[CLOSING, p] = closing
+        approaching = approaching or closing > 0.0
+    if not approaching:
         return False
-    cluster.before[:] = speed
-    for p in range(pairs):
-        cluster.struck[p] = 0
-        cluster.closing[p] = 0.0
-        if gap[p] <= 0.0:
-            cluster.closing[p] = contact_speed[p] if contact_speed[p] > 0.0 else speed[p + 1] - speed[p]
-    resolved = False
-    p = 0
-    while p < pairs:
-        last = p
+    for i in range(pairs + 1):
+        table[BEFORE, i] = table[SPEED, i]
+    first = 0
+    while first < pairs:
+        last = first
         approaching = False
-        while last < pairs and gap[last] <= 0.0:
-            approaching = approaching or cluster.closing[last] > 0.0
+        while last < pairs and table[GAP, last] <= 0.0:
+            approaching = approaching or table[CLOSING, last] > 0.0
             last += 1
         if approaching:
-            resolved = True
-            resolve_cluster(speed, mass, restitution, p, last, cluster)
-            for q in range(p, last):
-                cluster.struck[q] = 1 if cluster.closing[q] > TOUCH_SPEED_MPS else 0
-        p = last + 1
-    return resolved
+            resolve_cluster(table, restitution, first, last)
+        first = last + 1
+    for p in range(pairs):
+        table[CONTACT_SPEED, p] = 0.0
+        table[STRUCK, p] = 1.0 if table[CLOSING, p] > TOUCH_SPEED_MPS else 0.0
+    return True
