@@ -17,6 +17,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import Ledger, empty_ledger
 from ethbrake_marl.observations import Observations, ObservationSpec, observe
 from ethbrake_marl.physics import Bools, Floats, Impacts, Ints, Worlds, advance, assign
+from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.rewards import RewardParams, reward_params, reward_terms, weighted_sum
 from ethbrake_marl.scenario import Scenario
 
@@ -54,7 +55,9 @@ class Engine:
     """A batch of ``n`` running episodes of one scenario.
 
     ``learners`` are vehicle indices (0 = front); every other vehicle needs an entry in ``scripts``. Worlds come from
-    the scenario's training stream of ``seed`` unless ``reset`` is given some. With no learner, steps start at t = 0.
+    the scenario's training stream of ``seed`` unless they are given (``worlds``, at t = 0, here or in ``reset``).
+    Steps start when the first of the ``deciders`` may act: the learners, or the scripted vehicles named instead (an
+    evaluated agent drives its vehicle as a script, on a learner's grid of decisions). With none, they start at t = 0.
     """
 
     def __init__(
@@ -67,6 +70,8 @@ class Engine:
         reward: str | RewardParams = "harm",
         observation: ObservationSpec | None = None,
         seed: int = 0,
+        deciders: Sequence[int] | None = None,
+        worlds: Worlds | None = None,
     ) -> None:
         if not n >= 1:
             raise InvalidInput(f"engine: n = {n} worlds; at least 1 is needed")
@@ -80,6 +85,9 @@ class Engine:
                 f"engine: learners {self.learners} and scripts {tuple(self.scripts)} must name each of the"
                 f" {scenario.vehicles} vehicles exactly once"
             )
+        self.deciders = self.learners if deciders is None else tuple(deciders)
+        if not set(self.deciders) <= set(range(scenario.vehicles)):
+            raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
         self.reward = reward_params(reward)
         self.observation = observation or ObservationSpec()
         self.seed = seed
@@ -87,7 +95,7 @@ class Engine:
         self._drawn = 0
         self._pool: Worlds | None = None
         self._pool_next = 0
-        self.reset()
+        self.reset(worlds=worlds)
 
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
         """Start new episodes in all rows: the given worlds (at t = 0), or the next ones of the training stream.
@@ -126,21 +134,21 @@ class Engine:
         [-1, 1] per world. Rows whose episode has ended stay as they are until ``renew`` or ``reset``.
         """
         command = self._commands(actions)
-        before, running = self.worlds, ~self.ended
-        self._step_index += running
-        last = self._step_index >= self._last_step
-        horizon = self.scenario.horizon_s
-        until = np.where(last, horizon, self._start_s + self._step_index * self.scenario.time_step_s)
-        until = np.where(running, until, before.time_s)
-        after, impacts = advance(before, command, until_s=until)
-        self.worlds, self.ledger = after, self.ledger.add(impacts)
-        at_rest = (after.speeds_mps == 0.0).all(axis=1) & (command <= 0.0).all(axis=1)
-        terminated = running & at_rest
-        truncated = running & last & ~at_rest
+        before = self.worlds
+        index, until = next_times(
+            self._step_index, self._last_step, self._start_s, self.ended, before.time_s, self.scenario.time_step_s,
+            self.scenario.horizon_s,
+        )  # fmt: skip
+        self.worlds, impacts = advance(before, command, until_s=until)
+        self.ledger = self.ledger.add(impacts)
+        terminated, truncated, safe_end = episode_ends(
+            self.worlds.speeds_mps, command, self.ledger.count, self.ended, index >= self._last_step
+        )
+        terms = reward_terms(self.reward, before, self.worlds, impacts, safe_end, self.scenario.time_step_s)
+        reward = weighted_sum(self.reward, terms, command.shape)
+        reward[self.ended] = 0.0
+        self._step_index = index
         self.ended = self.ended | terminated | truncated
-        safe_end = (terminated | truncated) & ~self.ledger.collided
-        terms = reward_terms(self.reward, before, after, impacts, safe_end, self.scenario.time_step_s)
-        reward = weighted_sum(self.reward, terms, command.shape) * running[:, np.newaxis]
         return Step(reward, terms, terminated, truncated, impacts, command)
 
     def _commands(self, actions: Mapping[int, Floats] | Floats) -> Floats:
@@ -165,12 +173,12 @@ class Engine:
             script.begin(fresh, vehicle, rows)
             command[:, vehicle] = script.act(self.worlds, vehicle)[rows]
         start = np.zeros(len(rows))
-        if self.learners:
-            start = fresh.vehicles.latency_s[:, list(self.learners)].min(axis=1)
+        if self.deciders:
+            start = fresh.vehicles.latency_s[:, list(self.deciders)].min(axis=1)
         step, horizon = self.scenario.time_step_s, self.scenario.horizon_s
         if not (start < horizon).all():
             late = float(start.max())
-            raise InvalidInput(f"reset: no learner may act before the horizon ({late:g} s >= {horizon:g} s)")
+            raise InvalidInput(f"reset: nobody decides before the horizon ({late:g} s >= {horizon:g} s)")
         moved, impacts = advance(fresh, command, until_s=start)
         self.worlds = assign(self.worlds, rows, moved)
         self.ledger = _assign_ledger(self.ledger, rows, empty_ledger(fresh).add(impacts))
@@ -190,6 +198,41 @@ class Engine:
         rows = np.arange(self._pool_next, self._pool_next + count)
         self._pool_next += count
         return self._pool.take(rows)
+
+
+@compiled
+def next_times(
+    index: Ints, last: Ints, start_s: Floats, ended: Bools, time_s: Floats, time_step_s: float, horizon_s: float
+) -> tuple[Ints, Floats]:
+    """Number of the coming step and its end, [n]; the last step ends exactly at the horizon, ended worlds stay."""
+    coming, until = index.copy(), time_s.copy()
+    for k in range(index.shape[0]):
+        if not ended[k]:
+            coming[k] += 1
+            until[k] = horizon_s if coming[k] >= last[k] else start_s[k] + coming[k] * time_step_s
+    return coming, until
+
+
+@compiled
+def episode_ends(
+    speeds: Floats, command: Floats, impacts: Ints, ended: Bools, at_horizon: Bools
+) -> tuple[Bools, Bools, Bools]:
+    """Which running episodes terminate (at rest, nobody drives), are truncated, and end without a collision, [n]."""
+    n, vehicles = speeds.shape
+    terminated, truncated, safe = np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    for k in range(n):
+        if ended[k]:
+            continue
+        at_rest = True
+        for i in range(vehicles):
+            at_rest = at_rest and speeds[k, i] == 0.0 and command[k, i] <= 0.0
+        terminated[k] = at_rest
+        truncated[k] = at_horizon[k] and not at_rest
+        if terminated[k] or truncated[k]:
+            safe[k] = True
+            for p in range(vehicles - 1):
+                safe[k] = safe[k] and impacts[k, p] == 0
+    return terminated, truncated, safe
 
 
 def _assign_ledger(ledger: Ledger, rows: Ints, fresh: Ledger) -> Ledger:

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from ethbrake_marl.physics.advance import Impacts
+from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
 
 HarmCount = Literal["first", "total"]
@@ -51,14 +52,24 @@ class Ledger:
 
     def world_harm(self, count: HarmCount) -> Floats:
         """Harm of all vehicles of a world together, [n]."""
-        harm: Floats = self.pair_harm(count).sum(axis=1)
-        return harm
+        return line_sum(self.pair_harm(count))
 
     @property
     def collided(self) -> Bools:
         """Whether any impact happened, [n]."""
         hit: Bools = self.count.sum(axis=1) > 0
         return hit
+
+
+@compiled
+def line_sum(pair_values: Floats) -> Floats:
+    """Sum over the pairs of each world, [n], in a fixed order: the same bits in any batch."""
+    n, pairs = pair_values.shape
+    total = np.zeros(n)
+    for k in range(n):
+        for p in range(pairs):
+            total[k] += pair_values[k, p]
+    return total
 
 
 def empty_ledger(worlds: Worlds) -> Ledger:

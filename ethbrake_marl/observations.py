@@ -8,12 +8,14 @@ with its ``known`` flag 0. There are no running statistics: an observation means
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.v2x import informed
 
 Observations = NDArray[np.float32]
@@ -60,6 +62,8 @@ NEIGHBOUR_FEATURES = (
     ),
 )
 
+_OWN, _NEIGHBOUR = len(OWN_FEATURES), len(NEIGHBOUR_FEATURES)
+
 
 @dataclass(frozen=True, slots=True)
 class ObservationSpec:
@@ -92,81 +96,97 @@ class ObservationSpec:
     @property
     def size(self) -> int:
         """Length F of an observation."""
-        return len(OWN_FEATURES) + (self.front + self.rear) * len(NEIGHBOUR_FEATURES)
+        return _OWN + (self.front + self.rear) * _NEIGHBOUR
 
 
 def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
     """Observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in its own memory."""
     if not 0 <= vehicle < worlds.N:
         raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{worlds.N - 1}")
-    columns = _own_values(worlds, vehicle)
-    known = informed(worlds, vehicle)
-    absent = [np.zeros(worlds.n)] * len(NEIGHBOUR_FEATURES)
-    for _, offset in spec.sides:
-        other = vehicle + offset
-        if 0 <= other < worlds.N:
-            columns += [np.where(known, value, 0.0) for value in _neighbour_values(worlds, vehicle, other)]
-        else:
-            columns += absent
-    features = spec.features
-    observation = np.empty((worlds.n, len(features)), np.float32)
-    for k, (feature, column) in enumerate(zip(features, columns, strict=True)):
-        observation[:, k] = np.clip(column / feature.scale, feature.low, feature.high)
+    per_unit, low, high, offsets = _scaling(spec)
+    vehicles = worlds.vehicles
+    observation = np.empty((worlds.n, spec.size), np.float32)
+    _observe_worlds(
+        worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, worlds.command_mps2,
+        vehicles.braking_capacity_mps2, vehicles.driving_capacity_mps2, vehicles.latency_s, vehicles.mass_t,
+        vehicles.restitution, informed(worlds, vehicle), vehicle, offsets, per_unit, low, high, observation,
+    )  # fmt: skip
     return observation
 
 
-def _own_values(worlds: Worlds, vehicle: int) -> list[Floats]:
-    vehicles = worlds.vehicles
-    return [
-        worlds.speeds_mps[:, vehicle],
-        worlds.command_mps2[:, vehicle],
-        vehicles.braking_capacity_mps2[:, vehicle],
-        vehicles.driving_capacity_mps2[:, vehicle],
-        vehicles.mass_t[:, vehicle],
-        _latency_left(worlds, vehicle),
-        vehicles.restitution,
-    ]
+@cache
+def _scaling(spec: ObservationSpec) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
+    """1 / scale, low and high of every feature in order, and the neighbours' offsets in the line."""
+    features = spec.features
+    return (
+        np.array([1.0 / f.scale for f in features]),
+        np.array([f.low for f in features]),
+        np.array([f.high for f in features]),
+        np.array([offset for _, offset in spec.sides], np.int64),
+    )
 
 
-def _neighbour_values(worlds: Worlds, vehicle: int, other: int) -> list[Floats]:
-    vehicles = worlds.vehicles
-    front, rear = min(vehicle, other), max(vehicle, other)
-    gap = worlds.gaps_m[:, front:rear].sum(axis=1)
-    front_distance, rear_distance = (_stopping_distance(worlds, i) for i in (front, rear))
-    own_room = gap + front_distance if vehicle == rear else rear_distance - gap
-    return [
-        np.ones(worlds.n),
-        gap,
-        worlds.speeds_mps[:, rear] - worlds.speeds_mps[:, front],
-        worlds.command_mps2[:, other],
-        vehicles.braking_capacity_mps2[:, other],
-        vehicles.mass_t[:, other],
-        _latency_left(worlds, other),
-        worlds.pair_hit[:, vehicle - 1 if other < vehicle else vehicle].astype(np.float64),
-        gap + front_distance - rear_distance,
-        _fitting_deceleration(worlds, vehicle, own_room),
-    ]
+@compiled
+def _observe_worlds(
+    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, command: Floats, braking: Floats, driving: Floats,
+    latency: Floats, mass: Floats, restitution: Floats, known: Bools, vehicle: int, offsets: NDArray[np.int64],
+    per_unit: Floats, low: Floats, high: Floats, out: Observations,
+) -> None:  # fmt: skip
+    """Fill ``out`` with the clipped features, in the order of OWN_FEATURES and NEIGHBOUR_FEATURES."""
+    i = vehicle
+    value = np.zeros(out.shape[1])
+    for k in range(out.shape[0]):
+        own_latency = max(latency[k, i] - time[k], 0.0)
+        own_stop = _stopping_distance(speeds[k, i], own_latency, braking[k, i])
+        value[0] = speeds[k, i]
+        value[1] = command[k, i]
+        value[2] = braking[k, i]
+        value[3] = driving[k, i]
+        value[4] = mass[k, i]
+        value[5] = own_latency
+        value[6] = restitution[k]
+        c = _OWN
+        for offset in offsets:
+            j = i + offset
+            if not (known[k] and 0 <= j < speeds.shape[1]):
+                value[c : c + _NEIGHBOUR] = 0.0
+                c += _NEIGHBOUR
+                continue
+            gap = 0.0
+            for p in range(min(i, j), max(i, j)):
+                gap += gaps[k, p]
+            other_latency = max(latency[k, j] - time[k], 0.0)
+            other_stop = _stopping_distance(speeds[k, j], other_latency, braking[k, j])
+            in_front = j < i
+            room = gap + other_stop if in_front else other_stop - gap
+            value[c] = 1.0
+            value[c + 1] = gap
+            value[c + 2] = speeds[k, i] - speeds[k, j] if in_front else speeds[k, j] - speeds[k, i]
+            value[c + 3] = command[k, j]
+            value[c + 4] = braking[k, j]
+            value[c + 5] = mass[k, j]
+            value[c + 6] = other_latency
+            value[c + 7] = 1.0 if hit[k, i - 1 if in_front else i] else 0.0
+            value[c + 8] = gap + other_stop - own_stop if in_front else gap + own_stop - other_stop
+            value[c + 9] = _fitting_deceleration(speeds[k, i], own_latency, room)
+            c += _NEIGHBOUR
+        for c in range(out.shape[1]):
+            out[k, c] = min(max(value[c] * per_unit[c], low[c]), high[c])
 
 
-def _latency_left(worlds: Worlds, vehicle: int) -> Floats:
-    left: Floats = np.maximum(worlds.vehicles.latency_s[:, vehicle] - worlds.time_s, 0.0)
-    return left
-
-
-def _stopping_distance(worlds: Worlds, vehicle: int) -> Floats:
+@compiled
+def _stopping_distance(speed: float, latency_left: float, capacity: float) -> float:
     """Distance to rest under full braking once the latency has elapsed: ``v tau + v^2 / (2 a)``, 0 if not moving on."""
-    speed = np.maximum(worlds.speeds_mps[:, vehicle], 0.0)
-    capacity = worlds.vehicles.braking_capacity_mps2[:, vehicle]
-    distance: Floats = speed * _latency_left(worlds, vehicle) + speed * speed / (2.0 * capacity)
-    return distance
+    speed = max(speed, 0.0)
+    return speed * latency_left + speed * speed / (2.0 * capacity)
 
 
-def _fitting_deceleration(worlds: Worlds, vehicle: int, room: Floats) -> Floats:
+@compiled
+def _fitting_deceleration(speed: float, latency_left: float, room: float) -> float:
     """Constant deceleration that uses up exactly ``room`` after the own latency: ``v^2 / (2 (room - v tau))``.
 
     Where there is no room it reads as the upper clipping bound; at rest it is 0.
     """
-    speed = np.maximum(worlds.speeds_mps[:, vehicle], 0.0)
-    left = np.maximum(room - speed * _latency_left(worlds, vehicle), 1e-3)
-    needed: Floats = speed * speed / (2.0 * left)
-    return needed
+    speed = max(speed, 0.0)
+    left = max(room - speed * latency_left, 1e-3)
+    return speed * speed / (2.0 * left)

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import expit
 
 from ethbrake_marl.errors import unknown_name
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.harm import HarmCount, line_sum
 from ethbrake_marl.physics import Bools, Floats, Impacts, Worlds
 
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -73,9 +73,9 @@ def reward_terms(
     terms: dict[str, Floats] = {}
     if params.harm > 0.0:
         harm = impacts.first_impact_harm if params.harm_count == "first" else impacts.total_harm
-        terms["harm"] = _shared(-harm.sum(axis=1), shape)
+        terms["harm"] = _shared(-line_sum(harm), shape)
     if params.collision > 0.0:
-        terms["collision"] = _shared(-params.k_energy * impacts.total_harm.sum(axis=1), shape)
+        terms["collision"] = _shared(-params.k_energy * line_sum(impacts.total_harm), shape)
     if params.risk > 0.0:
         terms["risk"] = _risk(params, after)
     if params.jerk > 0.0:
@@ -94,7 +94,7 @@ def weighted_sum(params: RewardParams, terms: dict[str, Floats], shape: tuple[in
 
 
 def _shared(world_value: Floats, shape: tuple[int, ...]) -> Floats:
-    return np.repeat(world_value[:, np.newaxis], shape[1], axis=1)
+    return np.broadcast_to(world_value[:, np.newaxis], shape)
 
 
 def _risk(params: RewardParams, worlds: Worlds) -> Floats:

@@ -92,25 +92,30 @@ def settle(low: float, high: float) -> float:
 
 
 @compiled
-def solo_motion(speed: float, command: float, onset: float, limit: float, duration: float) -> tuple[float, float]:
-    """Speed and way after ``duration`` of a vehicle on its own: coast until ``onset``, then brake or drive.
+def solo_motion(
+    speed: float, command: float, onset: float, limit: float, duration: float
+) -> tuple[float, float, float]:
+    """A vehicle on its own for ``duration``: coast until ``onset``, then brake to standstill or drive to the limit.
 
-    Braking ends at standstill, driving at the speed limit; ``speed >= 0``. [m/s, m]
+    Returns the speed after it, the way, and the acceleration where that was constant all along (else NaN);
+    ``speed >= 0``. [m/s, m, m/s2]
     """
     way = 0.0
+    steady = command
     if onset > 0.0:
         if onset >= duration or command == 0.0:
-            return speed, speed * duration
+            return speed, speed * duration, 0.0
         way = speed * onset
         duration -= onset
+        steady = math.nan
     after = speed + command * duration
     if command < 0.0:
         if after <= 0.0:
-            return 0.0, way - speed * speed / (2.0 * command)
+            return 0.0, way - speed * speed / (2.0 * command), 0.0 if speed == 0.0 else math.nan
     elif command > 0.0:
         if speed >= limit:
-            return speed, way + speed * duration
+            return speed, way + speed * duration, 0.0
         if after >= limit:
             driving = (limit - speed) / command
-            return limit, way + 0.5 * (speed + limit) * driving + limit * (duration - driving)
-    return after, way + (speed + 0.5 * command * duration) * duration
+            return limit, way + 0.5 * (speed + limit) * driving + limit * (duration - driving), math.nan
+    return after, way + (speed + 0.5 * command * duration) * duration, steady

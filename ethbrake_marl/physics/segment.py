@@ -40,26 +40,31 @@ IMPACT, DONE, PENETRATED, STUCK = 0, 1, 2, 3
 def move_apart(table: Floats, duration: float) -> bool:
     """Move a world whose vehicles surely stay apart; leave it and return False when that is not sure.
 
-    Speeds are monotone within a segment, so a pair closes by at most ``(max rear speed - min front speed) T``.
+    Where both of a pair have constant accelerations, the contact time says it exactly. Else: speeds are monotone
+    within a segment, so a pair closes by at most ``(max rear speed - min front speed) T``.
     """
     vehicles = table.shape[1]
-    slowest_in_front = math.inf
+    slowest_in_front, front_steady = math.inf, 0.0
     for i in range(vehicles):
         speed = table[SPEED, i]
         if speed < 0.0:
             return False
-        after, way = solo_motion(speed, table[COMMAND, i], table[ONSET, i], table[LIMIT, i], duration)
+        after, way, steady = solo_motion(speed, table[COMMAND, i], table[ONSET, i], table[LIMIT, i], duration)
         table[SPEED_VALUE, i] = after
         table[WAY, i] = way
         if i > 0:
             closing = max(speed, after) - slowest_in_front
             if closing > 0.0 and closing * duration >= table[GAP, i - 1]:
-                return False
-        slowest_in_front = min(speed, after)
+                closing, pressing = speed - table[SPEED, i - 1], steady - front_steady
+                if math.isnan(pressing) or (table[GAP, i - 1] <= 0.0 and closing >= 0.0):
+                    return False
+                if contact(table[GAP, i - 1], closing, pressing)[0] <= duration:
+                    return False
+        slowest_in_front, front_steady = min(speed, after), steady
     for i in range(vehicles):
         table[SPEED, i] = table[SPEED_VALUE, i]
     for p in range(vehicles - 1):
-        table[GAP, p] += table[WAY, p] - table[WAY, p + 1]
+        table[GAP, p] = max(table[GAP, p] + (table[WAY, p] - table[WAY, p + 1]), 0.0)
     return True
 
 
