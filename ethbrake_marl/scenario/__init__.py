@@ -1,0 +1,40 @@
+"""Scenarios: strict YAML files that describe families of worlds, and the reproducible lists drawn from them."""
+
+from ethbrake_marl.scenario.catalogue import CatalogueEntry, list_scenarios, load_scenario, scenario_folder
+from ethbrake_marl.scenario.distributions import Choice, Normal, Uniform
+from ethbrake_marl.scenario.initial_states import (
+    initial_state_worlds,
+    read_initial_states,
+    table_columns,
+    worlds_from_table,
+)
+from ethbrake_marl.scenario.sampling import Channel, Sample
+from ethbrake_marl.scenario.schema import Scenario, scenario_json_schema
+from ethbrake_marl.scenario.scripts import constant_command, is_state_free, parse_agent_spec
+from ethbrake_marl.scenario.template import new_scenario_text
+from ethbrake_marl.scenario.yaml_loading import Document, parse_yaml, read_yaml
+
+__all__ = [
+    "CatalogueEntry",
+    "Channel",
+    "Choice",
+    "Document",
+    "Normal",
+    "Sample",
+    "Scenario",
+    "Uniform",
+    "constant_command",
+    "initial_state_worlds",
+    "is_state_free",
+    "list_scenarios",
+    "load_scenario",
+    "new_scenario_text",
+    "parse_agent_spec",
+    "parse_yaml",
+    "read_initial_states",
+    "read_yaml",
+    "scenario_folder",
+    "scenario_json_schema",
+    "table_columns",
+    "worlds_from_table",
+]

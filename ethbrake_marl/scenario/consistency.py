@@ -1,0 +1,110 @@
+"""Checks of a scenario that concern a whole field or several fields at once.
+
+Each raises pydantic's error for the first defect, with the path inside the field or file and the value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from pydantic import BaseModel
+from pydantic_core import PydanticCustomError
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.scenario.distributions import support
+from ethbrake_marl.scenario.flow_text import flow_text
+from ethbrake_marl.scenario.quantities import QuantityRule
+from ethbrake_marl.scenario.scripts import LEARNER, constant_deceleration, is_state_free, parse_agent_spec
+from ethbrake_marl.scenario.yaml_loading import YamlPath
+
+if TYPE_CHECKING:
+    from ethbrake_marl.scenario.schema import Scenario
+
+
+def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
+    """Raise the error for ``value`` at ``at`` (inside the field being checked): ``right`` says what would do."""
+    plain = value.model_dump(exclude_none=True) if isinstance(value, BaseModel) else value
+    raise PydanticCustomError("scenario", "{right}", {"right": right, "value": flow_text(plain, 60), "at": at})
+
+
+def check_entries(rule: QuantityRule, value: Any, vehicles: int | None) -> None:
+    """Every entry of a quantity is in range over its whole support, and a list has the right length."""
+    listed = isinstance(value, tuple)
+    if listed and vehicles is not None and len(value) != rule.count(vehicles):
+        per = "one per pair" if rule.per == "pair" else "one per vehicle"
+        right = f"has {len(value)} entries; {vehicles} vehicles need {rule.count(vehicles)} ({per}), or one for all"
+        raise PydanticCustomError("scenario", "{right}", {"right": right, "value": "", "at": ()})
+    for index, entry in enumerate(value if listed else (value,)):
+        if not rule.allows(*support(entry)):
+            overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" else ""
+            refuse((index,) if listed else (), entry, f"must be {rule.interval}{overlap}")
+
+
+def complete_roles(given: Mapping[str, str] | None, vehicles: int) -> dict[str, str]:
+    """A role for every vehicle in order: full braking where none is given; by default vehicle_2 learns."""
+    roles = {"vehicle_2": LEARNER} if given is None else given
+    names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+    return {name: roles.get(name, "full_brake") for name in names}
+
+
+def check_roles(roles: Mapping[str, str], vehicles: int) -> None:
+    """Every key is a vehicle of this scenario and every value is ``learner`` or the syntax of a script."""
+    names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+    for name, role in roles.items():
+        if name not in names:
+            close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
+            refuse((name,), role, f"unknown vehicle; {hint}")
+        try:
+            is_state_free(role)
+        except InvalidInput as error:
+            refuse((name,), role, str(error))
+        if role.startswith(f"{LEARNER}:"):
+            refuse((name,), role, f"{LEARNER} takes no argument")
+
+
+def check_whole(scenario: Scenario) -> None:
+    """Fields that limit each other: time step, horizon, latency, speeds, constant scripts, rejection."""
+    if not scenario.time_step_s <= scenario.horizon_s:
+        refuse(("time_step_s",), scenario.time_step_s, f"must not be above horizon_s ({scenario.horizon_s:g} s)")
+    for i, latency in enumerate(scenario.quantities("latency_s")):
+        if not support(latency)[1] < scenario.horizon_s:
+            right = f"must be below horizon_s ({scenario.horizon_s:g} s), or the vehicle can never act"
+            refuse(_path(scenario, "latency_s", i), latency, right)
+    limits = scenario.quantities("speed_limit_mps")
+    for i, speed in enumerate(scenario.quantities("speeds_mps")):
+        if not support(speed)[1] <= support(limits[i])[0]:
+            right = f"must not be above speed_limit_mps of vehicle_{i + 1}, {flow_text(_plain(limits[i]))} m/s"
+            refuse(_path(scenario, "speeds_mps", i), speed, right)
+    _check_constant_scripts(scenario)
+    if scenario.early_impacts == "reject":
+        _check_rejection(scenario)
+
+
+def _check_constant_scripts(scenario: Scenario) -> None:
+    for i, script in scenario.scripts.items():
+        deceleration = constant_deceleration(script) or 0.0
+        field = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
+        capacity = support(scenario.quantities(field)[i])[0]
+        if not abs(deceleration) <= capacity:
+            refuse(("roles", f"vehicle_{i + 1}"), script, f"is above this vehicle's {field}, {capacity:g} m/s2")
+
+
+def _check_rejection(scenario: Scenario) -> None:
+    if not scenario.learners:
+        refuse(("early_impacts",), "reject", "needs a learner: early means before the first learner may act; use keep")
+    for i, script in scenario.scripts.items():
+        if not is_state_free(script):
+            name = parse_agent_spec(script)[0]
+            right = f"{name} depends on the state; with early_impacts: reject only full_brake, coast and constant:a do"
+            refuse(("roles", f"vehicle_{i + 1}"), script, right)
+
+
+def _path(scenario: Scenario, field: str, index: int) -> YamlPath:
+    return (field, index) if isinstance(getattr(scenario, field), tuple) else (field,)
+
+
+def _plain(quantity: Any) -> Any:
+    return quantity.model_dump(exclude_none=True) if isinstance(quantity, BaseModel) else quantity

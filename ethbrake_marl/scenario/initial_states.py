@@ -1,0 +1,193 @@
+"""Worlds whose initial conditions the user gives: a table (one row per world) or one state for ``reset``."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.worlds import Bools, Floats, Worlds, make_worlds
+from ethbrake_marl.scenario.quantities import QUANTITIES, suggestion
+from ethbrake_marl.scenario.schema import Scenario
+
+Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
+
+_NUMBER = re.compile(r"\s*[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\s*")
+_ALWAYS_IN_A_TABLE = ("gaps_m", "speeds_mps")
+
+
+@dataclass(frozen=True, slots=True)
+class _Naming:
+    """How messages call a value: by column and row of a table, or by key and index of one state."""
+
+    where: str
+    kind: Literal["file", "table", "state"]
+
+    def entry(self, entry: Entry) -> str:
+        field, index = entry
+        if self.kind != "state":
+            return f"column {QUANTITIES[field].column_of(index)}"
+        return field if QUANTITIES[field].per == "world" else f"{field}[{index}]"
+
+    def value(self, entry: Entry, row: int) -> str:
+        if self.kind == "state":
+            return f"{self.where}: {self.entry(entry)}"
+        return f"{self.where}, {f'line {row + 2}' if self.kind == 'file' else f'row {row}'}, {self.entry(entry)}"
+
+
+def table_columns(scenario: Scenario) -> dict[str, Entry]:
+    """Columns that a table of initial states may have for this scenario: ``gap_1_m``, ``speed_1_mps``, ..."""
+    return {
+        rule.column_of(index): (field, index)
+        for field, rule in QUANTITIES.items()
+        for index in range(rule.count(scenario.vehicles))
+    }
+
+
+def read_initial_states(path: str | Path, scenario: Scenario) -> Worlds:
+    """Read worlds from a CSV file with a header line; columns as ``worlds_from_table``.
+
+    Raises ``InvalidInput`` with file, line and column for an unknown, repeated or missing column, a value that is
+    not a number or out of range, a row of another length, or a file without rows.
+    """
+    file = Path(path)
+    header, rows = _read_csv(file)
+    entries = _known_columns(header, scenario, f"{file}, line 1")
+    table = np.empty((len(rows), len(header)))
+    for r, row in enumerate(rows):
+        if len(row) != len(header):
+            raise InvalidInput(f"{file}, line {r + 2}: {len(row)} values, but the header has {len(header)} columns")
+        for c, text in enumerate(row):
+            if not _NUMBER.fullmatch(text):
+                raise InvalidInput(f"{file}, line {r + 2}, column {header[c]}: {text!r} is not a number")
+            table[r, c] = float(text)
+    given = {entry: table[:, c] for c, entry in enumerate(entries)}
+    return _worlds(given, scenario, _Naming(str(file), "file"))
+
+
+def worlds_from_table(columns: Mapping[str, ArrayLike], scenario: Scenario) -> Worlds:
+    """Worlds from columns of equal length n: ``gap_1_m`` ..., ``speed_1_mps`` ..., and optionally the others.
+
+    Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``,
+    ``speed_limit_1_mps`` and so on for each vehicle, and ``restitution``. What is left out comes from the scenario,
+    where it must be a fixed number. Raises ``InvalidInput`` naming the column and the row (from 0).
+    """
+    entries = _known_columns(list(columns), scenario, "initial states")
+    given = {
+        entry: _numbers(f"initial states: {name}", column)
+        for entry, (name, column) in zip(entries, columns.items(), strict=True)
+    }
+    shapes = {column.shape for column in given.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 1:
+        lengths = ", ".join(f"{name} {list(np.shape(column))}" for name, column in columns.items())
+        raise InvalidInput(f"initial states: columns must be lists of one and the same length, not {lengths}")
+    return _worlds(given, scenario, _Naming("initial states", "table"))
+
+
+def initial_state_worlds(initial_state: Mapping[str, Any], scenario: Scenario) -> Worlds:
+    """The one world of ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; keys are a scenario's quantities.
+
+    A single number stands for every vehicle. What is left out comes from the scenario, where it must be a fixed
+    number. Raises ``InvalidInput`` naming the key and the entry.
+    """
+    if not isinstance(initial_state, Mapping):
+        raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
+    given: dict[Entry, Floats] = {}
+    for field, value in initial_state.items():
+        if field not in QUANTITIES:
+            hint = suggestion(str(field), QUANTITIES) or f"known: {', '.join(QUANTITIES)}"
+            raise InvalidInput(f"initial_state: unknown key {field!r}; {hint}")
+        count = QUANTITIES[field].count(scenario.vehicles)
+        numbers = _numbers(f"initial_state: {field}", value)
+        if numbers.shape not in ((), (count,)):
+            raise InvalidInput(
+                f"initial_state: {field} has shape {list(numbers.shape)}; {scenario.vehicles} vehicles need {count}"
+                " numbers, or one for all"
+            )
+        for index, number in enumerate(np.broadcast_to(numbers, (count,))):
+            given[field, index] = np.array([number])
+    return _worlds(given, scenario, _Naming("initial_state", "state"))
+
+
+def _worlds(given: Mapping[Entry, Floats], scenario: Scenario, naming: _Naming) -> Worlds:
+    """Check the given columns, each [n], fill in the scenario's fixed numbers, and build the worlds."""
+    n = len(next(iter(given.values()))) if given else 1
+    full: dict[str, Floats] = {}
+    for field, rule in QUANTITIES.items():
+        full[field] = np.empty((n, rule.count(scenario.vehicles)))
+        for index, quantity in enumerate(scenario.quantities(field)):
+            column = given.get((field, index))
+            if column is not None:
+                good = (column > 0.0 if rule.positive else column >= 0.0) & (column <= rule.high)
+                _require(good, naming, (field, index), column, f"must be {rule.interval}")
+                full[field][:, index] = column
+            elif isinstance(quantity, float):
+                full[field][:, index] = quantity
+            else:
+                missing = naming.entry((field, index))
+                raise InvalidInput(f"{naming.where}: {missing} is missing, and random in scenario {scenario.name!r}")
+    _check_together(full, scenario, naming)
+    restitution = full.pop("restitution")[:, 0]
+    return make_worlds(full.pop("gaps_m"), full.pop("speeds_mps"), restitution=restitution, **full)
+
+
+def _check_together(full: Mapping[str, Floats], scenario: Scenario, naming: _Naming) -> None:
+    for index in range(scenario.vehicles):
+        latency, speed, limit = (full[f][:, index] for f in ("latency_s", "speeds_mps", "speed_limit_mps"))
+        right = f"must be below the scenario's horizon_s ({scenario.horizon_s:g} s)"
+        _require(latency < scenario.horizon_s, naming, ("latency_s", index), latency, right)
+        right = f"must not be above speed_limit_mps of vehicle_{index + 1}, {limit.min():g} m/s"
+        _require(speed <= limit, naming, ("speeds_mps", index), speed, right)
+
+
+def _require(good: Bools, naming: _Naming, entry: Entry, column: Floats, right: str) -> None:
+    if not good.all():
+        row = int(np.argmin(good))
+        raise InvalidInput(f"{naming.value(entry, row)} = {column[row]:g}: {right}")
+
+
+def _known_columns(header: list[str], scenario: Scenario, where: str) -> list[Entry]:
+    """The entry of each column; unknown, repeated and missing columns are errors."""
+    known = table_columns(scenario)
+    for name in header:
+        if name not in known:
+            hint = suggestion(name, known) or f"known: {', '.join(known)}"
+            separator = "; columns are separated by commas" if ";" in name or "\t" in name else ""
+            raise InvalidInput(f"{where}: unknown column {name!r}; {hint}{separator}")
+    if twice := [name for name in header if header.count(name) > 1]:
+        raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
+    for name, (field, _) in known.items():
+        if field in _ALWAYS_IN_A_TABLE and name not in header:
+            raise InvalidInput(f"{where}: column {name!r} is missing; {scenario.vehicles} vehicles need it")
+    return [known[name] for name in header]
+
+
+def _numbers(what: str, value: ArrayLike) -> Floats:
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        raise InvalidInput(f"{what}: must be a number or a list of numbers") from None
+    if array.dtype.kind not in "iuf":
+        raise InvalidInput(f"{what} = {value!r}: must be a number or a list of numbers")
+    return array.astype(np.float64)
+
+
+def _read_csv(file: Path) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of a CSV file, unchecked; there is at least one row."""
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as stream:
+            lines = list(csv.reader(stream, strict=True))
+    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
+        raise InvalidInput(f"{file}: cannot be read as CSV: {error}") from None
+    if not lines or not lines[0]:
+        raise InvalidInput(f"{file}, line 1: must name the columns, for instance gap_1_m,gap_2_m,speed_1_mps,...")
+    if len(lines) == 1:
+        raise InvalidInput(f"{file}: has a header but no rows; one row is one world")
+    return [name.strip() for name in lines[0]], lines[1:]

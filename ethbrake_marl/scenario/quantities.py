@@ -1,0 +1,117 @@
+"""The quantities that describe a world: meaning, unit, allowed range, and the place of each in the random numbers.
+
+One table serves the schema, its messages, the tables of initial states and the sampling.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Literal
+
+BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the numbers of one Philox counter
+
+# Ending of a key -> the unit in words.
+UNITS = {
+    "s": "seconds",
+    "m": "metres",
+    "mps": "metres per second",
+    "mps2": "metres per second squared",
+    "t": "tonnes",
+}
+SYMBOLS = {"mps": "m/s", "mps2": "m/s2"}  # of the endings that are not their own symbol
+
+
+@dataclass(frozen=True, slots=True)
+class QuantityRule:
+    """What a quantity means and which values it may take."""
+
+    name: str  # key in a scenario, field of Worlds or Vehicles
+    unit: str  # key of UNITS, or "" for a plain number
+    per: Literal["vehicle", "pair", "world"]
+    high: float  # largest allowed value
+    positive: bool  # 0 is refused
+    slot: int  # column inside a vehicle's block of uniform numbers
+    column: str  # name in a table of initial states
+    meaning: str
+    example: str
+
+    @property
+    def interval(self) -> str:
+        """The allowed range, with its unit, as messages write it."""
+        unit = f" {SYMBOLS.get(self.unit, self.unit)} ({UNITS[self.unit]})" if self.unit else ""
+        return f"finite and in {'(' if self.positive else '['}0, {self.high:g}]{unit}"
+
+    def allows(self, low: float, high: float) -> bool:
+        """Whether every value from ``low`` to ``high`` is in range; false for NaN."""
+        return (low > 0.0 if self.positive else low >= 0.0) and high <= self.high
+
+    def count(self, vehicles: int) -> int:
+        """How many values a world of ``vehicles`` vehicles has."""
+        return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
+
+    def column_of(self, index: int) -> str:
+        """Name of the column that holds entry ``index`` (from 0) in a table of initial states."""
+        return self.column.format(index + 1)
+
+    def owner(self, index: int) -> str:
+        """Whose value entry ``index`` (from 0) is, in words; empty for a value of the whole world."""
+        front = f"vehicle_{index + 1}"
+        return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
+
+
+# The upper ends are far outside traffic: they catch a value in the wrong unit (kilograms, kilometres per hour).
+# The slots are fixed for ever: another order would give other worlds for the same seed.
+QUANTITIES = {
+    rule.name: rule
+    for rule in (
+        QuantityRule(
+            "gaps_m", "m", "pair", 1e4, False, 0, "gap_{}_m",
+            "bumper-to-bumper gap of each pair at the alert, front to rear", "[7, 7]",
+        ),
+        QuantityRule(
+            "speeds_mps", "mps", "vehicle", 200.0, False, 1, "speed_{}_mps",
+            "speed of each vehicle at the alert", "[20, 18, 20]",
+        ),
+        QuantityRule(
+            "braking_capacity_mps2", "mps2", "vehicle", 100.0, True, 2, "braking_capacity_{}_mps2",
+            "largest deceleration of each vehicle", "[6, 7, 6]",
+        ),
+        QuantityRule(
+            "driving_capacity_mps2", "mps2", "vehicle", 100.0, False, 3, "driving_capacity_{}_mps2",
+            "largest forward acceleration of each vehicle", "[6, 7, 6]",
+        ),
+        QuantityRule(
+            "latency_s", "s", "vehicle", 3600.0, False, 4, "latency_{}_s",
+            "time from the alert until a vehicle's commands take effect; it coasts until then", "[0, 0.5, 0.8]",
+        ),
+        QuantityRule(
+            "mass_t", "t", "vehicle", 1000.0, True, 5, "mass_{}_t",
+            "mass of each vehicle", "[4.5, 5.5, 5.9]",
+        ),
+        QuantityRule(
+            "speed_limit_mps", "mps", "vehicle", 200.0, True, 6, "speed_limit_{}_mps",
+            "speed at which driving stops accelerating", "40",
+        ),
+        QuantityRule(
+            "restitution", "", "world", 1.0, False, 7, "restitution",
+            "coefficient of restitution of every impact: 0 plastic, 1 elastic", "0.1",
+        ),
+    )
+}  # fmt: skip
+
+
+def suggestion(key: str, known: Iterable[str]) -> str:
+    """What an unknown ``key`` was probably meant to be; empty when nothing is close.
+
+    A key that differs from a known one only in its unit is recognised as such: ``gaps_km``, ``mass``.
+    """
+    names = sorted(known)
+    stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}
+    same = stems.get(key.rsplit("_", 1)[0]) or stems.get(key)
+    close = [same] if same else get_close_matches(key, names, n=1)
+    if not close:
+        return ""
+    unit = UNITS.get(close[0].rsplit("_", 1)[-1], "")
+    return f"did you mean {close[0]}{f' ({unit})' if unit else ''}?"

@@ -1,0 +1,149 @@
+"""Counter-based sampling: world k of a list is a pure function of (scenario, seed, channel, k).
+
+Every quantity of every vehicle owns one column of uniform numbers, used or not, so changing how one quantity is
+drawn leaves all others alone. The uniform numbers of world k stand at a fixed place of a Philox stream; a list is
+one contiguous piece of it. Only Philox's integers and SeedSequence are taken from numpy, both of which numpy keeps
+stable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, concatenate, make_worlds
+from ethbrake_marl.scenario.distributions import values
+from ethbrake_marl.scenario.quantities import BLOCK, QUANTITIES
+from ethbrake_marl.scenario.scripts import constant_command
+
+if TYPE_CHECKING:
+    from ethbrake_marl.scenario.schema import Scenario
+
+Channel = Literal["list", "training"]
+
+CHANNELS: dict[str, int] = {"list": 0, "training": 1}
+MOST_ATTEMPTS = 1000  # draws of one world before its scenario is declared unusable
+_PATIENCE = 10  # attempts of a whole list before one world is tried to its end
+
+_MOST_WORLDS = 2**62  # their numbers are 64-bit integers
+_NUMBERS_PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Worlds at the alert, and where in the list they stand."""
+
+    worlds: Worlds  # at t = 0
+    index: Ints  # [n] number of each world in the list of its seed
+    rejected: int  # draws refused because of an early impact
+
+
+def uniform_numbers(seed: int, channel: Channel, attempt: int, first: int, n: int, width: int) -> Floats:
+    """Uniform numbers in [0, 1) of worlds ``first`` to ``first + n - 1``: [n, width], width a multiple of 4.
+
+    Row k depends on (seed, channel, attempt, first + k, width) only. u is the upper 53 bits of a Philox integer.
+    """
+    sequence = np.random.SeedSequence([seed], spawn_key=(CHANNELS[channel], attempt))
+    key = sequence.generate_state(2, np.uint64)
+    stream = np.random.Philox(key=key, counter=first * (width // _NUMBERS_PER_COUNTER))
+    integers = np.asarray(stream.random_raw(n * width)).reshape(n, width)
+    upper: Floats = (integers >> np.uint64(11)).astype(np.float64)
+    return upper * 2.0**-53
+
+
+def draw_list(scenario: Scenario, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
+    """Worlds ``first`` to ``first + n - 1`` of the scenario's list; see ``Scenario.sample``."""
+    _check_request(n, seed, first, channel)
+    seed = int(seed)
+    index = np.arange(first, first + n, dtype=np.int64)
+    worlds = _draw(scenario, seed, channel, 0, index)
+    if scenario.early_impacts == "keep":
+        return Sample(worlds, index, 0)
+    early = early_impact(scenario, worlds)
+    if not early.any():
+        return Sample(worlds, index, 0)
+    return _redraw(scenario, seed, channel, index, worlds, early)
+
+
+def early_impact(scenario: Scenario, worlds: Worlds) -> Bools:
+    """Which worlds have an impact before (or just when) the first learner may act: [n].
+
+    Vehicles follow their state-free scripts and learners coast, which nobody can change before that moment.
+    """
+    vehicles = worlds.vehicles
+    command = np.zeros(worlds.speeds_mps.shape)
+    for i, script in scenario.scripts.items():
+        scripted = constant_command(script, vehicles.braking_capacity_mps2[:, i], vehicles.driving_capacity_mps2[:, i])
+        if scripted is None:
+            raise InvalidInput(f"scenario {scenario.name!r}: early_impacts reject: {script!r} depends on the state")
+        command[:, i] = scripted
+    first_action_s = vehicles.latency_s[:, list(scenario.learners)].min(axis=1)
+    _, impacts = advance(worlds, command, until_s=first_action_s)
+    return np.asarray(impacts.count.sum(axis=1) > 0)
+
+
+def _redraw(scenario: Scenario, seed: int, channel: Channel, index: Ints, worlds: Worlds, early: Bools) -> Sample:
+    """Draw refused worlds again, attempt by attempt, until every one is accepted."""
+    accepted = np.flatnonzero(~early)
+    pending = np.flatnonzero(early)
+    parts, rows, rejected = [worlds.take(accepted)], [accepted], len(pending)
+    for attempt in range(1, MOST_ATTEMPTS):
+        if attempt == _PATIENCE and len(pending) > 1:
+            _redraw_one(scenario, seed, channel, index[pending[:1]])
+        drawn = _draw(scenario, seed, channel, attempt, index[pending])
+        early = early_impact(scenario, drawn)
+        if not early.all():
+            parts.append(drawn.take(~early))
+            rows.append(pending[~early])
+        pending = pending[early]
+        rejected += len(pending)
+        if len(pending) == 0:
+            order = np.argsort(np.concatenate(rows))
+            return Sample(concatenate(parts).take(order), index, rejected)
+    raise _unusable(scenario, int(index[pending[0]]))
+
+
+def _redraw_one(scenario: Scenario, seed: int, channel: Channel, index: Ints) -> None:
+    """Follow one world to its end; if it fails the whole list fails, and this way soon."""
+    for attempt in range(_PATIENCE, MOST_ATTEMPTS):
+        if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index))[0]:
+            return
+    raise _unusable(scenario, int(index[0]))
+
+
+def _unusable(scenario: Scenario, world: int) -> InvalidInput:
+    learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners)
+    return InvalidInput(
+        f"scenario {scenario.name!r}: early_impacts: reject, but {MOST_ATTEMPTS} draws of world {world} all have an"
+        f" impact before {learners} may act; give larger gaps_m, a smaller latency_s, or early_impacts: keep"
+    )
+
+
+def _draw(scenario: Scenario, seed: int, channel: Channel, attempt: int, index: Ints) -> Worlds:
+    """The worlds with these numbers (ascending), as drawn in this attempt."""
+    first, last = int(index[0]), int(index[-1])
+    u = uniform_numbers(seed, channel, attempt, first, last - first + 1, BLOCK * scenario.vehicles)
+    if len(u) != len(index):
+        u = u[index - first]
+    drawn = {}
+    for field, rule in QUANTITIES.items():
+        entries = scenario.quantities(field)
+        drawn[field] = np.empty((len(index), len(entries)))
+        for i, entry in enumerate(entries):
+            drawn[field][:, i] = values(entry, u[:, BLOCK * i + rule.slot])
+    restitution = drawn.pop("restitution")[:, 0]
+    return make_worlds(drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, **drawn)
+
+
+def _check_request(n: int, seed: int, first: int, channel: str) -> None:
+    for name, value, least in (("n", n, 1), ("seed", seed, 0), ("first", first, 0)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not value >= least:
+            raise InvalidInput(f"sample: {name} = {value!r}: must be a whole number, at least {least}")
+    if not int(first) + int(n) <= _MOST_WORLDS:
+        raise InvalidInput(f"sample: first = {first!r}: a list has {_MOST_WORLDS} worlds")
+    if channel not in CHANNELS:
+        raise InvalidInput(f"sample: channel {channel!r}: must be one of {', '.join(CHANNELS)}")
