@@ -6,8 +6,8 @@ when Vehicle 1 brakes; ``reset`` moves exactly to the first moment at which a le
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -22,6 +22,9 @@ from ethbrake_marl.rewards import RewardParams, reward_params, reward_terms, wei
 from ethbrake_marl.scenario import Scenario
 
 _SAMPLED_AT_ONCE = 1024  # training worlds are drawn in blocks of at least this many
+
+
+OnBegin = Callable[[Worlds, Ints], None]  # the new worlds at the alert, and the rows where their episodes start
 
 
 class Script(Protocol):
@@ -58,6 +61,7 @@ class Engine:
     the scenario's training stream of ``seed`` unless they are given (``worlds``, at t = 0, here or in ``reset``).
     Steps start when the first of the ``deciders`` may act: the learners, or the scripted vehicles named instead (an
     evaluated agent drives its vehicle as a script, on a learner's grid of decisions). With none, they start at t = 0.
+    Whoever must see each episode's start (a shield) adds a function to ``on_begin``.
     """
 
     def __init__(
@@ -91,6 +95,7 @@ class Engine:
         self.reward = reward_params(reward)
         self.observation = observation or ObservationSpec()
         self.seed = seed
+        self.on_begin: list[OnBegin] = []
         self.rejected = 0  # draws refused so far because of an impact before anybody could act
         self._drawn = 0
         self._pool: Worlds | None = None
@@ -168,6 +173,8 @@ class Engine:
     def _begin(self, rows: Ints, fresh: Worlds) -> None:
         """Put ``fresh`` worlds (at t = 0) into ``rows`` and move them to their first decision."""
         self.worlds = assign(self.worlds, rows, fresh)
+        for watch in self.on_begin:
+            watch(fresh, rows)
         command = np.zeros(fresh.speeds_mps.shape)
         for vehicle, script in self.scripts.items():
             script.begin(fresh, vehicle, rows)
@@ -238,8 +245,8 @@ def episode_ends(
 def _assign_ledger(ledger: Ledger, rows: Ints, fresh: Ledger) -> Ledger:
     """The ledger with ``rows`` replaced."""
     first, total, count, mass = (
-        a.copy() for a in (ledger.first_impact_harm, ledger.total_harm, ledger.count, ledger.mass_t)
-    )
+        ledger.first_impact_harm.copy(), ledger.total_harm.copy(), ledger.count.copy(), ledger.mass_t.copy(),
+    )  # fmt: skip
     first[rows], total[rows] = fresh.first_impact_harm, fresh.total_harm
     count[rows], mass[rows] = fresh.count, fresh.mass_t
-    return replace(ledger, first_impact_harm=first, total_harm=total, count=count, mass_t=mass)
+    return Ledger(first, total, count, mass)

@@ -12,9 +12,10 @@ import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import config as numba_config
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -41,9 +42,11 @@ def cache_folder() -> Path:
 
 def compiled(function: Function) -> Function:
     """Compile ``function`` with numba: no fast-math, no bounds checks, releases the GIL, cached on disk."""
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(cache_folder())
+    config: Any = numba_config  # its settings are made at run time
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(cache_folder())
     try:
-        return numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+        kernel: Any = numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy")(function)
+        return cast(Function, kernel)
     finally:
-        numba.config.CACHE_DIR = before
+        config.CACHE_DIR = before

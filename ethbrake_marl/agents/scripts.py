@@ -1,0 +1,85 @@
+"""Scripts: full braking, coasting, a constant, and two baselines that know only the vehicle in front."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.agents.pairwise import optimise_pairwise
+from ethbrake_marl.agents.protocol import place, recall
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.scenario.scripts import constant_command, is_state_free
+
+
+class StateFree:
+    """``full_brake``, ``coast`` or ``constant:a`` (deceleration in m/s2): the same command whatever happens.
+
+    ``full_brake`` of every vehicle is the paper's non-ethical strategy. Raises ``InvalidInput`` for any other script
+    and, at ``begin``, for a constant beyond the vehicle's capacity.
+    """
+
+    def __init__(self, spec: str) -> None:
+        if not is_state_free(spec):
+            raise InvalidInput(f"agent {spec!r}: must be full_brake, coast or constant:a")
+        self.name = spec
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Check the command against these worlds' capacities."""
+        self.act(worlds, vehicle)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The constant command, [n] m/s2."""
+        vehicles = worlds.vehicles
+        command = constant_command(
+            self.name, vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
+        )
+        assert command is not None
+        return command
+
+
+class CopyLeader:
+    """Brake exactly as hard as the vehicle in front can, as far as the own brakes allow.
+
+    ``a = min(a_front, a_own)``. Needs one number from the front vehicle. Raises ``InvalidInput`` for the first vehicle.
+    """
+
+    name = "copy_leader"
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Nothing to remember."""
+        _check_has_front(self.name, vehicle)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """``-min(a_front, a_own)``, [n] m/s2."""
+        _check_has_front(self.name, vehicle)
+        capacity = worlds.vehicles.braking_capacity_mps2
+        return -np.minimum(capacity[:, vehicle - 1], capacity[:, vehicle])
+
+
+class GentlestFront:
+    """The smallest constant deceleration that spares the vehicle in front; full braking if none does.
+
+    From the pairwise closed form; it needs nothing from the vehicle behind, and collides in the very worlds in which
+    E-V2X-BM does: what it lacks is the choice between two harms. Raises ``InvalidInput`` for the first vehicle.
+    """
+
+    name = "gentlest_front"
+
+    def __init__(self) -> None:
+        self._deceleration_mps2: Floats = np.empty(0)
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Compute the deceleration of these rows' episodes."""
+        _check_has_front(self.name, vehicle)
+        least = optimise_pairwise(worlds, vehicle).spares_front_mps2
+        chosen = np.minimum(least, worlds.vehicles.braking_capacity_mps2[:, vehicle])
+        self._deceleration_mps2 = place(self._deceleration_mps2, rows, chosen)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Minus that deceleration, [n] m/s2."""
+        return -recall(self._deceleration_mps2, worlds.n, self.name)
+
+
+def _check_has_front(name: str, vehicle: int) -> None:
+    if vehicle < 1:
+        raise InvalidInput(f"agent {name!r}: vehicle_{vehicle + 1} has no vehicle in front of it")

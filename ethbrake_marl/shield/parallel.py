@@ -1,0 +1,87 @@
+"""The shield as a PettingZoo wrapper."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+from pettingzoo.utils import BaseParallelWrapper
+
+from ethbrake_marl.actions import checked_action, command_to_action
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.observations import Observations
+from ethbrake_marl.physics import Ints, Worlds
+from ethbrake_marl.shield.episode import Bound, HybridAgent
+
+MODES = ("episode",)
+
+
+class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
+    """Shield learners of a parallel environment (``eb.parallel_env``) that are driven by ``policy``.
+
+    Mode ``episode`` is the paper's Algorithm 1: when an episode starts, ``policy`` is rolled out from the alert and its
+    harm compared with ``H*`` (``bound``, ``count``); the lower one drives that episode. What is certified is the
+    policy, not single actions: while it drives, its own deterministic action is applied, whatever is proposed.
+    ``infos[agent]["shield"]`` holds proposed and applied action, who drives, and both harms. The claim of a bound
+    holds for one shielded vehicle, the others following their scripts.
+    """
+
+    def __init__(
+        self,
+        env: ParallelEnv[str, Observations, NDArray[Any]],
+        policy: Agent,
+        *,
+        mode: str = "episode",
+        bound: Bound = "coupled",
+        count: HarmCount = "first",
+        agents: Sequence[str] | None = None,
+    ) -> None:
+        super().__init__(env)
+        if mode not in MODES:
+            raise unknown_name("shield mode", mode, MODES)
+        engine = getattr(env.unwrapped, "engine", None)
+        if not isinstance(engine, Engine):
+            raise InvalidInput(f"HybridShield: {env} is not one of this package's environments (eb.parallel_env)")
+        self._engine = engine
+        names = engine.scenario.vehicle_names
+        shielded = tuple(names[i] for i in engine.learners) if agents is None else tuple(agents)
+        if len(shielded) != 1 or shielded[0] not in names or names.index(shielded[0]) not in engine.learners:
+            raise InvalidInput(f"HybridShield: shields exactly one learner in mode {mode!r}; got {shielded}")
+        self.mode = mode
+        self.shielded = shielded[0]
+        self._vehicle = names.index(self.shielded)
+        self.hybrid = HybridAgent(policy, engine.scenario, bound=bound, count=count)
+        engine.on_begin.append(self._begin)
+
+    def step(self, actions: Mapping[str, Any]) -> tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]:
+        """Advance by one step with the shielded agent's action replaced; it may also be left out."""
+        engine, agent = self._engine, self.shielded
+        proposed = actions.get(agent)
+        if proposed is not None:
+            checked_action(proposed, (1,), agent)
+        command = self.hybrid.act(engine.worlds, self._vehicle)
+        applied = command_to_action(command, engine.worlds.vehicles, self._vehicle)
+        observations, rewards, terminations, truncations, infos = super().step({**actions, agent: applied})
+        infos[agent]["shield"] = self._info(proposed, float(applied[0]))
+        return observations, rewards, terminations, truncations, infos
+
+    def _begin(self, worlds: Worlds, rows: Ints) -> None:
+        self.hybrid.begin(worlds, self._vehicle, rows)
+
+    def _info(self, proposed: Any, applied: float) -> dict[str, Any]:
+        """What the shield did, for ``infos``; ``proposed_action`` is NaN when nothing was proposed."""
+        value = float("nan") if proposed is None else float(np.asarray(proposed).item())
+        return {
+            "mode": self.mode,
+            "proposed_action": value,
+            "applied_action": applied,
+            "chosen_policy": bool(self.hybrid.chosen_policy[0]),
+            "policy_harm": float(self.hybrid.policy_harm[0]),
+            "bound_harm": float(self.hybrid.bound_harm[0]),
+        }
