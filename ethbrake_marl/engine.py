@@ -18,7 +18,7 @@ from ethbrake_marl.harm import Ledger, empty_ledger
 from ethbrake_marl.observations import Observations, ObservationSpec, observe
 from ethbrake_marl.physics import Bools, Floats, Impacts, Ints, Worlds, advance, assign
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.rewards import RewardParams, reward_params, reward_terms, weighted_sum
+from ethbrake_marl.rewards import RewardParams, potential, reward_params, reward_terms, weighted_sum
 from ethbrake_marl.scenario import Scenario
 
 _SAMPLED_AT_ONCE = 1024  # training worlds are drawn in blocks of at least this many
@@ -118,6 +118,7 @@ class Engine:
         self.worlds = worlds
         self.ledger = empty_ledger(worlds)
         self.ended: Bools = np.zeros(self.n, np.bool_)
+        self._potential = np.zeros(worlds.speeds_mps.shape)
         self._start_s = np.zeros(self.n)
         self._step_index = np.zeros(self.n, np.int64)
         self._last_step = np.zeros(self.n, np.int64)
@@ -150,11 +151,28 @@ class Engine:
             self.worlds.speeds_mps, command, self.ledger.count, self.ended, index >= self._last_step
         )
         terms = reward_terms(self.reward, before, self.worlds, impacts, safe_end, self.scenario.time_step_s)
+        if self.reward.shaping > 0.0:
+            terms["shaping"] = self._shaping(terminated)
         reward = weighted_sum(self.reward, terms, command.shape)
         reward[self.ended] = 0.0
         self._step_index = index
         self.ended = self.ended | terminated | truncated
         return Step(reward, terms, terminated, truncated, impacts, command)
+
+    def _shaping(self, terminated: Bools) -> Floats:
+        """The shaping term [n, N] of this step; keeps the new potentials, which are 0 where an episode terminated."""
+        before = self._potential
+        self._potential = self._potentials(self.worlds)
+        self._potential[terminated] = 0.0
+        shaping: Floats = self.reward.shaping_discount * self._potential - before
+        return shaping
+
+    def _potentials(self, worlds: Worlds) -> Floats:
+        """Potential of every learner, 0 for other vehicles, [n, N]."""
+        potentials = np.zeros(worlds.speeds_mps.shape)
+        for vehicle in self.learners:
+            potentials[:, vehicle] = potential(self.reward, worlds, vehicle, self.scenario.horizon_s)
+        return potentials
 
     def _commands(self, actions: Mapping[int, Floats] | Floats) -> Floats:
         command = np.empty(self.worlds.speeds_mps.shape)
@@ -189,6 +207,8 @@ class Engine:
         moved, impacts = advance(fresh, command, until_s=start)
         self.worlds = assign(self.worlds, rows, moved)
         self.ledger = _assign_ledger(self.ledger, rows, empty_ledger(fresh).add(impacts))
+        if self.reward.shaping > 0.0:
+            self._potential[rows] = self._potentials(moved)
         self.ended[rows] = False
         self._start_s[rows] = start
         self._step_index[rows] = 0

@@ -9,6 +9,9 @@ risk       the paper's r_risk over the vehicle's own pairs: ``-sigma(-TTC / tau)
            opening pair has TTC = infinity (first part 0) and ``d - d_safe`` is not negative
 jerk       the paper's r_jerk: minus the squared rate of change of the own command
 terminal   the paper's r_terminal: 1 when an episode ends without any collision
+shaping    for learners: ``discount Phi(after) - Phi(before)``, Phi = minus the least harm ahead (``potential``); such a
+           difference of potentials leaves the optimal policy as it is (Ng, Harada and Russell 1999) if
+           ``shaping_discount`` is the learner's own discount
 =========  =======================================================================================================
 """
 
@@ -22,7 +25,7 @@ from scipy.special import expit
 
 from ethbrake_marl.errors import unknown_name
 from ethbrake_marl.harm import HarmCount, line_sum
-from ethbrake_marl.physics import Bools, Floats, Impacts, Worlds
+from ethbrake_marl.physics import Bools, Floats, Impacts, Worlds, forecast
 
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -39,6 +42,8 @@ class RewardParams(BaseModel):
     risk: NonNegative = 0.0
     jerk: NonNegative = 0.0
     terminal: NonNegative = 0.0
+    shaping: NonNegative = 0.0
+    shaping_discount: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     k_energy: NonNegative = 1.0
     ttc_scale_s: Positive = 1.0
     safety_buffer_m: NonNegative = 1.0
@@ -51,6 +56,8 @@ REWARDS = {
     "total-harm": RewardParams(harm_count="total"),
     "paper": RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
 }
+
+_BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
 
 
 def reward_params(reward: str | RewardParams) -> RewardParams:
@@ -83,6 +90,18 @@ def reward_terms(
     if params.terminal > 0.0:
         terms["terminal"] = _shared(safe_end.astype(np.float64), shape)
     return terms
+
+
+def potential(params: RewardParams, worlds: Worlds, vehicle: int, horizon_s: float) -> Floats:
+    """Minus the least harm ahead, [n]: the best of nine constant decelerations of ``vehicle`` from now on.
+
+    All others brake fully; harm is what ``harm_count`` counts, from now to the horizon, in the engine's own physics.
+    """
+    command = -worlds.vehicles.braking_capacity_mps2
+    candidates = command[:, vehicle, np.newaxis] * _BRAKING_SHARES
+    harm = forecast(worlds, command, vehicle, candidates, horizon_s)[0 if params.harm_count == "first" else 1]
+    least: Floats = -harm.min(axis=1)
+    return least
 
 
 def weighted_sum(params: RewardParams, terms: dict[str, Floats], shape: tuple[int, ...]) -> Floats:

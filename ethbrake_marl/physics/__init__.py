@@ -1,6 +1,7 @@
 """Exact physics of a line of vehicles: compiled and pure. No YAML, no random numbers, no torch."""
 
 from ethbrake_marl.physics.advance import ImpactRows, Impacts, advance
+from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, assign, concatenate, make_worlds
 
 __all__ = [
@@ -14,5 +15,6 @@ __all__ = [
     "advance",
     "assign",
     "concatenate",
+    "forecast",
     "make_worlds",
 ]

@@ -1,0 +1,93 @@
+"""What constant commands would lead to: the same physics as ``advance``, for many candidate commands of one vehicle.
+
+Nothing of the motion is kept, only the harm, so a candidate costs little more than its events.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.physics.advance import advance_near
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.impact import GAP, MASS, SPEED
+from ethbrake_marl.physics.segment import COMMAND, DONE, LIMIT, ONSET, TABLE_ROWS, move_apart
+from ethbrake_marl.physics.worlds import Bools, Floats, Worlds
+
+
+def forecast(
+    worlds: Worlds, command_mps2: Floats, vehicle: int, candidates_mps2: Floats, until_s: float
+) -> tuple[Floats, Floats]:
+    """First-impact and total harm from now to ``until_s`` if ``vehicle`` held each candidate command, [n, K] each.
+
+    ``command_mps2`` [n, N] are the other vehicles' commands (the vehicle's own column is ignored);
+    ``candidates_mps2`` [n, K]. Worlds at or beyond ``until_s`` have no harm left. Pairs hit before do not count
+    again in first-impact harm. Raises ``InvalidInput`` for shapes that do not fit or a candidate beyond capacity.
+    """
+    n, N = worlds.speeds_mps.shape
+    if command_mps2.shape != (n, N) or candidates_mps2.ndim != 2 or candidates_mps2.shape[0] != n:
+        raise InvalidInput(
+            f"forecast: commands {command_mps2.shape} and candidates {candidates_mps2.shape}; ({n}, {N}) and ({n}, K)"
+            " are needed"
+        )
+    if not 0 <= vehicle < N:
+        raise InvalidInput(f"forecast: vehicle index {vehicle}; must be in 0..{N - 1}")
+    v = worlds.vehicles
+    low, high = -v.braking_capacity_mps2[:, [vehicle]], v.driving_capacity_mps2[:, [vehicle]]
+    good = (candidates_mps2 >= low) & (candidates_mps2 <= high)
+    if not good.all():
+        raise InvalidInput(
+            f"forecast: candidate {candidates_mps2[~good][0]:g} m/s2 is beyond vehicle_{vehicle + 1}'s capacity"
+        )
+    first, total = np.zeros(candidates_mps2.shape), np.zeros(candidates_mps2.shape)
+    failed = forecast_worlds(
+        worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, np.ascontiguousarray(command_mps2), vehicle,
+        np.ascontiguousarray(candidates_mps2), until_s, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, first,
+        total,
+    )  # fmt: skip
+    if failed >= 0:
+        raise PhysicsError(f"forecast: world {failed} could not be advanced to {until_s:g} s")
+    return first, total
+
+
+@compiled
+def forecast_worlds(
+    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, command: Floats, vehicle: int, candidates: Floats,
+    until_s: float, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, first: Floats, total: Floats,
+) -> int:  # fmt: skip
+    """Fill ``first`` and ``total`` [n, K]; returns a world where a check failed, or -1."""
+    n, vehicles = speeds.shape
+    pairs = vehicles - 1
+    table = np.zeros((TABLE_ROWS, vehicles))
+    struck = np.zeros((1, pairs), np.bool_)
+    first_harm, total_harm = np.zeros((1, pairs)), np.zeros((1, pairs))
+    count = np.zeros((1, pairs), np.int64)
+    no_rows = np.empty((0, 7))
+    for k in range(n):
+        duration = until_s - time[k]
+        if not duration > 0.0:
+            continue
+        for c in range(candidates.shape[1]):
+            for i in range(vehicles):
+                table[SPEED, i] = speeds[k, i]
+                table[COMMAND, i] = candidates[k, c] if i == vehicle else command[k, i]
+                table[MASS, i] = mass[k, i]
+                table[LIMIT, i] = limit[k, i]
+                table[ONSET, i] = latency[k, i] - time[k]
+            for p in range(pairs):
+                table[GAP, p] = gaps[k, p]
+            if move_apart(table, duration):
+                continue
+            for p in range(pairs):
+                struck[0, p] = hit[k, p]
+                first_harm[0, p] = 0.0
+                total_harm[0, p] = 0.0
+            _, status = advance_near(
+                table, 0, 0.0, duration, restitution[k], struck, first_harm, total_harm, count, no_rows, 0
+            )
+            if status != DONE:
+                return k
+            for p in range(pairs):
+                first[k, c] += first_harm[0, p]
+                total[k, c] += total_harm[0, p]
+    return -1

@@ -1,0 +1,56 @@
+"""Forecasts are the same physics as the advance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import advance, forecast, make_worlds
+
+
+def worlds(n=300):
+    rng = np.random.default_rng(11)
+    start = make_worlds(
+        rng.uniform(2, 10, (n, 2)),
+        rng.uniform(15, 22, (n, 3)),
+        braking_capacity_mps2=[6.0, 7.0, 6.0],
+        driving_capacity_mps2=[6.0, 7.0, 6.0],
+        latency_s=[0.0, 0.5, 0.8],
+        mass_t=[4.5, 5.5, 5.9],
+        restitution=0.1,
+    )
+    return advance(start, [-6.0, 0.0, -6.0], until_s=rng.uniform(0.0, 3.0, n))[0]
+
+
+def test_forecast__equals_the_advance_bit_for_bit():
+    start = worlds()
+    command = np.tile([-6.0, 99.0, -6.0], (start.n, 1))
+    candidates = np.tile([-7.0, -4.0, 0.0, 3.0], (start.n, 1))
+    first, total = forecast(start, command, 1, candidates, 8.0)
+    assert (first > 0).sum() > 300 and (total > first).sum() > 50
+    for c in range(candidates.shape[1]):
+        command[:, 1] = candidates[:, c]
+        _, impacts = advance(start, command, until_s=8.0)
+        assert (impacts.first_impact_harm[:, 0] + impacts.first_impact_harm[:, 1]).tolist() == first[:, c].tolist()
+        assert (impacts.total_harm[:, 0] + impacts.total_harm[:, 1]).tolist() == total[:, c].tolist()
+
+
+def test_forecast__a_world_at_the_horizon_has_no_harm_left():
+    start, _ = advance(worlds(5), [-6.0, -7.0, -6.0], until_s=8.0)
+    first, total = forecast(start, np.full((5, 3), -6.0), 1, np.full((5, 2), -1.0), 8.0)
+    assert first.sum() == total.sum() == 0.0
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda w: forecast(w, np.zeros((5, 2)), 1, np.zeros((5, 1)), 8.0),
+        lambda w: forecast(w, np.zeros((5, 3)), 3, np.zeros((5, 1)), 8.0),
+        lambda w: forecast(w, np.zeros((5, 3)), 1, np.full((5, 1), -7.5), 8.0),
+        lambda w: forecast(w, np.zeros((5, 3)), 1, np.full((5, 1), np.nan), 8.0),
+    ],
+)
+def test_bad_input__is_refused(call):
+    with pytest.raises(InvalidInput, match="forecast"):
+        call(worlds(5))

@@ -1,0 +1,109 @@
+"""Reward terms against hand-computed values; shaping as a true difference of potentials."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.errors import UnknownName
+from ethbrake_marl.physics import advance, forecast, make_worlds
+from ethbrake_marl.rewards import RewardParams, reward_params, reward_terms, weighted_sum
+from ethbrake_marl.scenario import load_scenario
+
+
+def sigmoid(x: float) -> float:
+    return 1.0 / (1.0 + math.exp(-x))
+
+
+def step(params: RewardParams, *, safe_end: bool = False):
+    """Vehicle 2 strikes Vehicle 1 at 10 m/s (e = 0.5, equal masses); Vehicle 3 falls back."""
+    before = make_worlds(
+        [[1.0, 5.0]],
+        [[10.0, 20.0, 4.0]],
+        braking_capacity_mps2=10.0,
+        driving_capacity_mps2=10.0,
+        latency_s=0.0,
+        mass_t=1.0,
+        restitution=0.5,
+    )
+    after, impacts = advance(before, [0.0, 0.0, -2.0], 0.5)
+    return after, reward_terms(params, before, after, impacts, np.array([safe_end]), 0.5)
+
+
+def test_harm__is_shared_by_all_and_negative():
+    _, terms = step(RewardParams())
+    assert terms.keys() == {"harm"}
+    assert terms["harm"].tolist() == [[-100.0, -100.0, -100.0]]
+
+
+def test_collision__is_weighted_by_k_energy():
+    _, terms = step(RewardParams(harm=0.0, collision=1.0, k_energy=0.5))
+    assert terms["collision"][0, 0] == -50.0
+
+
+def test_risk__ignores_the_time_to_collision_of_opening_pairs():
+    # after: gap 1 = 0 + 5 m/s * 0.4 s = 2 m opening; gap 2: 5 + 2 + 0.4 * 12.5 - (2 - 0.25) = 10.25 m opening
+    params = RewardParams(harm=0.0, risk=1.0, safety_buffer_m=1.0, target_gap_m=3.0, distance_slope_per_m=0.5)
+    after, terms = step(params)
+    assert after.gaps_m[0] == pytest.approx([2.0, 10.25])
+    first, second = -sigmoid(0.5 * (3.0 - 2.0)), -sigmoid(0.5 * (3.0 - 10.25))
+    assert terms["risk"][0] == pytest.approx([first, first + second, second])
+
+
+def test_risk__of_a_closing_pair_adds_the_time_to_collision():
+    params = RewardParams(harm=0.0, risk=1.0, ttc_scale_s=2.0)
+    before = make_worlds([7.0], [0.0, 4.0], braking_capacity_mps2=1.0, driving_capacity_mps2=1.0, latency_s=0.0,
+                         mass_t=1.0, restitution=0.0)  # fmt: skip
+    after, impacts = advance(before, [0.0, 0.0], 0.5)
+    terms = reward_terms(params, before, after, impacts, np.array([False]), 0.5)
+    assert terms["risk"][0, 1] == pytest.approx(-sigmoid(-((5.0 - 1.0) / 4.0) / 2.0) - sigmoid(3.0 - 5.0))
+
+
+def test_jerk__is_the_squared_rate_of_the_own_command():
+    _, terms = step(RewardParams(harm=0.0, jerk=1.0))
+    assert terms["jerk"].tolist() == [[0.0, 0.0, -16.0]]
+
+
+def test_terminal__only_at_a_safe_end():
+    params = RewardParams(harm=0.0, terminal=3.0)
+    assert step(params)[1]["terminal"].tolist() == [[0.0] * 3]
+    _, terms = step(params, safe_end=True)
+    assert weighted_sum(params, terms, (1, 3)).tolist() == [[3.0] * 3]
+
+
+def test_paper__has_its_four_terms():
+    _, terms = step(reward_params("paper"))
+    assert terms.keys() == {"collision", "risk", "jerk", "terminal"}
+
+
+@pytest.mark.parametrize("discount", [1.0, 0.9])
+def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(discount):
+    scenario = load_scenario("paper-random")
+    reward = RewardParams(harm=0.0, shaping=1.0, shaping_discount=discount)
+    scripts = {0: make_agent("full_brake"), 2: make_agent("full_brake")}
+    engine = Engine(scenario, 50, learners=(1,), scripts=scripts, reward=reward)
+    command = -engine.worlds.vehicles.braking_capacity_mps2
+    candidates = command[:, 1:2] * np.linspace(0.0, 1.0, 9)
+    least = forecast(engine.worlds, command, 1, candidates, scenario.horizon_s)[0].min(axis=1)
+    rng = np.random.default_rng(5)
+    total, factor = np.zeros(50), 1.0
+    while not engine.ended.all():
+        result = engine.step(rng.uniform(-1.0, 0.0, (50, 1)))
+        total += factor * result.reward[:, 1]
+        factor *= discount
+        assert (result.reward[:, [0, 2]] == 0.0).all()
+    assert (least > 0).sum() > 20
+    assert total == pytest.approx(least, abs=1e-9)
+
+
+def test_bad_input__is_refused():
+    with pytest.raises(UnknownName, match="did you mean 'paper'"):
+        reward_params("papr")
+    for bad in ({"harm": -1.0}, {"harm": math.nan}, {"ham": 1.0}, {"harm_count": "all"}, {"shaping_discount": 1.5}):
+        with pytest.raises(ValidationError):
+            RewardParams(**bad)
