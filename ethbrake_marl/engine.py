@@ -190,13 +190,11 @@ class Engine:
 
     def _begin(self, rows: Ints, fresh: Worlds) -> None:
         """Put ``fresh`` worlds (at t = 0) into ``rows`` and move them to their first decision."""
-        self.worlds = assign(self.worlds, rows, fresh)
         for watch in self.on_begin:
             watch(fresh, rows)
-        command = np.zeros(fresh.speeds_mps.shape)
         for vehicle, script in self.scripts.items():
             script.begin(fresh, vehicle, rows)
-            command[:, vehicle] = script.act(self.worlds, vehicle)[rows]
+        command = self._first_commands(rows, fresh)
         start = np.zeros(len(rows))
         if self.deciders:
             start = fresh.vehicles.latency_s[:, list(self.deciders)].min(axis=1)
@@ -213,6 +211,18 @@ class Engine:
         self._start_s[rows] = start
         self._step_index[rows] = 0
         self._last_step[rows] = np.ceil((horizon - start) / step - 1e-9).astype(np.int64)
+
+    def _first_commands(self, rows: Ints, fresh: Worlds) -> Floats:
+        """What the scripts want at the alert, learners coasting, [len(rows), N]."""
+        command = np.zeros(fresh.speeds_mps.shape)
+        if not all(getattr(script, "state_free", False) for script in self.scripts.values()):
+            self.worlds = assign(self.worlds, rows, fresh)  # a script with a memory acts on the whole batch
+        for vehicle, script in self.scripts.items():
+            if getattr(script, "state_free", False):
+                command[:, vehicle] = script.act(fresh, vehicle)
+            else:
+                command[:, vehicle] = script.act(self.worlds, vehicle)[rows]
+        return command
 
     def _next_worlds(self, count: int) -> Worlds:
         if self._pool is None or self._pool_next + count > self._pool.n:

@@ -18,6 +18,8 @@ class StateFree:
     and, at ``begin``, for a constant beyond the vehicle's capacity.
     """
 
+    state_free = True
+
     def __init__(self, spec: str) -> None:
         if not is_state_free(spec):
             raise InvalidInput(f"agent {spec!r}: must be full_brake, coast or constant:a")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,7 @@ LEARNER = "learner"
 _SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
 
 
+@lru_cache(maxsize=256)
 def parse_agent_spec(spec: str) -> tuple[str, str | None]:
     """Split ``name[:argument]``, for instance ``constant:3.5``, into its name and its argument or None.
 
@@ -30,6 +32,7 @@ def parse_agent_spec(spec: str) -> tuple[str, str | None]:
     return match["name"], match["argument"]
 
 
+@lru_cache(maxsize=256)
 def constant_deceleration(spec: str) -> float | None:
     """The deceleration a (m/s2, negative = drive) of ``constant:a``; None for any other script.
 
@@ -49,6 +52,7 @@ def constant_deceleration(spec: str) -> float | None:
     return deceleration
 
 
+@lru_cache(maxsize=256)
 def is_state_free(spec: str) -> bool:
     """Whether the script's command never depends on the state: ``full_brake``, ``coast`` or ``constant:a``.
 
