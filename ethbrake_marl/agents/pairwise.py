@@ -2,8 +2,8 @@
 
 The controlled vehicle's neighbours brake at full capacity from their own latencies; its front and its rear pair are
 treated as independent, so each counts its first contact only and no velocity is exchanged. Predicted harm is
-``H(a) = c_front(a)^2 + c_rear(a)^2`` (m2/s2). It is piecewise linear or concave in ``a`` between closed-form
-breakpoints, so its minimum is at one of them: no grid. docs/baselines.md derives all of it.
+``H(a) = c_front(a)^2 + c_rear(a)^2`` (m2/s2). Between a handful of closed-form breakpoints it is concave in ``a``, so
+its minimum is at one of them: no grid. docs/baselines.md derives all of it.
 """
 
 from __future__ import annotations
@@ -19,14 +19,12 @@ from ethbrake_marl.agents.pair_contact import (
     closing_speed_squared,
     least_to_spare_front,
     most_to_spare_rear,
-    stopping_distance,
-    stopping_time,
 )
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.worlds import Floats, Worlds
 
-CANDIDATES = 14  # 0, capacity, both thresholds, 4 regime changes of the front pair, 6 of the rear pair
+CANDIDATES = 6  # 0, capacity, the two thresholds, and two more where the vehicle may brake before its front neighbour
 _TIE = 1e-12  # harms closer than this, relative to 1 + harm, are one harm
 
 
@@ -40,57 +38,18 @@ class PairwiseOptimum(NamedTuple):
 
 
 @compiled
-def add_front_breakpoints(
-    at: Floats, gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, onset_f: float
-) -> None:
-    """Regime changes of the front pair in the follower's deceleration, into ``at[4:8]`` (any value: no such change).
+def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> tuple[float, float]:
+    """Kink and jump of the front pair's harm when the follower may brake before the leader; (0, 0) otherwise.
 
-    Both orders of braking: contact exactly when the leader comes to rest. Follower braking first: contact, standstill
-    exactly at the leader's onset, and the lightest contact before it that still counts as an impact.
+    Kink: contact exactly at the leader's onset, ``2 (w lead - gap) / lead^2``. Jump: below ``w^2 / (2 gap)`` the
+    follower strikes the coasting leader lightly, above it grazes past and may strike harder once the leader brakes;
+    the lightest contact that still is an impact stands for the open end. [m/s2]
     """
-    w = v_f - v_l
-    gap = gap - w * min(onset_l, onset_f)
     lead = onset_l - onset_f
     if lead <= 0.0:
-        braking = stopping_time(v_l, a_l) + lead
-        room = gap + stopping_distance(v_l, a_l)
-        if braking > 0.0:
-            at[4] = 2.0 * (v_f * stopping_time(v_l, a_l) - room) / (braking * braking)
-        return
-    leader_rests = lead + stopping_time(v_l, a_l)
-    room = gap + v_l * lead + stopping_distance(v_l, a_l)
-    at[4] = 2.0 * (v_f * leader_rests - room) / (leader_rests * leader_rests)
-    at[5] = 2.0 * (w * lead - gap) / (lead * lead)
-    at[6] = v_f / lead
-    at[7] = (w * w - 4.0 * TOUCH_SQUARED) / (2.0 * gap)
-
-
-@compiled
-def add_rear_breakpoints(
-    at: Floats, gap: float, v_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float
-) -> None:
-    """Regime changes of the rear pair in the leader's deceleration, into ``at[8:14]`` (any value: no such change).
-
-    Contact, and the leader's standstill, exactly at the follower's onset; contact exactly at the leader's standstill
-    with the follower coasting, and braking (two roots); contact at the onset with the leader at rest.
-    """
-    w = v_f - v_l
-    gap = gap - w * min(onset_l, onset_f)
-    tau = onset_f - onset_l
-    if tau < 0.0:
-        gap = gap - (w + 0.5 * a_f * tau) * -tau
-        v_f = v_f + a_f * tau
-        tau = 0.0
-    excess = v_f - 0.5 * v_l
-    at[8] = 2.0 * (gap - w * tau) / (tau * tau)
-    at[9] = v_l / tau
-    at[10] = v_l * excess / gap
-    at[11] = v_l * v_l / (2.0 * (v_f * tau - gap))
-    squared = excess * excess + 2.0 * a_f * (excess * tau - gap)
-    if squared >= 0.0:
-        root = math.sqrt(squared)
-        at[12] = v_l / (tau + (excess + root) / a_f)
-        at[13] = v_l / (tau + (excess - root) / a_f)
+        return 0.0, 0.0
+    gap = gap - w * onset_f
+    return 2.0 * (w * lead - gap) / (lead * lead), (w * w - 4.0 * TOUCH_SQUARED) / (2.0 * gap)
 
 
 @compiled
@@ -113,18 +72,17 @@ def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, on
 def find_breakpoints(
     at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
 ) -> tuple[float, float]:
-    """Fill ``at`` [14] with the candidates of one world, all inside [0, capacity]; returns both thresholds."""
+    """Fill ``at`` [6] with the candidates of one world, all inside [0, capacity]; returns both thresholds."""
     low, high = 0.0, math.inf
     at[:] = 0.0
     at[1] = capacity[i]
     if i > 0:
         f = i - 1
         low = least_to_spare_front(gap[f], speed[f], capacity[f], onset[f], speed[i], onset[i])
-        add_front_breakpoints(at, gap[f], speed[f], capacity[f], onset[f], speed[i], onset[i])
+        at[4], at[5] = early_breakpoints(gap[f], speed[i] - speed[f], onset[f], onset[i])
     if i < gap.shape[0]:
         r = i + 1
         high = most_to_spare_rear(gap[i], speed[i], onset[i], speed[r], capacity[r], onset[r])
-        add_rear_breakpoints(at, gap[i], speed[i], onset[i], speed[r], capacity[r], onset[r])
     at[2] = low
     at[3] = high
     for k in range(at.shape[0]):
@@ -172,7 +130,7 @@ def optimise_worlds(gaps: Floats, speeds: Floats, capacity: Floats, onset: Float
 
 @compiled
 def breakpoints_of_worlds(gaps: Floats, speeds: Floats, capacity: Floats, onset: Floats, i: int, out: Floats) -> None:
-    """Candidates of every world into ``out`` [n, 14]."""
+    """Candidates of every world into ``out`` [n, 6]."""
     for k in range(gaps.shape[0]):
         find_breakpoints(out[k], i, gaps[k], speeds[k], capacity[k], onset[k])
 
@@ -206,7 +164,7 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
 
 def pairwise_breakpoints(worlds: Worlds, vehicle: int) -> Floats:
-    """Every deceleration at which the predicted harm of ``vehicle`` may have its minimum, [n, 14], unordered. [m/s2]
+    """Every deceleration at which the predicted harm of ``vehicle`` may have its minimum, [n, 6], unordered. [m/s2]
 
     Raises ``InvalidInput`` as ``optimise_pairwise`` does.
     """

@@ -10,6 +10,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Ints, Worlds
 
 
+@runtime_checkable
 class Agent(Protocol):
     """Drives one vehicle in every world of a batch of ``n``; one object per vehicle."""
 

@@ -11,6 +11,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
 from ethbrake_marl.actions import checked_action, command_to_action
+from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -23,7 +24,7 @@ MODES = ("episode",)
 
 
 class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
-    """Shield learners of a parallel environment (``eb.parallel_env``) that are driven by ``policy``.
+    """Shield a learner of a parallel environment (``eb.parallel_env``) that is driven by ``policy``, or by an agent.
 
     Mode ``episode`` is the paper's Algorithm 1: when an episode starts, ``policy`` is rolled out from the alert and its
     harm compared with ``H*`` (``bound``, ``count``); the lower one drives that episode. What is certified is the
@@ -35,7 +36,7 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
     def __init__(
         self,
         env: ParallelEnv[str, Observations, NDArray[Any]],
-        policy: Agent,
+        policy: Agent | LearnedPolicy,
         *,
         mode: str = "episode",
         bound: Bound = "coupled",
@@ -56,7 +57,8 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         self.mode = mode
         self.shielded = shielded[0]
         self._vehicle = names.index(self.shielded)
-        self.hybrid = HybridAgent(policy, engine.scenario, bound=bound, count=count)
+        agent = policy if isinstance(policy, Agent) else LearnedAgent(policy)
+        self.hybrid = HybridAgent(agent, engine.scenario, bound=bound, count=count)
         engine.on_begin.append(self._begin)
 
     def step(self, actions: Mapping[str, Any]) -> tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]:

@@ -1,0 +1,30 @@
+"""Measuring agents on fixed lists of worlds: outcomes, statistics, tables, figures, the report.
+
+``figures``, ``trajectories`` and ``report`` load matplotlib and Jinja2; import those modules where they are used.
+"""
+
+from ethbrake_marl.evaluation.output_files import check_target
+from ethbrake_marl.evaluation.parameters import parameter_line, parameters
+from ethbrake_marl.evaluation.per_world import write_per_world_csv
+from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
+from ethbrake_marl.evaluation.rendering import markdown_table, rich_table
+from ethbrake_marl.evaluation.rollout import Evaluation, Outcome, evaluate
+from ethbrake_marl.evaluation.statistics import Estimate
+from ethbrake_marl.evaluation.table import SummaryRow, summarise
+
+__all__ = [
+    "EpisodeRecord",
+    "Estimate",
+    "Evaluation",
+    "Outcome",
+    "SummaryRow",
+    "check_target",
+    "evaluate",
+    "markdown_table",
+    "parameter_line",
+    "parameters",
+    "record_episode",
+    "rich_table",
+    "summarise",
+    "write_per_world_csv",
+]

@@ -1,0 +1,84 @@
+"""The conditions behind a result: what stands beside every table, figure and report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.evaluation.rollout import Evaluation
+from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.scenario.quantities import QUANTITIES
+
+_SYMBOLS = {
+    "gaps_m": ("d", "m"),
+    "speeds_mps": ("v", "m/s"),
+    "braking_capacity_mps2": ("braking capacity", "m/s²"),
+    "driving_capacity_mps2": ("driving capacity", "m/s²"),
+    "latency_s": ("τ", "s"),
+    "mass_t": ("m", "t"),
+    "restitution": ("e", ""),
+}
+_STAY = "\u00a0"  # a blank at which no line is broken
+
+
+def quantity(worlds: Worlds, field: str) -> Floats:
+    """A quantity of every world, [n, entries]: one entry per vehicle, pair or world (see ``QUANTITIES``)."""
+    holder = worlds if field in ("gaps_m", "speeds_mps") else worlds.vehicles
+    values: Floats = getattr(holder, field)
+    return values.reshape(worlds.n, -1)
+
+
+def quantities(worlds: Worlds) -> dict[str, Any]:
+    """Every quantity of the worlds as plain data: a list per vehicle or pair, one entry for the whole world.
+
+    An entry is a number where all worlds agree, else its ``[least, largest]`` value.
+    """
+    found: dict[str, Any] = {}
+    for field, rule in QUANTITIES.items():
+        entries = [_entry(column) for column in quantity(worlds, field).T]
+        found[field] = entries[0] if rule.per == "world" else entries
+    return found
+
+
+def parameters(evaluation: Evaluation) -> dict[str, Any]:
+    """Conditions of an evaluation as plain data: scenario, seed, count, who drove what, and all ``quantities``."""
+    scenario = evaluation.scenario
+    scripts = {scenario.vehicle_names[i]: script for i, script in scenario.scripts.items() if i != evaluation.vehicle}
+    return {
+        "scenario": scenario.name,
+        "seed": evaluation.seed,
+        "count": evaluation.worlds.n,
+        "controlled_vehicle": scenario.vehicle_names[evaluation.vehicle],
+        "scripts": scripts,
+        "time_step_s": scenario.time_step_s,
+        "horizon_s": scenario.horizon_s,
+        **quantities(evaluation.worlds),
+    }
+
+
+def parameter_line(found: Mapping[str, Any]) -> str:
+    """The ``parameters`` in one line, for captions: scenario, number of worlds, seed, then ``quantity_line``."""
+    seed = "" if found["seed"] is None else f", seed {found['seed']}"
+    return f"{found['scenario']}: {found['count']:,} worlds{seed}; {quantity_line(found)}"
+
+
+def quantity_line(found: Mapping[str, Any]) -> str:
+    """The ``quantities`` in one line, each with its symbol and unit: ``d = 7 m; v = (20, 18, 20) m/s; ...``."""
+    parts = []
+    for field, (symbol, unit) in _SYMBOLS.items():
+        entries = [found[field]] if QUANTITIES[field].per == "world" else found[field]
+        parts.append(f"{symbol}{_STAY}={_STAY}{_entries(entries)}{f'{_STAY}{unit}' if unit else ''}")
+    return "; ".join(parts)
+
+
+def _entry(column: Floats) -> float | list[float]:
+    low, high = float(np.min(column)), float(np.max(column))
+    return low if low == high else [low, high]
+
+
+def _entries(entries: list[float | list[float]]) -> str:
+    """``20``, ``(6, 7, 6)`` or ``5–10``; entries that read alike are written once."""
+    texts = [f"{e[0]:.3g}–{e[1]:.3g}" if isinstance(e, list) else f"{e:.4g}" for e in entries]
+    return texts[0] if len(set(texts)) == 1 else f"({f',{_STAY}'.join(texts)})"

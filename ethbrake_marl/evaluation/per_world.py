@@ -1,0 +1,69 @@
+"""One row per world and agent as CSV; every number reads back as the same bits."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.evaluation.output_files import check_target, write_output
+from ethbrake_marl.evaluation.parameters import quantity
+from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
+from ethbrake_marl.scenario.quantities import QUANTITIES
+
+Columns = dict[str, list[Any]]
+
+_ALWAYS = ("gaps_m", "speeds_mps")
+
+
+def write_per_world_csv(path: str | Path, evaluation: Evaluation, *, force: bool = False) -> None:
+    """Write one row per agent and world; docs/evaluation.md lists the columns.
+
+    The file appears whole or not at all. Raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` without a folder.
+    """
+    check_target(path, force=force)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    initial = initial_columns(evaluation)
+    for number, (agent, outcome) in enumerate(evaluation.outcomes.items()):
+        columns = {"agent": [agent] * evaluation.worlds.n, **initial, **outcome_columns(outcome)}
+        if number == 0:
+            writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
+    write_output(path, text.getvalue().encode(), force=force)
+
+
+def initial_columns(evaluation: Evaluation) -> Columns:
+    """World number and its initial state: gaps, speeds, and any other quantity that differs between worlds.
+
+    Named as in a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``.
+    """
+    columns: Columns = {"world": evaluation.index.tolist()}
+    for field, rule in QUANTITIES.items():
+        values = quantity(evaluation.worlds, field)
+        if field in _ALWAYS or np.ptp(values, axis=0).any():
+            columns |= {rule.column_of(i): values[:, i].tolist() for i in range(values.shape[1])}
+    return columns
+
+
+def outcome_columns(outcome: Outcome) -> Columns:
+    """What happened in each world; a column that the agent says nothing about is empty."""
+    n = len(outcome.collided)
+    columns: Columns = {"collided": outcome.collided.astype(int).tolist(), "impacts": outcome.impacts.tolist()}
+    for name, harm in (
+        ("first_impact_harm", outcome.vehicle_harm("first")),
+        ("total_harm", outcome.vehicle_harm("total")),
+    ):
+        columns |= {f"{name}_{i + 1}": harm[:, i].tolist() for i in range(harm.shape[1])}
+    columns |= {"first_impact_harm": outcome.first_impact_harm.tolist(), "total_harm": outcome.total_harm.tolist()}
+    final = outcome.final
+    columns |= {f"final_gap_{p + 1}_m": final.gaps_m[:, p].tolist() for p in range(final.N - 1)}
+    columns |= {f"final_speed_{i + 1}_mps": final.speeds_mps[:, i].tolist() for i in range(final.N)}
+    columns |= {"end_s": final.time_s.tolist(), "ended": outcome.ended.tolist()}
+    predicted, chosen = outcome.predicted_harm, outcome.chosen_policy
+    columns["predicted_harm"] = [""] * n if predicted is None else predicted.tolist()
+    columns["chosen_policy"] = [""] * n if chosen is None else chosen.astype(int).tolist()
+    return columns

@@ -1,0 +1,135 @@
+"""One episode at fine time resolution: what a figure or a viewer draws.
+
+Between decisions the motion follows from the state and the command alone, so the episode is first run as in an
+evaluation, and then sampled inside its steps: every sample is advanced straight from the beginning of its step.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import episode_engine
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.rollout import controlled_vehicle
+from ethbrake_marl.harm import Ledger
+from ethbrake_marl.physics import Floats, ImpactRows, Vehicles, Worlds, advance
+from ethbrake_marl.scenario import Scenario
+
+SAMPLE_S = 0.02
+
+Segment = tuple[Worlds, Floats, float]  # world (n = 1) at its start, constant command [1, N], time of its end
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeRecord:
+    """One world from the alert to its end, at k times; row 0 is the alert."""
+
+    agent: str
+    scenario: Scenario
+    vehicle: int  # index (0 = front) of the vehicle that the agent drove
+    initial: Worlds  # n = 1, at the alert
+    time_s: Floats  # [k] since Vehicle 1 began to brake, ascending
+    gaps_m: Floats  # [k, P]
+    speeds_mps: Floats  # [k, N]
+    positions_m: Floats  # [k, N] front bumpers along the road; a vehicle's length is not counted
+    command_mps2: Floats  # [k, N] signed acceleration asked for from then on; 0 before the latency has elapsed
+    impacts: ImpactRows  # in order of time; world is 0
+    ledger: Ledger  # n = 1
+    at_rest: bool  # the line came to rest; else the horizon cut the episode off
+
+
+def record_episode(
+    world: Worlds, agent: Agent, *, scenario: Scenario, vehicle: int | None = None, sample_s: float = SAMPLE_S
+) -> EpisodeRecord:
+    """Record ``agent`` driving ``vehicle`` through one world (n = 1, at t = 0), exactly as ``evaluate`` runs it.
+
+    Samples lie at most ``sample_s`` apart, and at every decision. Positions count from Vehicle 1's at the alert,
+    forward. Raises ``InvalidInput`` for more than one world or ``sample_s`` not above 0.
+    """
+    if world.n != 1:
+        raise InvalidInput(
+            f"record_episode: {world.n} worlds given; exactly 1 is needed, for instance worlds.take([0])"
+        )
+    if not (sample_s > 0.0 and math.isfinite(sample_s)):
+        raise InvalidInput(f"record_episode: sample_s = {sample_s}; must be finite and above 0")
+    driven = controlled_vehicle(scenario, vehicle)
+    engine = episode_engine(world, copy.deepcopy(agent), scenario, driven)
+    segments: list[Segment] = [(world, engine.worlds.command_mps2, float(engine.worlds.time_s[0]))]
+    at_rest = False
+    while not engine.ended.all():
+        before = engine.worlds
+        step = engine.step({})
+        segments.append((before, step.command_mps2, float(engine.worlds.time_s[0])))
+        at_rest = bool(step.terminated[0])
+    samples = list(_samples(segments, sample_s))
+    time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))
+    return EpisodeRecord(
+        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, _impacts(segments), engine.ledger,
+        at_rest,
+    )  # fmt: skip
+
+
+def _samples(segments: list[Segment], sample_s: float) -> Iterator[tuple[Floats, ...]]:
+    """Rows of (time, gaps, speeds, positions, command from then on), segment by segment, the last with its end.
+
+    Worlds know gaps and speeds only. A post that stands still, ahead of Vehicle 1, makes its position one more gap.
+    """
+    front = 0.0  # position of Vehicle 1 at the start of the segment
+    for number, (before, command, end) in enumerate(segments):
+        start = float(before.time_s[0])
+        count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
+        times = np.linspace(start, end, count + 1)
+        distance = float(before.vehicles.speed_limit_mps[0, 0]) * (end - start) + 1.0
+        copies = _with_post(before, distance).take(np.zeros(count + 1, np.int64))
+        moved, _ = advance(copies, _ahead(-1.0, command), until_s=times)
+        position, gaps, speeds = front + (distance - moved.gaps_m[:, 0]), moved.gaps_m[:, 1:], moved.speeds_mps[:, 1:]
+        in_force = np.where(before.vehicles.latency_s <= times[:, np.newaxis], command, 0.0)
+        rows = slice(None) if number == len(segments) - 1 else slice(count)
+        columns = (times, gaps, speeds, _positions(position, gaps), in_force)
+        yield tuple(column[rows] for column in columns)
+        front = float(position[-1])
+
+
+def _positions(front: Floats, gaps: Floats) -> Floats:
+    """Positions [k, N] from those of Vehicle 1 [k] and the gaps [k, P]."""
+    return np.concatenate([front[:, np.newaxis], front[:, np.newaxis] - np.cumsum(gaps, axis=1)], axis=1)
+
+
+def _with_post(world: Worlds, distance: float) -> Worlds:
+    """The world with one more vehicle in front that stands and holds, ``distance`` ahead of Vehicle 1."""
+    vehicles = world.vehicles
+    with_post = Vehicles(
+        _ahead(1.0, vehicles.braking_capacity_mps2),
+        _ahead(0.0, vehicles.driving_capacity_mps2),
+        _ahead(0.0, vehicles.latency_s),
+        _ahead(1.0, vehicles.mass_t),
+        _ahead(1.0, vehicles.speed_limit_mps),
+        vehicles.restitution,
+    )
+    no_hit = np.zeros((world.n, 1), np.bool_)
+    return Worlds(
+        with_post,
+        _ahead(distance, world.gaps_m),
+        _ahead(0.0, world.speeds_mps),
+        world.time_s,
+        np.concatenate([no_hit, world.pair_hit], axis=1),
+        _ahead(0.0, world.command_mps2),
+    )
+
+
+def _ahead(value: float, columns: Floats) -> Floats:
+    """One more column, in front."""
+    return np.concatenate([np.full((len(columns), 1), value), columns], axis=1)
+
+
+def _impacts(segments: list[Segment]) -> ImpactRows:
+    """Every impact of the episode."""
+    parts = [advance(before, command, until_s=end, record=True)[1].rows for before, command, end in segments]
+    rows = [part for part in parts if part is not None]
+    return ImpactRows(*(np.concatenate([getattr(part, f.name) for part in rows]) for f in fields(ImpactRows)))

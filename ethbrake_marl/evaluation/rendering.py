@@ -1,0 +1,167 @@
+"""The summary table as text: for a terminal (rich), for a document (markdown), and its cells for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS, PaperRow, paper_rows
+from ethbrake_marl.evaluation.parameters import parameter_line
+from ethbrake_marl.evaluation.statistics import Estimate
+from ethbrake_marl.evaluation.table import SummaryRow
+
+NONE = "–"
+
+_TERMINAL_HEADINGS = (
+    "Collisions",
+    "First-impact\nharm",
+    "Total\nharm",
+    "Decrease\nfirst",
+    "Decrease\ntotal",
+    "Pre-\ndicted",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One entry of the table: the value, and its 95 % interval or nothing."""
+
+    value: str
+    interval: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One line of the table."""
+
+    agent: str
+    cells: tuple[Cell, ...]
+
+
+COLUMNS = (
+    "Collisions",
+    "First-impact harm",
+    "Total harm",
+    "Decrease, first-impact",
+    "Decrease, total",
+    "Predicted harm",
+)
+
+MEANINGS = {
+    "Agent": "What drives the controlled vehicle; all other vehicles follow the scenario. full_brake is the paper's"
+    " non-ethical strategy (Non-E). e_v2x_bm is the best constant deceleration found in this simulation;"
+    " e_v2x_bm:pairwise is the paper's closed form, which treats the pairs as independent.",
+    "Collisions": "Share of worlds with at least one impact; Wilson's interval. Every agent meets the same worlds, each"
+    " once.",
+    "First-impact harm": "Squared closing speed (m²/s²), summed over the pairs, each pair's first impact only (the"
+    " paper's protocol); mean per world.",
+    "Total harm": "The same over every impact. A light early touch makes a later, harder impact of the same pair free"
+    " under the first count, so both are shown.",
+    "Decrease": "1 − harm / harm of full braking in the same worlds; interval by the delta method, paired by world.",
+    "Predicted harm": "What the agent itself expected at the alert, under the count that it minimises.",
+}
+
+
+def our_lines(rows: Sequence[SummaryRow]) -> list[Line]:
+    """Our results, one line per agent."""
+    return [
+        Line(
+            row.agent,
+            (
+                _percent(row.collision_rate, 1),
+                _number(row.first_impact_harm),
+                _number(row.total_harm),
+                _percent(row.first_decrease, 1),
+                _percent(row.total_decrease, 1),
+                _number(row.predicted_harm),
+            ),
+        )
+        for row in rows
+    ]
+
+
+def paper_blocks(rows: Sequence[SummaryRow]) -> list[tuple[str, list[Line]]]:
+    """The paper's tables that belong beside these rows, as (table, lines)."""
+    blocks: dict[str, list[Line]] = {}
+    for paper in paper_rows(rows[0].parameters["scenario"]) if rows else ():
+        blocks.setdefault(paper.table, []).append(_paper_line(paper))
+    return list(blocks.items())
+
+
+def rich_table(rows: Sequence[SummaryRow]) -> RenderableType:
+    """The table for a terminal of 80 columns or more: ours, then the paper's rows, then the conditions of each."""
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=0, pad_edge=False)
+    table.add_column("Agent", overflow="fold")
+    for heading in _TERMINAL_HEADINGS:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for line in our_lines(rows):
+        table.add_row(Text(line.agent), *(_terminal_cell(k, cell) for k, cell in enumerate(line.cells)))
+    for name, lines in paper_blocks(rows):
+        table.add_section()
+        table.add_row(Text(f"paper, {name}", style="dim"))
+        for line in lines:
+            table.add_row(line.agent, *(cell.value for cell in line.cells))
+    return Group(table, Text(), Text(_conditions(rows), style="dim"))
+
+
+def _terminal_cell(column: int, cell: Cell) -> Text:
+    """Value, and in the first three columns its interval below; the others' are in the JSON and the report."""
+    text = Text(cell.value)
+    return text.append(f"\n{cell.interval}", style="dim") if cell.interval and column < 3 else text
+
+
+def markdown_table(rows: Sequence[SummaryRow]) -> str:
+    """The table for a document, with the conditions of ours and of the paper's below it."""
+    head = ["Agent", *COLUMNS]
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" + " ---: |" * len(COLUMNS)]
+    lines += [_markdown_line(line) for line in our_lines(rows)]
+    for name, block in paper_blocks(rows):
+        lines += [_markdown_line(Line(f"paper, {name}: {line.agent}", line.cells)) for line in block]
+    return "\n".join([*lines, "", _conditions(rows), ""])
+
+
+def _markdown_line(line: Line) -> str:
+    cells = (f"{c.value} [{c.interval}]" if c.interval else c.value for c in line.cells)
+    return "| " + " | ".join([line.agent.replace("|", "\\|"), *cells]) + " |"
+
+
+def _conditions(rows: Sequence[SummaryRow]) -> str:
+    if not rows:
+        return ""
+    texts = [
+        f"Ours: {parameter_line(rows[0].parameters)}. Harms are means per world in m²/s²; in brackets or"
+        " below a value: its 95 % interval; decreases are relative to full braking."
+    ]
+    blocks = paper_blocks(rows)
+    texts += [f"Paper, {name}: {PAPER_PARAMETERS[name]}." for name, _ in blocks]
+    return "\n\n".join([*texts, *([PAPER_NOTE] if blocks else [])])
+
+
+def _paper_line(row: PaperRow) -> Line:
+    """The paper's figures with the digits that it prints."""
+    decrease = NONE if row.harm_decrease is None else f"{100 * row.harm_decrease:.4g} %"
+    cells = (f"{100 * row.collision_rate:.4g} %", f"{row.average_harm:.6g}", NONE, decrease, NONE, NONE)
+    return Line(row.agent, tuple(Cell(cell) for cell in cells))
+
+
+def _percent(estimate: Estimate | None, digits: int) -> Cell:
+    return _cell(estimate, 100.0, digits, " %")
+
+
+def _number(estimate: Estimate | None) -> Cell:
+    return _cell(estimate, 1.0, 2, "")
+
+
+def _cell(estimate: Estimate | None, scale: float, digits: int, unit: str) -> Cell:
+    if estimate is None:
+        return Cell(NONE)
+    value = f"{scale * estimate.value:.{digits}f}{unit}"
+    if estimate.interval is None:
+        return Cell(value)
+    low, high = (f"{scale * end:.{digits}f}" for end in estimate.interval)
+    return Cell(value, f"{low}, {high}")

@@ -1,0 +1,180 @@
+"""Every agent on the same fixed list of worlds, each world once.
+
+Counting "the first episodes that finish" instead would over-count short ones, and crashes end early.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import HarmCount, Ledger
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate
+from ethbrake_marl.scenario import Sample, Scenario
+
+CHUNK = 10_000  # worlds advanced together: bounds memory, changes no result
+
+Progress = Callable[[str, int], None]  # agent, worlds done so far
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one agent achieved, world by world."""
+
+    ledger: Ledger
+    final: Worlds  # each world as its episode left it
+    at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
+    predicted_harm: Floats | None  # [n] what the agent expected at the alert, if it predicts
+    chosen_policy: Bools | None  # [n] a hybrid drove by its policy; else by its backup
+
+    @property
+    def collided(self) -> Bools:
+        """Whether any impact happened, [n]."""
+        return self.ledger.collided
+
+    @property
+    def impacts(self) -> Ints:
+        """Number of impacts of all pairs, [n]."""
+        impacts: Ints = self.ledger.count.sum(axis=1)
+        return impacts
+
+    @property
+    def first_impact_harm(self) -> Floats:
+        """Harm of all vehicles, each pair's first impact only, [n] m2/s2."""
+        return self.ledger.world_harm("first")
+
+    @property
+    def total_harm(self) -> Floats:
+        """Harm of all vehicles, every impact, [n] m2/s2."""
+        return self.ledger.world_harm("total")
+
+    def vehicle_harm(self, count: HarmCount) -> Floats:
+        """Harm of each vehicle, [n, N] m2/s2."""
+        return self.ledger.vehicle_harm(count)
+
+    @property
+    def ended(self) -> NDArray[np.str_]:
+        """How each episode ended, [n]: ``at_rest`` or ``horizon``."""
+        return np.where(self.at_rest, "at_rest", "horizon")
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Outcomes of agents that drove the same vehicle in the same worlds, row k of every array being world k."""
+
+    scenario: Scenario
+    vehicle: int  # index (0 = front) of the vehicle that the agents drove
+    worlds: Worlds  # at the alert
+    index: Ints  # [n] number of each world in its list
+    seed: int | None  # of the list; None for worlds that were given
+    outcomes: dict[str, Outcome]
+
+    def outcome(self, agent: str) -> Outcome:
+        """The outcome of one agent; raises ``InvalidInput`` naming those that were evaluated."""
+        if agent not in self.outcomes:
+            raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated: {', '.join(self.outcomes)}")
+        return self.outcomes[agent]
+
+
+def evaluate(
+    worlds: Worlds | Sample,
+    agents: Mapping[str, Agent],
+    *,
+    scenario: Scenario,
+    vehicle: int | None = None,
+    seed: int | None = None,
+    chunk: int = CHUNK,
+    on_progress: Progress | None = None,
+) -> Evaluation:
+    """Let each agent drive ``vehicle`` through every world once, from the alert to the episode's end.
+
+    ``vehicle`` is an index (0 = front), by default the scenario's only learner; all others follow the scenario's
+    scripts (see ``agents.driving``). A world's outcome depends neither on ``chunk`` nor on the other worlds, and the
+    given agents are left as they are. ``seed`` is noted, not used. Raises ``InvalidInput`` for worlds that do not fit
+    the scenario, no agents, or a second learner that nobody drives.
+    """
+    sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
+    if not agents:
+        raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
+    if not chunk >= 1:
+        raise InvalidInput(f"evaluate: chunk = {chunk}; at least 1 world at a time is needed")
+    driven = controlled_vehicle(scenario, vehicle)
+    outcomes = {}
+    for name, agent in agents.items():
+        parts = []
+        for first in range(0, sample.worlds.n, chunk):
+            rows = np.arange(first, min(first + chunk, sample.worlds.n))
+            parts.append(_roll_out(sample.worlds.take(rows), agent, scenario, driven))
+            if on_progress is not None:
+                on_progress(name, int(rows[-1]) + 1)
+        outcomes[name] = _joined(parts)
+    return Evaluation(scenario, driven, sample.worlds, sample.index, seed, outcomes)
+
+
+def controlled_vehicle(scenario: Scenario, vehicle: int | None) -> int:
+    """Index of the vehicle to drive: the given one, or the scenario's only learner; raises ``InvalidInput``."""
+    learners = scenario.learners
+    names = ", ".join(scenario.vehicle_names[i] for i in learners)
+    if vehicle is None:
+        if len(learners) != 1:
+            raise InvalidInput(
+                f"scenario {scenario.name!r} has {len(learners)} learners ({names or 'none'}); say which vehicle the"
+                " agents drive"
+            )
+        return learners[0]
+    if isinstance(vehicle, bool) or not 0 <= vehicle < scenario.vehicles:
+        raise InvalidInput(f"vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
+    if set(learners) - {vehicle}:
+        raise InvalidInput(
+            f"scenario {scenario.name!r}: {names} learn, but only {scenario.vehicle_names[vehicle]} is driven;"
+            " give the others a script"
+        )
+    return int(vehicle)
+
+
+def _roll_out(worlds: Worlds, agent: Agent, scenario: Scenario, vehicle: int) -> Outcome:
+    """Outcome of a copy of the agent: what the given one remembers is neither used nor changed."""
+    driver = copy.deepcopy(agent)
+    episodes = drive(worlds, driver, scenario, vehicle)
+    predicted, chosen = _said(driver, "predicted_harm", worlds.n), _said(driver, "chosen_policy", worlds.n)
+    return Outcome(
+        episodes.ledger,
+        episodes.final,
+        episodes.at_rest,
+        None if predicted is None else predicted.astype(np.float64),
+        None if chosen is None else chosen.astype(np.bool_),
+    )
+
+
+def _said(agent: Agent, attribute: str, n: int) -> NDArray[np.generic] | None:
+    """What the agent says about each world of the batch, or None when it says nothing."""
+    value = getattr(agent, attribute, None)
+    if value is None:
+        return None
+    column = np.asarray(value)
+    if column.shape != (n,):
+        raise InvalidInput(
+            f"agent {agent.name!r}: {attribute} has shape {column.shape}; one per world, ({n},), is needed"
+        )
+    return column
+
+
+def _joined(parts: list[Outcome]) -> Outcome:
+    """One outcome from those of consecutive chunks."""
+    ledger = Ledger(*(np.concatenate([getattr(part.ledger, f.name) for part in parts]) for f in fields(Ledger)))
+    predicted = [part.predicted_harm for part in parts if part.predicted_harm is not None]
+    chosen = [part.chosen_policy for part in parts if part.chosen_policy is not None]
+    return Outcome(
+        ledger,
+        concatenate([part.final for part in parts]),
+        np.concatenate([part.at_rest for part in parts]),
+        np.concatenate(predicted) if predicted else None,
+        np.concatenate(chosen) if chosen else None,
+    )

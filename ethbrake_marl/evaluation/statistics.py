@@ -1,0 +1,102 @@
+"""Estimates with 95 % intervals, from one number per world.
+
+The worlds of a list are independent draws, and every agent is measured on the same ones: rates get Wilson's score
+interval, means the t interval of the mean, and comparisons with a baseline are paired by world, so that the spread
+between easy and hard worlds cancels.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri, stdtrit
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import Floats
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A value and its interval; the interval is None where the data cannot give one (a single world)."""
+
+    value: float
+    interval: tuple[float, float] | None
+
+
+def rate(successes: int, count: int, *, confidence: float = CONFIDENCE) -> Estimate:
+    """Share ``p = successes / count`` with Wilson's score interval, which stays inside [0, 1].
+
+    With z the normal quantile: centre ``(p + z^2/2n) / (1 + z^2/n)``, half-width
+    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``. Raises ``InvalidInput`` unless 0 <= successes <= count >= 1.
+    """
+    if not (count >= 1 and 0 <= successes <= count):
+        raise InvalidInput(f"rate: {successes} of {count}: must be 0 <= successes <= count, and count at least 1")
+    p, z = successes / count, _normal_quantile(confidence)
+    shrink = 1.0 + z * z / count
+    centre = (p + z * z / (2.0 * count)) / shrink
+    half = z / shrink * math.sqrt(p * (1.0 - p) / count + z * z / (4.0 * count * count))
+    low = 0.0 if successes == 0 else max(centre - half, 0.0)
+    high = 1.0 if successes == count else min(centre + half, 1.0)
+    return Estimate(p, (low, high))
+
+
+def mean(values: Floats, *, confidence: float = CONFIDENCE) -> Estimate:
+    """Mean of ``values`` [n] with the interval ``mean -+ t s / sqrt(n)``; t with n - 1 degrees of freedom.
+
+    At thousands of worlds the mean is normal whatever the harm's own distribution, and the interval equals the
+    bootstrap's. Raises ``InvalidInput`` when ``values`` is empty or not finite.
+    """
+    data = _checked(values)
+    return _around(float(data.mean()), data, 1.0, confidence)
+
+
+def paired_difference(values: Floats, baseline: Floats, *, confidence: float = CONFIDENCE) -> Estimate:
+    """Mean of ``values - baseline`` world by world, with the t interval of that mean."""
+    data, reference = _checked_pair(values, baseline)
+    return mean(data - reference, confidence=confidence)
+
+
+def relative_decrease(values: Floats, baseline: Floats, *, confidence: float = CONFIDENCE) -> Estimate | None:
+    """``1 - mean(values) / mean(baseline)``, paired by world; None when the baseline's mean is 0.
+
+    Interval by the delta method: with ``r`` the ratio of the means, the residuals ``values - r baseline`` have mean 0
+    and the standard error of r is ``s_residual / (sqrt(n) mean(baseline))``.
+    """
+    data, reference = _checked_pair(values, baseline)
+    scale = float(reference.mean())
+    if scale == 0.0:
+        return None
+    ratio = float(data.mean()) / scale
+    return _around(1.0 - ratio, data - ratio * reference, scale, confidence)
+
+
+def _around(value: float, data: Floats, scale: float, confidence: float) -> Estimate:
+    """``value`` with the half-width ``t s(data) / (sqrt(n) |scale|)``."""
+    n = len(data)
+    if n < 2:
+        return Estimate(value, None)
+    quantile = float(stdtrit(n - 1, 0.5 + 0.5 * confidence))
+    half = quantile * float(data.std(ddof=1)) / (math.sqrt(n) * abs(scale))
+    return Estimate(value, (value - half, value + half))
+
+
+def _normal_quantile(confidence: float) -> float:
+    return float(ndtri(0.5 + 0.5 * confidence))
+
+
+def _checked(values: Floats) -> Floats:
+    data = np.asarray(values, np.float64)
+    if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():
+        raise InvalidInput(f"statistics: shape {data.shape}; at least one finite number per world is needed, as [n]")
+    return data
+
+
+def _checked_pair(values: Floats, baseline: Floats) -> tuple[Floats, Floats]:
+    data, reference = _checked(values), _checked(baseline)
+    if data.shape != reference.shape:
+        raise InvalidInput(f"statistics: {len(data)} values cannot be paired with {len(reference)} of the baseline")
+    return data, reference

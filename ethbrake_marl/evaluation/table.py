@@ -1,0 +1,88 @@
+"""One row per agent: collisions, both harms, and how much less harm than full braking, each with its interval."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ethbrake_marl.evaluation.parameters import parameters
+from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
+from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, rate, relative_decrease
+
+BASELINE = "full_brake"
+
+
+@dataclass(frozen=True, slots=True)
+class SummaryRow:
+    """What one agent achieved over the list of worlds; harms are means per world, m2/s2."""
+
+    agent: str
+    episodes: int
+    collisions: int  # worlds with at least one impact
+    horizon_ends: int  # worlds that the horizon cut off before the line stood
+    collision_rate: Estimate
+    first_impact_harm: Estimate
+    total_harm: Estimate
+    first_difference: Estimate | None  # first-impact harm minus the baseline's, paired by world
+    total_difference: Estimate | None
+    first_decrease: Estimate | None  # 1 - harm / the baseline's harm
+    total_decrease: Estimate | None
+    predicted_harm: Estimate | None  # where the agent predicts
+    policy_share: float | None  # share of worlds in which a hybrid drove by its policy
+    parameters: dict[str, Any]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
+        return {
+            "agent": self.agent,
+            "episodes": self.episodes,
+            "collisions": self.collisions,
+            "horizon_ends": self.horizon_ends,
+            **_named("collision_rate", self.collision_rate),
+            **_named("first_impact_harm", self.first_impact_harm),
+            **_named("total_harm", self.total_harm),
+            **_named("first_impact_harm_difference", self.first_difference),
+            **_named("total_harm_difference", self.total_difference),
+            **_named("harm_decrease_first", self.first_decrease),
+            **_named("harm_decrease_total", self.total_decrease),
+            **(_named("predicted_harm", self.predicted_harm) if self.predicted_harm else {}),
+            **({"policy_share": self.policy_share} if self.policy_share is not None else {}),
+            "parameters": self.parameters,
+        }
+
+
+def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> list[SummaryRow]:
+    """One row per agent, in the order of the evaluation; compared with ``baseline`` where that was evaluated."""
+    conditions = parameters(evaluation)
+    reference = evaluation.outcomes.get(baseline)
+    return [_row(agent, outcome, reference, conditions) for agent, outcome in evaluation.outcomes.items()]
+
+
+def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: dict[str, Any]) -> SummaryRow:
+    first, total = outcome.first_impact_harm, outcome.total_harm
+    collisions, episodes = int(outcome.collided.sum()), len(first)
+    against = None if reference is None else (reference.first_impact_harm, reference.total_harm)
+    return SummaryRow(
+        agent=agent,
+        episodes=episodes,
+        collisions=collisions,
+        horizon_ends=int((~outcome.at_rest).sum()),
+        collision_rate=rate(collisions, episodes),
+        first_impact_harm=mean(first),
+        total_harm=mean(total),
+        first_difference=None if against is None else paired_difference(first, against[0]),
+        total_difference=None if against is None else paired_difference(total, against[1]),
+        first_decrease=None if against is None else relative_decrease(first, against[0]),
+        total_decrease=None if against is None else relative_decrease(total, against[1]),
+        predicted_harm=None if outcome.predicted_harm is None else mean(outcome.predicted_harm),
+        policy_share=None if outcome.chosen_policy is None else float(outcome.chosen_policy.mean()),
+        parameters=conditions,
+    )
+
+
+def _named(name: str, estimate: Estimate | None) -> dict[str, Any]:
+    """``{name: value, name_interval: [low, high]}``, with null for what does not exist."""
+    if estimate is None:
+        return {name: None, f"{name}_interval": None}
+    interval = estimate.interval
+    return {name: estimate.value, f"{name}_interval": None if interval is None else list(interval)}

@@ -1,0 +1,1 @@
+"""Training, and the policies that come out of it. torch is imported only by the modules that train."""

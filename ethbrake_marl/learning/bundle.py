@@ -1,0 +1,192 @@
+"""A policy as a folder of two plain files: ``manifest.json`` (what it is) and ``weights.safetensors`` (numbers).
+
+Reading one runs no code from it: no pickle, no names to import, no torch. Everything is checked against our own
+table of tensors before any of it is used, and what is damaged or unknown is refused by name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+from pydantic import ValidationError
+from safetensors import SafetensorError
+
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.learning.durable_files import new_folder, write_file
+from ethbrake_marl.learning.forward import Actor, Float32s
+from ethbrake_marl.learning.manifest import Manifest, observation_schema
+from ethbrake_marl.learning.networks import TensorRow, tensor_table
+from ethbrake_marl.learning.strict_json import parse_strict_json
+from ethbrake_marl.observations import ObservationSpec
+
+MANIFEST = "manifest.json"
+WEIGHTS = "weights.safetensors"
+MANIFEST_LIMIT_BYTES = 1 << 20
+WEIGHTS_LIMIT_BYTES = 256 << 20
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy in memory: its manifest, its tensors, and ``policy(observation)`` for the deterministic action."""
+
+    manifest: Manifest
+    tensors: Mapping[str, Float32s]
+    _actor: Actor = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Build the forward pass."""
+        object.__setattr__(self, "_actor", Actor(self.manifest.network, self.tensors))
+
+    def __call__(self, observation: Float32s) -> Float32s:
+        """Map observation [n, F] float32 to action [n, A] float32 in [-1, 1]; row k depends on row k alone."""
+        return self._actor(observation)
+
+    @property
+    def observation(self) -> ObservationSpec:
+        """What to observe for this policy."""
+        return self.manifest.observation.spec
+
+
+def make_policy(tensors: Mapping[str, Float32s], **manifest: Any) -> Policy:
+    """Build a policy from ``tensors`` and the fields of ``Manifest`` (all but the hash, which is computed).
+
+    Raises ``InvalidInput`` naming the tensor or field that does not fit.
+    """
+    data = _serialise(tensors)
+    try:
+        checked = Manifest(**manifest, weights_sha256=hashlib.sha256(data).hexdigest())
+        return Policy(checked, _tensors(data, checked))
+    except ValidationError as error:
+        raise InvalidInput(f"policy: {_first_line(error)}") from None
+    except ValueError as error:
+        raise InvalidInput(f"policy: {error}") from None
+
+
+def save_policy(policy: Policy, folder: Path) -> None:
+    """Write ``policy`` as the new folder ``folder``, completely or not at all; raises ``AlreadyExists``."""
+    with new_folder(folder) as partial:
+        write_file(partial / WEIGHTS, _serialise(policy.tensors))
+        write_file(partial / MANIFEST, policy.manifest.model_dump_json(indent=2).encode() + b"\n")
+
+
+def load_policy(path: str | os.PathLike[str]) -> Policy:
+    """Read the bundle at ``path``: a bundle's own folder, or a run's folder (then its ``policy/``).
+
+    Raises ``InvalidInput`` when there is none, ``CorruptBundle`` (file, what is wrong) when it cannot be trusted.
+    """
+    folder = _bundle_folder(Path(path))
+    _check_files(folder)
+    manifest = _manifest(folder / MANIFEST)
+    data = _read(folder / WEIGHTS, WEIGHTS_LIMIT_BYTES)
+    found = hashlib.sha256(data).hexdigest()
+    if found != manifest.weights_sha256:
+        raise CorruptBundle(f"{folder / WEIGHTS}: SHA-256 is {found}, the manifest says {manifest.weights_sha256}")
+    try:
+        return Policy(manifest, _tensors(data, manifest))
+    except ValueError as error:
+        raise CorruptBundle(f"{folder / WEIGHTS}: {error}") from None
+
+
+def _bundle_folder(path: Path) -> Path:
+    for folder in (path, path / "policy"):
+        if (folder / MANIFEST).exists() or (folder / WEIGHTS).exists():
+            if folder.is_symlink():
+                raise CorruptBundle(f"{folder}: is a symbolic link; give the folder it points to")
+            return folder
+    reason = "holds no policy" if path.is_dir() else "is not a folder"
+    raise InvalidInput(f"{path}: {reason}; give a policy bundle ({MANIFEST}, {WEIGHTS}) or a run that finished")
+
+
+def _check_files(folder: Path) -> None:
+    found = {entry.name for entry in os.scandir(folder)}
+    for name in sorted({MANIFEST, WEIGHTS} - found):
+        raise CorruptBundle(f"{folder / name}: is missing")
+    for name in sorted(found - {MANIFEST, WEIGHTS}):
+        raise CorruptBundle(f"{folder / name}: does not belong into a bundle, which is {MANIFEST} and {WEIGHTS} only")
+
+
+def _read(path: Path, limit: int) -> bytes:
+    """Read a regular file of at most ``limit`` bytes; follows no link and does not wait on a pipe."""
+    if path.is_symlink():
+        raise CorruptBundle(f"{path}: is a symbolic link; a bundle holds plain files")
+    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    try:
+        with os.fdopen(os.open(path, flags), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise CorruptBundle(f"{path}: is not a plain file")
+            data = file.read(limit + 1)
+    except OSError as error:
+        raise CorruptBundle(f"{path}: cannot be read ({error.strerror})") from None
+    if len(data) > limit:
+        raise CorruptBundle(f"{path}: larger than {limit} bytes")
+    return data
+
+
+def _manifest(path: Path) -> Manifest:
+    data = _read(path, MANIFEST_LIMIT_BYTES)
+    try:
+        parse_strict_json(data)
+        manifest = Manifest.model_validate_json(data)
+    except ValidationError as error:
+        raise CorruptBundle(f"{path}: {_first_line(error)}") from None
+    except ValueError as error:
+        raise CorruptBundle(f"{path}: {error}") from None
+    if manifest.observation != observation_schema(manifest.observation.spec):
+        raise CorruptBundle(
+            f"{path}: observation: features or their scaling are not those of this version of the package;"
+            f" use the one it was made with ({manifest.versions.get('ethbrake-marl', 'unknown')}), or train again"
+        )
+    return manifest
+
+
+def _first_line(error: ValidationError) -> str:
+    first = error.errors(include_url=False)[0]
+    where = ".".join(str(part) for part in first["loc"])
+    reason = first["msg"].removeprefix("Value error, ")
+    return f"{where}: {reason}" if where else reason
+
+
+def _serialise(tensors: Mapping[str, Float32s]) -> bytes:
+    return safetensors.numpy.save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+
+
+def _tensors(data: bytes, manifest: Manifest) -> dict[str, Float32s]:
+    """Check ``data`` against the tensor table, then read it; raises ``ValueError`` naming the tensor."""
+    table = tensor_table(manifest.network)
+    _check_header(data, table)
+    try:
+        tensors = safetensors.numpy.load(data)
+    except SafetensorError as error:
+        raise ValueError(f"not a safetensors file ({error})") from None
+    for name, tensor in tensors.items():
+        if not np.isfinite(tensor).all():
+            raise ValueError(f"tensor {name!r} holds a number that is not finite")
+        tensor.setflags(write=False)
+    return tensors
+
+
+def _check_header(data: bytes, table: tuple[TensorRow, ...]) -> None:
+    """Compare names, dtypes and shapes of a safetensors header with ``table``."""
+    length = int.from_bytes(data[:8], "little")
+    if not 2 <= length <= min(len(data) - 8, MANIFEST_LIMIT_BYTES):
+        raise ValueError(f"not a safetensors file (a header of {length} bytes in a file of {len(data)})")
+    header = parse_strict_json(data[8 : 8 + length])
+    if not isinstance(header, dict) or not all(isinstance(entry, dict) for entry in header.values()):
+        raise ValueError("not a safetensors file (the header is not a table of tensors)")
+    wanted = {row.name: row for row in table}
+    for name in sorted(wanted.keys() - header.keys()):
+        raise ValueError(f"tensor {name!r} is missing")
+    for name in sorted(header.keys() - wanted.keys()):
+        raise ValueError(f"tensor {name!r} does not belong to this network")
+    for name, row in wanted.items():
+        dtype, shape = header[name].get("dtype"), header[name].get("shape")
+        if dtype != "F32" or shape != list(row.shape):
+            raise ValueError(f"tensor {name!r} is {dtype} {shape}, should be F32 {list(row.shape)}")

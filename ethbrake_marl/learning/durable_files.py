@@ -1,0 +1,74 @@
+"""Files and folders that are either there completely or not at all, also after a crash."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ethbrake_marl.errors import AlreadyExists
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Write ``data`` to ``path``, replacing it in one step; a reader sees the old or the new content, whole."""
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            _to_disk(file.fileno())
+        os.chmod(name, 0o666 & ~_umask())
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+    _folder_to_disk(path.parent)
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Give a temporary folder beside ``path`` that takes its name when the block ends well, and vanishes otherwise.
+
+    Raises ``AlreadyExists`` when there is something at ``path``, at the start or at the end.
+    """
+    _refuse_existing(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial"))
+    try:
+        yield partial
+        partial.chmod(0o777 & ~_umask())
+        _folder_to_disk(partial)
+        _refuse_existing(path)
+        partial.rename(path)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    _folder_to_disk(path.parent)
+
+
+def _refuse_existing(path: Path) -> None:
+    if path.is_symlink() or path.exists():
+        raise AlreadyExists(f"{path}: is there already; give another name")
+
+
+def _folder_to_disk(path: Path) -> None:
+    """Make renames inside ``path`` survive a power cut (a folder cannot be opened for this outside POSIX)."""
+    if os.name == "posix":
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            _to_disk(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _to_disk(descriptor: int) -> None:
+    os.fsync(descriptor)
+
+
+def _umask() -> int:
+    """The permissions that new files do not get; temporary ones are private until they are named."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

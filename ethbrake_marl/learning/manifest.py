@@ -1,0 +1,69 @@
+"""What a policy bundle says about its policy: everything but the numbers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+
+from ethbrake_marl.learning.networks import NetworkSpec
+from ethbrake_marl.observations import ObservationSpec
+
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Neighbours = Annotated[int, Field(ge=0, le=64)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class ObservationSchema(_Strict):
+    """What the policy sees: neighbours on each side, feature names in order, and a hash of how each is scaled."""
+
+    front: Neighbours
+    rear: Neighbours
+    features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]
+    scaling_sha256: Sha256
+
+    @property
+    def spec(self) -> ObservationSpec:
+        """The observation as the environment builds it."""
+        return ObservationSpec(front=self.front, rear=self.rear)
+
+
+class Manifest(_Strict):
+    """Everything about a policy but its tensors; ``action`` is a fraction of the own capacity, -1 = full braking."""
+
+    format: Literal["ethbrake-policy"] = "ethbrake-policy"
+    format_version: Literal[1] = 1
+    algorithm: Literal["ppo"]
+    network: NetworkSpec
+    observation: ObservationSchema
+    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"
+    learners: Annotated[tuple[str, ...], Field(min_length=1)]
+    scenario: dict[str, JsonValue]
+    reward: dict[str, JsonValue]
+    seeds: dict[str, int]
+    steps: Annotated[int, Field(ge=0)]
+    versions: dict[str, str]
+    weights_sha256: Sha256
+
+    @model_validator(mode="after")
+    def _one_input_per_feature(self) -> Manifest:
+        features, inputs = len(self.observation.features), self.network.observation_size
+        if features != inputs:
+            raise ValueError(f"{features} observation features for a network that takes {inputs}")
+        return self
+
+
+def observation_schema(spec: ObservationSpec) -> ObservationSchema:
+    """Describe ``spec`` so that a later change of a name, unit, scale or bound is noticed."""
+    rows = [[f.name, f.unit, f.scale, f.low, f.high] for f in spec.features]
+    return ObservationSchema(
+        front=spec.front,
+        rear=spec.rear,
+        features=tuple(f.name for f in spec.features),
+        scaling_sha256=hashlib.sha256(json.dumps(rows).encode()).hexdigest(),
+    )

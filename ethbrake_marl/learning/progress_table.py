@@ -1,0 +1,44 @@
+"""``progress.csv``: one row per update, columns in an order that is the same in every run."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.logger import KVWriter, filter_excluded_keys
+
+from ethbrake_marl.learning.durable_files import write_file
+
+
+class ProgressTable(KVWriter):
+    """Writer for Stable-Baselines3's logger; its own CSV writer orders columns by the hash of their names."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._rows: list[dict[str, Any]] = []
+        self._columns: list[str] = []
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Add a row; when a column is new the table is written again, in one step, with that column."""
+        values = {"steps": step} | filter_excluded_keys(key_values, key_excluded, "csv")
+        row = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
+        self._rows.append(row)
+        if row.keys() <= set(self._columns):
+            with self._path.open("a", newline="", encoding="utf-8") as file:
+                file.write(_lines([row], self._columns))
+            return
+        self._columns = ["steps", *sorted({name for row in self._rows for name in row} - {"steps"})]
+        heading = _lines([dict(zip(self._columns, self._columns, strict=True))], self._columns)
+        write_file(self._path, (heading + _lines(self._rows, self._columns)).encode())
+
+    def close(self) -> None:
+        """Nothing is held open between rows."""
+
+
+def _lines(rows: list[dict[str, Any]], columns: list[str]) -> str:
+    text = io.StringIO()
+    csv.DictWriter(text, columns, restval="", lineterminator="\n").writerows(rows)
+    return text.getvalue()

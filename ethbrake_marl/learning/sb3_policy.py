@@ -1,0 +1,38 @@
+"""Between our tensor table and Stable-Baselines3's actor-critic policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import nn
+
+from ethbrake_marl.learning.forward import Float32s
+from ethbrake_marl.learning.networks import Activation, NetworkSpec, tensor_table
+
+_ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
+
+
+def policy_arguments(spec: NetworkSpec, initial_log_std: float) -> dict[str, Any]:
+    """Arguments of ``ActorCriticPolicy`` for ``spec``: separate actor and critic, orthogonal initial weights."""
+    return {
+        "net_arch": {"pi": list(spec.policy_hidden), "vf": list(spec.value_hidden)},
+        "activation_fn": _ACTIVATIONS[spec.activation],
+        "ortho_init": True,
+        "log_std_init": initial_log_std,
+    }
+
+
+def tensors_of(policy: ActorCriticPolicy, spec: NetworkSpec) -> dict[str, Float32s]:
+    """Copy the policy's weights under the names of our table."""
+    state = policy.state_dict()
+    return {row.name: state[row.sb3_name].detach().cpu().numpy().astype(np.float32) for row in tensor_table(spec)}
+
+
+def load_tensors(policy: ActorCriticPolicy, spec: NetworkSpec, tensors: Mapping[str, Float32s]) -> None:
+    """Put ``tensors`` into ``policy``, all of them."""
+    table = tensor_table(spec)
+    policy.load_state_dict({row.sb3_name: torch.from_numpy(np.array(tensors[row.name])) for row in table}, strict=True)

@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import io
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, rich_table, summarise
+from ethbrake_marl.evaluation.paper import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST, paper_rows
+from ethbrake_marl.evaluation.parameters import parameter_line, parameters
+from ethbrake_marl.scenario import Scenario
+
+ALWAYS = {
+    "agent", "episodes", "collisions", "horizon_ends", "collision_rate", "collision_rate_interval",
+    "first_impact_harm", "first_impact_harm_interval", "total_harm", "total_harm_interval",
+    "first_impact_harm_difference", "first_impact_harm_difference_interval", "total_harm_difference",
+    "total_harm_difference_interval", "harm_decrease_first", "harm_decrease_first_interval", "harm_decrease_total",
+    "harm_decrease_total_interval", "parameters",
+}  # fmt: skip
+
+
+def printed(evaluation: Evaluation, width: int = 80) -> str:
+    console = Console(width=width, file=io.StringIO(), color_system=None)
+    console.print(rich_table(summarise(evaluation)))
+    text = console.file.getvalue()
+    assert all(len(line) <= width for line in text.splitlines())
+    return text
+
+
+def test_summarise__json_keys(evaluation: Evaluation) -> None:
+    full, constant, gap = (row.to_json() for row in summarise(evaluation))
+    assert set(full) == set(constant) == ALWAYS
+    assert set(gap) == ALWAYS | {"predicted_harm", "predicted_harm_interval", "policy_share"}
+    assert [row["agent"] for row in (full, constant, gap)] == ["full_brake", "constant:4.5", "gap"]
+    assert json.loads(json.dumps([full, constant, gap], allow_nan=False)) == [full, constant, gap]
+
+
+def test_summarise__values_are_those_of_the_worlds(evaluation: Evaluation) -> None:
+    full, constant, gap = (row.to_json() for row in summarise(evaluation))
+    first = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
+    total = {name: outcome.total_harm for name, outcome in evaluation.outcomes.items()}
+    collided = evaluation.outcome("constant:4.5").collided
+    assert constant["episodes"] == 200
+    assert constant["collisions"] == np.count_nonzero(collided)
+    assert constant["collision_rate"] == np.count_nonzero(collided) / 200
+    assert constant["first_impact_harm"] == pytest.approx(first["constant:4.5"].mean(), rel=1e-12)
+    assert constant["total_harm"] == pytest.approx(total["constant:4.5"].mean(), rel=1e-12)
+    assert constant["total_harm_difference"] == pytest.approx(
+        total["constant:4.5"].mean() - total["full_brake"].mean(), rel=1e-9
+    )
+    assert gap["harm_decrease_total"] == pytest.approx(1 - total["gap"].mean() / total["full_brake"].mean(), rel=1e-9)
+    assert constant["first_impact_harm_difference"] == pytest.approx(
+        first["constant:4.5"].mean() - first["full_brake"].mean(), rel=1e-9
+    )
+    assert gap["harm_decrease_first"] == pytest.approx(1 - first["gap"].mean() / first["full_brake"].mean(), rel=1e-9)
+    assert gap["predicted_harm"] == pytest.approx(evaluation.worlds.gaps_m[:, 0].mean(), rel=1e-12)
+    assert gap["policy_share"] == np.mean(evaluation.worlds.gaps_m[:, 0] > 7.5)
+    assert full["harm_decrease_first"] == full["harm_decrease_total"] == 0.0
+    for name in ("collision_rate", "first_impact_harm", "total_harm", "harm_decrease_total"):
+        low, high = constant[f"{name}_interval"]
+        assert low < constant[name] < high
+
+
+def test_summarise__without_full_braking_there_is_no_decrease(pair: Scenario) -> None:
+    result = evaluate(pair.sample(1, 0), {"coast": make_agent("coast")}, scenario=pair)
+    (row,) = (row.to_json() for row in summarise(result))
+    assert row["harm_decrease_first"] is row["harm_decrease_total"] is row["total_harm_difference"] is None
+    assert row["harm_decrease_first_interval"] is None
+    assert row["first_impact_harm_interval"] is None  # a single world
+    assert row["collision_rate_interval"] is not None
+
+
+def test_parameters__say_under_which_conditions(evaluation: Evaluation) -> None:
+    found = parameters(evaluation)
+    assert (found["scenario"], found["seed"], found["count"]) == ("paper-random", 7, 200)
+    assert found["controlled_vehicle"] == "vehicle_2"
+    assert found["scripts"] == {"vehicle_1": "full_brake", "vehicle_3": "full_brake"}
+    assert found["restitution"] == 0.1
+    assert found["latency_s"] == [0.0, 0.5, 0.8]
+    assert found["mass_t"] == [4.5, 5.5, 5.9]
+    assert found["gaps_m"][1] == [evaluation.worlds.gaps_m[:, 1].min(), evaluation.worlds.gaps_m[:, 1].max()]
+    line = parameter_line(found).replace("\u00a0", " ")
+    assert line.startswith("paper-random: 200 worlds, seed 7; d = ")
+    assert line.endswith("τ = (0, 0.5, 0.8) s; m = (4.5, 5.5, 5.9) t; e = 0.1")
+
+
+def test_rich_table__fits_80_columns_and_shows_both_counts(evaluation: Evaluation) -> None:
+    text = printed(evaluation)
+    row = summarise(evaluation)[0]
+    for estimate in (row.first_impact_harm, row.total_harm):
+        assert f"{estimate.value:.2f}" in text
+        assert f"{estimate.interval[0]:.2f}, {estimate.interval[1]:.2f}" in text
+    collided = evaluation.outcome("full_brake").collided.mean()
+    assert f"full_brake {100 * collided:.1f} % " in " ".join(text.split())
+    decrease = 1 - summarise(evaluation)[2].total_harm.value / row.total_harm.value
+    assert f"{100 * decrease:.1f} %" in text
+
+
+def test_rich_table__has_the_papers_rows_beside_ours_and_its_conditions(evaluation: Evaluation) -> None:
+    text = " ".join(printed(evaluation, width=100).split())
+    assert "Non-E 93.91 % 33.5878" in text
+    assert "Hybrid PPO 59.74 % 5.6202 – 83.26 %" in text
+    assert "Standalone DRL 74.74 % 12.229" in text
+    assert "m = (4.5, 5.5, 5.9) t; not stated: e" in text
+    assert "64.5 %" in text
+
+
+def test_rich_table__of_another_scenario_has_none_of_the_papers_rows(pair: Scenario) -> None:
+    result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
+    assert "paper" not in printed(result).lower()
+    assert "paper" not in markdown_table(summarise(result)).lower()
+
+
+def test_rich_table__brackets_in_a_name_are_text(pair: Scenario) -> None:
+    result = evaluate(pair.sample(2, 0), {"ppo@[red]x": make_agent("full_brake")}, scenario=pair)
+    assert "ppo@[red]x" in printed(result)
+
+
+def test_markdown_table__a_bar_in_a_name_makes_no_column(pair: Scenario) -> None:
+    result = evaluate(pair.sample(2, 0), {"ppo@a|b": make_agent("full_brake")}, scenario=pair)
+    assert "| ppo@a\\|b |" in markdown_table(summarise(result))
+
+
+def test_markdown_table__every_row_has_every_column(evaluation: Evaluation) -> None:
+    rows = [line for line in markdown_table(summarise(evaluation)).splitlines() if line.startswith("|")]
+    assert {line.count("|") for line in rows} == {8}
+    assert len(rows) == 2 + 3 + len(PAPER_ROWS)
+    estimate = summarise(evaluation)[0].first_impact_harm
+    assert f"{estimate.value:.2f} [{estimate.interval[0]:.2f}, {estimate.interval[1]:.2f}]" in rows[2]
+
+
+def test_tables__of_nothing_are_empty() -> None:
+    assert "Agent" in markdown_table([])
+    console = Console(width=80, file=io.StringIO())
+    console.print(rich_table([]))
+    assert "Agent" in console.file.getvalue()
+
+
+def test_paper_rows__agree_with_themselves() -> None:
+    for row in PAPER_ROWS:
+        assert row.collision_rate == pytest.approx(row.collisions / row.episodes, abs=5e-5)
+    random = {row.agent: row for row in PAPER_ROWS if row.table == RANDOM_TEST}
+    for row in random.values():
+        assert row.harm_decrease == pytest.approx(1.0 - row.average_harm / random["Non-E"].average_harm, abs=1e-4)
+    avoided = {row.agent: row.episodes - row.collisions for row in PAPER_ROWS if row.table == HYBRID_TEST}
+    assert avoided["Hybrid"] == 2005  # what the note says
+    assert avoided["E-V2X-BM"] + avoided["Standalone DRL"] == 2000
+
+
+def test_paper_rows__stand_only_beside_the_random_test() -> None:
+    assert paper_rows("paper-random") == paper_rows("paper-random-early") == PAPER_ROWS
+    assert paper_rows("paper-scenario-1") == ()

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.errors import AlreadyExists
+from ethbrake_marl.learning.durable_files import new_folder, write_file
+from ethbrake_marl.learning.progress_table import ProgressTable
+from ethbrake_marl.learning.run_directory import create_run
+
+
+def test_write_file__replaces_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "run.json"
+    write_file(path, b"old")
+
+    def power_cut(*_: object) -> None:
+        raise OSError("power cut")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", power_cut)
+        with pytest.raises(OSError, match="power cut"):
+            write_file(path, b"new, but only half of i")
+    assert path.read_bytes() == b"old"
+    write_file(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_new_folder__is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+    with new_folder(tmp_path / "a" / "good") as partial:
+        (partial / "x").write_text("1")
+        assert not (tmp_path / "a" / "good").exists()
+    with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "a" / "bad") as partial:
+        (partial / "x").write_text("1")
+        raise KeyboardInterrupt
+    assert [str(p.relative_to(tmp_path)) for p in sorted(tmp_path.rglob("*"))] == ["a", "a/good", "a/good/x"]
+
+
+def test_new_folder__does_not_take_a_name_that_was_taken_meanwhile(tmp_path: Path) -> None:
+    with pytest.raises(AlreadyExists, match="good: is there already"), new_folder(tmp_path / "good"):
+        (tmp_path / "good").mkdir()
+    assert list(tmp_path.iterdir()) == [tmp_path / "good"]
+
+
+def test_create_run__refuses_what_exists(tmp_path: Path) -> None:
+    run = create_run(tmp_path / "runs" / "first")
+    run.write_json(run.status, {"status": "finished"})
+    with pytest.raises(AlreadyExists, match="first: is there already; give another name or force"):
+        create_run(run.path)
+    assert run.status.is_file()
+
+
+def test_create_run__force_replaces_a_run_and_nothing_else(tmp_path: Path) -> None:
+    run = create_run(tmp_path / "first")
+    run.write_json(run.status, {})
+    (run.path / "old").touch()
+    assert list(create_run(run.path, force=True).path.iterdir()) == []
+    precious = tmp_path / "thesis"
+    precious.mkdir()
+    (precious / "chapter-1").touch()
+    with pytest.raises(AlreadyExists, match="thesis: is there already, and is no run; give another name"):
+        create_run(precious, force=True)
+    assert (precious / "chapter-1").is_file()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["first", "thesis"]
+
+
+def test_progress_table__columns_are_sorted_and_later_ones_are_filled_in(tmp_path: Path) -> None:
+    table = ProgressTable(tmp_path / "progress.csv")
+    table.write({"train/b": np.float32(0.5), "train/a": 1}, {"train/b": (), "train/a": ()}, step=10)
+    table.write({"train/a": 2}, {"train/a": ()}, step=20)
+    table.write({"eval/z": 3.25, "train/a": 4, "hidden": 1}, {"eval/z": (), "train/a": (), "hidden": ("csv",)}, step=30)
+    text = (tmp_path / "progress.csv").read_text()
+    assert text == "steps,eval/z,train/a,train/b\n10,,1,0.5\n20,,2,\n30,3.25,4,\n"
+    assert len(list(csv.DictReader(text.splitlines()))) == 3

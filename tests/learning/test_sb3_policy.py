@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from ethbrake_marl.learning.forward import Actor
+from ethbrake_marl.learning.networks import NetworkSpec, paper_network
+from ethbrake_marl.learning.sb3_policy import load_tensors, policy_arguments, tensors_of
+
+
+def _policy(spec: NetworkSpec, seed: int) -> ActorCriticPolicy:
+    torch.manual_seed(seed)
+    seen = Box(-10.0, 10.0, (spec.observation_size,), np.float32)
+    policy = ActorCriticPolicy(seen, Box(-1.0, 1.0, (1,), np.float32), lambda _: 1e-3, **policy_arguments(spec, -0.5))
+    with torch.no_grad():
+        policy.action_net.weight *= 100.0  # fresh weights are tiny: fill [-1, 1] and go beyond it
+    return policy
+
+
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+def test_tensors_of__our_forward_pass_gives_sb3s_deterministic_action(activation: str) -> None:
+    spec = paper_network(27).model_copy(update={"activation": activation})
+    policy = _policy(spec, 0)
+    seen = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 27)).astype(np.float32)
+    expected, _ = policy.predict(seen, deterministic=True)
+    actual = Actor(spec, tensors_of(policy, spec))(seen)
+    assert (np.abs(expected) == 1.0).any() and (np.abs(expected) < 0.5).any()
+    np.testing.assert_allclose(actual, expected, rtol=0.0, atol=1e-6)
+
+
+def test_tensors_of__holds_every_weight_once() -> None:
+    spec = paper_network(27)
+    policy = _policy(spec, 0)
+    assert sum(t.size for t in tensors_of(policy, spec).values()) == sum(p.numel() for p in policy.parameters())
+    assert tensors_of(policy, spec)["policy.log_std"].tolist() == [-0.5]
+
+
+def test_load_tensors__restores_actor_and_critic() -> None:
+    spec = paper_network(5)
+    source, target = _policy(spec, 1), _policy(spec, 2)
+    load_tensors(target, spec, tensors_of(source, spec))
+    seen = torch.linspace(-1.0, 1.0, 50).reshape(10, 5)
+    assert torch.equal(target.predict_values(seen), source.predict_values(seen))
+    assert np.array_equal(
+        target.predict(seen.numpy(), deterministic=True)[0], source.predict(seen.numpy(), deterministic=True)[0]
+    )
+
+
+def test_tensors_of__is_a_copy() -> None:
+    spec = paper_network(5)
+    policy = _policy(spec, 1)
+    before = tensors_of(policy, spec)
+    kept = before["policy.0.weight"].copy()
+    with torch.no_grad():
+        policy.mlp_extractor.policy_net[0].weight += 1.0
+    assert np.array_equal(before["policy.0.weight"], kept)

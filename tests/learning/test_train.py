@@ -1,0 +1,212 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+import random
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.learning import train as train_module
+from ethbrake_marl.learning.bundle import Policy, load_policy
+from ethbrake_marl.learning.callback import Progress
+from ethbrake_marl.learning.divergence import TrainingDiverged
+from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.learning.train import train
+from ethbrake_marl.scenario import load_scenario
+
+SCENARIO = load_scenario("paper-random")
+ROLLOUT = 16 * 32
+
+
+@pytest.fixture
+def recipe() -> TrainingRecipe:
+    return load_recipe("ppo").replace(
+        total_steps=3 * ROLLOUT,
+        n_envs=16,
+        n_steps=32,
+        batch_size=128,
+        n_epochs=2,
+        network={"policy": [8], "value": [8, 4]},
+        evaluation={"every_updates": 2, "worlds": 10, "seed": 7},
+        checkpoint_every_updates=2,
+    )
+
+
+def _mean_weight(policy: Policy) -> dict[str, float]:
+    return {"mean_weight": float(policy.tensors["policy.0.weight"].mean())}
+
+
+def _bytes(folder: Path) -> tuple[bytes, bytes]:
+    return (folder / "manifest.json").read_bytes(), (folder / "weights.safetensors").read_bytes()
+
+
+def _rows(table: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(table.read_text().splitlines()))
+
+
+def _spoiled_steps(monkeypatch: pytest.MonkeyPatch, spoil: Callable[[int, tuple[Any, ...]], tuple[Any, ...]]) -> None:
+    """Let every step's answer pass through ``spoil(number of the step, answer)``."""
+
+    class Spoiled(EthBrakeVecEnv):
+        count = 0
+
+        def step_wait(self) -> tuple[Any, ...]:
+            self.count += 1
+            return spoil(self.count, super().step_wait())
+
+    def make(*args: Any, **kwargs: Any) -> EthBrakeVecEnv:
+        environment = make_sb3_vec_env(*args, **kwargs)
+        environment.__class__ = Spoiled
+        return environment
+
+    monkeypatch.setattr(train_module, "make_sb3_vec_env", make)
+
+
+def test_train__leaves_a_complete_folder(recipe: TrainingRecipe, tmp_path: Path) -> None:
+    seen: list[Progress] = []
+    result = train(recipe, SCENARIO, tmp_path / "run", evaluate=_mean_weight, on_progress=seen.append)
+    assert (result.status, result.steps, result.updates) == ("finished", 3 * ROLLOUT, 3)
+    assert [e["updates"] for e in result.evaluations] == [0, 2, 3]
+    assert [p.steps for p in seen] == [0, ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT]
+    assert seen[-1].metrics["episode_return"] < 0.0
+
+    names = sorted(str(p.relative_to(tmp_path / "run")) for p in (tmp_path / "run").rglob("*") if p.is_dir())
+    assert names == ["checkpoints", "checkpoints/step_000001024", "policy", "tensorboard"]
+    assert [p.stat().st_size > 0 for p in (tmp_path / "run" / "tensorboard").iterdir()] == [True]
+
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert TrainingRecipe.model_validate_json(json.dumps(config["recipe"])) == recipe
+    assert config["scenario"]["name"] == "paper-random"
+    assert (
+        config["versions"]["torch"] == torch.__version__.split("+")[0]
+        or config["versions"]["torch"] == torch.__version__
+    )
+    status = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (status["status"], status["steps"], status["policy"]) == ("finished", 3 * ROLLOUT, "policy")
+    assert status["checkpoints"] == ["step_000001024"]
+
+    rows = _rows(tmp_path / "run" / "progress.csv")
+    assert [int(row["steps"]) for row in rows] == [0, ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT]
+    assert [row["eval/mean_weight"] != "" for row in rows] == [True, False, True, True]
+    assert float(rows[-1]["eval/mean_weight"]) == result.evaluations[-1]["mean_weight"]
+    rates = [float(row["train/learning_rate"]) for row in rows[1:]]
+    assert rates == pytest.approx([recipe.learning_rate.at(share) for share in (2 / 3, 1 / 3, 0.0)])
+    for row in rows[2:]:  # an episode of this scenario is longer than one short rollout
+        assert 0.0 <= float(row["rollout/collision_rate"]) <= 1.0
+        assert float(row["rollout/total_harm"]) >= float(row["rollout/first_impact_harm"]) > 0.0
+
+    loaded = load_policy(tmp_path / "run")
+    assert loaded.manifest == result.policy.manifest
+    assert loaded.manifest.learners == ("vehicle_2",)
+    assert loaded.manifest.steps == 3 * ROLLOUT
+    assert load_policy(tmp_path / "run" / "checkpoints" / "step_000001024").manifest.steps == 2 * ROLLOUT
+
+
+def test_train__is_bitwise_reproducible_and_leaves_global_random_states(recipe: TrainingRecipe, tmp_path: Path) -> None:
+    random.seed(1)
+    np.random.seed(1)  # noqa: NPY002
+    torch.manual_seed(1)
+    expected = random.Random(1).random(), np.random.RandomState(1).rand(), torch.get_rng_state()
+    for name, seed in (("a", 5), ("b", 5), ("c", 6)):
+        train(recipe, SCENARIO, tmp_path / name, seed=seed, steps=2 * ROLLOUT)
+    assert _bytes(tmp_path / "a" / "policy") == _bytes(tmp_path / "b" / "policy")
+    assert _bytes(tmp_path / "a" / "policy")[1] != _bytes(tmp_path / "c" / "policy")[1]
+    assert (random.random(), np.random.rand()) == expected[:2]  # noqa: NPY002
+    assert torch.equal(torch.get_rng_state(), expected[2])
+    assert load_policy(tmp_path / "c").manifest.seeds == {"training": 6}
+
+
+def test_train__learners_share_one_policy(recipe: TrainingRecipe, tmp_path: Path) -> None:
+    scenario = SCENARIO.with_learners(["vehicle_2", "vehicle_3"])
+    result = train(recipe, scenario, tmp_path / "run", steps=1)
+    assert result.steps == 2 * ROLLOUT
+    assert load_policy(tmp_path / "run").manifest.learners == ("vehicle_2", "vehicle_3")
+
+
+def test_train__refuses_before_it_makes_anything(recipe: TrainingRecipe, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="'paper-random': no vehicle learns"):
+        train(recipe, SCENARIO.replace(early_impacts="keep").with_learners([]), tmp_path / "run")
+    with pytest.raises(InvalidInput, match="total_steps = 0"):
+        train(recipe, SCENARIO, tmp_path / "run", steps=0)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "run").mkdir()
+    with pytest.raises(AlreadyExists, match="run: is there already"):
+        train(recipe, SCENARIO, tmp_path / "run")
+    assert list((tmp_path / "run").iterdir()) == []
+
+
+def test_train__ctrl_c_stops_after_the_update_in_progress(
+    recipe: TrainingRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ctrl_c(step: int, answer: tuple[Any, ...]) -> tuple[Any, ...]:
+        if step == 40:  # in the second rollout of 32 steps
+            os.kill(os.getpid(), signal.SIGINT)
+        return answer
+
+    _spoiled_steps(monkeypatch, ctrl_c)
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    result = train(recipe, SCENARIO, tmp_path / "run", steps=100 * ROLLOUT)
+    assert (result.status, result.updates, result.steps) == ("interrupted", 2, 2 * ROLLOUT)
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"
+    assert load_policy(tmp_path / "run").manifest.steps == 2 * ROLLOUT
+    assert len(_rows(tmp_path / "run" / "progress.csv")) == 2
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_train__second_ctrl_c_stops_at_once_and_keeps_the_last_policy(
+    recipe: TrainingRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def impatient(step: int, answer: tuple[Any, ...]) -> tuple[Any, ...]:
+        if step in (40, 41):
+            os.kill(os.getpid(), signal.SIGINT)
+        return answer
+
+    _spoiled_steps(monkeypatch, impatient)
+    with pytest.raises(KeyboardInterrupt):
+        train(recipe, SCENARIO, tmp_path / "run", steps=100 * ROLLOUT)
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"
+    assert load_policy(tmp_path / "run").manifest.steps == ROLLOUT
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the training library's own statistics overflow first
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda reward: reward * np.nan, r"rewards\[step 7, row 0\] = nan in the rollout that ends at step 1024"),
+        (lambda reward: reward * 0.0 + np.float32(1e25), r"train/loss = inf after step 1024: must be finite"),
+        (lambda reward: reward * 0.0 + np.float32(3e38), r"the gradient of the loss is not finite at step 1024"),
+    ],
+)
+def test_train__numbers_that_are_not_finite_stop_it_and_keep_the_last_good_policy(
+    spoil: Callable[[Any], Any], message: str, recipe: TrainingRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(recipe, SCENARIO, tmp_path / "sound", steps=ROLLOUT)
+    _spoiled_steps(monkeypatch, lambda step, a: (a[0], spoil(a[1]) if step == 40 else a[1], *a[2:]))
+    with pytest.raises(TrainingDiverged, match=message):
+        train(recipe, SCENARIO, tmp_path / "run", steps=ROLLOUT + 1)
+    status = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert status["status"] == "failed"
+    assert status["reason"].startswith("TrainingDiverged: training: ")
+    kept = load_policy(tmp_path / "run")
+    assert kept.manifest.steps == ROLLOUT
+    assert np.isfinite(kept.tensors["policy.0.weight"]).all()
+
+
+def test_train__an_error_of_the_callers_function_is_passed_on(recipe: TrainingRecipe, tmp_path: Path) -> None:
+    def broken(policy: Policy) -> dict[str, float]:
+        raise RuntimeError("no worlds")
+
+    with pytest.raises(RuntimeError, match="no worlds"):
+        train(recipe, SCENARIO, tmp_path / "run", evaluate=broken)
+    status = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (status["status"], status["reason"]) == ("failed", "RuntimeError: no worlds")
+    assert load_policy(tmp_path / "run").manifest.steps == 0

@@ -1,0 +1,88 @@
+"""The episode shield: never worse than its baseline, in any world, and as predicted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pettingzoo.test import parallel_api_test
+
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield import HybridAgent, HybridShield
+
+SCENARIO = load_scenario("paper-random")
+WORLDS = SCENARIO.sample(300, 3).worlds
+
+
+def harm(agent, count="first"):
+    return drive(WORLDS, agent, SCENARIO, 1).ledger.world_harm(count)
+
+
+class LateBrake:
+    """Coasts until 0.9 s, then brakes fully: no constant deceleration, so sometimes better than any."""
+
+    name = "late_brake"
+
+    def begin(self, worlds, vehicle, rows):
+        pass
+
+    def act(self, worlds, vehicle):
+        return np.where(worlds.time_s < 0.9, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+
+@pytest.mark.parametrize("count", ["first", "total"])
+def test_coupled__is_never_worse_than_either_part(count):
+    hybrid = HybridAgent(LateBrake(), SCENARIO, count=count)
+    realised = harm(hybrid, count)
+    alone, baseline = harm(LateBrake(), count), harm(make_agent("e_v2x_bm", count=count), count)
+    assert (realised <= baseline).all() and (realised <= alone).all()
+    assert realised.tolist() == hybrid.predicted_harm.tolist()
+    assert hybrid.chosen_policy.tolist() == (alone <= baseline).tolist()
+    assert 0 < hybrid.chosen_policy.sum() < WORLDS.n
+
+
+def test_pairwise__bound_is_exceeded_in_the_same_physics():
+    hybrid = HybridAgent(make_agent("constant:0.5"), SCENARIO, bound="pairwise")
+    realised = harm(hybrid)
+    assert (realised > hybrid.bound_harm + 1.0).mean() > 0.3
+
+
+def test_begin__of_some_rows_leaves_the_others_alone():
+    hybrid = HybridAgent(make_agent("full_brake"), SCENARIO)
+    hybrid.begin(WORLDS, 1, np.arange(WORLDS.n))
+    before = hybrid.bound_harm.copy()
+    hybrid.begin(WORLDS.take([7]), 1, np.array([2]))
+    assert hybrid.bound_harm[2] == before[7]
+    assert np.delete(hybrid.bound_harm, 2).tolist() == np.delete(before, 2).tolist()
+
+
+def test_wrapper__applies_the_certified_strategy_whatever_is_proposed():
+    for seed in range(6):
+        shielded = HybridShield(parallel_env(), make_agent("full_brake"))
+        _, _ = shielded.reset(seed=seed)
+        while shielded.agents:
+            _, _, _, _, infos = shielded.step({"vehicle_2": np.array([1.0])})
+            shield = infos["vehicle_2"]["shield"]
+            assert shield["proposed_action"] == 1.0 and shield["applied_action"] <= 0.0
+            assert infos["vehicle_2"]["applied_action"] == pytest.approx(shield["applied_action"], abs=1e-12)
+        realised = shielded.unwrapped.engine.ledger.world_harm("first")[0]
+        assert realised == pytest.approx(min(shield["policy_harm"], shield["bound_harm"]), abs=1e-9)
+
+
+def test_wrapper__passes_the_api_test():
+    with pytest.warns(UserWarning, match="option"):
+        parallel_api_test(HybridShield(parallel_env(), make_agent("constant:3")), num_cycles=100)
+
+
+def test_bad_input__is_refused():
+    with pytest.raises(UnknownName, match="did you mean 'episode'"):
+        HybridShield(parallel_env(), make_agent("full_brake"), mode="episod")
+    with pytest.raises(InvalidInput, match="exactly one learner"):
+        HybridShield(parallel_env(), make_agent("full_brake"), agents=["vehicle_1"])
+    shielded = HybridShield(parallel_env(), make_agent("full_brake"))
+    shielded.reset(seed=0)
+    with pytest.raises(InvalidInput, match="vehicle_2"):
+        shielded.step({"vehicle_2": np.array([1.5])})
