@@ -29,7 +29,9 @@ def episode_engine(worlds: Worlds, agent: Agent, scenario: Scenario, vehicle: in
     The agent decides when that vehicle's latency has elapsed and every time step from then on, as a learner does; its
     commands are applied unrounded.
     """
-    scripts = {i: make_agent(spec) for i, spec in scenario.scripts.items() if i != vehicle}
+    scripts = {
+        i: make_agent(spec, horizon_s=scenario.horizon_s) for i, spec in scenario.scripts.items() if i != vehicle
+    }
     return Engine(
         scenario, worlds.n, learners=(), scripts={**scripts, vehicle: agent}, deciders=(vehicle,), worlds=worlds
     )

@@ -1,0 +1,198 @@
+"""Agents by name, what they ask for, and how they keep their episodes apart."""
+
+from __future__ import annotations
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents import agent_names, make_agent, optimise_coupled, optimise_pairwise, register_agent, registry
+from ethbrake_marl.agents.protocol import PredictingAgent
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
+from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
+
+ALL = ["full_brake", "coast", "constant:3.5", "copy_leader", "gentlest_front", "e_v2x_bm", "e_v2x_bm:pairwise"]
+
+
+def random_worlds(n: int, seed: int = 31, *, capacity: tuple[float, float, float] = (6, 7, 6)) -> Worlds:
+    rng = np.random.default_rng(seed)
+    return make_worlds(
+        rng.uniform(5, 10, (n, 2)),
+        rng.uniform(18, 22, (n, 3)),
+        braking_capacity_mps2=capacity,
+        driving_capacity_mps2=[6, 5, 6],
+        latency_s=[0, 0.5, 0.8],
+        mass_t=[4.5, 5.5, 5.9],
+        restitution=0.1,
+    )
+
+
+def asked(spec: str, worlds: Worlds, vehicle: int = 1, **settings) -> Floats:
+    agent = make_agent(spec, **settings)
+    agent.begin(worlds, vehicle, np.arange(worlds.n))
+    return agent.act(worlds, vehicle)
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [("full_brake", -7.0), ("coast", 0.0), ("constant:3.5", -3.5), ("constant:-2", 2.0), ("copy_leader", -6.0)],
+)
+def test_scripts__ask_for_their_acceleration(spec, expected):
+    assert asked(spec, random_worlds(3)).tolist() == [expected] * 3
+
+
+def test_copy_leader__brakes_no_harder_than_its_own_brakes():
+    assert asked("copy_leader", random_worlds(2, capacity=(6, 4, 6))).tolist() == [-4.0, -4.0]
+
+
+def test_gentlest_front__spares_the_front_vehicle_and_nothing_gentler_does():
+    worlds = random_worlds(300)
+    command = -worlds.vehicles.braking_capacity_mps2
+    command[:, 1] = asked("gentlest_front", worlds)
+    reachable = command[:, 1] > -7.0
+    assert 100 < reachable.sum() < 300
+    alone = worlds.take(reachable)
+    alone.gaps_m[:, 1] = 1000.0  # nobody behind
+    _, impacts = advance(alone, command[reachable], until_s=20.0)
+    assert impacts.count.sum() == 0
+    command[:, 1] += 1e-4
+    _, impacts = advance(alone, command[reachable], until_s=20.0)
+    assert np.all(impacts.count[:, 0] >= 1)
+
+
+def test_gentlest_front__collides_in_the_worlds_of_e_v2x_bm():
+    worlds = random_worlds(400)
+    collided = []
+    for spec in ("gentlest_front", "e_v2x_bm", "e_v2x_bm:pairwise"):
+        command = -worlds.vehicles.braking_capacity_mps2
+        command[:, 1] = asked(spec, worlds)
+        collided.append(advance(worlds, command, until_s=8.0)[1].count.sum(axis=1) > 0)
+    assert np.array_equal(collided[0], collided[1]) and np.array_equal(collided[1], collided[2])
+
+
+@pytest.mark.parametrize("count", ["first", "total"])
+def test_e_v2x_bm__predicts_what_it_realises(count):
+    worlds = random_worlds(100)
+    agent = make_agent("e_v2x_bm", count=count)
+    agent.begin(worlds, 1, np.arange(100))
+    assert isinstance(agent, PredictingAgent)
+    command = -worlds.vehicles.braking_capacity_mps2
+    realised = np.zeros(100)
+    for time in np.arange(0.1, 8.05, 0.1):
+        command[:, 1] = agent.act(worlds, 1)
+        worlds, impacts = advance(worlds, command, until_s=time)
+        harm = impacts.first_impact_harm if count == "first" else impacts.total_harm
+        realised += harm.sum(axis=1)
+    assert np.abs(realised - agent.predicted_harm).max() < 1e-6
+
+
+def test_e_v2x_bm__pairwise_predicts_the_closed_form():
+    worlds = random_worlds(50)
+    agent = make_agent("e_v2x_bm:pairwise")
+    agent.begin(worlds, 1, np.arange(50))
+    closed = optimise_pairwise(worlds, 1)
+    assert np.array_equal(agent.predicted_harm, closed.harm)
+    assert np.array_equal(agent.act(worlds, 1), -closed.deceleration_mps2)
+
+
+def test_e_v2x_bm__uses_the_count_and_the_horizon_it_was_given():
+    worlds = random_worlds(40)
+    for settings in ({"count": "first"}, {"count": "total"}, {"horizon_s": 1.5}):
+        assert np.array_equal(asked("e_v2x_bm", worlds, **settings), -optimise_coupled(worlds, 1, **settings)[0])
+    assert not np.array_equal(asked("e_v2x_bm", worlds), asked("e_v2x_bm", worlds, count="total"))
+    assert not np.array_equal(asked("e_v2x_bm", worlds), asked("e_v2x_bm", worlds, horizon_s=1.5))
+
+
+@pytest.mark.parametrize("spec", ALL)
+def test_agents__new_episodes_change_their_rows_only(spec):
+    worlds, fresh = random_worlds(6), random_worlds(2, seed=32)
+    agent = make_agent(spec)
+    agent.begin(worlds, 1, np.arange(6))
+    before = agent.act(worlds, 1)
+    agent.begin(fresh, 1, np.array([4, 1]))
+    after = agent.act(worlds, 1)
+    assert after[[0, 2, 3, 5]].tolist() == before[[0, 2, 3, 5]].tolist()
+    assert after[[4, 1]].tolist() == asked(spec, fresh).tolist()
+
+
+@pytest.mark.parametrize("spec", ALL)
+def test_agents__do_not_share_memory_with_what_they_return_and_can_be_pickled(spec):
+    worlds = random_worlds(4)
+    agent = make_agent(spec)
+    agent.begin(worlds, 1, np.arange(4))
+    first = agent.act(worlds, 1)
+    kept = first.copy()
+    first[:] = 99.0
+    assert agent.act(worlds, 1).tolist() == kept.tolist()
+    assert pickle.loads(pickle.dumps(agent)).act(worlds, 1).tolist() == kept.tolist()
+    assert agent.name == spec
+
+
+@pytest.mark.parametrize("spec", ["gentlest_front", "e_v2x_bm", "e_v2x_bm:pairwise"])
+def test_agents__acting_before_every_episode_began_is_an_error(spec):
+    worlds = random_worlds(3)
+    agent = make_agent(spec)
+    agent.begin(worlds.take([0, 2]), 1, np.array([0, 2]))
+    with pytest.raises(InvalidInput, match="begin was not called"):
+        agent.act(worlds, 1)
+
+
+@pytest.mark.parametrize("spec", ["copy_leader", "gentlest_front"])
+def test_front_only_scripts__refuse_the_first_vehicle(spec):
+    with pytest.raises(InvalidInput, match="vehicle_1 has no vehicle in front"):
+        asked(spec, random_worlds(1), vehicle=0)
+
+
+@pytest.mark.parametrize("spec", ["constant:7.5", "constant:-5.5"])
+def test_constant__beyond_the_capacity_is_refused_when_the_episode_begins(spec):
+    with pytest.raises(InvalidInput, match="capacity"):
+        make_agent(spec).begin(random_worlds(2), 1, np.arange(2))
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        *("constant", "constant:", "constant:fast", "constant:nan", "full_brake:1", "coast:1", "copy_leader:1"),
+        *("gentlest_front:1", "e_v2x_bm:total", "", "Full", "full_brake@", "e_v2x_bm@coupled@x", "a:b c", None),
+    ],
+)
+def test_make_agent__refuses_bad_arguments(spec):
+    with pytest.raises(InvalidInput):
+        make_agent(spec)
+
+
+@pytest.mark.parametrize("settings", [{"count": "both"}, {"horizon_s": 0.0}, {"horizon_s": math.nan}])
+def test_make_agent__refuses_bad_settings(settings):
+    with pytest.raises(InvalidInput, match=next(iter(settings))):
+        make_agent("e_v2x_bm", **settings)
+
+
+def test_make_agent__suggests_the_name_that_was_meant():
+    with pytest.raises(UnknownName, match="did you mean 'full_brake'"):
+        make_agent("full_break")
+
+
+def test_agent_names__are_those_that_ship():
+    assert agent_names() == ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front")
+
+
+def test_register_agent__makes_names_and_paths_known(monkeypatch):
+    monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))
+    seen = []
+
+    def factory(argument, settings):
+        seen.append((argument, settings.count))
+        return make_agent("coast")
+
+    register_agent("ppo", factory)
+    register_agent("ppo", factory)
+    for spec in ("ppo", "ppo:my-run", "ppo@my-run", "ppo@C:/runs/my run@2"):
+        make_agent(spec, count="total")
+    assert seen == [(None, "total"), ("my-run", "total"), ("my-run", "total"), ("C:/runs/my run@2", "total")]
+    assert "ppo" in agent_names()
+    with pytest.raises(AlreadyExists):
+        register_agent("ppo", lambda argument, settings: make_agent("coast"))
+    with pytest.raises(InvalidInput):
+        register_agent("ppo:x", factory)
