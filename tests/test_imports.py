@@ -29,7 +29,10 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("analysis", "shield"),
     ("learning", "evaluation"),
     ("viewer",),
+    ("lineup", "results_folder"),
+    ("experiment",),
     ("__init__",),
+    ("doctor", "terminal"),
     ("cli", "__main__"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
