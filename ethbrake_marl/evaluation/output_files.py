@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ethbrake_marl.durable_files import write_file
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.learning.durable_files import write_file
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:

@@ -19,8 +19,8 @@ import safetensors.numpy
 from pydantic import ValidationError
 from safetensors import SafetensorError
 
+from ethbrake_marl.durable_files import new_folder, write_file
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
-from ethbrake_marl.learning.durable_files import new_folder, write_file
 from ethbrake_marl.learning.forward import Actor, Float32s
 from ethbrake_marl.learning.manifest import Manifest, observation_schema
 from ethbrake_marl.learning.networks import TensorRow, tensor_table

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.logger import KVWriter, filter_excluded_keys
 
-from ethbrake_marl.learning.durable_files import write_file
+from ethbrake_marl.durable_files import write_file
 
 
 class ProgressTable(KVWriter):

@@ -12,8 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from ethbrake_marl.durable_files import write_file
 from ethbrake_marl.errors import AlreadyExists
-from ethbrake_marl.learning.durable_files import write_file
 
 RunStatus = Literal["running", "finished", "interrupted", "failed"]
 

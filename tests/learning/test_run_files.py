@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ethbrake_marl.durable_files import new_folder, write_file
 from ethbrake_marl.errors import AlreadyExists
-from ethbrake_marl.learning.durable_files import new_folder, write_file
 from ethbrake_marl.learning.progress_table import ProgressTable
 from ethbrake_marl.learning.run_directory import create_run
 
