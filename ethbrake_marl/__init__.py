@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from ethbrake_marl.envs.single import EthBrakeEnv as EthBrakeEnv
     from ethbrake_marl.envs.vector import EthBrakeVectorEnv as EthBrakeVectorEnv
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError
+    from ethbrake_marl.evaluation import evaluate as evaluate
+    from ethbrake_marl.learning.bundle import load_policy as load_policy
     from ethbrake_marl.observations import ObservationSpec as ObservationSpec
     from ethbrake_marl.physics import Worlds as Worlds
     from ethbrake_marl.physics import advance as advance
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario import Scenario as Scenario
     from ethbrake_marl.scenario import list_scenarios as list_scenarios
     from ethbrake_marl.scenario import load_scenario as load_scenario
+    from ethbrake_marl.shield import HybridShield as HybridShield
 
 __version__ = "0.1.0"
 
@@ -41,13 +44,16 @@ _HOME = {
     "EthBrakeParallelEnv": "envs.parallel",
     "EthBrakeVecEnv": "envs.sb3",
     "EthBrakeVectorEnv": "envs.vector",
+    "HybridShield": "shield",
     "ObservationSpec": "observations",
     "RewardParams": "rewards",
     "Scenario": "scenario",
     "Worlds": "physics",
     "advance": "physics",
     "env": "envs.parallel",
+    "evaluate": "evaluation",
     "list_scenarios": "scenario",
+    "load_policy": "learning.bundle",
     "load_scenario": "scenario",
     "make_agent": "agents.registry",
     "make_sb3_vec_env": "envs.sb3",

@@ -15,15 +15,16 @@ import numpy as np
 from packaging.requirements import Requirement
 from packaging.version import Version
 
+from ethbrake_marl import __version__
 from ethbrake_marl.agents.pairwise import optimise_pairwise
-from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.physics import Worlds, advance, make_worlds
 from ethbrake_marl.physics.compiled import cache_folder
 from ethbrake_marl.scenario import list_scenarios, scenario_folder
 
 DISTRIBUTION = "ethbrake-marl"
 OLDEST_PYTHON = (3, 11)
-_CHECKOUT = Path(__file__).resolve().parents[1]
+_PACKAGE = Path(__file__).resolve().parent
+_CHECKOUT = _PACKAGE.parent  # or the folder of installed packages, where there is no pyproject.toml
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +39,7 @@ class Check:
 def diagnose() -> list[Check]:
     """All checks, in the order in which they should be repaired; none of them raises."""
     return [
+        Check("ethbrake_marl", True, f"{__version__} in {_PACKAGE}"),
         _checked("python", _python),
         *_dependencies(),
         _checked("processor", _processor),
@@ -49,11 +51,11 @@ def diagnose() -> list[Check]:
 
 
 def _checked(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
-    """The finding of ``look``; an error of the package or of the system is a finding too."""
+    """The finding of ``look``; whatever it raises is a finding too, so that the other checks are still made."""
     try:
         return Check(name, *look())
-    except (EthBrakeError, OSError) as error:
-        return Check(name, False, str(error))
+    except Exception as error:
+        return Check(name, False, f"{type(error).__name__}: {error}")
 
 
 def _python() -> tuple[bool, str]:
@@ -108,7 +110,7 @@ def _kernel_cache() -> tuple[bool, str]:
     folder = cache_folder()
     temporary = folder.name.startswith("ethbrake_marl-")
     note = "temporary: kernels are compiled anew in every process; set NUMBA_CACHE_DIR to a writable folder"
-    return not temporary, f"{folder} ({note})" if temporary else str(folder)
+    return True, f"{folder} ({note})" if temporary else str(folder)
 
 
 def _scenarios() -> tuple[bool, str]:

@@ -1,0 +1,298 @@
+"""The command ``ethbrake``: parse, call, print. Figures as JSON go to stdout alone, everything else to stderr."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer.exceptions import TyperException
+
+from ethbrake_marl.doctor import diagnose
+from ethbrake_marl.errors import EthBrakeError
+from ethbrake_marl.evaluation import SummaryRow, check_target, evaluate, rich_table, summarise, write_per_world_csv
+from ethbrake_marl.evaluation.output_files import write_output
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.lineup import EPISODES, LIST_SEED, choose_worlds, make_lineup
+from ethbrake_marl.scenario import (
+    list_scenarios,
+    load_scenario,
+    new_scenario_text,
+    scenario_json_schema,
+)
+from ethbrake_marl.terminal import INTERRUPTED, interruptible, progress_bars, result_console, say, write_json
+
+BAD_INPUT = 2
+CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
+PROGRESS_EVERY = 500  # worlds
+
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Ethical emergency braking: train, shield, evaluate. Every command has its own --help with an example.",
+    epilog="Example: ethbrake run",
+)
+scenario_app = typer.Typer(
+    rich_markup_mode=None,
+    help="Look at scenarios, check one, or start a new one.",
+    epilog="Example: ethbrake scenario show paper-random",
+)
+app.add_typer(scenario_app, name="scenario")
+
+ScenarioOption = Annotated[
+    str, typer.Option("--scenario", metavar="NAME|PATH", help="A shipped scenario, or a path to a YAML file.")
+]
+RecipeOption = Annotated[
+    str, typer.Option("--recipe", metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file.")
+]
+StepsOption = Annotated[int | None, typer.Option(help="Training steps (decisions).", show_default="the recipe's")]
+TrainingSeedOption = Annotated[
+    int | None, typer.Option("--seed", help="Seed of the training alone.", show_default="the recipe's")
+]
+NameOption = Annotated[
+    str | None, typer.Option(help="Folder of the run inside runs/.", show_default="SCENARIO-RECIPE-seedSEED")
+]
+OutputOption = Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the run, instead of --name.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace what is already there.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout.")]
+
+_KEPT = "if the training had begun, the run's folder keeps the last good policy"
+
+
+def main() -> None:
+    """Entry point: run the command line and exit with its status."""
+    sys.exit(run_command(sys.argv[1:]))
+
+
+def run_command(arguments: Sequence[str]) -> int:
+    """Exit status of a command line: 2 with one line on stderr for bad input or usage; other errors pass through."""
+    try:
+        status = app(list(arguments), prog_name="ethbrake", standalone_mode=False)
+    except TyperException as error:
+        context = getattr(error, "ctx", None)
+        where = context.command_path if context else "ethbrake"
+        return _refuse(f"{error.format_message().replace('Value error, ', '')} (see: {where} --help)")
+    except EthBrakeError as error:
+        return _refuse(str(error))
+    return status if isinstance(status, int) else 0
+
+
+@app.command(epilog="Example: ethbrake run --steps 200000 --seed 1")
+def run(
+    scenario: ScenarioOption = "paper-random",
+    steps: StepsOption = None,
+    seed: TrainingSeedOption = None,
+    episodes: Annotated[int, typer.Option(help="Worlds of the evaluation list.")] = EPISODES,
+    list_seed: Annotated[int, typer.Option(help="Seed of the evaluation list.")] = LIST_SEED,
+    recipe: RecipeOption = "ppo",
+    name: NameOption = None,
+    output: OutputOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Train PPO, shield it, compare with the baselines, report.
+
+    Writes the run's folder: the policy, results as CSV and JSON, every world, three figures, and report.html.
+    Ctrl-C ends the training early, and what it has is evaluated; a second Ctrl-C stops at once.
+    """
+    with interruptible(_KEPT):
+        # Here and in `train`: torch takes seconds to load, and no other command needs it.
+        from ethbrake_marl.experiment import run_experiment, run_folder
+
+        chosen, plan = load_scenario(scenario), load_recipe(recipe)
+        folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
+        with progress_bars() as bars:
+            result = run_experiment(
+                chosen,
+                folder,
+                recipe=plan,
+                steps=steps,
+                seed=seed,
+                episodes=episodes,
+                list_seed=list_seed,
+                force=force,
+                on_stage=lambda stage: bars.show(stage.name, stage.done, stage.total, stage.metrics, stage.note),
+            )
+    _show_rows(result.rows, as_json)
+    say(f"report: {result.report}")
+    _end(result.status, result.steps, folder)
+
+
+@app.command(epilog="Example: ethbrake train --scenario paper-random-early --steps 200000 --name early")
+def train(
+    scenario: ScenarioOption = "paper-random",
+    recipe: RecipeOption = "ppo",
+    steps: StepsOption = None,
+    seed: TrainingSeedOption = None,
+    name: NameOption = None,
+    output: OutputOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Train a policy into a run's folder.
+
+    Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,hybrid@FOLDER`.
+    Ctrl-C ends the training after the update in progress and keeps the policy.
+    """
+    with interruptible(_KEPT):
+        from ethbrake_marl.experiment import run_folder, train_measured
+
+        chosen, plan = load_scenario(scenario), load_recipe(recipe)
+        folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
+        with progress_bars() as bars:
+            result = train_measured(
+                chosen,
+                folder,
+                recipe=plan,
+                steps=steps,
+                seed=seed,
+                force=force,
+                on_progress=lambda p: bars.show("training", p.steps, p.total_steps, p.metrics),
+            )
+    if as_json:
+        last = result.evaluations[-1] if result.evaluations else None
+        write_json({"directory": str(folder), "status": result.status, "steps": result.steps, "evaluation": last})
+    _end(result.status, result.steps, folder)
+
+
+@app.command("evaluate", epilog="Example: ethbrake evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000")
+def evaluate_command(
+    scenario: ScenarioOption = "paper-random",
+    agents: Annotated[
+        str, typer.Option(metavar="A,B,...", help="Who drives, with commas between them.")
+    ] = "full_brake,e_v2x_bm,e_v2x_bm:pairwise",
+    episodes: Annotated[int | None, typer.Option(help="Worlds of the list.", show_default=str(EPISODES))] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the list.", show_default=str(LIST_SEED))] = None,
+    count: Annotated[HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")] = "first",
+    initial_states: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Your own worlds, one per row, instead of the list.")
+    ] = None,
+    vehicle: Annotated[
+        str | None, typer.Option(help="Who is driven; other learners brake fully.", show_default="the learner")
+    ] = None,
+    per_world: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Also write one row per world and agent to this file.")
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare agents on the same fixed list of worlds.
+
+    Agents: full_brake, coast, constant:A (deceleration in m/s2), copy_leader, gentlest_front, e_v2x_bm,
+    e_v2x_bm:pairwise; and of a run or a policy bundle: ppo@PATH, hybrid@PATH, hybrid:pairwise@PATH.
+    """
+    if per_world is not None:
+        check_target(per_world, force=force)
+    chosen = load_scenario(scenario)
+    if vehicle is not None:
+        chosen = chosen.with_learners([vehicle])
+    sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
+    lineup = make_lineup(agents.split(","), chosen, count=count)
+    with interruptible("nothing was written"), progress_bars() as bars:
+        evaluation = evaluate(
+            sample,
+            lineup,
+            scenario=chosen,
+            seed=list_seed,
+            chunk=PROGRESS_EVERY,
+            on_progress=lambda agent, done: bars.show(agent, done, sample.worlds.n),
+        )
+    if per_world is not None:
+        write_per_world_csv(per_world, evaluation, force=force)
+        say(f"every world: {per_world}")
+    _show_rows(summarise(evaluation), as_json)
+
+
+@scenario_app.command("list", epilog="Example: ethbrake scenario list")
+def scenario_list(as_json: JsonOption = False) -> None:
+    """List the shipped scenarios: name and title."""
+    entries = list_scenarios()
+    if as_json:
+        write_json([{"name": e.name, "title": e.title, "path": str(e.path)} for e in entries])
+        return
+    width = max(len(entry.name) for entry in entries)
+    for entry in entries:
+        typer.echo(f"{entry.name:{width}}  {entry.title}")
+
+
+@scenario_app.command("show", epilog="Example: ethbrake scenario show paper-random")
+def scenario_show(scenario: Annotated[str, typer.Argument(metavar="NAME|PATH")]) -> None:
+    """Print the YAML of a scenario that is in order."""
+    load_scenario(scenario)
+    shipped = {entry.name: entry.path for entry in list_scenarios()}
+    typer.echo(shipped.get(scenario, Path(scenario)).read_text("utf-8"), nl=False)
+
+
+@scenario_app.command("validate", epilog="Example: ethbrake scenario validate my-scenario.yaml")
+def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")]) -> None:
+    """Check a scenario: one line, OK or what is wrong."""
+    scenario = load_scenario(path)
+    sample = scenario.sample(CHECKED_DRAWS, LIST_SEED)
+    learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "none"
+    counts = f"{CHECKED_DRAWS:,} worlds drawn, {sample.rejected:,} more refused for an early impact"
+    typer.echo(f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}")
+
+
+@scenario_app.command("new", epilog="Example: ethbrake scenario new my-scenario --based-on paper-distance")
+def scenario_new(
+    name: str,
+    based_on: Annotated[str, typer.Option(metavar="NAME|PATH", help="Whose values to start from.")] = "paper-random",
+    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")] = Path(),
+    force: ForceOption = False,
+) -> None:
+    """Write a commented NAME.yaml with every key."""
+    file = output / f"{name}.yaml"
+    write_output(file, new_scenario_text(name, based_on).encode(), force=force)
+    say(f"written: {file}; change it, then: ethbrake scenario validate {file}")
+
+
+@scenario_app.command("schema", epilog="Example: ethbrake scenario schema > scenario.schema.json")
+def scenario_schema() -> None:
+    """Print the JSON Schema of scenario files.
+
+    For editors that complete and check YAML.
+    """
+    write_json(scenario_json_schema())
+
+
+@app.command(epilog="Example: ethbrake doctor")
+def doctor(as_json: JsonOption = False) -> None:
+    """Check this installation: versions, folders, physics.
+
+    One line per check, OK or FAIL; exit status 1 when any failed.
+    """
+    checks = diagnose()
+    if as_json:
+        write_json([asdict(check) for check in checks])
+    else:
+        width = max(len(check.name) for check in checks)
+        for check in checks:
+            typer.echo(f"{'OK' if check.ok else 'FAIL':4}  {check.name:{width}}  {check.detail}")
+    if not all(check.ok for check in checks):
+        raise typer.Exit(1)
+
+
+def _refuse(reason: str) -> int:
+    """Say why, in one line; gives the exit status."""
+    say(f"ethbrake: error: {' '.join(reason.split())}")
+    return BAD_INPUT
+
+
+def _show_rows(rows: Sequence[SummaryRow], as_json: bool) -> None:
+    if as_json:
+        write_json([row.to_json() for row in rows])
+    else:
+        result_console().print(rich_table(rows))
+
+
+def _end(status: str, steps: int, folder: Path) -> None:
+    """Say what a training left; an interrupted one ends with that status."""
+    if status == "interrupted":
+        say(f"interrupted after {steps:,} training steps; the policy of that moment is in {folder}")
+        raise typer.Exit(INTERRUPTED)
+    say(f"{status} after {steps:,} training steps: {folder}")

@@ -1,0 +1,251 @@
+"""The main job, end to end: train a policy, shield it, measure both against the baselines, and show the result."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import Evaluation, SummaryRow, evaluate, parameter_line, summarise
+from ethbrake_marl.evaluation.rollout import controlled_vehicle
+from ethbrake_marl.learning.bundle import Policy
+from ethbrake_marl.learning.callback import Progress
+from ethbrake_marl.learning.recipe import TrainingRecipe
+from ethbrake_marl.learning.run_directory import RunDirectory, RunStatus
+from ethbrake_marl.learning.train import TrainResult, train
+from ethbrake_marl.learning.versions import installed_versions
+from ethbrake_marl.lineup import EPISODES, LIST_SEED, make_lineup
+from ethbrake_marl.results_folder import write_figures, write_page, write_results
+from ethbrake_marl.rewards import RewardParams
+from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.shield import HybridAgent
+
+RUNS = Path("runs")
+PROGRESS_EVERY = 500  # worlds
+BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
+
+Ended = Literal["finished", "interrupted"]
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """How far an experiment is: ``done`` of ``total`` steps or worlds of the part called ``name``."""
+
+    name: str  # "training", or the agent that is being evaluated, or "figures"
+    done: int
+    total: int
+    metrics: Mapping[str, float] = field(default_factory=dict)  # of the policy, while it is trained
+    note: str = ""  # to be told once
+
+
+OnStage = Callable[[Stage], None]
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentResult:
+    """What an experiment left behind."""
+
+    directory: Path
+    status: Ended  # interrupted: the policy was not trained to the end, everything else is there
+    steps: int
+    rows: list[SummaryRow]
+    report: Path
+
+
+def run_folder(
+    scenario: Scenario,
+    recipe: TrainingRecipe,
+    *,
+    seed: int | None = None,
+    name: str | None = None,
+    output: Path | None = None,
+) -> Path:
+    """Folder of a run: ``output``, or ``runs/<name>``, by default ``runs/<scenario>-<recipe>-seed<seed>``.
+
+    Raises ``InvalidInput`` when both are given, or for a name that is not a plain folder name.
+    """
+    if output is not None:
+        if name is not None:
+            raise InvalidInput(f"name {name!r} and output {str(output)!r}: give one of the two")
+        return output
+    if name is not None and not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]*", name):
+        raise InvalidInput(f"run name {name!r}: must be letters, digits, . _ -, not beginning with . or -")
+    return RUNS / (name or f"{scenario.name}-{recipe.name}-seed{recipe.seed if seed is None else seed}")
+
+
+def train_measured(
+    scenario: Scenario,
+    directory: Path,
+    *,
+    recipe: TrainingRecipe,
+    steps: int | None = None,
+    seed: int | None = None,
+    force: bool = False,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> TrainResult:
+    """Train as ``learning.train.train`` does, measuring the policy on the recipe's fixed list while it learns.
+
+    The list is the first part of that seed's evaluation list: metrics are those of ``evaluate`` on it.
+    """
+    plan = recipe.evaluation
+    worlds = scenario.sample(plan.worlds, plan.seed) if len(scenario.learners) == 1 else None
+
+    def measure(policy: Policy) -> dict[str, float]:
+        assert worlds is not None
+        row = summarise(evaluate(worlds, {"ppo": LearnedAgent(policy, "ppo")}, scenario=scenario))[0]
+        return {name: getattr(row, name).value for name in ("first_impact_harm", "total_harm", "collision_rate")}
+
+    return train(
+        recipe,
+        scenario,
+        directory,
+        steps=steps,
+        seed=seed,
+        force=force,
+        evaluate=None if worlds is None else measure,
+        on_progress=on_progress,
+    )
+
+
+def run_experiment(
+    scenario: Scenario,
+    directory: Path,
+    *,
+    recipe: TrainingRecipe,
+    steps: int | None = None,
+    seed: int | None = None,
+    episodes: int = EPISODES,
+    list_seed: int = LIST_SEED,
+    force: bool = False,
+    on_stage: OnStage | None = None,
+) -> ExperimentResult:
+    """Train PPO on ``scenario``, evaluate it, its hybrid and the baselines on a fixed list, write everything.
+
+    ``seed`` is the training's; the list is ``episodes`` worlds of ``list_seed``. Ctrl-C during the training ends it
+    after the update in progress, and the policy so far is evaluated; a second one, or one during the evaluation,
+    raises ``KeyboardInterrupt``, and the folder keeps the policy. ``run.json`` always says which. Raises what
+    ``train`` and ``evaluate`` raise, ``AlreadyExists`` for an existing run before any work.
+    """
+    started = time.monotonic()
+    tell = on_stage or (lambda stage: None)
+    vehicle = controlled_vehicle(scenario, None)
+    sample = scenario.sample(episodes, list_seed)
+    trained = train_measured(
+        scenario,
+        directory,
+        recipe=recipe,
+        steps=steps,
+        seed=seed,
+        force=force,
+        on_progress=lambda p: tell(Stage("training", p.steps, p.total_steps, p.metrics)),
+    )
+    run = RunDirectory(trained.directory)
+    with _status(run, trained.status):
+        agents = _agents(trained.policy, scenario)
+        evaluation = _evaluated(sample, agents, scenario, vehicle, list_seed, trained, tell)
+        tell(Stage("figures", 0, 1))
+        rows = summarise(evaluation)
+        write_results(run.path, evaluation, rows)
+        report = _shown(run, evaluation, rows, trained, agents, wall_s=time.monotonic() - started)
+        tell(Stage("figures", 1, 1))
+    return ExperimentResult(run.path, trained.status, trained.steps, rows, report)
+
+
+def _agents(policy: Policy, scenario: Scenario) -> dict[str, Agent]:
+    """The baselines, the policy alone (``ppo``), and the policy behind its shield (``hybrid``)."""
+    learned: dict[str, Agent] = {
+        "ppo": LearnedAgent(policy, "ppo"),
+        "hybrid": HybridAgent(LearnedAgent(policy, "ppo"), scenario),
+    }
+    return {**make_lineup(BASELINES, scenario), **learned}
+
+
+def _evaluated(
+    sample: Sample,
+    agents: Mapping[str, Agent],
+    scenario: Scenario,
+    vehicle: int,
+    list_seed: int,
+    trained: TrainResult,
+    tell: OnStage,
+) -> Evaluation:
+    """Every agent on the list, with its progress told."""
+    total = sample.worlds.n
+    if trained.status == "interrupted":
+        note = f"interrupted after {trained.steps:,} steps: evaluating the policy so far; Ctrl-C again stops at once"
+        tell(Stage(next(iter(agents)), 0, total, note=note))
+    return evaluate(
+        sample,
+        agents,
+        scenario=scenario,
+        vehicle=vehicle,
+        seed=list_seed,
+        chunk=PROGRESS_EVERY,
+        on_progress=lambda name, done: tell(Stage(name, done, total)),
+    )
+
+
+def _shown(
+    run: RunDirectory,
+    evaluation: Evaluation,
+    rows: list[SummaryRow],
+    trained: TrainResult,
+    agents: Mapping[str, Agent],
+    *,
+    wall_s: float,
+) -> Path:
+    """Figures and page."""
+    config = json.loads(run.config.read_text("utf-8"))
+    plan = config["recipe"]["evaluation"]
+    caption = (
+        f"{evaluation.scenario.name}: worlds 0 to {plan['worlds'] - 1} of the list of seed {plan['seed']} at every"
+        f" point; training seed {config['seeds']['training']}. Level lines: {parameter_line(rows[0].parameters)}."
+    )
+    figures = write_figures(
+        run.path, evaluation, rows, course=trained.evaluations, course_caption=caption, agents=agents
+    )
+    settings = {
+        "Training": f"{config['recipe']['title'] or config['recipe']['name']}: {trained.steps:,} steps"
+        f" of {config['recipe']['total_steps']:,} ({trained.status}), {trained.wall_s:.0f} s",
+        "Seeds": f"training {config['seeds']['training']}, evaluation list {evaluation.seed}",
+        "Reward": _reward(config["recipe"]["reward"]),
+        "Whole run": f"{wall_s:.0f} s",
+    }
+    summary = f"PPO after {trained.steps:,} steps, alone and behind its shield, against the baselines."
+    if trained.status == "interrupted":
+        summary += " The training was interrupted; this is the policy it had by then."
+    return write_page(run.path, rows, figures, summary=summary, settings=settings, versions=installed_versions())
+
+
+def _reward(given: dict[str, Any]) -> str:
+    """The settings of a reward that are not its defaults."""
+    own = RewardParams(**given).model_dump(exclude_defaults=True)
+    return ", ".join(f"{name} {value}" for name, value in own.items()) or "minus the first-impact harm"
+
+
+@contextmanager
+def _status(run: RunDirectory, status: Ended) -> Iterator[None]:
+    """Keep ``run.json`` true while the evaluation runs: ``running``, then the training's status or what went wrong."""
+    _note(run, "running", "evaluation", None)
+    try:
+        yield
+    except BaseException as error:
+        _note(run, "interrupted" if isinstance(error, KeyboardInterrupt) else "failed", "evaluation", repr(error))
+        raise
+    _note(run, status, "report", None)
+
+
+def _note(run: RunDirectory, status: RunStatus, stage: str, reason: str | None) -> None:
+    """Bring ``run.json`` up to date; its steps and ``wall_s`` stay those of the training."""
+    content: dict[str, Any] = json.loads(run.status.read_text("utf-8"))
+    ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")
+    run.write_json(run.status, {**content, "status": status, "stage": stage, "ended_utc": ended, "reason": reason})

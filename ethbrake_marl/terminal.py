@@ -1,0 +1,80 @@
+"""What the command line shows while it works and how it ends: lines and progress bars on stderr, JSON on stdout."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+INTERRUPTED = 130  # 128 + SIGINT, as shells expect
+
+
+def say(text: str) -> None:
+    """One line to the person at the terminal."""
+    typer.echo(text, err=True)
+
+
+def write_json(content: Any) -> None:
+    """JSON on stdout."""
+    typer.echo(json.dumps(content, indent=2, allow_nan=False))
+
+
+@contextmanager
+def interruptible(kept: str) -> Iterator[None]:
+    """Turn Ctrl-C inside the block into one line, which says what is kept, and the exit status of an interruption."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(f"interrupted; {kept}")
+        raise typer.Exit(INTERRUPTED) from None
+
+
+class Bars:
+    """One progress bar per part of the work when stderr is a terminal, else a line when a part begins or has news."""
+
+    def __init__(self, bars: Progress | None) -> None:
+        self._bars = bars
+        self._tasks: dict[str, TaskID] = {}
+        self._last_line = ""
+
+    def show(
+        self, name: str, done: int, total: int, metrics: Mapping[str, float] | None = None, note: str = ""
+    ) -> None:
+        """The part ``name`` has come to ``done`` of ``total``; ``note`` is said once, above the bars."""
+        harm = (metrics or {}).get("first_impact_harm")
+        label = name if harm is None else f"{name}, first-impact harm {harm:.2f}"
+        if self._bars is None:
+            if note:
+                say(note)
+            if label != self._last_line:
+                say(f"{label}: {done:,} of {total:,}")
+            self._last_line = label
+            return
+        if note:
+            self._bars.console.print(note, highlight=False)
+        if name not in self._tasks:
+            self._tasks[name] = self._bars.add_task(label, total=total)
+        self._bars.update(self._tasks[name], completed=min(done, total), total=total, description=label)
+
+
+@contextmanager
+def progress_bars() -> Iterator[Bars]:
+    """Bars on stderr while the block runs."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield Bars(None)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bars:
+        yield Bars(bars)
+
+
+def result_console() -> Console:
+    """Where tables go: stdout, at the terminal's width or 100 columns in a file."""
+    return Console() if sys.stdout.isatty() else Console(width=100)

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import yaml
+
+from ethbrake_marl.cli import run_command
+from ethbrake_marl.scenario import new_scenario_text
+
+TINY_RECIPE = {
+    "name": "tiny",
+    "algorithm": "ppo",
+    "total_steps": 256,
+    "n_envs": 16,
+    "n_steps": 8,
+    "batch_size": 64,
+    "n_epochs": 1,
+    "learning_rate": {"start": 3e-4, "end": 3e-5},
+    "gamma": 0.99,
+    "gae_lambda": 0.95,
+    "clip_range": 0.2,
+    "ent_coef": 0.0,
+    "vf_coef": 0.5,
+    "max_grad_norm": 0.5,
+    "network": {"policy": [8], "value": [8]},
+    "reward": {"harm": 1.0},
+    "seed": 3,
+    "evaluation": {"every_updates": 1, "worlds": 10, "seed": 7},
+    "checkpoint_every_updates": 100,
+}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a command line left: exit status, stdout, stderr."""
+
+    status: int
+    out: str
+    err: str
+
+
+Command = Callable[..., Answer]
+
+
+@pytest.fixture
+def ethbrake(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs a command line in this process, 200 columns wide."""
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def call(*arguments: str | Path) -> Answer:
+        capsys.readouterr()
+        status = run_command([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return Answer(status, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def tiny_recipe(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recipe that trains for two updates of 128 decisions."""
+    path = tmp_path_factory.mktemp("recipe") / "tiny.yaml"
+    path.write_text(yaml.safe_dump(TINY_RECIPE))
+    return path
+
+
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_recipe: Path) -> Path:
+    """The folder of an `ethbrake run` with 60 worlds; not to be changed."""
+    folder = tmp_path_factory.mktemp("runs") / "tiny"
+    status = run_command(["run", "--recipe", str(tiny_recipe), "--episodes", "60", "--output", str(folder), "--json"])
+    assert status == 0
+    return folder
+
+
+@pytest.fixture
+def scenario_file(tmp_path: Path) -> Callable[[str, str], Path]:
+    """Writes mine.yaml, the template with one piece of text replaced."""
+
+    def write(old: str, new: str) -> Path:
+        text = new_scenario_text("mine")
+        assert text.count(old) == 1
+        path = tmp_path / "mine.yaml"
+        path.write_text(text.replace(old, new))
+        return path
+
+    return write

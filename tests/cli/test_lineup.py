@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.experiment import run_folder
+from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.lineup import choose_worlds, make_lineup
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield import HybridAgent
+
+SCENARIO = load_scenario("paper-random")
+
+
+def test_lineup__keeps_order_and_specs():
+    lineup = make_lineup(["e_v2x_bm:pairwise", "constant:3.5", "coast"], SCENARIO)
+    assert list(lineup) == ["e_v2x_bm:pairwise", "constant:3.5", "coast"]
+
+
+def test_lineup__agents_of_a_run_and_of_its_bundle_are_the_same(finished_run):
+    run, bundle = make_lineup([f"ppo@{finished_run}", f"ppo@{finished_run / 'policy'}"], SCENARIO).values()
+    worlds = SCENARIO.sample(20, 1).worlds
+    assert np.array_equal(run.act(worlds, 1), bundle.act(worlds, 1))
+
+
+@pytest.mark.parametrize(("spec", "bound"), [("hybrid", "coupled"), ("hybrid:pairwise", "pairwise")])
+def test_lineup__the_hybrids_bound_and_count_are_as_asked(finished_run, spec, bound):
+    (agent,) = make_lineup([f"{spec}@{finished_run}"], SCENARIO, count="total").values()
+    assert isinstance(agent, HybridAgent)
+    assert (agent.bound, agent.count) == (bound, "total")
+
+
+def test_worlds__are_the_list_of_the_seed():
+    sample, seed = choose_worlds(SCENARIO, episodes=5, seed=9)
+    assert seed == 9
+    assert np.array_equal(sample.worlds.gaps_m, SCENARIO.sample(5, 9).worlds.gaps_m)
+    sample, seed = choose_worlds(SCENARIO)
+    assert (sample.worlds.n, seed) == (10_000, 7)
+
+
+def test_run_folder__by_default_says_scenario_recipe_and_seed():
+    recipe = load_recipe("ppo")
+    assert run_folder(SCENARIO, recipe) == Path("runs/paper-random-ppo-seed0")
+    assert run_folder(SCENARIO, recipe, seed=4) == Path("runs/paper-random-ppo-seed4")
+    assert run_folder(SCENARIO, recipe, name="mine") == Path("runs/mine")
+    assert run_folder(SCENARIO, recipe, output=Path("/elsewhere/x")) == Path("/elsewhere/x")
+
+
+@pytest.mark.parametrize("name", ["", "..", "a/b", "-x", "a b"])
+def test_run_folder__a_name_is_one_plain_folder(name):
+    with pytest.raises(InvalidInput, match="run name"):
+        run_folder(SCENARIO, load_recipe("ppo"), name=name)

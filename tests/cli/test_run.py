@@ -1,0 +1,201 @@
+"""`ethbrake run` and `ethbrake train`, with a training of two small updates."""
+
+from __future__ import annotations
+
+import csv
+import inspect
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ethbrake_marl.terminal import Bars
+
+ROOT = Path(__file__).resolve().parents[2]
+AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo", "hybrid"]
+
+
+def program(source: str) -> subprocess.CompletedProcess[str]:
+    """Runs Python source in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-c", source],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def run_json(folder: Path) -> dict:
+    return json.loads((folder / "run.json").read_text())
+
+
+def test_run__leaves_results_figures_report_and_policy(finished_run):
+    names = {path.name for path in finished_run.iterdir()}
+    assert names >= {"config.json", "run.json", "progress.csv", "policy", "results.csv", "results.json"}
+    assert names >= {"per_world.csv", "report.html"}
+    pictures = [finished_run / f"{name}.png" for name in ("learning_curve", "harm_against_gap", "trajectories")]
+    assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in pictures)
+    assert (finished_run / "report.html").read_text().count("data:image/png;base64,") == 3
+    assert run_json(finished_run)["status"] == "finished"
+    assert run_json(finished_run)["steps"] == 256
+
+
+def test_run__results_agree_in_json_csv_and_per_world(finished_run):
+    rows = json.loads((finished_run / "results.json").read_text())
+    flat = list(csv.DictReader((finished_run / "results.csv").read_text().splitlines()))
+    worlds = list(csv.DictReader((finished_run / "per_world.csv").read_text().splitlines()))
+    assert [row["agent"] for row in rows] == [row["agent"] for row in flat] == AGENTS
+    for row, line in zip(rows, flat, strict=True):
+        mine = [world for world in worlds if world["agent"] == row["agent"]]
+        assert len(mine) == row["episodes"] == int(line["episodes"]) == 60
+        assert float(line["total_harm"]) == row["total_harm"]
+        assert sum(float(world["total_harm"]) for world in mine) / 60 == pytest.approx(row["total_harm"], rel=1e-12)
+        assert [float(line["total_harm_low"]), float(line["total_harm_high"])] == row["total_harm_interval"]
+    assert flat[0]["predicted_harm"] == ""
+    assert flat[0]["scenario"] == "paper-random"
+
+
+def test_run__the_hybrid_is_in_no_world_worse_than_its_baseline(finished_run):
+    harm = {
+        (row["agent"], row["world"]): float(row["first_impact_harm"])
+        for row in csv.DictReader((finished_run / "per_world.csv").read_text().splitlines())
+    }
+    assert all(harm["hybrid", str(k)] <= harm["e_v2x_bm", str(k)] for k in range(60))
+
+
+def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake, finished_run):
+    answer = ethbrake(
+        "evaluate", "--agents", f"full_brake,ppo@{finished_run},hybrid@{finished_run}", "--episodes", "60", "--json"
+    )
+    now = json.loads(answer.out)
+    then = {row["agent"]: row for row in json.loads((finished_run / "results.json").read_text())}
+    for row in now:
+        assert row == {**then[row["agent"].partition("@")[0]], "agent": row["agent"]}
+
+
+def test_run_json__prints_the_rows_alone_and_force_replaces(ethbrake, tiny_recipe, finished_run, tmp_path):
+    folder = tmp_path / "again"
+    shutil.copytree(finished_run, folder)
+    (folder / "per_world.csv").write_text("stale")
+    answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "60", "--output", folder, "--force", "--json")
+    assert answer.status == 0
+    assert json.loads(answer.out) == json.loads((finished_run / "results.json").read_text())
+    assert (folder / "per_world.csv").read_bytes() == (finished_run / "per_world.csv").read_bytes()
+    assert "training" in answer.err
+    assert str(folder / "report.html") in answer.err
+
+
+def test_train__names_its_folder_after_scenario_recipe_and_seed(ethbrake, tiny_recipe, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    answer = ethbrake("train", "--recipe", tiny_recipe, "--seed", "5", "--steps", "128", "--json")
+    assert answer.status == 0
+    folder = Path("runs/paper-random-tiny-seed5")
+    figures = json.loads(answer.out)
+    assert (figures["directory"], figures["status"], figures["steps"]) == (str(folder), "finished", 128)
+    assert figures["evaluation"]["steps"] == 128
+    assert (folder / "policy" / "manifest.json").is_file()
+    assert ethbrake("train", "--recipe", tiny_recipe, "--steps", "128", "--name", "mine").status == 0
+    assert run_json(Path("runs/mine"))["status"] == "finished"
+
+
+def test_train__several_learners_share_a_policy(ethbrake, tiny_recipe, scenario_file, tmp_path):
+    scenario = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: learner\n")
+    folder = tmp_path / "two"
+    answer = ethbrake("train", "--scenario", scenario, "--recipe", tiny_recipe, "--output", folder, "--json")
+    assert answer.status == 0
+    assert json.loads(answer.out)["evaluation"] is None
+    manifest = json.loads((folder / "policy" / "manifest.json").read_text())
+    assert manifest["learners"] == ["vehicle_2", "vehicle_3"]
+
+
+def ctrl_c_when(monkeypatch: pytest.MonkeyPatch, *moments: Callable[[dict[str, Any]], bool]) -> None:
+    """Press Ctrl-C when what is shown first fits the first moment, then when it first fits the second, ..."""
+    waiting = list(moments)
+
+    class Pressing(Bars):
+        def show(self, *args: Any, **kwargs: Any) -> None:
+            super().show(*args, **kwargs)
+            shown = inspect.signature(Bars.show).bind(self, *args, **kwargs).arguments
+            if waiting and waiting[0](shown):
+                waiting.pop(0)
+                signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("ethbrake_marl.terminal.Bars", Pressing)
+
+
+def test_run_interrupted__the_policy_so_far_is_evaluated(ethbrake, tiny_recipe, tmp_path, monkeypatch):
+    ctrl_c_when(monkeypatch, lambda shown: shown["done"] == 256)
+    folder = tmp_path / "stopped"
+    answer = ethbrake(
+        "run", "--recipe", tiny_recipe, "--steps", "100000000", "--episodes", "40", "--output", folder, "--json"
+    )
+    assert answer.status == 130
+    assert [row["agent"] for row in json.loads(answer.out)] == AGENTS
+    assert "interrupted after 256 steps: evaluating the policy so far" in answer.err
+    assert answer.err.splitlines()[-1].startswith("interrupted after 256 training steps")
+    assert str(folder) in answer.err.splitlines()[-1]
+    assert (run_json(folder)["status"], run_json(folder)["steps"]) == ("interrupted", 256)
+    assert "interrupted" in (folder / "report.html").read_text()
+
+
+def test_run_interrupted_twice__stops_at_once_and_keeps_the_policy(ethbrake, tiny_recipe, tmp_path, monkeypatch):
+    ctrl_c_when(monkeypatch, lambda shown: shown["done"] == 128, lambda shown: shown["name"] == "e_v2x_bm")
+    folder = tmp_path / "stopped"
+    answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "40", "--output", folder)
+    assert (answer.status, answer.out) == (130, "")
+    assert answer.err.splitlines()[-1].startswith("interrupted; ")
+    assert (run_json(folder)["status"], run_json(folder)["stage"]) == ("interrupted", "evaluation")
+    assert not (folder / "results.json").exists()
+    assert (folder / "policy" / "weights.safetensors").is_file()
+
+
+def test_train_interrupted__the_policy_is_kept(ethbrake, tiny_recipe, tmp_path, monkeypatch):
+    ctrl_c_when(monkeypatch, lambda shown: shown["done"] == 128)
+    answer = ethbrake("train", "--recipe", tiny_recipe, "--output", tmp_path / "stopped")
+    assert answer.status == 130
+    assert "interrupted after 128 training steps" in answer.err
+    assert run_json(tmp_path / "stopped")["policy"] == "policy"
+
+
+def test_evaluate_interrupted__writes_nothing(ethbrake, tmp_path, monkeypatch):
+    ctrl_c_when(monkeypatch, lambda shown: shown["name"] == "coast")
+    answer = ethbrake("evaluate", "--episodes", "5", "--agents", "coast", "--per-world", tmp_path / "out.csv")
+    assert (answer.status, answer.out) == (130, "")
+    assert answer.err.splitlines()[-1] == "interrupted; nothing was written"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_run_failed__the_status_says_so(ethbrake, tiny_recipe, tmp_path, monkeypatch):
+    def broken(*args: object, **kwargs: object) -> None:
+        raise RuntimeError("no space left")
+
+    monkeypatch.setattr("ethbrake_marl.experiment.write_results", broken)
+    folder = tmp_path / "failed"
+    with pytest.raises(RuntimeError, match="no space left"):
+        ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", folder)
+    content = run_json(folder)
+    assert (content["status"], content["stage"]) == ("failed", "evaluation")
+    assert "no space left" in content["reason"]
+
+
+def test_command_line__exit_status_and_streams_of_the_program():
+    process = program("import sys; from ethbrake_marl.cli import main; sys.argv[1:] = ['evalute']; main()")
+    assert (process.returncode, process.stdout, process.stderr.count("\n")) == (2, "", 1)
+
+
+def test_evaluate__needs_no_torch_and_help_neither():
+    process = program(
+        "import sys; from ethbrake_marl.cli import run_command;"
+        "run_command(['--help']); run_command(['evaluate', '--episodes', '5', '--agents', 'coast']);"
+        "sys.exit(', '.join(sorted({'torch', 'stable_baselines3', 'matplotlib'} & set(sys.modules))) or None)"
+    )
+    assert process.returncode == 0, process.stderr
