@@ -24,27 +24,26 @@ from ethbrake_marl.physics.worlds import Floats
 SPEED = 0
 MASS = 1
 BEFORE = 2  # speed before an impact
-RELATIVE = 3  # speed before an impact, relative to the front vehicle of its cluster
-POOLED = 4
+POOLED = 3
 # per pair
-GAP = 5
-CLOSING = 6  # closing speed before an impact, 0 where the pair does not touch
-CONTACT_SPEED = 7  # exact closing speed of a pair that has just met, else 0
-STRUCK = 8  # 1 where the last round was an impact (not a touch)
+GAP = 4
+CLOSING = 5  # closing speed before an impact, 0 where the pair does not touch
+CONTACT_SPEED = 6  # exact closing speed of a pair that has just met, else 0
+STRUCK = 7  # 1 where the last round was an impact (not a touch)
 # per pooled block
-BLOCK_MASS = 9
-BLOCK_LOW = 10
-BLOCK_HIGH = 11
-BLOCK_FIRST = 12
-IMPACT_ROWS = 13
+BLOCK_MASS = 8
+BLOCK_LOW = 9
+BLOCK_HIGH = 10
+BLOCK_FIRST = 11
+IMPACT_ROWS = 12
 
 
 @compiled
-def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> None:
-    """Mass-weighted isotonic regression of vehicles ``first..last`` (inclusive) into row ``out``.
+def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
+    """Mass-weighted isotonic regression of vehicles ``first..last`` (inclusive) into row ``out``; the number of blocks.
 
     Rows ``low`` and ``high`` bound each vehicle's own value (equal for an ordinary one). All members of a pooled
-    block get the same bits.
+    block get the same bits. Rows BLOCK_* describe the blocks.
     """
     count = 0
     for i in range(first, last + 1):
@@ -70,6 +69,7 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
         while member >= table[BLOCK_FIRST, k]:
             table[out, member] = value
             member -= 1
+    return count
 
 
 @compiled
@@ -77,20 +77,24 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
     """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
 
     One restitution holds per world, so clusters never mix two; the cluster is plastic when its largest closing speed
-    is below ``PLASTIC_SPEED_MPS``. Speeds are taken relative to the front vehicle, which keeps the digits of small
-    closing speeds.
+    is below ``PLASTIC_SPEED_MPS``. A block's common speed is refined by the mean of what is left over, so the momentum
+    error stays within 4 eps of ``sum(m |v|)`` whatever the masses; a vehicle that nobody strikes keeps its bits.
     """
     largest = 0.0
     for p in range(first, last):
         largest = max(largest, table[CLOSING, p])
     bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0
-    reference = table[SPEED, first]
-    for i in range(first, last + 1):
-        table[RELATIVE, i] = table[SPEED, i] - reference
-    pool(table, RELATIVE, RELATIVE, first, last, POOLED)
-    for i in range(first, last + 1):
-        pooled = table[POOLED, i]
-        table[SPEED, i] = reference + (pooled + bounce * (pooled - table[RELATIVE, i]))
+    end = last + 1
+    for block in range(pool(table, SPEED, SPEED, first, last, POOLED) - 1, -1, -1):
+        head = int(table[BLOCK_FIRST, block])
+        pooled = table[POOLED, head]
+        rest = 0.0
+        for i in range(head, end):
+            rest += table[MASS, i] * (table[SPEED, i] - pooled)
+        pooled += rest / table[BLOCK_MASS, block]
+        for i in range(head, end):
+            table[SPEED, i] = pooled + bounce * (pooled - table[SPEED, i])
+        end = head
 
 
 @compiled

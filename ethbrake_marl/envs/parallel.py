@@ -1,0 +1,125 @@
+"""PettingZoo's face: every vehicle of one world is an agent, to the collective end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from numpy.typing import NDArray
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils.conversions import parallel_to_aec
+
+from ethbrake_marl.envs.build import check_render_mode, make_engine
+from ethbrake_marl.envs.infos import Table, row_info, state_table, step_table
+from ethbrake_marl.envs.restart import fresh_seed, restart
+from ethbrake_marl.envs.spaces import action_box, feature_box
+from ethbrake_marl.envs.state import full_state, state_features
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.observations import Observations, ObservationSpec
+from ethbrake_marl.rewards import RewardParams
+from ethbrake_marl.scenario import Scenario
+
+Infos = dict[str, dict[str, Any]]
+
+
+class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
+    """A line of vehicles ``vehicle_1`` (front) ... ``vehicle_N``, all of them agents from the alert to the end.
+
+    Learners need an action [1] in [-1, 1] in each step: -1 full braking capacity, 0 coasts, +1 full driving capacity.
+    Scripted vehicles observe, are rewarded and get infos too; what is passed for them is ignored, and
+    ``infos[agent]["applied_action"]`` shows what their script did. All agents end together: terminated when all are
+    at rest and no command would move one, truncated at the horizon. ``state()`` is the full state for centralised
+    critics. Observations, rewards, infos and ``reset``: as for ``EthBrakeEnv``; any number of ``learners``.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "ethbrake_v0", "render_modes": [], "is_parallelizable": True}
+
+    def __init__(
+        self,
+        scenario: str | Path | Scenario = "paper-random",
+        render_mode: str | None = None,
+        learners: Sequence[str | int] | None = None,
+        reward: str | RewardParams = "harm",
+        observation: ObservationSpec | None = None,
+    ) -> None:
+        check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
+        self.possible_agents = list(self.engine.scenario.vehicle_names)
+        self.agents: list[str] = []
+        features = self.engine.observation.features
+        self.observation_spaces = {agent: feature_box(features) for agent in self.possible_agents}
+        self.action_spaces = {agent: action_box() for agent in self.possible_agents}
+        self.state_space = feature_box(state_features(self.engine.scenario))
+        self._seeded = False
+        self._started = False
+
+    def observation_space(self, agent: str) -> Any:
+        """Float32 box [F], the same object on each call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:
+        """Float32 box [1], the same object on each call."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observations], Infos]:
+        """Start an episode; see ``envs.restart``."""
+        restart(self.engine, fresh_seed() if seed is None and not self._seeded else seed, options)
+        self._seeded = self._started = True
+        self.agents = self.possible_agents[:]
+        return self._observations(), self._infos(state_table(self.engine))
+
+    def step(
+        self, actions: Mapping[str, Any]
+    ) -> tuple[dict[str, Observations], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
+        """Advance by one time step. Raises ``InvalidInput`` naming the agent whose action is missing or unusable."""
+        if not self.agents:
+            raise InvalidInput("step: no episode is running; call reset first")
+        step = self.engine.step(self._learners_actions(actions))
+        agents = self.possible_agents
+        rewards = {agent: float(step.reward[0, i]) for i, agent in enumerate(agents)}
+        terminations = dict.fromkeys(agents, bool(step.terminated[0]))
+        truncations = dict.fromkeys(agents, bool(step.truncated[0]))
+        infos = self._infos(state_table(self.engine) | step_table(self.engine, step))
+        if step.ended[0]:
+            self.agents = []
+        return self._observations(), rewards, terminations, truncations, infos
+
+    def state(self) -> Observations:
+        """The full state of all vehicles, float32 [S] within ``state_space``."""
+        if not self._started:
+            raise InvalidInput("state: no episode was started; call reset first")
+        state: Observations = full_state(self.engine.worlds, self.engine.scenario)[0].copy()
+        return state
+
+    def _learners_actions(self, actions: Mapping[str, Any]) -> dict[int, Any]:
+        for agent in actions:
+            if agent not in self.action_spaces:
+                raise unknown_name("agent", agent, self.possible_agents)
+        names = self.possible_agents
+        return {i: actions[names[i]] for i in self.engine.learners if names[i] in actions}
+
+    def _observations(self) -> dict[str, Observations]:
+        return {agent: self.engine.observe(i)[0].copy() for i, agent in enumerate(self.possible_agents)}
+
+    def _infos(self, table: Table) -> Infos:
+        return {agent: row_info(table, 0, i) for i, agent in enumerate(self.possible_agents)}
+
+
+parallel_env = EthBrakeParallelEnv
+
+
+def raw_env(**settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
+    """The same environment with agents acting in turn (AEC), front to rear; arguments as ``parallel_env``."""
+    return parallel_to_aec(parallel_env(**settings))
+
+
+def env(**settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
+    """The AEC environment with PettingZoo's usual wrapper, order enforcement, which ``raw_env`` already has.
+
+    Actions are not clipped and nothing ends an episode early: an unusable action is an ``InvalidInput``.
+    """
+    return raw_env(**settings)

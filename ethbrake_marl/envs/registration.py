@@ -1,0 +1,23 @@
+"""Ids under which Gymnasium and PettingZoo know this environment. Naming a face does not import it."""
+
+from __future__ import annotations
+
+import gymnasium
+import pettingzoo
+
+GYMNASIUM_ID = "EthBrake-v0"
+PETTINGZOO_ID = "ethbrake/ethbrake-v0"
+
+
+def register_environments() -> None:
+    """Register every id that is not registered yet; calling it again changes nothing."""
+    if GYMNASIUM_ID not in gymnasium.registry:
+        gymnasium.register(
+            GYMNASIUM_ID,
+            entry_point="ethbrake_marl.envs.single:EthBrakeEnv",
+            vector_entry_point="ethbrake_marl.envs.vector:EthBrakeVectorEnv",
+        )
+    if PETTINGZOO_ID not in pettingzoo.parallel_registry:
+        pettingzoo.register("parallel", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v0:parallel_env")
+    if PETTINGZOO_ID not in pettingzoo.aec_registry:
+        pettingzoo.register("aec", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v0:env")

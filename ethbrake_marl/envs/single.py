@@ -1,0 +1,75 @@
+"""Gymnasium's face: one learner, one world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+from numpy.typing import NDArray
+
+from ethbrake_marl.envs.build import check_render_mode, make_engine, only_learner
+from ethbrake_marl.envs.infos import row_info, state_table, step_table
+from ethbrake_marl.envs.restart import check_seed, restart
+from ethbrake_marl.envs.spaces import action_box, feature_box
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.observations import Observations, ObservationSpec
+from ethbrake_marl.rewards import RewardParams
+from ethbrake_marl.scenario import Scenario
+
+
+class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
+    """One learner brakes in a line of vehicles that follow their scripts: ``gymnasium.make("EthBrake-v0")``.
+
+    Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity,
+    0 coasts, +1 full driving capacity. Reward: by name (``"harm"``, ``"total-harm"``, ``"paper"``) or
+    ``RewardParams``. Terminated: all at rest and no command that would move one. Truncated: the horizon.
+    Infos: see ``envs.infos``. ``reset(seed=s)`` starts the stream of worlds of s, ``reset()`` goes on in it;
+    ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from there.
+
+    ``learners`` (one vehicle, by name or index from 0) replaces the scenario's. Raises ``InvalidInput`` for more or
+    fewer than one learner, an action that is not in [-1, 1], and a step without a running episode.
+    """
+
+    def __init__(
+        self,
+        scenario: str | Path | Scenario = "paper-random",
+        render_mode: str | None = None,
+        learners: Sequence[str | int] | None = None,
+        reward: str | RewardParams = "harm",
+        observation: ObservationSpec | None = None,
+    ) -> None:
+        check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
+        self.learner = only_learner(self.engine)
+        self.observation_space = feature_box(self.engine.observation.features)
+        self.action_space = action_box()
+        self._running = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start an episode; see ``envs.restart``."""
+        check_seed(seed)
+        if seed is None and self._np_random_seed is None:
+            seed = self.np_random_seed  # fresh entropy, kept by Gymnasium: reset(seed=env.np_random_seed) repeats it
+        restart(self.engine, seed, options)
+        super().reset(seed=seed)
+        self._running = True
+        return self._observe(), row_info(state_table(self.engine), 0, self.learner)
+
+    def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
+        """Advance by one time step."""
+        if not self._running:
+            raise InvalidInput("step: no episode is running; call reset first")
+        step = self.engine.step({self.learner: action})
+        self._running = not step.ended[0]
+        info = row_info(state_table(self.engine) | step_table(self.engine, step), 0, self.learner)
+        reward = float(step.reward[0, self.learner])
+        return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info
+
+    def _observe(self) -> Observations:
+        observation: Observations = self.engine.observe(self.learner)[0].copy()
+        return observation

@@ -1,0 +1,46 @@
+"""The tables that docs/environment.md shows, made from the code; a test compares the two."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ethbrake_marl.envs.state import state_features
+from ethbrake_marl.observations import Feature, ObservationSpec
+from ethbrake_marl.rewards import REWARDS, RewardParams
+from ethbrake_marl.scenario import load_scenario
+
+
+def feature_table(features: Sequence[Feature]) -> str:
+    """Markdown table of features, one line each, in the order of the vector."""
+    rows = [
+        (str(k), f"`{f.name}`", f.unit, f"{f.scale:g}", f"{f.low:g}", f"{f.high:g}", f.meaning)
+        for k, f in enumerate(features)
+    ]
+    return _markdown(("#", "feature", "unit", "scale", "low", "high", "meaning"), rows)
+
+
+def reward_table(rewards: Mapping[str, RewardParams]) -> str:
+    """Markdown table of the named rewards: one line for each setting, one column for each reward."""
+    settings = {name: params.model_dump() for name, params in rewards.items()}
+    rows = [
+        (f"`{field}`", *(_plain(params[field]) for params in settings.values())) for field in RewardParams.model_fields
+    ]
+    return _markdown(("setting", *(f"`{name}`" for name in settings)), rows)
+
+
+def environment_tables() -> dict[str, str]:
+    """Every table of docs/environment.md by its marker."""
+    return {
+        "observation": feature_table(ObservationSpec().features),
+        "state": feature_table(state_features(load_scenario("paper-random"))),
+        "rewards": reward_table(REWARDS),
+    }
+
+
+def _plain(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,0 +1,111 @@
+"""Gymnasium's vector face: one learner, many worlds, advanced together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from ethbrake_marl.engine import Step
+from ethbrake_marl.envs.build import check_render_mode, make_engine, only_learner
+from ethbrake_marl.envs.infos import batch_info, state_table, step_table
+from ethbrake_marl.envs.restart import check_seed, restart
+from ethbrake_marl.envs.spaces import action_box, feature_box
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.observations import Observations, ObservationSpec
+from ethbrake_marl.physics import Bools, Floats
+from ethbrake_marl.rewards import RewardParams
+from ethbrake_marl.scenario import Scenario
+
+_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
+
+
+class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
+    """``num_envs`` worlds of ``EthBrakeEnv``: ``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``.
+
+    All worlds take their episodes from one stream: row k of ``reset(seed=s)`` is world k of s, and each new episode is
+    the next world of it. ``autoreset_mode`` is Gymnasium's: ``"SameStep"`` (default) returns the first observation
+    of the new episode, with the last one of the old in ``infos["final_obs"]`` and its infos in
+    ``infos["final_info"]``; ``"NextStep"`` returns the last observation and spends the next step, whose action is
+    ignored and whose reward is 0, on the reset. Every array that is returned has its own memory.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: str | Path | Scenario = "paper-random",
+        render_mode: str | None = None,
+        learners: Sequence[str | int] | None = None,
+        reward: str | RewardParams = "harm",
+        observation: ObservationSpec | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+    ) -> None:
+        check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.autoreset_mode = _checked_mode(autoreset_mode)
+        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        self.engine = make_engine(scenario, num_envs, learners=learners, reward=reward, observation=observation)
+        self.learner = only_learner(self.engine)
+        self.num_envs = num_envs
+        self.single_observation_space = feature_box(self.engine.observation.features)
+        self.single_action_space = action_box()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._started = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start an episode in every world; see ``envs.restart``."""
+        check_seed(seed)
+        if seed is None and self._np_random_seed is None:
+            seed = self.np_random_seed  # fresh entropy, kept by Gymnasium
+        restart(self.engine, seed, options)
+        super().reset(seed=seed)
+        self._started = True
+        return self.engine.observe(self.learner), self._infos(np.ones(self.num_envs, np.bool_))
+
+    def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
+        """Advance every world by one time step, and start new episodes as the autoreset mode says."""
+        if not self._started:
+            raise InvalidInput("step: no episode is running; call reset first")
+        engine, before = self.engine, self.engine.ended
+        step = engine.step(actions)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
+            renewed = step.ended
+            infos = self._final_infos(step) if renewed.any() else {}
+        else:
+            renewed, infos = before, {}
+        infos |= batch_info(step_table(engine, step), self.learner, ~renewed)
+        engine.renew(np.flatnonzero(renewed))
+        infos |= self._infos(np.ones(self.num_envs, np.bool_))
+        reward = step.reward[:, self.learner].copy()
+        return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
+
+    def _infos(self, rows: Bools) -> dict[str, Any]:
+        return batch_info(state_table(self.engine), self.learner, rows)
+
+    def _final_infos(self, step: Step) -> dict[str, Any]:
+        """The last observation and infos of the episodes that ended with this step."""
+        ended = step.ended
+        observations = self.engine.observe(self.learner)
+        final = np.full(self.num_envs, None, dtype=object)
+        for row in np.flatnonzero(ended):
+            final[row] = observations[row].copy()
+        table = state_table(self.engine) | step_table(self.engine, step)
+        info = batch_info(table, self.learner, ended)
+        return {"final_obs": final, "_final_obs": ended, "final_info": info, "_final_info": ended.copy()}
+
+
+def _checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    if isinstance(mode, AutoresetMode) and mode in _MODES:
+        return mode
+    for known in _MODES:
+        if mode == known.value:
+            return known
+    raise InvalidInput(f"autoreset_mode = {mode!r}: must be {' or '.join(repr(m.value) for m in _MODES)}")

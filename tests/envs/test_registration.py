@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import pettingzoo
+import pytest
+
+import ethbrake_marl
+from ethbrake_marl import ethbrake_v0
+from ethbrake_marl.envs.parallel import EthBrakeParallelEnv
+from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID, register_environments
+from ethbrake_marl.envs.single import EthBrakeEnv
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(program: str) -> str:
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout.strip()
+
+
+def test_registration__twice_changes_nothing_and_says_nothing() -> None:
+    before = (gymnasium.registry[GYMNASIUM_ID], pettingzoo.parallel_registry[PETTINGZOO_ID])
+    register_environments()
+    assert (gymnasium.registry[GYMNASIUM_ID], pettingzoo.parallel_registry[PETTINGZOO_ID]) == before
+
+
+def test_registration__gymnasium_and_pettingzoo_make_it_by_id() -> None:
+    assert isinstance(gymnasium.make("EthBrake-v0").unwrapped, EthBrakeEnv)
+    assert isinstance(pettingzoo.make("parallel", "ethbrake/ethbrake-v0", learners=[2]), EthBrakeParallelEnv)
+    in_turn = pettingzoo.make("aec", "ethbrake/ethbrake-v0")
+    assert isinstance(in_turn, pettingzoo.AECEnv) and isinstance(in_turn.unwrapped, EthBrakeParallelEnv)
+
+
+def test_registration__gymnasium_can_import_the_package_by_the_id() -> None:
+    assert run("import gymnasium; print(gymnasium.make('ethbrake_marl:EthBrake-v0').unwrapped)").startswith(
+        "<EthBrakeEnv"
+    )
+
+
+def test_import__stays_light_until_a_name_is_used() -> None:
+    program = (
+        "import sys, ethbrake_marl as eb\n"
+        "heavy = lambda: sorted({'torch', 'numba', 'stable_baselines3', 'matplotlib', 'pydantic'} & set(sys.modules))\n"
+        "print(heavy()); eb.parallel_env().reset(seed=0); print(heavy()); eb.make_sb3_vec_env; print(heavy())"
+    )
+    first, second, third = run(program).splitlines()
+    assert first == "[]"
+    assert second == "['numba', 'pydantic']"
+    assert "stable_baselines3" in third and "torch" in third
+
+
+@pytest.mark.parametrize("name", ethbrake_marl.__all__)
+def test_public_name__is_found_and_listed(name: str) -> None:
+    assert getattr(ethbrake_marl, name) is not None
+    assert name in dir(ethbrake_marl)
+
+
+def test_public_name__has_a_type_for_checkers() -> None:
+    tree = ast.parse(Path(str(ethbrake_marl.__file__)).read_text("utf-8"))
+    typed = {
+        alias.asname: (node.module, alias.name)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    found = {name: (f"ethbrake_marl.{home}", name) for name, home in ethbrake_marl._HOME.items()}
+    assert typed == found
+
+
+def test_public_name__a_wrong_one_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="module 'ethbrake_marl' has no attribute 'paralel_env'"):
+        ethbrake_marl.paralel_env  # noqa: B018
+
+
+def test_ethbrake_v0__has_pettingzoos_three_names() -> None:
+    assert ethbrake_v0.parallel_env is ethbrake_marl.parallel_env
+    assert {"env", "parallel_env", "raw_env"} <= set(dir(ethbrake_v0))
