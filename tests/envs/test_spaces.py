@@ -7,6 +7,7 @@ from ethbrake_marl.envs.spaces import action_box, feature_box
 from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.observations import Feature, ObservationSpec
 from ethbrake_marl.physics import make_worlds
+from ethbrake_marl.scenario import Scenario
 from tests.contract.faces import FIVE, PAPER
 
 
@@ -21,13 +22,18 @@ def test_action_box__is_one_number() -> None:
 
 
 @pytest.mark.parametrize("scenario", [PAPER, FIVE])
-def test_state_features__fit_the_state(scenario: object) -> None:
-    features = state_features(scenario)  # type: ignore[arg-type]
-    state = full_state(scenario.sample(3, 0).worlds, scenario)  # type: ignore[attr-defined]
-    N = scenario.vehicles  # type: ignore[attr-defined]
+def test_state_features__fit_the_state(scenario: Scenario) -> None:
+    features = state_features(scenario)
+    worlds = scenario.sample(3, 0).worlds
+    state = full_state(worlds, scenario)
+    N = scenario.vehicles
     assert state.shape == (3, 7 * N + 2 * (N - 1) + 1) == (3, len(features))
     assert len({feature.name for feature in features}) == len(features)
     assert state.dtype == np.float32 and state.flags.owndata
+    column = {feature.name: state[:, k] for k, feature in enumerate(features)}
+    for i in range(N - 1):
+        assert column[f"pair_{i + 1}.gap"] == pytest.approx(worlds.gaps_m[:, i] / 10.0)
+        assert column[f"vehicle_{i + 2}.speed"] == pytest.approx(worlds.speeds_mps[:, i + 1] / 20.0)
 
 
 def test_full_state__is_clipped_to_its_bounds() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from itertools import combinations
 from typing import Any
 
 import gymnasium
@@ -46,6 +47,7 @@ def test_autoreset__same_step_literally() -> None:
         rows.append((k, terminated.tolist(), truncated.tolist(), np.round(infos["time_s"], 9).tolist()))
         assert ("final_obs" in infos) == ended.any()
         assert np.array_equal(infos["_applied_action"], ~ended)
+        assert (infos["applied_action"][ended] == 0.0).all()
         if ended.any():
             assert np.array_equal(infos["_final_obs"], ended)
             assert [final is not None for final in infos["final_obs"]] == ended.tolist()
@@ -144,6 +146,8 @@ def test_infos__are_gymnasiums_columns_and_masks() -> None:
         assert infos[name].shape == ((3, 1) if name == "applied_action" else (3,))
         assert infos[f"_{name}"].tolist() == [True] * 3
     assert infos["reward_terms"]["harm"].shape == (3,)
+    arrays = [value for value in infos.values() if isinstance(value, np.ndarray)]
+    assert not any(np.shares_memory(a, b) for a, b in combinations(arrays, 2))
     assert np.array_equal(infos["applied_action"], action)
     assert infos["wanted_command_mps2"] == near(action[:, 0] * np.where(action[:, 0] < 0, capacity, 3.0))
 
