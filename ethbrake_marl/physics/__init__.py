@@ -2,6 +2,7 @@
 
 from ethbrake_marl.physics.advance import ImpactRows, Impacts, advance
 from ethbrake_marl.physics.forecast import forecast
+from ethbrake_marl.physics.sampled import advance_sampled
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, assign, concatenate, make_worlds
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "Vehicles",
     "Worlds",
     "advance",
+    "advance_sampled",
     "assign",
     "concatenate",
     "forecast",
