@@ -145,9 +145,19 @@ class Engine:
         return self._stream.rejected
 
     @property
+    def packed(self) -> Packed:
+        """The running worlds themselves, as rows of ``physics.packed``: for kernels to read, not to be changed."""
+        return Packed(self._state, self._params)
+
+    @property
+    def wanted_mps2(self) -> Floats:
+        """What each vehicle wanted in the last step, [n, N]: for kernels to read, not to be changed."""
+        return self._wanted
+
+    @property
     def worlds(self) -> Worlds:
         """The worlds as they are now, in their own memory."""
-        return unpack(Packed(self._state, self._params))
+        return unpack(self.packed)
 
     @property
     def ledger(self) -> Ledger:
@@ -251,7 +261,8 @@ class Engine:
 
     def _fail(self, world: int, status: int, actions: Floats) -> None:
         if status == BAD_ACTION:
-            checked_action(actions, actions.shape, "the learners")
+            for c, vehicle in enumerate(self.learners):
+                checked_action(actions[:, c], (self.n,), f"vehicle_{vehicle + 1}")
         raise PhysicsError(f"world {world}: the step from {self._state[world, 0]:g} s failed with status {status}")
 
     def _add_further_terms(self, step: Step) -> None:

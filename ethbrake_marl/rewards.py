@@ -135,7 +135,7 @@ def weighted_sum(params: RewardParams, terms: Mapping[str, Floats], shape: tuple
 
 
 def _shared(world_value: Floats, shape: tuple[int, ...]) -> Floats:
-    return np.broadcast_to(world_value[:, np.newaxis], shape)
+    return world_value.repeat(shape[1]).reshape(shape)
 
 
 def _risk(params: RewardParams, step: StepOutcome) -> Floats:

@@ -53,7 +53,7 @@ BAD_ACTION = -1
 
 
 @compiled
-def step_worlds(
+def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to functions costs more than the work
     state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
     wanted: Floats, reward: Floats, facts: Floats,
 ) -> tuple[int, int]:  # fmt: skip
