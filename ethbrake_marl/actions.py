@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Vehicles
+from ethbrake_marl.physics.compiled import compiled
 
 
 def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Floats:
@@ -28,17 +29,40 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Flo
 
 def action_to_command(action: Floats, vehicles: Vehicles, vehicle: int) -> Floats:
     """Wanted signed acceleration of one vehicle, [n] m/s2, for its action [n] in [-1, 1]."""
-    capacity = np.where(
-        action < 0.0, vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
-    )
-    command: Floats = action * capacity
-    return command
+    braking, driving = vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
+    return _commands(np.ascontiguousarray(action, np.float64), braking, driving)
 
 
 def command_to_action(command_mps2: Floats, vehicles: Vehicles, vehicle: int) -> Floats:
     """The action [n] that asks for ``command_mps2`` [n]; clipped to [-1, 1], 0 where the capacity is 0."""
-    capacity = np.where(
-        command_mps2 < 0.0, vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
-    )
-    action: Floats = np.clip(command_mps2 / np.where(capacity > 0.0, capacity, np.inf), -1.0, 1.0)
+    braking, driving = vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
+    return _actions(np.ascontiguousarray(command_mps2, np.float64), braking, driving)
+
+
+@compiled
+def command_of(action: float, braking: float, driving: float) -> float:
+    """Wanted signed acceleration (m/s2) for an action, given the two capacities (m/s2)."""
+    return action * braking if action < 0.0 else action * driving
+
+
+@compiled
+def action_of(command: float, braking: float, driving: float) -> float:
+    """The action that asks for a command (m/s2); clipped to [-1, 1], 0 where the capacity is 0."""
+    capacity = braking if command < 0.0 else driving
+    return min(max(command / capacity, -1.0), 1.0) if capacity > 0.0 else 0.0
+
+
+@compiled
+def _commands(action: Floats, braking: Floats, driving: Floats) -> Floats:
+    command = np.empty(action.shape[0])
+    for k in range(action.shape[0]):
+        command[k] = command_of(action[k], braking[k], driving[k])
+    return command
+
+
+@compiled
+def _actions(command: Floats, braking: Floats, driving: Floats) -> Floats:
+    action = np.empty(command.shape[0])
+    for k in range(command.shape[0]):
+        action[k] = action_of(command[k], braking[k], driving[k])
     return action

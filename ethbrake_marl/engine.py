@@ -7,34 +7,55 @@ when Vehicle 1 brakes; ``reset`` moves exactly to the first moment at which a le
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ethbrake_marl.actions import action_to_command, checked_action
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import Ledger, empty_ledger
-from ethbrake_marl.observations import Observations, ObservationSpec, observe
-from ethbrake_marl.physics import Bools, Floats, Impacts, Ints, Worlds, advance, assign
-from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.rewards import RewardParams, potential, reward_params, reward_terms, weighted_sum
+from ethbrake_marl.actions import checked_action
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.harm import Ledger
+from ethbrake_marl.observations import Observations, ObservationSpec, observe_packed
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.packed import (
+    NO_ROWS,
+    Packed,
+    command_at,
+    gap_at,
+    ledger_columns,
+    pack,
+    params_at,
+    previous_at,
+    speed_at,
+    unpack,
+)
+from ethbrake_marl.physics.segment import DONE
+from ethbrake_marl.rewards import (
+    RewardParams,
+    StepOutcome,
+    further_terms,
+    potential,
+    reward_params,
+    shared_terms,
+    weighted_sum,
+)
 from ethbrake_marl.scenario import Scenario
-
-_SAMPLED_AT_ONCE = 1024  # training worlds are drawn in blocks of at least this many
-
+from ethbrake_marl.starts import Script, Start, Stream, is_state_free, moved, within_capacity
+from ethbrake_marl.stepping import (
+    BAD_ACTION,
+    ENDED,
+    FACTS_WIDTH,
+    SAFE_END,
+    START,
+    STEP_FIRST_HARM,
+    STEP_TOTAL_HARM,
+    TERMINATED,
+    TRUNCATED,
+    step_worlds,
+)
 
 OnBegin = Callable[[Worlds, Ints], None]  # the new worlds at the alert, and the rows where their episodes start
-
-
-class Script(Protocol):
-    """What drives a vehicle that does not learn (see ``agents.protocol``)."""
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """New episodes start in these rows of the batch; ``worlds`` holds those rows only, at the alert."""
-
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Wanted signed acceleration in every world of the batch, [n] m/s2."""
+Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,16 +63,25 @@ class Step:
     """What one step brought, for every world of the batch."""
 
     reward: Floats  # [n, N]
-    terms: dict[str, Floats]  # unweighted reward terms, each [n, N]
     terminated: Bools  # [n] everything at rest, no command that would move it
     truncated: Bools  # [n] the horizon was reached
-    impacts: Impacts
+    first_impact_harm: Floats  # [n] of the whole line in this step
+    total_harm: Floats  # [n] likewise
+    safe_end: Bools  # [n] the episode ended with this step without any collision
     command_mps2: Floats  # [n, N] wanted by each vehicle in this step
+    params: RewardParams
+    further: dict[str, Floats] = field(default_factory=dict)  # terms that the harm does not tell
 
     @property
     def ended(self) -> Bools:
         """Episodes that ended with this step, [n]."""
         return self.terminated | self.truncated
+
+    @property
+    def terms(self) -> dict[str, Floats]:
+        """Unweighted reward terms, each [n, N]."""
+        harm = self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
+        return shared_terms(self.params, harm, self.safe_end, self.reward.shape) | self.further
 
 
 class Engine:
@@ -94,70 +124,168 @@ class Engine:
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
         self.reward = reward_params(reward)
         self.observation = observation or ObservationSpec()
-        self.seed = seed
         self.on_begin: list[OnBegin] = []
-        self.rejected = 0  # draws refused so far because of an impact before anybody could act
-        self._drawn = 0
-        self._pool: Worlds | None = None
-        self._pool_next = 0
+        self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
+        self._learner_index = np.array(self.learners, np.int64)
+        total = float(self.reward.harm_count == "total")
+        times = scenario.time_step_s, scenario.horizon_s
+        self._settings = np.array([*times, self.reward.harm, total, self.reward.terminal])
+        self._moves_reward = self.reward.collision + self.reward.risk + self.reward.jerk > 0.0
+        self._stream = Stream(scenario, self.deciders, self.scripts, seed)
         self.reset(worlds=worlds)
+
+    @property
+    def seed(self) -> int:
+        """Seed of the training stream."""
+        return self._stream.seed
+
+    @property
+    def rejected(self) -> int:
+        """Draws of the stream refused so far because of an impact before anybody could act."""
+        return self._stream.rejected
+
+    @property
+    def packed(self) -> Packed:
+        """The running worlds themselves, as rows of ``physics.packed``: for kernels to read, not to be changed."""
+        return Packed(self._state, self._params)
+
+    @property
+    def wanted_mps2(self) -> Floats:
+        """What each vehicle wanted in the last step, [n, N]: for kernels to read, not to be changed."""
+        return self._wanted
+
+    @property
+    def worlds(self) -> Worlds:
+        """The worlds as they are now, in their own memory."""
+        return unpack(self.packed)
+
+    @property
+    def ledger(self) -> Ledger:
+        """Harm of the running episodes so far, in its own memory."""
+        vehicles = self.scenario.vehicles
+        first, total, count = ledger_columns(self._state, vehicles)
+        mass = self._params[:, params_at(3, vehicles) : params_at(4, vehicles)].copy()
+        return Ledger(first, total, count, mass)
+
+    @property
+    def ended(self) -> Bools:
+        """Episodes that have ended, [n]."""
+        ended: Bools = self._clock[:, ENDED] == 1.0
+        return ended
 
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
         """Start new episodes in all rows: the given worlds (at t = 0), or the next ones of the training stream.
 
         With ``seed`` the stream starts again from its beginning.
         """
-        if seed is not None:
-            self.seed, self._drawn, self._pool, self.rejected = seed, 0, None, 0
-        if worlds is None:
-            worlds = self._next_worlds(self.n)
-        elif (worlds.n, worlds.N) != (self.n, self.scenario.vehicles):
+        if worlds is not None and (worlds.n, worlds.N) != (self.n, self.scenario.vehicles):
             raise InvalidInput(
                 f"reset: {worlds.n} worlds of {worlds.N} vehicles given; {self.n} of {self.scenario.vehicles} needed"
             )
-        self.worlds = worlds
-        self.ledger = empty_ledger(worlds)
-        self.ended: Bools = np.zeros(self.n, np.bool_)
-        self._potential = np.zeros(worlds.speeds_mps.shape)
-        self._start_s = np.zeros(self.n)
-        self._step_index = np.zeros(self.n, np.int64)
-        self._last_step = np.zeros(self.n, np.int64)
-        self._begin(np.arange(self.n), worlds)
+        if seed is not None:
+            self._stream.restart(seed)
+        start = self._stream.take(self.n) if worlds is None else self._stream.prepare(worlds)
+        self._state, self._params = start.packed.state.copy(), start.packed.params.copy()
+        self._clock, self._wanted = start.clock.copy(), start.wanted.copy()
+        self._potential = np.zeros(self._wanted.shape)
+        self._begin(np.arange(self.n), start)
 
     def renew(self, rows: Ints) -> None:
         """Start new episodes of the training stream in these rows (autoreset)."""
-        if len(rows):
-            self._begin(rows, self._next_worlds(len(rows)))
+        if len(rows) == 0:
+            return
+        start = self._stream.take(len(rows))
+        self._state[rows], self._params[rows] = start.packed
+        self._clock[rows], self._wanted[rows] = start.clock, start.wanted
+        self._begin(rows, start)
 
     def observe(self, vehicle: int) -> Observations:
         """Current observation of one vehicle, [n, F]."""
-        return observe(self.worlds, vehicle, self.observation)
+        if not 0 <= vehicle < self.scenario.vehicles:
+            raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{self.scenario.vehicles - 1}")
+        return self.observe_all(np.array([vehicle]))[:, 0]
 
-    def step(self, actions: Mapping[int, Floats] | Floats) -> Step:
+    def observe_all(self, vehicles: Ints, rows: Ints | None = None) -> Observations:
+        """Current observations of several vehicles, [n, len(vehicles), F]; only of the worlds ``rows`` if given."""
+        state, params = self._state, self._params
+        if rows is not None:
+            state, params = state[rows], params[rows]
+        return observe_packed(state, params, vehicles, self.observation)
+
+    def step(self, actions: Actions) -> Step:
         """Advance every running episode by one time step.
 
         ``actions``: for each learner (by vehicle index, or as columns [n, L] in the order of ``learners``) a number in
         [-1, 1] per world. Rows whose episode has ended stay as they are until ``renew`` or ``reset``.
         """
-        command = self._commands(actions)
-        before = self.worlds
-        index, until = next_times(
-            self._step_index, self._last_step, self._start_s, self.ended, before.time_s, self.scenario.time_step_s,
-            self.scenario.horizon_s,
+        columns = self._columns(actions)
+        if self._remembering:
+            worlds = self.worlds
+            for vehicle, script in self._remembering.items():
+                self._wanted[:, vehicle] = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
+        reward, facts = np.empty(self._wanted.shape), np.empty((self.n, FACTS_WIDTH))
+        world, status = step_worlds(
+            self._state, self._params, self._clock, columns, self._learner_index, self._settings, NO_ROWS,
+            self._wanted, reward, facts,
         )  # fmt: skip
-        self.worlds, impacts = advance(before, command, until_s=until)
-        self.ledger = self.ledger.add(impacts)
-        terminated, truncated, safe_end = episode_ends(
-            self.worlds.speeds_mps, command, self.ledger.count, self.ended, index >= self._last_step
+        if status != DONE:
+            self._fail(world, status, columns)
+        step = Step(
+            reward,
+            facts[:, TERMINATED] == 1.0,
+            facts[:, TRUNCATED] == 1.0,
+            facts[:, STEP_FIRST_HARM],
+            facts[:, STEP_TOTAL_HARM],
+            facts[:, SAFE_END] == 1.0,
+            self._wanted.copy(),
+            self.reward,
         )
-        terms = reward_terms(self.reward, before, self.worlds, impacts, safe_end, self.scenario.time_step_s)
+        if self._moves_reward or self.reward.shaping > 0.0:
+            self._add_further_terms(step)
+        return step
+
+    def _columns(self, actions: Actions) -> Floats:
+        """The learners' actions as [n, L]; their range is checked where they are used."""
+        shape = (self.n, len(self.learners))
+        if not isinstance(actions, Mapping):
+            given = np.asarray(actions)
+            if given.shape != shape or given.dtype.kind not in "fiu":
+                return checked_action(actions, shape, "the learners")
+            return np.ascontiguousarray(given, np.float64)
+        columns = np.empty(shape)
+        for c, vehicle in enumerate(self.learners):
+            if vehicle not in actions:
+                raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
+            columns[:, c] = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
+        return columns
+
+    def _fail(self, world: int, status: int, actions: Floats) -> None:
+        if status == BAD_ACTION:
+            for c, vehicle in enumerate(self.learners):
+                checked_action(actions[:, c], (self.n,), f"vehicle_{vehicle + 1}")
+        raise PhysicsError(f"world {world}: the step from {self._state[world, 0]:g} s failed with status {status}")
+
+    def _add_further_terms(self, step: Step) -> None:
+        """Add the terms that need the motion, or the future, to a step's reward; nothing for rows that stood still."""
+        vehicles, state = self.scenario.vehicles, self._state
+        gaps = gap_at(vehicles)
+        if self._moves_reward:
+            outcome = StepOutcome(
+                step.first_impact_harm,
+                step.total_harm,
+                step.safe_end,
+                state[:, gaps : gaps + vehicles - 1],
+                state[:, speed_at(vehicles) : command_at(vehicles)],
+                state[:, command_at(vehicles) : previous_at(vehicles)],
+                state[:, previous_at(vehicles) : gaps],
+                self.scenario.time_step_s,
+            )
+            step.further.update(further_terms(self.reward, outcome))
         if self.reward.shaping > 0.0:
-            terms["shaping"] = self._shaping(terminated)
-        reward = weighted_sum(self.reward, terms, command.shape)
-        reward[self.ended] = 0.0
-        self._step_index = index
-        self.ended = self.ended | terminated | truncated
-        return Step(reward, terms, terminated, truncated, impacts, command)
+            step.further["shaping"] = self._shaping(step.terminated)
+        extra = weighted_sum(self.reward, step.further, step.reward.shape)
+        extra[self.ended & ~step.ended] = 0.0
+        step.reward[:] += extra
 
     def _shaping(self, terminated: Bools) -> Floats:
         """The shaping term [n, N] of this step; keeps the new potentials, which are 0 where an episode terminated."""
@@ -174,109 +302,23 @@ class Engine:
             potentials[:, vehicle] = potential(self.reward, worlds, vehicle, self.scenario.horizon_s)
         return potentials
 
-    def _commands(self, actions: Mapping[int, Floats] | Floats) -> Floats:
-        command = np.empty(self.worlds.speeds_mps.shape)
-        for vehicle, script in self.scripts.items():
-            command[:, vehicle] = script.act(self.worlds, vehicle)
-        if not isinstance(actions, Mapping):
-            columns = checked_action(actions, (self.n, len(self.learners)), "the learners")
-            actions = {vehicle: columns[:, k] for k, vehicle in enumerate(self.learners)}
-        for vehicle in self.learners:
-            if vehicle not in actions:
-                raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
-            action = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
-            command[:, vehicle] = action_to_command(action, self.worlds.vehicles, vehicle)
-        return command
-
-    def _begin(self, rows: Ints, fresh: Worlds) -> None:
-        """Put ``fresh`` worlds (at t = 0) into ``rows`` and move them to their first decision."""
-        for watch in self.on_begin:
-            watch(fresh, rows)
-        for vehicle, script in self.scripts.items():
-            script.begin(fresh, vehicle, rows)
-        command = self._first_commands(rows, fresh)
-        start = np.zeros(len(rows))
-        if self.deciders:
-            start = fresh.vehicles.latency_s[:, list(self.deciders)].min(axis=1)
-        step, horizon = self.scenario.time_step_s, self.scenario.horizon_s
-        if not (start < horizon).all():
-            late = float(start.max())
-            raise InvalidInput(f"reset: nobody decides before the horizon ({late:g} s >= {horizon:g} s)")
-        moved, impacts = advance(fresh, command, until_s=start)
-        self.worlds = assign(self.worlds, rows, moved)
-        self.ledger = _assign_ledger(self.ledger, rows, empty_ledger(fresh).add(impacts))
+    def _begin(self, rows: Ints, start: Start) -> None:
+        """Tell those who must know that episodes start in ``rows``, and move what depends on them."""
+        if self.on_begin or self._remembering:
+            alert = start.alert
+            for watch in self.on_begin:
+                watch(alert, rows)
+            for vehicle, script in self._remembering.items():
+                script.begin(alert, vehicle, rows)
+            if self._remembering:
+                self._begin_with_memory(rows, alert, start.clock[:, START])
         if self.reward.shaping > 0.0:
-            self._potential[rows] = self._potentials(moved)
-        self.ended[rows] = False
-        self._start_s[rows] = start
-        self._step_index[rows] = 0
-        self._last_step[rows] = np.ceil((horizon - start) / step - 1e-9).astype(np.int64)
+            self._potential[rows] = self._potentials(unpack(Packed(self._state[rows], self._params[rows])))
 
-    def _first_commands(self, rows: Ints, fresh: Worlds) -> Floats:
-        """What the scripts want at the alert, learners coasting, [len(rows), N]."""
-        command = np.zeros(fresh.speeds_mps.shape)
-        if not all(getattr(script, "state_free", False) for script in self.scripts.values()):
-            self.worlds = assign(self.worlds, rows, fresh)  # a script with a memory acts on the whole batch
-        for vehicle, script in self.scripts.items():
-            if getattr(script, "state_free", False):
-                command[:, vehicle] = script.act(fresh, vehicle)
-            else:
-                command[:, vehicle] = script.act(self.worlds, vehicle)[rows]
-        return command
-
-    def _next_worlds(self, count: int) -> Worlds:
-        if self._pool is None or self._pool_next + count > self._pool.n:
-            size = max(count, _SAMPLED_AT_ONCE)
-            kept = 0 if self._pool is None else self._pool.n - self._pool_next
-            first = self._drawn - kept
-            sample = self.scenario.sample(size, self.seed, first=first, channel="training")
-            self.rejected += sample.rejected
-            self._pool, self._pool_next, self._drawn = sample.worlds, 0, first + size
-        rows = np.arange(self._pool_next, self._pool_next + count)
-        self._pool_next += count
-        return self._pool.take(rows)
-
-
-@compiled
-def next_times(
-    index: Ints, last: Ints, start_s: Floats, ended: Bools, time_s: Floats, time_step_s: float, horizon_s: float
-) -> tuple[Ints, Floats]:
-    """Number of the coming step and its end, [n]; the last step ends exactly at the horizon, ended worlds stay."""
-    coming, until = index.copy(), time_s.copy()
-    for k in range(index.shape[0]):
-        if not ended[k]:
-            coming[k] += 1
-            until[k] = horizon_s if coming[k] >= last[k] else start_s[k] + coming[k] * time_step_s
-    return coming, until
-
-
-@compiled
-def episode_ends(
-    speeds: Floats, command: Floats, impacts: Ints, ended: Bools, at_horizon: Bools
-) -> tuple[Bools, Bools, Bools]:
-    """Which running episodes terminate (at rest, nobody drives), are truncated, and end without a collision, [n]."""
-    n, vehicles = speeds.shape
-    terminated, truncated, safe = np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    for k in range(n):
-        if ended[k]:
-            continue
-        at_rest = True
-        for i in range(vehicles):
-            at_rest = at_rest and speeds[k, i] == 0.0 and command[k, i] <= 0.0
-        terminated[k] = at_rest
-        truncated[k] = at_horizon[k] and not at_rest
-        if terminated[k] or truncated[k]:
-            safe[k] = True
-            for p in range(vehicles - 1):
-                safe[k] = safe[k] and impacts[k, p] == 0
-    return terminated, truncated, safe
-
-
-def _assign_ledger(ledger: Ledger, rows: Ints, fresh: Ledger) -> Ledger:
-    """The ledger with ``rows`` replaced."""
-    first, total, count, mass = (
-        ledger.first_impact_harm.copy(), ledger.total_harm.copy(), ledger.count.copy(), ledger.mass_t.copy(),
-    )  # fmt: skip
-    first[rows], total[rows] = fresh.first_impact_harm, fresh.total_harm
-    count[rows], mass[rows] = fresh.count, fresh.mass_t
-    return Ledger(first, total, count, mass)
+    def _begin_with_memory(self, rows: Ints, alert: Worlds, start_s: Floats) -> None:
+        """Scripts with a memory act at the alert on the whole batch; then the new worlds move to the first decision."""
+        self._state[rows] = pack(alert).state
+        worlds = self.worlds
+        for vehicle, script in self._remembering.items():
+            self._wanted[:, vehicle] = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
+        self._state[rows] = moved(alert, self._wanted[rows], start_s).state

@@ -78,18 +78,28 @@ def empty_ledger(worlds: Worlds) -> Ledger:
     return Ledger(np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64), worlds.vehicles.mass_t)
 
 
+@compiled
 def split(pair_harm: Floats, mass_t: Floats) -> Floats:
-    """Share each pair's harm [n, P] between its two vehicles by mass (the lighter one bears more), [n, N].
+    """Share each pair's harm [n, P] between its two vehicles by mass (the lighter one bears more), [n, N]."""
+    n, vehicles = mass_t.shape
+    harm = np.zeros((n, vehicles))
+    for k in range(n):
+        for p in range(vehicles - 1):
+            front = front_share(pair_harm[k, p], mass_t[k, p], mass_t[k, p + 1])
+            harm[k, p] += front
+            harm[k, p + 1] += pair_harm[k, p] - front
+    return harm
+
+
+@compiled
+def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
+    """What the front vehicle of a pair bears: ``m_rear / (m_front + m_rear) harm``.
 
     The larger share is computed and the smaller one is the rest, an exact subtraction: the two add up to the last bit.
     """
-    front, rear = mass_t[:, :-1], mass_t[:, 1:]
-    larger = np.maximum(front, rear) / (front + rear) * pair_harm
-    front_is_lighter = front <= rear
-    harm = np.zeros(mass_t.shape)
-    harm[:, :-1] += np.where(front_is_lighter, larger, pair_harm - larger)
-    harm[:, 1:] += np.where(front_is_lighter, pair_harm - larger, larger)
-    return harm
+    if front_mass <= rear_mass:
+        return rear_mass / (front_mass + rear_mass) * harm
+    return harm - front_mass / (front_mass + rear_mass) * harm
 
 
 def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"]) -> Floats:

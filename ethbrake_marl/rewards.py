@@ -17,6 +17,8 @@ shaping    for learners: ``discount Phi(after) - Phi(before)``, Phi = minus the 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -24,8 +26,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import expit
 
 from ethbrake_marl.errors import unknown_name
-from ethbrake_marl.harm import HarmCount, line_sum
-from ethbrake_marl.physics import Bools, Floats, Impacts, Worlds, forecast
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import Bools, Floats, Worlds, forecast
 
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -69,26 +71,46 @@ def reward_params(reward: str | RewardParams) -> RewardParams:
     return REWARDS[reward]
 
 
-def reward_terms(
-    params: RewardParams, before: Worlds, after: Worlds, impacts: Impacts, safe_end: Bools, time_step_s: float
-) -> dict[str, Floats]:
-    """Unweighted terms of one step, each [n, N]; only those with a weight above 0.
+@dataclass(frozen=True, slots=True)
+class StepOutcome:
+    """What the terms of one step are computed from."""
 
-    ``safe_end`` [n] marks worlds whose episode ends with this step without any collision.
-    """
-    shape = after.speeds_mps.shape
-    terms: dict[str, Floats] = {}
+    first_impact_harm: Floats  # [n] of the whole line in this step
+    total_harm: Floats  # [n] likewise
+    safe_end: Bools  # [n] the episode ended with this step without any collision
+    gaps_m: Floats  # [n, P] after the step
+    speeds_mps: Floats  # [n, N] after the step
+    command_mps2: Floats  # [n, N] in force after the step
+    previous_mps2: Floats  # [n, N] in force before it
+    time_step_s: float
+
+
+def shared_terms(params: RewardParams, harm: Floats, safe_end: Bools, shape: tuple[int, ...]) -> dict[str, Floats]:
+    """The terms that are the same for all vehicles and need no more than the step's facts; ``harm`` as counted."""
+    terms = {}
     if params.harm > 0.0:
-        harm = impacts.first_impact_harm if params.harm_count == "first" else impacts.total_harm
-        terms["harm"] = _shared(-line_sum(harm), shape)
-    if params.collision > 0.0:
-        terms["collision"] = _shared(-params.k_energy * line_sum(impacts.total_harm), shape)
-    if params.risk > 0.0:
-        terms["risk"] = _risk(params, after)
-    if params.jerk > 0.0:
-        terms["jerk"] = _jerk(before, after, time_step_s)
+        terms["harm"] = _shared(-harm, shape)
     if params.terminal > 0.0:
         terms["terminal"] = _shared(safe_end.astype(np.float64), shape)
+    return terms
+
+
+def reward_terms(params: RewardParams, step: StepOutcome) -> dict[str, Floats]:
+    """Unweighted terms of one step, each [n, N]; only those with a weight above 0 (all but shaping)."""
+    harm = step.first_impact_harm if params.harm_count == "first" else step.total_harm
+    return shared_terms(params, harm, step.safe_end, step.speeds_mps.shape) | further_terms(params, step)
+
+
+def further_terms(params: RewardParams, step: StepOutcome) -> dict[str, Floats]:
+    """The terms that need the motion: collision, risk, jerk."""
+    terms: dict[str, Floats] = {}
+    if params.collision > 0.0:
+        terms["collision"] = _shared(-params.k_energy * step.total_harm, step.speeds_mps.shape)
+    if params.risk > 0.0:
+        terms["risk"] = _risk(params, step)
+    if params.jerk > 0.0:
+        rate = (step.command_mps2 - step.previous_mps2) / step.time_step_s
+        terms["jerk"] = -rate * rate
     return terms
 
 
@@ -104,7 +126,7 @@ def potential(params: RewardParams, worlds: Worlds, vehicle: int, horizon_s: flo
     return least
 
 
-def weighted_sum(params: RewardParams, terms: dict[str, Floats], shape: tuple[int, ...]) -> Floats:
+def weighted_sum(params: RewardParams, terms: Mapping[str, Floats], shape: tuple[int, ...]) -> Floats:
     """Reward of every vehicle, [n, N]."""
     total = np.zeros(shape)
     for name, term in terms.items():
@@ -113,24 +135,18 @@ def weighted_sum(params: RewardParams, terms: dict[str, Floats], shape: tuple[in
 
 
 def _shared(world_value: Floats, shape: tuple[int, ...]) -> Floats:
-    return np.broadcast_to(world_value[:, np.newaxis], shape)
+    return world_value.repeat(shape[1]).reshape(shape)
 
 
-def _risk(params: RewardParams, worlds: Worlds) -> Floats:
-    closing = worlds.speeds_mps[:, 1:] - worlds.speeds_mps[:, :-1]
-    room = np.maximum(worlds.gaps_m - params.safety_buffer_m, 0.0)
+def _risk(params: RewardParams, step: StepOutcome) -> Floats:
+    closing = step.speeds_mps[:, 1:] - step.speeds_mps[:, :-1]
+    room = np.maximum(step.gaps_m - params.safety_buffer_m, 0.0)
     approaching = closing > 0.0
     time_to_collision = room / np.where(approaching, closing, 1.0)
     urgency = np.where(approaching, expit(-time_to_collision / params.ttc_scale_s), 0.0)
-    nearness = expit(params.distance_slope_per_m * (params.target_gap_m - worlds.gaps_m))
+    nearness = expit(params.distance_slope_per_m * (params.target_gap_m - step.gaps_m))
     pair_risk = -(urgency + nearness)
-    risk = np.zeros(worlds.speeds_mps.shape)
+    risk = np.zeros(step.speeds_mps.shape)
     risk[:, :-1] += pair_risk
     risk[:, 1:] += pair_risk
     return risk
-
-
-def _jerk(before: Worlds, after: Worlds, time_step_s: float) -> Floats:
-    rate = (after.command_mps2 - before.command_mps2) / time_step_s
-    penalty: Floats = -rate * rate
-    return penalty

@@ -7,10 +7,10 @@ it knows only itself.
 
 from __future__ import annotations
 
-from ethbrake_marl.physics import Bools, Worlds
+from ethbrake_marl.physics.compiled import compiled
 
 
-def informed(worlds: Worlds, vehicle: int) -> Bools:
-    """Whether ``vehicle`` has received the news of the other vehicles, [n]."""
-    known: Bools = worlds.time_s >= worlds.vehicles.latency_s[:, vehicle]
-    return known
+@compiled
+def knows(time_s: float, own_latency_s: float) -> bool:
+    """Whether a vehicle with this latency has the news of the other vehicles at this time."""
+    return time_s >= own_latency_s

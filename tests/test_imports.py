@@ -23,7 +23,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("harm",),
     ("scenario", "v2x"),
     ("actions", "observations", "rewards"),
-    ("engine",),
+    ("stepping", "starts", "engine"),
     ("agents",),
     ("envs",),
     ("ethbrake_v0",),

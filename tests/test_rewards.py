@@ -12,12 +12,18 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.physics import advance, forecast, make_worlds
-from ethbrake_marl.rewards import RewardParams, reward_params, reward_terms, weighted_sum
+from ethbrake_marl.rewards import RewardParams, StepOutcome, reward_params, reward_terms, weighted_sum
 from ethbrake_marl.scenario import load_scenario
 
 
 def sigmoid(x: float) -> float:
     return 1.0 / (1.0 + math.exp(-x))
+
+
+def outcome(before, after, impacts, safe_end) -> StepOutcome:
+    harms = impacts.first_impact_harm.sum(axis=1), impacts.total_harm.sum(axis=1)
+    motion = after.gaps_m, after.speeds_mps, after.command_mps2, before.command_mps2
+    return StepOutcome(*harms, np.array([safe_end]), *motion, 0.5)
 
 
 def step(params: RewardParams, *, safe_end: bool = False):
@@ -32,7 +38,7 @@ def step(params: RewardParams, *, safe_end: bool = False):
         restitution=0.5,
     )
     after, impacts = advance(before, [0.0, 0.0, -2.0], 0.5)
-    return after, reward_terms(params, before, after, impacts, np.array([safe_end]), 0.5)
+    return after, reward_terms(params, outcome(before, after, impacts, safe_end))
 
 
 def test_harm__is_shared_by_all_and_negative():
@@ -60,7 +66,7 @@ def test_risk__of_a_closing_pair_adds_the_time_to_collision():
     before = make_worlds([7.0], [0.0, 4.0], braking_capacity_mps2=1.0, driving_capacity_mps2=1.0, latency_s=0.0,
                          mass_t=1.0, restitution=0.0)  # fmt: skip
     after, impacts = advance(before, [0.0, 0.0], 0.5)
-    terms = reward_terms(params, before, after, impacts, np.array([False]), 0.5)
+    terms = reward_terms(params, outcome(before, after, impacts, False))
     assert terms["risk"][0, 1] == pytest.approx(-sigmoid(-((5.0 - 1.0) / 4.0) / 2.0) - sigmoid(3.0 - 5.0))
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec
+from ethbrake_marl.physics import Floats
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import Scenario, load_scenario
 
@@ -54,6 +57,22 @@ def only_learner(engine: Engine) -> int:
             " exactly one: pass learners=['vehicle_2'], or use parallel_env or make_sb3_vec_env"
         )
     return engine.learners[0]
+
+
+def learner_columns(engine: Engine, actions: Mapping[int, Any]) -> Floats:
+    """The learners' actions of one world as [1, L], from an action [1] for each by vehicle index.
+
+    Raises ``InvalidInput`` naming the vehicle whose action is missing or misshapen; the engine checks the range.
+    """
+    columns = np.empty((1, len(engine.learners)))
+    for c, vehicle in enumerate(engine.learners):
+        if vehicle not in actions:
+            raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
+        action = np.asarray(actions[vehicle])
+        if action.shape != (1,) or action.dtype.kind not in "fiu":
+            action = checked_action(actions[vehicle], (1,), f"vehicle_{vehicle + 1}")
+        columns[0, c] = action[0]
+    return columns
 
 
 def check_render_mode(render_mode: str | None) -> None:

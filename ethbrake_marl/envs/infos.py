@@ -2,78 +2,125 @@
 
 After a reset: ``time_s``, ``applied_command_mps2`` (in force now; 0 until the latency has elapsed), the vehicle's share
 of the harm so far under both counts, the same for the whole world, and whether anything has collided. After a step
-also ``applied_action`` (the vehicle's command as an action, whoever chose it), ``wanted_command_mps2``, and the reward
+also ``wanted_command_mps2``, ``applied_action`` (the vehicle's command as an action, whoever chose it), and the reward
 terms before their weights.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.actions import action_of
 from ethbrake_marl.engine import Engine, Step
-from ethbrake_marl.physics import Bools
+from ethbrake_marl.harm import front_share
+from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.packed import TIME, command_at, harm_at, params_at
 
-Table = dict[str, Any]  # name -> [n, N]; applied_action [n, N, 1]; reward_terms: another table
-
-
-def state_table(engine: Engine) -> Table:
-    """What is known at any time, each [n, N]."""
-    worlds, ledger = engine.worlds, engine.ledger
-    table = {
-        "time_s": worlds.time_s,
-        "applied_command_mps2": worlds.command_mps2,
-        "first_impact_harm": ledger.vehicle_harm("first"),
-        "total_harm": ledger.vehicle_harm("total"),
-        "world_first_impact_harm": ledger.world_harm("first"),
-        "world_total_harm": ledger.world_harm("total"),
-        "collided": ledger.collided,
-    }
-    return {name: value if value.ndim == 2 else _every_vehicle(value, worlds.N) for name, value in table.items()}
+AT_ANY_TIME = (
+    "time_s",
+    "applied_command_mps2",
+    "first_impact_harm",
+    "total_harm",
+    "world_first_impact_harm",
+    "world_total_harm",
+    "collided",
+)
+AFTER_A_STEP = (*AT_ANY_TIME, "wanted_command_mps2", "applied_action")
+_COLLIDED, _ACTION = AFTER_A_STEP.index("collided"), AFTER_A_STEP.index("applied_action")
 
 
-def step_table(engine: Engine, step: Step) -> Table:
-    """What the last step adds, before any of its rows is renewed; each [n, N].
+class Report(NamedTuple):
+    """What there is to tell about some worlds."""
 
-    The applied action reads 0 where the capacity on that side is 0.
+    values: Floats  # [n, N, len(AFTER_A_STEP)]
+    terms: dict[str, Floats] | None  # reward terms, each [n, N]; None if no step was taken yet
+
+
+def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
+    """The engine's worlds as they are now, before any of them is renewed; only the worlds ``rows`` if given."""
+    packed, wanted = engine.packed, engine.wanted_mps2
+    state, params = packed.state, packed.params
+    if rows is not None:
+        state, params, wanted = state[rows], params[rows], wanted[rows]
+    values = np.empty((*wanted.shape, len(AFTER_A_STEP)))
+    _report_rows(state, params, wanted, values)
+    return Report(values, None if step is None else step.terms)
+
+
+@compiled
+def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
+    """Fill ``out`` [n, N, ...] with the columns of AFTER_A_STEP."""
+    n, N = wanted.shape
+    P, harm, mass = N - 1, harm_at(N), params_at(3, N)
+    for k in range(n):
+        first, total, impacts = 0.0, 0.0, 0.0
+        for i in range(N):
+            out[k, i, 2] = 0.0
+            out[k, i, 3] = 0.0
+        for p in range(P):
+            for count in range(2):
+                value = state[k, harm + count * P + p]
+                front = front_share(value, params[k, mass + p], params[k, mass + p + 1])
+                out[k, p, 2 + count] += front
+                out[k, p + 1, 2 + count] += value - front
+            first += state[k, harm + p]
+            total += state[k, harm + P + p]
+            impacts += state[k, harm + 2 * P + p]
+        for i in range(N):
+            out[k, i, 0] = state[k, TIME]
+            out[k, i, 1] = state[k, command_at(N) + i]
+            out[k, i, 4] = first
+            out[k, i, 5] = total
+            out[k, i, 6] = 1.0 if impacts > 0.0 else 0.0
+            out[k, i, 7] = wanted[k, i]
+            out[k, i, 8] = action_of(wanted[k, i], params[k, params_at(0, N) + i], params[k, params_at(1, N) + i])
+
+
+def plain_infos(told: Report, vehicles: list[int] | slice) -> list[dict[str, Any]]:
+    """Infos of these vehicles, world by world, as plain numbers; ``applied_action`` is an array [1] of its own."""
+    rows: list[list[Any]] = told.values[:, vehicles].reshape(-1, len(AFTER_A_STEP)).tolist()
+    for values in rows:
+        values[_COLLIDED] = values[_COLLIDED] == 1.0
+    if told.terms is None:
+        return [dict(zip(AT_ANY_TIME, values, strict=False)) for values in rows]
+    infos: list[dict[str, Any]] = []
+    for values in rows:
+        values[_ACTION] = np.array([values[_ACTION]], np.float32)
+        infos.append(dict(zip(AFTER_A_STEP, values, strict=True), reward_terms={}))
+    for name, term in told.terms.items():
+        for info, value in zip(infos, term[:, vehicles].ravel().tolist(), strict=True):
+            info["reward_terms"][name] = value
+    return infos
+
+
+def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools | None) -> dict[str, Any]:
+    """One vehicle in many worlds as Gymnasium's vector infos: ``name`` [n] and its mask ``_name`` [n].
+
+    What can be told at any time is told of the worlds marked by ``rows``; what a step adds (None: nothing), of those
+    marked by ``stepped``.
     """
-    vehicles = engine.worlds.vehicles
-    actions = [command_to_action(step.command_mps2[:, i], vehicles, i) for i in range(engine.worlds.N)]
-    return {
-        "applied_action": np.stack(actions, axis=1).astype(np.float32)[:, :, np.newaxis],
-        "wanted_command_mps2": step.command_mps2,
-        "reward_terms": step.terms,
-    }
-
-
-def row_info(table: Table, row: int, vehicle: int) -> dict[str, Any]:
-    """One vehicle of one world as plain numbers; arrays are copies."""
-    info: dict[str, Any] = {}
-    for name, value in table.items():
-        if isinstance(value, dict):
-            info[name] = row_info(value, row, vehicle)
-        else:
-            entry = value[row, vehicle]
-            info[name] = entry.copy() if entry.ndim else entry.item()
+    columns: dict[str, NDArray[Any]] = {name: told.values[:, vehicle, c] for c, name in enumerate(AFTER_A_STEP)}
+    columns["collided"] = columns["collided"] == 1.0
+    info = _masked({name: columns[name] for name in AT_ANY_TIME}, rows)
+    if stepped is None:
+        return info
+    columns["applied_action"] = columns["applied_action"].astype(np.float32)[:, np.newaxis]
+    info |= _masked({name: columns[name] for name in AFTER_A_STEP[len(AT_ANY_TIME) :]}, stepped)
+    info["reward_terms"] = _masked({name: term[:, vehicle] for name, term in (told.terms or {}).items()}, stepped)
+    info["_reward_terms"] = stepped.copy()
     return info
 
 
-def batch_info(table: Table, vehicle: int, rows: Bools) -> dict[str, Any]:
-    """One vehicle in the worlds marked by ``rows``, as Gymnasium's vector infos: ``name`` [n], mask ``_name`` [n]."""
-    info: dict[str, Any] = {}
-    for name, value in table.items():
-        if isinstance(value, dict):
-            info[name] = batch_info(value, vehicle, rows)
-        else:
-            column = np.zeros_like(value[:, vehicle])
-            column[rows] = value[rows, vehicle]
-            info[name] = column
-        info[f"_{name}"] = rows.copy()
-    return info
-
-
-def _every_vehicle(value: NDArray[Any], vehicles: int) -> NDArray[Any]:
-    return np.repeat(value[:, np.newaxis], vehicles, axis=1)
+def _masked(columns: dict[str, NDArray[Any]], rows: Bools) -> dict[str, Any]:
+    """Each column where ``rows`` marks it, else zeros, and its mask beside it."""
+    masked: dict[str, Any] = {}
+    for name, column in columns.items():
+        kept = np.zeros_like(column, order="C")
+        kept[rows] = column[rows]
+        masked[name] = kept
+        masked[f"_{name}"] = rows.copy()
+    return masked

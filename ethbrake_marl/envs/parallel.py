@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
-from ethbrake_marl.envs.build import check_render_mode, make_engine
-from ethbrake_marl.envs.infos import Table, row_info, state_table, step_table
+from ethbrake_marl.envs.build import check_render_mode, learner_columns, make_engine
+from ethbrake_marl.envs.infos import Report, plain_infos, report
 from ethbrake_marl.envs.restart import fresh_seed, restart
 from ethbrake_marl.envs.spaces import action_box, feature_box
 from ethbrake_marl.envs.state import full_state, state_features
@@ -48,6 +49,8 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
         self.possible_agents = list(self.engine.scenario.vehicle_names)
         self.agents: list[str] = []
+        self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
+        self._vehicles = np.arange(len(self.possible_agents))
         features = self.engine.observation.features
         self.observation_spaces = {agent: feature_box(features) for agent in self.possible_agents}
         self.action_spaces = {agent: action_box() for agent in self.possible_agents}
@@ -70,7 +73,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         restart(self.engine, fresh_seed() if seed is None and not self._seeded else seed, options)
         self._seeded = self._started = True
         self.agents = self.possible_agents[:]
-        return self._observations(), self._infos(state_table(self.engine))
+        return self._observations(), self._infos(report(self.engine))
 
     def step(
         self, actions: Mapping[str, Any]
@@ -78,15 +81,20 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         """Advance by one time step. Raises ``InvalidInput`` naming the agent whose action is missing or unusable."""
         if not self.agents:
             raise InvalidInput("step: no episode is running; call reset first")
-        step = self.engine.step(self._learners_actions(actions))
+        step = self.engine.step(learner_columns(self.engine, self._by_index(actions)))
         agents = self.possible_agents
-        rewards = {agent: float(step.reward[0, i]) for i, agent in enumerate(agents)}
-        terminations = dict.fromkeys(agents, bool(step.terminated[0]))
-        truncations = dict.fromkeys(agents, bool(step.truncated[0]))
-        infos = self._infos(state_table(self.engine) | step_table(self.engine, step))
-        if step.ended[0]:
+        rewards = dict(zip(agents, step.reward[0].tolist(), strict=True))
+        terminated, truncated = step.terminated.item(), step.truncated.item()
+        infos = self._infos(report(self.engine, step))
+        if terminated or truncated:
             self.agents = []
-        return self._observations(), rewards, terminations, truncations, infos
+        return (
+            self._observations(),
+            rewards,
+            dict.fromkeys(agents, terminated),
+            dict.fromkeys(agents, truncated),
+            infos,
+        )
 
     def state(self) -> Observations:
         """The full state of all vehicles, float32 [S] within ``state_space``."""
@@ -95,18 +103,19 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         state: Observations = full_state(self.engine.worlds, self.engine.scenario)[0].copy()
         return state
 
-    def _learners_actions(self, actions: Mapping[str, Any]) -> dict[int, Any]:
-        for agent in actions:
-            if agent not in self.action_spaces:
-                raise unknown_name("agent", agent, self.possible_agents)
-        names = self.possible_agents
-        return {i: actions[names[i]] for i in self.engine.learners if names[i] in actions}
+    def _by_index(self, actions: Mapping[str, Any]) -> dict[int, Any]:
+        index = self._index
+        try:
+            return {index[agent]: action for agent, action in actions.items()}
+        except KeyError as unknown:
+            raise unknown_name("agent", unknown.args[0], self.possible_agents) from None
 
     def _observations(self) -> dict[str, Observations]:
-        return {agent: self.engine.observe(i)[0].copy() for i, agent in enumerate(self.possible_agents)}
+        every = self.engine.observe_all(self._vehicles)[0]
+        return {agent: every[i].copy() for i, agent in enumerate(self.possible_agents)}
 
-    def _infos(self, table: Table) -> Infos:
-        return {agent: row_info(table, 0, i) for i, agent in enumerate(self.possible_agents)}
+    def _infos(self, told: Report) -> Infos:
+        return dict(zip(self.possible_agents, plain_infos(told, slice(None)), strict=True))
 
 
 parallel_env = EthBrakeParallelEnv

@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from ethbrake_marl.actions import checked_action
 from ethbrake_marl.engine import Engine, Step
 from ethbrake_marl.envs.build import make_engine
-from ethbrake_marl.envs.infos import row_info, state_table
+from ethbrake_marl.envs.infos import Report, plain_infos, report
 from ethbrake_marl.envs.restart import INITIAL_STATE, check_seed, fresh_seed, restart_from, warn_of_unknown
 from ethbrake_marl.envs.spaces import action_box, feature_box
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Observations, ObservationSpec, observe
-from ethbrake_marl.physics import Bools, Worlds, concatenate
+from ethbrake_marl.observations import Observations, ObservationSpec
+from ethbrake_marl.physics import Bools, Ints, Worlds, concatenate
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import Scenario, initial_state_worlds
 
@@ -47,8 +46,9 @@ class EthBrakeVecEnv(VecEnv):
     With one learner rows are worlds; with several, all rows share one policy (parameter sharing), and the rows of a
     world end together. All worlds take their episodes from one stream, as in ``EthBrakeVectorEnv``.
 
-    Infos hold ``TimeLimit.truncated``; at the end of an episode also ``terminal_observation``, ``episode`` (return
-    ``r``, steps ``l``; ``t`` is always 0, no clock is read), and harm under both counts as in ``envs.infos``.
+    At the end of an episode its rows' infos hold ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return
+    ``r``, steps ``l``; ``t`` is always 0, no clock is read), and harm under both counts as in ``envs.infos``; all other
+    infos are empty.
     There are no environments inside: attributes and methods belong to the whole batch.
     """
 
@@ -59,10 +59,12 @@ class EthBrakeVecEnv(VecEnv):
             raise InvalidInput(f"scenario {engine.scenario.name!r} has no learner; pass learners=['vehicle_2']")
         self.engine = engine
         self._next_seed: int | None = seed
+        self._learners = np.array(engine.learners, np.int64)
         self._actions: NDArray[Any] | None = None
         rows = engine.n * len(engine.learners)
         self._return = np.zeros(rows)
         self._steps = np.zeros(rows, np.int64)
+        self._begun = np.zeros(0)  # values of the report at each episode's beginning
         self._started = False
         super().__init__(rows, feature_box(engine.observation.features), action_box())
 
@@ -79,9 +81,8 @@ class EthBrakeVecEnv(VecEnv):
         self._reset_options()
         self._return[:], self._steps[:] = 0.0, 0
         self._started = True
-        table = state_table(self.engine)
-        self.reset_infos = [row_info(table, *self._place(row)) for row in range(self.num_envs)]
-        return self._observe(self.engine.worlds)
+        self._begun = report(self.engine).values
+        return self._observe()
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep actions [rows, 1] for ``step_wait``."""
@@ -92,16 +93,22 @@ class EthBrakeVecEnv(VecEnv):
         if not self._started or self._actions is None:
             raise InvalidInput("step: no episode is running; call reset first")
         actions, self._actions = self._actions, None
-        engine, learners = self.engine, self.engine.learners
-        checked = checked_action(actions, (self.num_envs, 1), "the rows")
-        step = engine.step(checked.reshape(engine.n, len(learners)))
-        reward = step.reward[:, list(learners)].reshape(-1)
+        engine, learners = self.engine, self._learners
+        if actions.shape != (self.num_envs, 1):
+            raise InvalidInput(
+                f"step: actions of shape {actions.shape}; one for each row, ({self.num_envs}, 1), is needed"
+            )
+        step = engine.step(actions.reshape(engine.n, len(learners)))
+        reward = step.reward[:, learners].reshape(-1)
         self._return += reward
         self._steps += 1
-        infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(self.num_envs)]
-        if step.ended.any():
-            self._close_episodes(step, infos)
-        return self._observe(engine.worlds), reward.astype(np.float32), self._by_row(step.ended), infos
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        ended = np.flatnonzero(step.ended)
+        if len(ended):
+            self._close_episodes(ended, step, infos)
+            engine.renew(ended)
+            self._begun[ended] = report(engine, rows=ended).values
+        return self._observe(), reward.astype(np.float32), self._by_row(step.ended), infos
 
     def close(self) -> None:
         """Nothing to release."""
@@ -124,40 +131,44 @@ class EthBrakeVecEnv(VecEnv):
         """False for every row: nothing is wrapped."""
         return [False for _ in self._get_indices(indices)]
 
-    def _close_episodes(self, step: Step, infos: list[dict[str, Any]]) -> None:
-        """Fill in the infos of rows whose episode has ended, then start the next episodes of their worlds."""
-        engine = self.engine
-        ended = np.flatnonzero(step.ended)
-        final = self._observe(engine.worlds.take(ended))
-        table = state_table(engine)
-        rows = np.flatnonzero(self._by_row(step.ended))
-        for row, observation in zip(rows.tolist(), final, strict=True):
-            world, vehicle = self._place(row)
-            episode = {"r": float(self._return[row]), "l": int(self._steps[row]), "t": 0.0}
-            infos[row] = row_info(table, world, vehicle) | {
-                "TimeLimit.truncated": bool(step.truncated[world]),
-                "terminal_observation": observation.copy(),
-                "episode": episode,
-            }
+    def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
+        """Fill in the infos of the rows whose world has ended, before the next episodes start."""
+        rows, final = self._rows(ended), self._observe(ended)
+        told = plain_infos(report(self.engine, rows=ended), list(self.engine.learners))
+        truncated = self._by_row(step.truncated)[rows].tolist()
+        for row, info, cut, seen, gained, steps in zip(
+            rows, told, truncated, final, self._return[rows].tolist(), self._steps[rows].tolist(), strict=True
+        ):
+            info["TimeLimit.truncated"] = cut
+            info["terminal_observation"] = seen.copy()
+            info["episode"] = {"r": gained, "l": steps, "t": 0.0}
+            infos[row] = info
         self._return[rows], self._steps[rows] = 0.0, 0
-        engine.renew(ended)
-        table = state_table(engine)
-        for row in rows.tolist():
-            self.reset_infos[row] = row_info(table, *self._place(row))
 
-    def _observe(self, worlds: Worlds) -> Observations:
-        """Observations of all learners of ``worlds`` by row, in their own memory."""
-        spec = self.engine.observation
-        columns = [observe(worlds, vehicle, spec) for vehicle in self.engine.learners]
-        return columns[0] if len(columns) == 1 else np.stack(columns, axis=1).reshape(-1, spec.size).copy()
+    def _rows(self, worlds: Ints) -> list[int]:
+        """Rows of all learners of these worlds, in order."""
+        width = len(self.engine.learners)
+        rows: list[int] = (worlds[:, np.newaxis] * width + np.arange(width)).ravel().tolist()
+        return rows
+
+    @property
+    def reset_infos(self) -> list[dict[str, Any]]:
+        """The infos with which the running episodes began, row by row; made when they are asked for."""
+        if not self._started:
+            return [{} for _ in range(self.num_envs)]
+        return plain_infos(Report(self._begun, None), list(self.engine.learners))
+
+    @reset_infos.setter
+    def reset_infos(self, infos: list[dict[str, Any]]) -> None:
+        """Nothing: SB3's constructor assigns empty ones."""
+
+    def _observe(self, worlds: Ints | None = None) -> Observations:
+        """Observations of all learners, row by row, in their own memory; only of some worlds if given."""
+        every = self.engine.observe_all(self._learners, worlds)
+        return every.reshape(-1, every.shape[2])
 
     def _by_row(self, worlds: Bools) -> Bools:
         return np.repeat(worlds, len(self.engine.learners))
-
-    def _place(self, row: int) -> tuple[int, int]:
-        """World and vehicle index of a row."""
-        world, learner = divmod(row, len(self.engine.learners))
-        return world, self.engine.learners[learner]
 
     def _given_worlds(self) -> Worlds | None:
         """The worlds that the options of the rows ask for; None for the stream's."""

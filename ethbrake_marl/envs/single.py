@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium
 from numpy.typing import NDArray
 
-from ethbrake_marl.envs.build import check_render_mode, make_engine, only_learner
-from ethbrake_marl.envs.infos import row_info, state_table, step_table
+from ethbrake_marl.envs.build import check_render_mode, learner_columns, make_engine, only_learner
+from ethbrake_marl.envs.infos import plain_infos, report
 from ethbrake_marl.envs.restart import check_seed, restart
 from ethbrake_marl.envs.spaces import action_box, feature_box
 from ethbrake_marl.errors import InvalidInput
@@ -58,15 +58,15 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         restart(self.engine, seed, options)
         super().reset(seed=seed)
         self._running = True
-        return self._observe(), row_info(state_table(self.engine), 0, self.learner)
+        return self._observe(), plain_infos(report(self.engine), [self.learner])[0]
 
     def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Advance by one time step."""
         if not self._running:
             raise InvalidInput("step: no episode is running; call reset first")
-        step = self.engine.step({self.learner: action})
+        step = self.engine.step(learner_columns(self.engine, {self.learner: action}))
         self._running = not step.ended[0]
-        info = row_info(state_table(self.engine) | step_table(self.engine, step), 0, self.learner)
+        info = plain_infos(report(self.engine, step), [self.learner])[0]
         reward = float(step.reward[0, self.learner])
         return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info
 

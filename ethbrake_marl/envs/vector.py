@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.engine import Step
 from ethbrake_marl.envs.build import check_render_mode, make_engine, only_learner
-from ethbrake_marl.envs.infos import batch_info, state_table, step_table
+from ethbrake_marl.envs.infos import batch_info, report
 from ethbrake_marl.envs.restart import check_seed, restart
 from ethbrake_marl.envs.spaces import action_box, feature_box
 from ethbrake_marl.errors import InvalidInput
@@ -68,7 +68,8 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         restart(self.engine, seed, options)
         super().reset(seed=seed)
         self._started = True
-        return self.engine.observe(self.learner), self._infos(np.ones(self.num_envs, np.bool_))
+        every = np.ones(self.num_envs, np.bool_)
+        return self.engine.observe(self.learner), batch_info(report(self.engine), self.learner, every, None)
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step, and start new episodes as the autoreset mode says."""
@@ -76,19 +77,15 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
             raise InvalidInput("step: no episode is running; call reset first")
         engine, before = self.engine, self.engine.ended
         step = engine.step(actions)
-        if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            renewed = step.ended
-            infos = self._final_infos(step) if renewed.any() else {}
-        else:
-            renewed, infos = before, {}
-        infos |= batch_info(step_table(engine, step), self.learner, ~renewed)
+        renewed = step.ended if self.autoreset_mode is AutoresetMode.SAME_STEP else before
+        infos: dict[str, Any] = {}
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and renewed.any():
+            infos = self._final_infos(step)
         engine.renew(np.flatnonzero(renewed))
-        infos |= self._infos(np.ones(self.num_envs, np.bool_))
+        every = np.ones(self.num_envs, np.bool_)
+        infos |= batch_info(report(engine, step), self.learner, every, ~renewed)
         reward = step.reward[:, self.learner].copy()
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
-
-    def _infos(self, rows: Bools) -> dict[str, Any]:
-        return batch_info(state_table(self.engine), self.learner, rows)
 
     def _final_infos(self, step: Step) -> dict[str, Any]:
         """The last observation and infos of the episodes that ended with this step."""
@@ -97,8 +94,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         final = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(ended):
             final[row] = observations[row].copy()
-        table = state_table(self.engine) | step_table(self.engine, step)
-        info = batch_info(table, self.learner, ended)
+        info = batch_info(report(self.engine, step), self.learner, ended, ended)
         return {"final_obs": final, "_final_obs": ended, "final_info": info, "_final_info": ended.copy()}
 
 

@@ -15,20 +15,29 @@ from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.impact import BEFORE, CLOSING, GAP, MASS, SPEED, STRUCK
+from ethbrake_marl.physics.impact import GAP, MASS, SPEED
 from ethbrake_marl.physics.segment import (
     COMMAND,
+    COUNT,
     DONE,
-    IMPACT,
+    FIRST_HARM,
+    HIT,
     LIMIT,
     MOST_EVENTS,
     ONSET,
     PENETRATED,
+    ROW_CLOSING,
+    ROW_FIRST,
+    ROW_FRONT_CHANGE,
+    ROW_PAIR,
+    ROW_REAR_CHANGE,
+    ROW_TIME,
+    ROW_WIDTH,
+    ROW_WORLD,
     STUCK,
     TABLE_ROWS,
-    move_apart,
-    start_events,
-    to_next_impact,
+    TOTAL_HARM,
+    advance_table,
 )
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
 
@@ -66,8 +75,8 @@ def advance_worlds(
 ) -> tuple[int, int, int]:  # fmt: skip
     """Advance every world to its ``until``, in place (the first five arrays and the harm).
 
-    ``rows`` [capacity, 7] receives the impacts that fit. Returns their whole number, the world where a check failed
-    (or -1) and its status.
+    ``rows`` [capacity, ROW_WIDTH] receives the impacts that fit. Returns their whole number, the world where a check
+    failed (or -1) and its status.
     """
     n, vehicles = speeds.shape
     table = np.zeros((TABLE_ROWS, vehicles))
@@ -88,62 +97,20 @@ def advance_worlds(
             in_force[k, i] = wanted if latency[k, i] <= until[k] else 0.0
         for p in range(vehicles - 1):
             table[GAP, p] = gaps[k, p]
-        if not move_apart(table, duration):
-            recorded, status = advance_near(
-                table, k, time[k], duration, restitution[k], hit, first_harm, total_harm, count, rows, recorded
-            )
-            if status != DONE:
-                return recorded, k, status
+            table[HIT, p] = 1.0 if hit[k, p] else 0.0
+        recorded, status = advance_table(table, restitution[k], duration, time[k], k, rows, recorded)
+        if status != DONE:
+            return recorded, k, status
         time[k] = until[k]
         for i in range(vehicles):
             speeds[k, i] = table[SPEED, i]
         for p in range(vehicles - 1):
             gaps[k, p] = table[GAP, p]
+            hit[k, p] = table[HIT, p] == 1.0
+            first_harm[k, p] = table[FIRST_HARM, p]
+            total_harm[k, p] = table[TOTAL_HARM, p]
+            count[k, p] = int(table[COUNT, p])
     return recorded, -1, DONE
-
-
-@compiled
-def advance_near(
-    table: Floats, k: int, time_s: float, duration: float, restitution: float, hit: Bools, first_harm: Floats,
-    total_harm: Floats, count: Ints, rows: Floats, recorded: int,
-) -> tuple[int, int]:  # fmt: skip
-    """Take world ``k``, whose vehicles may meet, through its segment and record its impacts."""
-    start_events(table)
-    now = 0.0
-    for _ in range(MOST_EVENTS):
-        status, now = to_next_impact(table, restitution, now, duration)
-        if status != IMPACT:
-            return recorded, status
-        recorded = record_impacts(table, k, time_s + now, hit, first_harm, total_harm, count, rows, recorded)
-    return recorded, STUCK
-
-
-@compiled
-def record_impacts(
-    table: Floats, k: int, time_s: float, hit: Bools, first_harm: Floats, total_harm: Floats, count: Ints, rows: Floats,
-    recorded: int,
-) -> int:  # fmt: skip
-    """Write the last round of impacts of world ``k`` to the ledger; rows beyond their capacity are only counted."""
-    for p in range(table.shape[1] - 1):
-        if table[STRUCK, p] == 0.0:
-            continue
-        closing = table[CLOSING, p]
-        harm = closing * closing
-        if recorded < rows.shape[0]:
-            rows[recorded, 0] = k
-            rows[recorded, 1] = p
-            rows[recorded, 2] = time_s
-            rows[recorded, 3] = closing
-            rows[recorded, 4] = 0.0 if hit[k, p] else 1.0
-            rows[recorded, 5] = table[SPEED, p] - table[BEFORE, p]
-            rows[recorded, 6] = table[SPEED, p + 1] - table[BEFORE, p + 1]
-        recorded += 1
-        total_harm[k, p] += harm
-        count[k, p] += 1
-        if not hit[k, p]:
-            hit[k, p] = True
-            first_harm[k, p] += harm
-    return recorded
 
 
 def advance(
@@ -177,7 +144,7 @@ def advance(
         )  # fmt: skip
         shape = worlds.gaps_m.shape
         first_harm, total_harm, count = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
-        rows = np.empty((capacity, 7))
+        rows = np.empty((capacity, ROW_WIDTH))
         recorded, world, status = advance_worlds(
             after.gaps_m, after.speeds_mps, after.time_s, after.pair_hit, after.command_mps2, command, until,
             vehicles.braking_capacity_mps2, vehicles.driving_capacity_mps2, vehicles.latency_s, vehicles.mass_t,
@@ -215,6 +182,11 @@ def _failure(worlds: Worlds, command: Floats, until: Floats, k: int, status: int
 
 def _impact_rows(rows: Floats) -> ImpactRows:
     return ImpactRows(
-        rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2].copy(), rows[:, 3].copy(),
-        rows[:, 4] > 0.0, rows[:, 5].copy(), rows[:, 6].copy(),
-    )  # fmt: skip
+        rows[:, ROW_WORLD].astype(np.int64),
+        rows[:, ROW_PAIR].astype(np.int64),
+        rows[:, ROW_TIME].copy(),
+        rows[:, ROW_CLOSING].copy(),
+        rows[:, ROW_FIRST] > 0.0,
+        rows[:, ROW_FRONT_CHANGE].copy(),
+        rows[:, ROW_REAR_CHANGE].copy(),
+    )

@@ -8,10 +8,20 @@ from __future__ import annotations
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.physics.advance import advance_near
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
-from ethbrake_marl.physics.segment import COMMAND, DONE, LIMIT, ONSET, TABLE_ROWS, move_apart
+from ethbrake_marl.physics.segment import (
+    COMMAND,
+    DONE,
+    FIRST_HARM,
+    HIT,
+    LIMIT,
+    ONSET,
+    ROW_WIDTH,
+    TABLE_ROWS,
+    TOTAL_HARM,
+    advance_table,
+)
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds
 
 
@@ -57,12 +67,8 @@ def forecast_worlds(
 ) -> int:  # fmt: skip
     """Fill ``first`` and ``total`` [n, K]; returns a world where a check failed, or -1."""
     n, vehicles = speeds.shape
-    pairs = vehicles - 1
     table = np.zeros((TABLE_ROWS, vehicles))
-    struck = np.zeros((1, pairs), np.bool_)
-    first_harm, total_harm = np.zeros((1, pairs)), np.zeros((1, pairs))
-    count = np.zeros((1, pairs), np.int64)
-    no_rows = np.empty((0, 7))
+    no_rows = np.empty((0, ROW_WIDTH))
     for k in range(n):
         duration = until_s - time[k]
         if not duration > 0.0:
@@ -74,20 +80,12 @@ def forecast_worlds(
                 table[MASS, i] = mass[k, i]
                 table[LIMIT, i] = limit[k, i]
                 table[ONSET, i] = latency[k, i] - time[k]
-            for p in range(pairs):
+            for p in range(vehicles - 1):
                 table[GAP, p] = gaps[k, p]
-            if move_apart(table, duration):
-                continue
-            for p in range(pairs):
-                struck[0, p] = hit[k, p]
-                first_harm[0, p] = 0.0
-                total_harm[0, p] = 0.0
-            _, status = advance_near(
-                table, 0, 0.0, duration, restitution[k], struck, first_harm, total_harm, count, no_rows, 0
-            )
-            if status != DONE:
+                table[HIT, p] = 1.0 if hit[k, p] else 0.0
+            if advance_table(table, restitution[k], duration, 0.0, k, no_rows, 0)[1] != DONE:
                 return k
-            for p in range(pairs):
-                first[k, c] += first_harm[0, p]
-                total[k, c] += total_harm[0, p]
+            for p in range(vehicles - 1):
+                first[k, c] += table[FIRST_HARM, p]
+                total[k, c] += table[TOTAL_HARM, p]
     return -1

@@ -11,7 +11,17 @@ import math
 
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.events import contact, drift, force_range, settle, solo_motion, speed_event
-from ethbrake_marl.physics.impact import CONTACT_SPEED, GAP, IMPACT_ROWS, SPEED, pool, resolve_impacts
+from ethbrake_marl.physics.impact import (
+    BEFORE,
+    CLOSING,
+    CONTACT_SPEED,
+    GAP,
+    IMPACT_ROWS,
+    SPEED,
+    STRUCK,
+    pool,
+    resolve_impacts,
+)
 from ethbrake_marl.physics.worlds import Floats
 
 PENETRATION_TOLERANCE_M = 1e-9  # a gap below minus this means that a contact was missed
@@ -31,9 +41,65 @@ WAY = IMPACT_ROWS + 9
 # per pair
 JOINED = IMPACT_ROWS + 10  # 1 where the pair moves as one body
 CONTACT_TIME = IMPACT_ROWS + 11
-TABLE_ROWS = IMPACT_ROWS + 12
+HIT = IMPACT_ROWS + 12  # 1 once the pair has had an impact
+FIRST_HARM = IMPACT_ROWS + 13  # harm of this segment
+TOTAL_HARM = IMPACT_ROWS + 14
+COUNT = IMPACT_ROWS + 15  # impacts of this segment
+TABLE_ROWS = IMPACT_ROWS + 16
 
 IMPACT, DONE, PENETRATED, STUCK = 0, 1, 2, 3
+# columns of the list of impacts
+ROW_WORLD, ROW_PAIR, ROW_TIME, ROW_CLOSING, ROW_FIRST, ROW_FRONT_CHANGE, ROW_REAR_CHANGE, ROW_WIDTH = range(8)
+
+
+@compiled
+def advance_table(
+    table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
+) -> tuple[int, int]:
+    """Take one world through a segment. Returns how many impacts are recorded by now, and a status (DONE if well).
+
+    Harm of the segment is in rows FIRST_HARM, TOTAL_HARM and COUNT. ``rows`` [capacity, ROW_WIDTH] receives the impacts
+    that fit, those beyond are only counted.
+    """
+    for p in range(table.shape[1] - 1):
+        table[FIRST_HARM, p] = 0.0
+        table[TOTAL_HARM, p] = 0.0
+        table[COUNT, p] = 0.0
+    if move_apart(table, duration):
+        return recorded, DONE
+    start_events(table)
+    now = 0.0
+    for _ in range(MOST_EVENTS):
+        status, now = to_next_impact(table, restitution, now, duration)
+        if status != IMPACT:
+            return recorded, status
+        recorded = record_impacts(table, start_s + now, world, rows, recorded)
+    return recorded, STUCK
+
+
+@compiled
+def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
+    """Add the last round of impacts to the harm, and to the list of impacts."""
+    for p in range(table.shape[1] - 1):
+        if table[STRUCK, p] == 0.0:
+            continue
+        closing = table[CLOSING, p]
+        harm = closing * closing
+        if recorded < rows.shape[0]:
+            rows[recorded, ROW_WORLD] = world
+            rows[recorded, ROW_PAIR] = p
+            rows[recorded, ROW_TIME] = time_s
+            rows[recorded, ROW_CLOSING] = closing
+            rows[recorded, ROW_FIRST] = 1.0 - table[HIT, p]
+            rows[recorded, ROW_FRONT_CHANGE] = table[SPEED, p] - table[BEFORE, p]
+            rows[recorded, ROW_REAR_CHANGE] = table[SPEED, p + 1] - table[BEFORE, p + 1]
+        recorded += 1
+        table[TOTAL_HARM, p] += harm
+        table[COUNT, p] += 1.0
+        if table[HIT, p] == 0.0:
+            table[HIT, p] = 1.0
+            table[FIRST_HARM, p] += harm
+    return recorded
 
 
 @compiled

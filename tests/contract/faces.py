@@ -153,7 +153,7 @@ class Sb3:
 
     def step(self, action: Array) -> Turn:
         observation, reward, done, infos = self.env.step(action)
-        truncated = np.array([info["TimeLimit.truncated"] for info in infos])
+        truncated = np.array([info.get("TimeLimit.truncated", False) for info in infos])
         turn = Turn(observation, reward, done & ~truncated, truncated)
         for row in np.flatnonzero(done).tolist():
             turn.final[row], turn.harm[row] = infos[row]["terminal_observation"], harms(infos[row])

@@ -119,7 +119,9 @@ def eighths(rng: np.random.Generator, low: int, high: int) -> Fraction:
 
 def worlds_of(lines: Sequence[Line]) -> Worlds:
     """The lines as one batch; their numbers must be doubles."""
-    rows = {name: [floats(getattr(line, name)) for line in lines] for name in ("gaps", "speeds", "latency", "mass", "limit")}
+    rows = {
+        name: [floats(getattr(line, name)) for line in lines] for name in ("gaps", "speeds", "latency", "mass", "limit")
+    }
     return make_worlds(
         rows["gaps"],
         rows["speeds"],

@@ -1,0 +1,123 @@
+"""One row per world: the layout in which worlds are kept while they run.
+
+The engine steps thousands of worlds, or one world thousands of times. Two arrays (state and parameters) are then far
+cheaper to hand to a kernel, to copy and to replace row by row than a dozen. ``Worlds`` stays what everybody else sees.
+
+Columns, for N vehicles and P = N - 1 pairs; the ``_at`` functions give the first column of each group:
+
+state   time, speeds N, commands in force N, commands in force before N, gaps P, hit flags P; and since the
+        episode began: first-impact harm P, total harm P, impacts P
+params  restitution, braking N, driving N, latency N, mass N, speed limit N
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.segment import ROW_WIDTH
+from ethbrake_marl.physics.worlds import Floats, Ints, Vehicles, Worlds
+
+TIME = 0
+RESTITUTION = 0
+
+
+@compiled
+def speed_at(vehicles: int) -> int:
+    """First column of the speeds (m/s)."""
+    return 1
+
+
+@compiled
+def command_at(vehicles: int) -> int:
+    """First column of the commands in force (m/s2)."""
+    return 1 + vehicles
+
+
+@compiled
+def previous_at(vehicles: int) -> int:
+    """First column of the commands in force before the last segment (m/s2)."""
+    return 1 + 2 * vehicles
+
+
+@compiled
+def gap_at(vehicles: int) -> int:
+    """First column of the gaps (m); those of the hit flags and of the harm follow, P columns each."""
+    return 1 + 3 * vehicles
+
+
+@compiled
+def harm_at(vehicles: int) -> int:
+    """First column of first-impact harm; total harm and impacts follow, P columns each."""
+    return 1 + 3 * vehicles + 2 * (vehicles - 1)
+
+
+@compiled
+def state_width(vehicles: int) -> int:
+    """Columns of the state."""
+    return 1 + 3 * vehicles + 5 * (vehicles - 1)
+
+
+@compiled
+def params_at(group: int, vehicles: int) -> int:
+    """First column of a group of parameters: 0 braking, 1 driving, 2 latency, 3 mass, 4 speed limit."""
+    return 1 + group * vehicles
+
+
+class Packed(NamedTuple):
+    """Worlds by rows."""
+
+    state: Floats  # [n, S]
+    params: Floats  # [n, 1 + 5 N]
+
+
+def pack(worlds: Worlds) -> Packed:
+    """Worlds by rows, with no harm so far."""
+    n, N = worlds.speeds_mps.shape
+    state = np.zeros((n, state_width(N)))
+    state[:, TIME] = worlds.time_s
+    state[:, speed_at(N) : command_at(N)] = worlds.speeds_mps
+    state[:, command_at(N) : previous_at(N)] = worlds.command_mps2
+    state[:, gap_at(N) : gap_at(N) + N - 1] = worlds.gaps_m
+    state[:, gap_at(N) + N - 1 : harm_at(N)] = worlds.pair_hit
+    v = worlds.vehicles
+    params = np.concatenate(
+        [
+            v.restitution[:, np.newaxis],
+            v.braking_capacity_mps2,
+            v.driving_capacity_mps2,
+            v.latency_s,
+            v.mass_t,
+            v.speed_limit_mps,
+        ],
+        axis=1,
+    )
+    return Packed(state, params)
+
+
+def unpack(packed: Packed) -> Worlds:
+    """The worlds of these rows, in their own memory."""
+    state, params = packed
+    N = (params.shape[1] - 1) // 5
+    braking, driving, latency, mass, limit = (params[:, params_at(g, N) : params_at(g + 1, N)].copy() for g in range(5))
+    gaps = gap_at(N)
+    return Worlds(
+        Vehicles(braking, driving, latency, mass, limit, params[:, RESTITUTION].copy()),
+        state[:, gaps : gaps + N - 1].copy(),
+        state[:, speed_at(N) : command_at(N)].copy(),
+        state[:, TIME].copy(),
+        state[:, gaps + N - 1 : harm_at(N)] == 1.0,
+        state[:, command_at(N) : previous_at(N)].copy(),
+    )
+
+
+def ledger_columns(state: Floats, vehicles: int) -> tuple[Floats, Floats, Ints]:
+    """First-impact harm, total harm and impacts of each pair since the episode began, [n, P] each."""
+    pairs, first = vehicles - 1, harm_at(vehicles)
+    groups = [state[:, first + g * pairs : first + (g + 1) * pairs].copy() for g in range(3)]
+    return groups[0], groups[1], groups[2].astype(np.int64)
+
+
+NO_ROWS = np.empty((0, ROW_WIDTH))  # for kernels that keep no list of impacts

@@ -1,0 +1,135 @@
+"""Where episodes come from: worlds at the alert, made ready for their first decision, and the stream of training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate
+from ethbrake_marl.physics.packed import Packed, harm_at, pack
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.stepping import CLOCK_WIDTH, LAST_STEP, START
+
+_SAMPLED_AT_ONCE = 1024  # training worlds are drawn in blocks of at least this many
+
+
+class Script(Protocol):
+    """What drives a vehicle that does not learn (see ``agents.protocol``).
+
+    With an attribute ``state_free = True`` it is asked only once per episode: its command never changes.
+    """
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """New episodes start in these rows of the batch; ``worlds`` holds those rows only, at the alert."""
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Wanted signed acceleration in every world of the batch, [n] m/s2."""
+
+
+class Start(NamedTuple):
+    """Worlds ready for their first decision."""
+
+    origin: Worlds  # at t = 0: these worlds are its ``first``, ``first + 1``, ...
+    first: int
+    packed: Packed  # at the first decision
+    clock: Floats  # [n, CLOCK_WIDTH]
+    wanted: Floats  # [n, N] commands of the state-free scripts, 0 for all others
+
+    @property
+    def alert(self) -> Worlds:
+        """These worlds at the alert, t = 0."""
+        return self.origin.take(np.arange(self.first, self.first + len(self.clock)))
+
+    def part(self, first: int, count: int) -> Start:
+        """``count`` worlds of these, from ``first`` on."""
+        rows = slice(first, first + count)
+        packed = Packed(self.packed.state[rows], self.packed.params[rows])
+        return Start(self.origin, self.first + first, packed, self.clock[rows], self.wanted[rows])
+
+
+class Stream:
+    """The training worlds of a seed, one after the other, each ready for its first decision.
+
+    Learners and scripts with a memory coast until then: whoever uses them moves their worlds anew (``moved``).
+    """
+
+    def __init__(self, scenario: Scenario, deciders: Sequence[int], scripts: Mapping[int, Script], seed: int) -> None:
+        self._scenario = scenario
+        self._deciders = list(deciders)
+        self._state_free = {i: script for i, script in scripts.items() if is_state_free(script)}
+        self.restart(seed)
+
+    def restart(self, seed: int) -> None:
+        """Go back to the first world of ``seed``."""
+        self.seed = seed
+        self.rejected = 0  # draws refused because of an impact before anybody could act
+        self._drawn = 0
+        self._pool: Start | None = None
+        self._next = 0
+
+    def take(self, count: int) -> Start:
+        """The next ``count`` worlds."""
+        if self._pool is None or self._next + count > len(self._pool.clock):
+            self._fill(count)
+        assert self._pool is not None
+        taken = self._pool.part(self._next, count)
+        self._next += count
+        return taken
+
+    def _fill(self, count: int) -> None:
+        left = None
+        if self._pool is not None:
+            left = self._pool.part(self._next, len(self._pool.clock) - self._next).alert
+        size = max(4 * count, _SAMPLED_AT_ONCE)
+        sample = self._scenario.sample(size, self.seed, first=self._drawn, channel="training")
+        self.rejected += sample.rejected
+        self._drawn += size
+        self._pool = self.prepare(sample.worlds if left is None else concatenate([left, sample.worlds]))
+        self._next = 0
+
+    def prepare(self, alert: Worlds) -> Start:
+        """Worlds at t = 0, made ready for their first decision. Raises ``InvalidInput`` if nobody may ever decide."""
+        clock = np.zeros((alert.n, CLOCK_WIDTH))
+        if self._deciders:
+            clock[:, START] = alert.vehicles.latency_s[:, self._deciders].min(axis=1)
+        step, horizon = self._scenario.time_step_s, self._scenario.horizon_s
+        if not (clock[:, START] < horizon).all():
+            late = float(clock[:, START].max())
+            raise InvalidInput(f"reset: nobody decides before the horizon ({late:g} s >= {horizon:g} s)")
+        clock[:, LAST_STEP] = np.ceil((horizon - clock[:, START]) / step - 1e-9)
+        wanted = np.zeros(alert.speeds_mps.shape)
+        for vehicle, script in self._state_free.items():
+            script.begin(alert, vehicle, np.arange(alert.n))
+            wanted[:, vehicle] = within_capacity(script.act(alert, vehicle), alert, vehicle)
+        return Start(alert, 0, moved(alert, wanted, clock[:, START]), clock, wanted)
+
+
+def is_state_free(script: Script) -> bool:
+    """Whether the script's command never changes during an episode."""
+    return bool(getattr(script, "state_free", False))
+
+
+def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
+    """Worlds at t = 0 moved to their first decision, harm on the way included."""
+    after, impacts = advance(alert, wanted, until_s=start_s)
+    packed = pack(after)
+    at, pairs = harm_at(alert.N), alert.N - 1
+    for group, harm in enumerate((impacts.first_impact_harm, impacts.total_harm, impacts.count)):
+        packed.state[:, at + group * pairs : at + (group + 1) * pairs] = harm
+    return packed
+
+
+def within_capacity(command_mps2: Floats, worlds: Worlds, vehicle: int) -> Floats:
+    """A script's command [n], refused with ``InvalidInput`` where it is not within the vehicle's capacities."""
+    low, high = -worlds.vehicles.braking_capacity_mps2[:, vehicle], worlds.vehicles.driving_capacity_mps2[:, vehicle]
+    good = (command_mps2 >= low) & (command_mps2 <= high)
+    if not good.all():
+        k = int(np.argmin(good))
+        raise InvalidInput(
+            f"script of vehicle_{vehicle + 1}, world {k}: command {command_mps2[k]:g} m/s2; must be in"
+            f" [{low[k]:g}, {high[k]:g}]"
+        )
+    return command_mps2
