@@ -51,7 +51,7 @@ class Worlds:
     """The state of ``n`` worlds at their times ``time_s``."""
 
     vehicles: Vehicles
-    gaps_m: Floats  # [n, P] bumper to bumper, >= 0
+    gaps_m: Floats  # [n, P] bumper to bumper, >= 0 (below only in the sampled map)
     speeds_mps: Floats  # [n, N] forward positive; negative only after a bounce-back
     time_s: Floats  # [n] since Vehicle 1 began to brake
     pair_hit: Bools  # [n, P] this pair has had an impact
