@@ -23,7 +23,7 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Flo
         raise InvalidInput(f"action of {names}: shape {given.shape}; {shape} is needed")
     good = (given >= -1.0) & (given <= 1.0)
     if not good.all():
-        raise InvalidInput(f"action of {names}: {given[~good].flat[0]:g}; must be in [-1, 1]")
+        raise InvalidInput(f"action of {names}: {float(given[~good].flat[0])!r}; must be in [-1, 1]")
     return given
 
 

@@ -11,24 +11,54 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
+from ethbrake_marl.command_options import (
+    ForceOption,
+    JsonOption,
+    NameOption,
+    OutputOption,
+    RecipeOption,
+    ScenarioOption,
+    StepsOption,
+    TrainingSeedOption,
+    VehicleOption,
+)
 from ethbrake_marl.doctor import diagnose
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.evaluation import SummaryRow, check_target, evaluate, rich_table, summarise, write_per_world_csv
 from ethbrake_marl.evaluation.output_files import write_output
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.lineup import EPISODES, LIST_SEED, choose_worlds, make_lineup
+from ethbrake_marl.lineup import (
+    EPISODES,
+    LIST_SEED,
+    PROGRESS_EVERY,
+    check_agents,
+    choose_worlds,
+    load_driven,
+    load_runnable,
+    make_lineup,
+)
+from ethbrake_marl.picture_commands import picture_app
 from ethbrake_marl.scenario import (
     list_scenarios,
     load_scenario,
     new_scenario_text,
     scenario_json_schema,
 )
-from ethbrake_marl.terminal import INTERRUPTED, interruptible, progress_bars, result_console, say, write_json
+from ethbrake_marl.search_commands import best_harm_command
+from ethbrake_marl.terminal import (
+    INTERRUPTED,
+    abandon_output,
+    interruptible,
+    progress_bars,
+    result_console,
+    say,
+    tolerate_narrow_streams,
+    write_json,
+)
 
 BAD_INPUT = 2
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
-PROGRESS_EVERY = 500  # worlds
 
 app = typer.Typer(
     add_completion=False,
@@ -43,42 +73,37 @@ scenario_app = typer.Typer(
     epilog="Example: ethbrake scenario show paper-random",
 )
 app.add_typer(scenario_app, name="scenario")
-
-ScenarioOption = Annotated[
-    str, typer.Option("--scenario", metavar="NAME|PATH", help="A shipped scenario, or a path to a YAML file.")
-]
-RecipeOption = Annotated[
-    str, typer.Option("--recipe", metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file.")
-]
-StepsOption = Annotated[int | None, typer.Option(help="Training steps (decisions).", show_default="the recipe's")]
-TrainingSeedOption = Annotated[
-    int | None, typer.Option("--seed", help="Seed of the training alone.", show_default="the recipe's")
-]
-NameOption = Annotated[
-    str | None, typer.Option(help="Folder of the run inside runs/.", show_default="SCENARIO-RECIPE-seedSEED")
-]
-OutputOption = Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the run, instead of --name.")]
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace what is already there.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout.")]
+app.add_typer(picture_app, name="picture")
+app.command("best-harm", epilog="Example: ethbrake best-harm --episodes 200 --budget 20000 --json")(best_harm_command)
 
 _KEPT = "if the training had begun, the run's folder keeps the last good policy"
 
 
 def main() -> None:
     """Entry point: run the command line and exit with its status."""
+    tolerate_narrow_streams()
     sys.exit(run_command(sys.argv[1:]))
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Exit status of a command line: 2 with one line on stderr for bad input or usage; other errors pass through."""
+    """Exit status of a command line: 2 with one line on stderr for bad input, bad usage or a file that fails.
+
+    Other errors, which are defects, pass through.
+    """
     try:
         status = app(list(arguments), prog_name="ethbrake", standalone_mode=False)
+        sys.stdout.flush()
     except TyperException as error:
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "ethbrake"
         return _refuse(f"{error.format_message().replace('Value error, ', '')} (see: {where} --help)")
     except EthBrakeError as error:
         return _refuse(str(error))
+    except OSError as error:
+        abandon_output()
+        return _refuse(f"{error.filename or 'output'!s:.200}: {error.strerror or error}")
+    except MemoryError as error:
+        return _refuse(f"not enough memory{f' ({error})' if str(error) else ''}; ask for fewer worlds at once")
     return status if isinstance(status, int) else 0
 
 
@@ -90,6 +115,7 @@ def run(
     episodes: Annotated[int, typer.Option(help="Worlds of the evaluation list.")] = EPISODES,
     list_seed: Annotated[int, typer.Option(help="Seed of the evaluation list.")] = LIST_SEED,
     recipe: RecipeOption = "ppo",
+    vehicle: VehicleOption = None,
     name: NameOption = None,
     output: OutputOption = None,
     force: ForceOption = False,
@@ -104,7 +130,7 @@ def run(
         # Here and in `train`: torch takes seconds to load, and no other command needs it.
         from ethbrake_marl.experiment import run_experiment, run_folder
 
-        chosen, plan = load_scenario(scenario), load_recipe(recipe)
+        chosen, plan = load_driven(scenario, vehicle), load_recipe(recipe)
         folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
         with progress_bars() as bars:
             result = run_experiment(
@@ -142,7 +168,7 @@ def train(
     with interruptible(_KEPT):
         from ethbrake_marl.experiment import run_folder, train_measured
 
-        chosen, plan = load_scenario(scenario), load_recipe(recipe)
+        chosen, plan = load_runnable(scenario), load_recipe(recipe)
         folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
         with progress_bars() as bars:
             result = train_measured(
@@ -172,9 +198,7 @@ def evaluate_command(
     initial_states: Annotated[
         Path | None, typer.Option(metavar="CSV", help="Your own worlds, one per row, instead of the list.")
     ] = None,
-    vehicle: Annotated[
-        str | None, typer.Option(help="Who is driven; other learners brake fully.", show_default="the learner")
-    ] = None,
+    vehicle: VehicleOption = None,
     per_world: Annotated[
         Path | None, typer.Option(metavar="CSV", help="Also write one row per world and agent to this file.")
     ] = None,
@@ -188,11 +212,10 @@ def evaluate_command(
     """
     if per_world is not None:
         check_target(per_world, force=force)
-    chosen = load_scenario(scenario)
-    if vehicle is not None:
-        chosen = chosen.with_learners([vehicle])
+    chosen = load_driven(scenario, vehicle)
     sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
     lineup = make_lineup(agents.split(","), chosen, count=count)
+    check_agents(lineup, sample.worlds, chosen)
     with interruptible("nothing was written"), progress_bars() as bars:
         evaluation = evaluate(
             sample,
@@ -231,7 +254,7 @@ def scenario_show(scenario: Annotated[str, typer.Argument(metavar="NAME|PATH")])
 @scenario_app.command("validate", epilog="Example: ethbrake scenario validate my-scenario.yaml")
 def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")]) -> None:
     """Check a scenario: one line, OK or what is wrong."""
-    scenario = load_scenario(path)
+    scenario = load_runnable(path)
     sample = scenario.sample(CHECKED_DRAWS, LIST_SEED)
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "none"
     counts = f"{CHECKED_DRAWS:,} worlds drawn, {sample.rejected:,} more refused for an early impact"

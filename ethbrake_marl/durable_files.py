@@ -11,10 +11,12 @@ from pathlib import Path
 
 from ethbrake_marl.errors import AlreadyExists
 
+_HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"  # short whatever the target is called: file names have a longest length
+
 
 def write_file(path: Path, data: bytes) -> None:
     """Write ``data`` to ``path``, replacing it in one step; a reader sees the old or the new content, whole."""
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED)
     try:
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)
@@ -27,6 +29,13 @@ def write_file(path: Path, data: bytes) -> None:
     _folder_to_disk(path.parent)
 
 
+def check_writable(folder: Path) -> None:
+    """Make a file in ``folder`` and remove it again; raises the ``OSError`` that a later write would meet."""
+    descriptor, name = tempfile.mkstemp(dir=folder, prefix=_HIDDEN, suffix=_UNFINISHED)
+    os.close(descriptor)
+    Path(name).unlink()
+
+
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """Give a temporary folder beside ``path`` that takes its name when the block ends well, and vanishes otherwise.
@@ -35,7 +44,7 @@ def new_folder(path: Path) -> Iterator[Path]:
     """
     _refuse_existing(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial"))
+    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED))
     try:
         yield partial
         partial.chmod(0o777 & ~_umask())

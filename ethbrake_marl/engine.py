@@ -6,6 +6,7 @@ when Vehicle 1 brakes; ``reset`` moves exactly to the first moment at which a le
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -31,6 +32,7 @@ from ethbrake_marl.physics.packed import (
 )
 from ethbrake_marl.physics.segment import DONE
 from ethbrake_marl.rewards import (
+    Reward,
     RewardParams,
     StepOutcome,
     further_terms,
@@ -40,7 +42,7 @@ from ethbrake_marl.rewards import (
     weighted_sum,
 )
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.starts import Script, Start, Stream, is_state_free, moved, within_capacity
+from ethbrake_marl.starts import Script, Start, Stream, check_alert, is_state_free, moved, within_capacity
 from ethbrake_marl.stepping import (
     BAD_ACTION,
     ENDED,
@@ -56,6 +58,8 @@ from ethbrake_marl.stepping import (
 
 OnBegin = Callable[[Worlds, Ints], None]  # the new worlds at the alert, and the rows where their episodes start
 Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
+
+_RUNNING = ("_state", "_params", "_clock", "_wanted", "_potential")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +105,7 @@ class Engine:
         *,
         learners: Sequence[int],
         scripts: Mapping[int, Script],
-        reward: str | RewardParams = "harm",
+        reward: Reward = "harm",
         observation: ObservationSpec | None = None,
         seed: int = 0,
         deciders: Sequence[int] | None = None,
@@ -140,11 +144,6 @@ class Engine:
         return self._stream.seed
 
     @property
-    def rejected(self) -> int:
-        """Draws of the stream refused so far because of an impact before anybody could act."""
-        return self._stream.rejected
-
-    @property
     def packed(self) -> Packed:
         """The running worlds themselves, as rows of ``physics.packed``: for kernels to read, not to be changed."""
         return Packed(self._state, self._params)
@@ -176,24 +175,41 @@ class Engine:
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
         """Start new episodes in all rows: the given worlds (at t = 0), or the next ones of the training stream.
 
-        With ``seed`` the stream starts again from its beginning.
+        With ``seed`` the stream starts again from its beginning. Whatever fails, the running episodes go on.
         """
-        if worlds is not None and (worlds.n, worlds.N) != (self.n, self.scenario.vehicles):
-            raise InvalidInput(
-                f"reset: {worlds.n} worlds of {worlds.N} vehicles given; {self.n} of {self.scenario.vehicles} needed"
-            )
+        if worlds is not None:
+            check_alert(worlds, self.n, self.scenario.vehicles)
+        stream = copy.copy(self._stream)
         if seed is not None:
-            self._stream.restart(seed)
-        start = self._stream.take(self.n) if worlds is None else self._stream.prepare(worlds)
+            stream.restart(seed)
+        start = stream.take(self.n) if worlds is None else stream.prepare(worlds)
+        before = self.__dict__.copy()
+        self._stream = stream
         self._state, self._params = start.packed.state.copy(), start.packed.params.copy()
         self._clock, self._wanted = start.clock.copy(), start.wanted.copy()
         self._potential = np.zeros(self._wanted.shape)
-        self._begin(np.arange(self.n), start)
+        try:
+            self._begin(np.arange(self.n), start)
+        except Exception:
+            self.__dict__.update(before)
+            raise
 
     def renew(self, rows: Ints) -> None:
-        """Start new episodes of the training stream in these rows (autoreset)."""
+        """Start new episodes of the training stream in these rows (autoreset). Whatever fails, nothing is changed."""
         if len(rows) == 0:
             return
+        if self.on_begin or self._remembering:
+            before = self.__dict__ | {"_stream": copy.copy(self._stream)}
+            before |= {name: getattr(self, name).copy() for name in _RUNNING}
+            try:
+                self._renew(rows)
+            except Exception:
+                self.__dict__.update(before)
+                raise
+        else:
+            self._renew(rows)
+
+    def _renew(self, rows: Ints) -> None:
         start = self._stream.take(len(rows))
         self._state[rows], self._params[rows] = start.packed
         self._clock[rows], self._wanted[rows] = start.clock, start.wanted
@@ -320,5 +336,6 @@ class Engine:
         self._state[rows] = pack(alert).state
         worlds = self.worlds
         for vehicle, script in self._remembering.items():
-            self._wanted[:, vehicle] = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
+            wanted = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
+            self._wanted[rows, vehicle] = wanted[rows]
         self._state[rows] = moved(alert, self._wanted[rows], start_s).state

@@ -30,9 +30,9 @@ class PhysicsError(EthBrakeError, ArithmeticError):
     """The advance could not finish a segment: a defect of the kernel, never of the input."""
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownName:
+def unknown_name(kind: str, name: object, known: Iterable[str]) -> UnknownName:
     """Build the error for an unknown ``name``, with a suggestion when one is close."""
     names = sorted(known)
-    close = get_close_matches(name, names, n=1)
+    close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names)}"
     return UnknownName(f"unknown {kind} {name!r}; {hint}")

@@ -23,14 +23,13 @@ from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.learning.run_directory import RunDirectory, RunStatus
 from ethbrake_marl.learning.train import TrainResult, train
 from ethbrake_marl.learning.versions import installed_versions
-from ethbrake_marl.lineup import EPISODES, LIST_SEED, make_lineup
+from ethbrake_marl.lineup import EPISODES, LIST_SEED, PROGRESS_EVERY, make_lineup
 from ethbrake_marl.results_folder import write_figures, write_page, write_results
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.shield import HybridAgent
 
 RUNS = Path("runs")
-PROGRESS_EVERY = 500  # worlds
 BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
 
 Ended = Literal["finished", "interrupted"]
@@ -77,8 +76,10 @@ def run_folder(
         if name is not None:
             raise InvalidInput(f"name {name!r} and output {str(output)!r}: give one of the two")
         return output
-    if name is not None and not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]*", name):
-        raise InvalidInput(f"run name {name!r}: must be letters, digits, . _ -, not beginning with . or -")
+    if name is not None and not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,127}", name):
+        raise InvalidInput(
+            f"run name {name!r:.60}: must be up to 128 letters, digits, . _ -, not beginning with . or -"
+        )
     return RUNS / (name or f"{scenario.name}-{recipe.name}-seed{recipe.seed if seed is None else seed}")
 
 

@@ -10,18 +10,26 @@ The first can be gamed (a light early touch makes the later, harder impact free)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.advance import Impacts
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
 
 HarmCount = Literal["first", "total"]
+COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
 
 _INJURY_SLOPE = 0.177  # per m/s of speed change
 _INJURY_OFFSET = {"front": -4.457, "rear": -4.888}  # side of the car that is hit
+
+
+def check_count(count: str) -> None:
+    """Refuse a name that is not a counting rule with ``InvalidInput``."""
+    if count not in COUNTS:
+        raise InvalidInput(f"count {count!r}: must be {' or '.join(repr(known) for known in COUNTS)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +51,8 @@ class Ledger:
         )
 
     def pair_harm(self, count: HarmCount) -> Floats:
-        """Harm of each pair under a counting rule, [n, P]."""
+        """Harm of each pair under a counting rule, [n, P]. Raises ``InvalidInput`` for an unknown one."""
+        check_count(count)
         return self.first_impact_harm if count == "first" else self.total_harm
 
     def vehicle_harm(self, count: HarmCount) -> Floats:

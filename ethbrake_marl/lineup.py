@@ -2,25 +2,87 @@
 
 from __future__ import annotations
 
+import copy
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.registry import agent_names, make_agent
+from ethbrake_marl.agents.registry import agent_names, make_agent, register_agent
+from ethbrake_marl.analysis.best_harm_shipped import make_best_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.bundle import load_policy
-from ethbrake_marl.scenario import Sample, Scenario, read_initial_states
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
 from ethbrake_marl.shield.episode import HybridAgent
 
 EPISODES = 10_000
+PROGRESS_EVERY = 500  # worlds between two signs of life
 LIST_SEED = 7  # of the worlds on which everything is measured; has nothing to do with the seed of a training
 
+LADDER = (  # from no decision at all up to the best that is known
+    "coast",
+    "copy_leader",
+    "full_brake",
+    "gentlest_front",
+    "e_v2x_bm:pairwise",
+    "e_v2x_bm",
+    "planner",
+    "best_harm",
+)
+
+register_agent("best_harm", make_best_harm)
+
 _OF_A_POLICY = ("ppo", "hybrid")
+_LADDER_SPEC = "ladder"
+
+
+def load_runnable(name_or_path: str) -> Scenario:
+    """Load a scenario as ``load_scenario`` does, and try its scripts, which the file's own check cannot know.
+
+    Raises ``InvalidInput`` naming the file, line, role and script that no agent of that name and argument can play.
+    """
+    scenario = load_scenario(name_or_path)
+    worlds = scenario.replace(early_impacts="keep").sample(1, LIST_SEED).worlds
+    for vehicle, script in scenario.scripts.items():
+        try:
+            _try_out(make_agent(script, horizon_s=scenario.horizon_s), worlds, vehicle)
+        except InvalidInput as error:
+            role = scenario.vehicle_names[vehicle]
+            where = _place_of_role(name_or_path, role)
+            raise InvalidInput(f"{where}: roles.{role} = {script}: {error}") from None
+    return scenario
+
+
+def load_driven(name_or_path: str, vehicle: str | None) -> Scenario:
+    """A runnable scenario with one learner, the vehicle to drive: ``vehicle``, by default the only learner.
+
+    Raises ``InvalidInput`` when there is no such vehicle, or nothing says which one it is.
+    """
+    scenario = load_runnable(name_or_path)
+    if vehicle is not None:
+        return scenario.with_learners([vehicle])
+    if len(scenario.learners) != 1:
+        learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "none"
+        raise InvalidInput(
+            f"scenario {scenario.name!r} has {len(scenario.learners)} learners ({learners}); say which vehicle is"
+            " driven, for instance --vehicle vehicle_2"
+        )
+    return scenario
+
+
+def check_agents(agents: Mapping[str, Agent], worlds: Worlds, scenario: Scenario) -> None:
+    """Try every agent before the first of them starts a long evaluation; raises what it would raise then.
+
+    Scripts that need no state are tried on all worlds, which takes no time; all others on the first.
+    """
+    (vehicle,) = scenario.learners
+    for agent in agents.values():
+        _try_out(agent, worlds if getattr(agent, "state_free", False) else worlds.take([0]), vehicle)
 
 
 def make_lineup(specs: Sequence[str], scenario: Scenario, *, count: HarmCount = "first") -> dict[str, Agent]:
@@ -28,9 +90,11 @@ def make_lineup(specs: Sequence[str], scenario: Scenario, *, count: HarmCount = 
 
     Every spec of ``make_agent``, and ``ppo@PATH`` (the policy of a run, or a bundle), ``hybrid@PATH`` (Algorithm 1:
     that policy or coupled E-V2X-BM, whichever harms less) and ``hybrid:pairwise@PATH`` (with the paper's closed form
-    instead). ``count`` is the harm that optimising and choosing agents minimise. Raises ``InvalidInput`` for a spec
-    given twice, ``UnknownName`` with a suggestion, and whatever loading a policy raises.
+    instead). ``ladder`` stands for every agent of ``LADDER`` that there is. ``count`` is the harm that optimising and
+    choosing agents minimise. Raises ``InvalidInput`` for a spec given twice, ``UnknownName`` with a suggestion, and
+    whatever loading a policy raises.
     """
+    specs = [each for spec in specs for each in (_ladder() if spec == _LADDER_SPEC else [spec])]
     for k, spec in enumerate(specs):
         if spec in specs[:k]:
             raise InvalidInput(f"agent {spec!r} is given twice; each agent drives every world once")
@@ -55,12 +119,31 @@ def choose_worlds(
     return Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0), None
 
 
+def _try_out(agent: Agent, worlds: Worlds, vehicle: int) -> None:
+    """Let a copy of the agent begin and act once."""
+    driver = copy.deepcopy(agent)
+    driver.begin(worlds, vehicle, np.arange(worlds.n))
+    driver.act(worlds, vehicle)
+
+
+def _place_of_role(name_or_path: str, role: str) -> str:
+    """File and line of a role, or the name of a shipped scenario."""
+    if not Path(name_or_path).is_file():
+        return f"scenario {name_or_path!r}"
+    return f"{name_or_path}, line {read_yaml(name_or_path).line_of(('roles', role))}"
+
+
+def _ladder() -> list[str]:
+    """The agents of the ladder that are registered."""
+    return [spec for spec in LADDER if spec.partition(":")[0] in agent_names()]
+
+
 def _agent(spec: str, scenario: Scenario, count: HarmCount) -> Agent:
     name = re.split("[:@]", spec, maxsplit=1)[0]
     if name in _OF_A_POLICY:
         return _agent_of_a_policy(spec, scenario, count)
     if name not in agent_names():
-        raise unknown_name("agent", name, [*agent_names(), *_OF_A_POLICY])
+        raise unknown_name("agent", name, [*agent_names(), *_OF_A_POLICY, _LADDER_SPEC])
     return make_agent(spec, count=count, horizon_s=scenario.horizon_s)
 
 

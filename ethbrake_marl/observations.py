@@ -74,9 +74,10 @@ class ObservationSpec:
     rear: int = 1
 
     def __post_init__(self) -> None:
-        """Refuse negative numbers of neighbours."""
-        if not (0 <= self.front <= 64 and 0 <= self.rear <= 64):
-            raise InvalidInput(f"observation: front={self.front}, rear={self.rear}; each must be in 0..64")
+        """Refuse what is not a number of neighbours."""
+        for side, count in (("front", self.front), ("rear", self.rear)):
+            if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= 64:
+                raise InvalidInput(f"observation: {side} = {count!r}; must be a whole number in 0..64")
 
     @property
     def sides(self) -> tuple[tuple[str, int], ...]:
@@ -196,7 +197,8 @@ def _stopping_distance(speed: float, latency_left: float, capacity: float) -> fl
 def _fitting_deceleration(speed: float, latency_left: float, room: float) -> float:
     """Constant deceleration that uses up exactly ``room`` after the own latency: ``v^2 / (2 (room - v tau))``.
 
-    Where there is no room it reads as the upper clipping bound; at rest it is 0.
+    Room below 1 mm counts as 1 mm. Without room it therefore reads as the upper clipping bound (20 m/s2) from 0.2 m/s
+    on, and lower for a slower vehicle; at rest it is 0.
     """
     speed = max(speed, 0.0)
     left = max(room - speed * latency_left, 1e-3)

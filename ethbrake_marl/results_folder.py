@@ -17,9 +17,9 @@ from ethbrake_marl.evaluation.figure_style import png_bytes
 from ethbrake_marl.evaluation.figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.evaluation.output_files import write_output
 from ethbrake_marl.evaluation.report import Report, ReportFigure, write_report
+from ethbrake_marl.evaluation.table import BASELINE
 from ethbrake_marl.evaluation.trajectories import trajectories
 
-BASELINE = "full_brake"
 REFERENCES = ("full_brake", "e_v2x_bm")  # level lines beside the learning curve
 SHOWN = ("full_brake", "e_v2x_bm", "ppo")  # columns of the figure of one episode
 

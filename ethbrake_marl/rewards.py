@@ -19,13 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.special import expit
 
-from ethbrake_marl.errors import unknown_name
+from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Worlds, forecast
 
@@ -62,13 +62,38 @@ REWARDS = {
 _BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
 
 
-def reward_params(reward: str | RewardParams) -> RewardParams:
-    """Look up a named reward, or pass one through."""
+Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
+
+
+def reward_params(reward: Reward) -> RewardParams:
+    """Look up a named reward, build one from a mapping of settings, or pass one through.
+
+    Raises ``UnknownName`` for an unknown name or setting and ``InvalidInput`` for a value out of its range.
+    """
     if isinstance(reward, RewardParams):
         return reward
+    if isinstance(reward, Mapping):
+        return _from_settings(reward)
+    if not isinstance(reward, str):
+        raise InvalidInput(
+            f"reward = {reward!r}: must be a name ({', '.join(REWARDS)}), a mapping such as {{'harm': 1.0}}, or"
+            " RewardParams"
+        )
     if reward not in REWARDS:
         raise unknown_name("reward", reward, REWARDS)
     return REWARDS[reward]
+
+
+def _from_settings(settings: Mapping[str, Any]) -> RewardParams:
+    for name in settings:
+        if name not in RewardParams.model_fields:
+            raise unknown_name("setting of a reward", name, RewardParams.model_fields)
+    try:
+        return RewardParams(**settings)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        right = first["msg"].replace("Input should be", "must be").replace("a valid number", "a number")
+        raise InvalidInput(f"reward: {first['loc'][0]} = {first['input']!r}: {right}") from None
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,16 +17,21 @@ _SAMPLED_AT_ONCE = 1024  # training worlds are drawn in blocks of at least this 
 
 
 class Script(Protocol):
-    """What drives a vehicle that does not learn (see ``agents.protocol``).
+    """Drives one vehicle in every world of a batch of ``n``; one object per vehicle. An ``Agent`` is one with a name.
 
-    With an attribute ``state_free = True`` it is asked only once per episode: its command never changes.
+    With an attribute ``state_free = True`` it is asked only once per episode, right after ``begin``: its command is
+    fixed at the alert and never changes.
     """
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """New episodes start in these rows of the batch; ``worlds`` holds those rows only, at the alert."""
+        """New episodes start in these rows of the batch.
+
+        ``worlds`` holds those rows only (``len(rows)`` worlds), in their state at the alert. The first call of a
+        batch has ``rows = 0..n-1``; later ones, after an automatic reset, any subset.
+        """
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Wanted signed acceleration in every world of the batch, [n] m/s2."""
+        """Wanted signed acceleration of ``vehicle`` (index from 0) in every world of the batch, [n] m/s2."""
 
 
 class Start(NamedTuple):
@@ -65,7 +70,6 @@ class Stream:
     def restart(self, seed: int) -> None:
         """Go back to the first world of ``seed``."""
         self.seed = seed
-        self.rejected = 0  # draws refused because of an impact before anybody could act
         self._drawn = 0
         self._pool: Start | None = None
         self._next = 0
@@ -85,9 +89,8 @@ class Stream:
             left = self._pool.part(self._next, len(self._pool.clock) - self._next).alert
         size = max(4 * count, _SAMPLED_AT_ONCE)
         sample = self._scenario.sample(size, self.seed, first=self._drawn, channel="training")
-        self.rejected += sample.rejected
-        self._drawn += size
         self._pool = self.prepare(sample.worlds if left is None else concatenate([left, sample.worlds]))
+        self._drawn += size
         self._next = 0
 
     def prepare(self, alert: Worlds) -> Start:
@@ -105,6 +108,17 @@ class Stream:
             script.begin(alert, vehicle, np.arange(alert.n))
             wanted[:, vehicle] = within_capacity(script.act(alert, vehicle), alert, vehicle)
         return Start(alert, 0, moved(alert, wanted, clock[:, START]), clock, wanted)
+
+
+def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
+    """Refuse worlds, with ``InvalidInput``, that are not ``n`` lines of ``vehicles`` at the alert: t = 0, no impact."""
+    if (worlds.n, worlds.N) != (n, vehicles):
+        raise InvalidInput(f"reset: {worlds.n} worlds of {worlds.N} vehicles given; {n} of {vehicles} needed")
+    at_alert = (worlds.time_s == 0.0) & ~worlds.pair_hit.any(axis=1)
+    if not at_alert.all():
+        k = int(np.argmin(at_alert))
+        what = "after an impact" if worlds.time_s[k] == 0.0 else f"at {worlds.time_s[k]:g} s"
+        raise InvalidInput(f"reset: world {k} is {what}; episodes start at the alert, t = 0, without any impact")
 
 
 def is_state_free(script: Script) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -23,6 +25,20 @@ def say(text: str) -> None:
 def write_json(content: Any) -> None:
     """JSON on stdout."""
     typer.echo(json.dumps(content, indent=2, allow_nan=False))
+
+
+def tolerate_narrow_streams() -> None:
+    """Show ``?`` for what stdout's encoding does not have (m², box lines in Latin-1) instead of failing at the end."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+
+
+def abandon_output() -> None:
+    """Drop what stdout still holds and cannot hand on (a full disk), or Python fails a second time when it ends."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextmanager

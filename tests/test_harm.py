@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import empty_ledger, injury_probability, split
 from ethbrake_marl.physics import advance, make_worlds
 
@@ -40,3 +41,11 @@ def test_ledger__first_counts_one_impact_per_pair_and_total_all():
 def test_injury_probability__matches_its_formula():
     assert injury_probability(np.array([0.0]), "front")[0] == pytest.approx(1 / (1 + np.exp(4.457)))
     assert injury_probability(np.array([-10.0]), "rear")[0] == pytest.approx(1 / (1 + np.exp(4.888 - 1.77)))
+
+
+def test_ledger__refuses_an_unknown_count():
+    ledger = empty_ledger(make_worlds([5.0], [20.0, 20.0], braking_capacity_mps2=6, driving_capacity_mps2=6,
+                                      latency_s=0, mass_t=1, restitution=0))  # fmt: skip
+    for harm in (ledger.pair_harm, ledger.vehicle_harm, ledger.world_harm):
+        with pytest.raises(InvalidInput, match="count 'frist': must be 'first' or 'total'"):
+            harm("frist")

@@ -33,7 +33,8 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("lineup", "results_folder"),
     ("experiment",),
     ("__init__",),
-    ("doctor", "terminal"),
+    ("doctor", "terminal", "command_options"),
+    ("picture_commands", "search_commands"),
     ("cli", "__main__"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}

@@ -95,6 +95,22 @@ def test_spec__names_are_unique_and_size_fits():
     assert len(set(names)) == len(names) == SPEC.size
 
 
+@pytest.mark.parametrize(("speed", "reads"), [(0.0, 0.0), (0.1, 0.5), (0.2, 2.0), (20.0, 2.0)])
+def test_observe__without_room_the_fitting_deceleration_is_that_of_one_millimetre(speed, reads):
+    # v^2 / (2 * 0.001 m) = 500 v^2 m/s2, scale 10 and clipped at 2: 0.1 m/s reads 5 / 10.
+    touching = make_worlds([0.0], [0.0, speed], braking_capacity_mps2=6, driving_capacity_mps2=1, latency_s=0, mass_t=1,
+                           restitution=0)  # fmt: skip
+    names = [f.name for f in ObservationSpec(1, 0).features]
+    seen = dict(zip(names, observe(touching, 1, ObservationSpec(1, 0))[0].tolist(), strict=True))
+    assert seen["front_1.fitting_deceleration"] == pytest.approx(reads, rel=1e-6)
+
+
+@pytest.mark.parametrize("front", [1.5, True, "a", 65, None])
+def test_spec__refuses_what_is_not_a_number_of_neighbours(front):
+    with pytest.raises(InvalidInput, match=r"front = .*must be a whole number"):
+        ObservationSpec(front, 0)
+
+
 @pytest.mark.parametrize("call", [lambda: ObservationSpec(front=-1), lambda: observe(worlds(), 4, SPEC)])
 def test_bad_input__is_refused(call):
     with pytest.raises(InvalidInput):

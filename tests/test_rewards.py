@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
-from ethbrake_marl.errors import UnknownName
+from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics import advance, forecast, make_worlds
 from ethbrake_marl.rewards import RewardParams, StepOutcome, reward_params, reward_terms, weighted_sum
 from ethbrake_marl.scenario import load_scenario
@@ -113,3 +113,23 @@ def test_bad_input__is_refused():
     for bad in ({"harm": -1.0}, {"harm": math.nan}, {"ham": 1.0}, {"harm_count": "all"}, {"shaping_discount": 1.5}):
         with pytest.raises(ValidationError):
             RewardParams(**bad)
+
+
+def test_reward__may_be_given_as_settings():
+    assert reward_params({"harm": 2, "jerk": 0.5}) == RewardParams(harm=2.0, jerk=0.5)
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        (5, "reward = 5: must be a name"),
+        (None, "reward = None: must be a name"),
+        ({"hram": 1.0}, "unknown setting of a reward 'hram'; did you mean 'harm'"),
+        ({"jerk": -1.0}, "reward: jerk = -1.0: must be greater than or equal to 0"),
+        ({"jerk": "a"}, "reward: jerk = 'a': must be a number"),
+    ],
+)
+def test_reward__that_cannot_be_one_is_refused_in_one_line(reward, message):
+    with pytest.raises(InvalidInput, match=message) as caught:
+        reward_params(reward)
+    assert "\n" not in str(caught.value)

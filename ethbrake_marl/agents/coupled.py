@@ -7,13 +7,13 @@ three baselines that may bound a shield. docs/baselines.md says how close to the
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.agents.pairwise import optimise_pairwise, pairwise_breakpoints
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.harm import HarmCount, check_count
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance
 
 GRID = 161  # first look: evenly spaced decelerations from 0 to the capacity
@@ -69,10 +69,9 @@ def optimise_coupled(
 
     Raises ``InvalidInput`` for an unknown ``vehicle`` or ``count`` or others beyond their capacities.
     """
-    if count not in ("first", "total"):
-        raise InvalidInput(f"count {count!r}: must be 'first' or 'total'")
+    check_count(count)
     search = _Search(worlds, vehicle, count, horizon_s, others_mps2)
-    best = optimise_pairwise(worlds, vehicle).deceleration_mps2
+    best = optimise_pairwise(search.paired, vehicle).deceleration_mps2
     rows = np.arange(worlds.n)
     first, total = search.simulate(rows, best)
     hit = np.flatnonzero(total > 0.0)
@@ -95,6 +94,7 @@ class _Search:
         self._count = count
         self._horizon_s = horizon_s
         self._command = -capacity if others_mps2 is None else np.array(others_mps2, dtype=np.float64)
+        self.paired = _braking_as_told(worlds, vehicle, self._command)
 
     def simulate(self, rows: Ints, deceleration: Floats) -> tuple[Floats, Floats]:
         """First-impact and total harm [k] of world ``rows[k]`` under ``deceleration[k]``."""
@@ -119,7 +119,7 @@ class _Search:
         worlds = self._worlds.take(rows)
         capacity = worlds.vehicles.braking_capacity_mps2[:, self._vehicle]
         grid = self.evaluate(rows, capacity[:, None] * np.linspace(0.0, 1.0, GRID))
-        looked = grid.join(self.evaluate(rows, pairwise_breakpoints(worlds, self._vehicle)))
+        looked = grid.join(self.evaluate(rows, pairwise_breakpoints(self.paired.take(rows), self._vehicle)))
         looked = looked.join(self.look_inside(rows, grid, looked.harm.min(axis=1)))
         best = self.step_back(rows, choose(looked.join(self.narrow(rows, looked))), capacity)
         first, total = self.simulate(rows, best)
@@ -174,6 +174,16 @@ class _Search:
         k[worst[m, 1] - worst[m, k] < _JUMP] = 1
         steady: Floats = around[m, k + 1]
         return steady
+
+
+def _braking_as_told(worlds: Worlds, vehicle: int, command: Floats) -> Worlds:
+    """The worlds for the closed form, which lets the others brake with all their capacity: it is what they are told.
+
+    Who is told to coast or to drive keeps the capacity: the closed form cannot say what that one does.
+    """
+    capacity = np.where(command < 0.0, -command, worlds.vehicles.braking_capacity_mps2)
+    capacity[:, vehicle] = worlds.vehicles.braking_capacity_mps2[:, vehicle]
+    return replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=capacity))
 
 
 def cell_bounds(harm: Floats) -> Floats:

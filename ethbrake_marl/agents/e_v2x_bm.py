@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -10,26 +12,31 @@ from ethbrake_marl.agents.coupled import optimise_coupled
 from ethbrake_marl.agents.pairwise import optimise_pairwise
 from ethbrake_marl.agents.protocol import place, recall
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.harm import HarmCount, check_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.starts import Script, is_state_free
 
 Mode = Literal["coupled", "pairwise"]
 
 
 class EV2XBM:
-    """The constant deceleration of least harm, all other vehicles braking at full capacity.
+    """The constant deceleration of least harm.
 
-    ``coupled`` minimises the harm realised in the engine's physics until ``horizon_s`` under the given ``count``;
-    ``pairwise`` is the paper's closed form, whose prediction does not hold once velocities are exchanged.
-    ``predicted_harm`` [n] is what each of them expects (m2/s2). Raises ``InvalidInput`` for an unknown mode.
+    ``coupled`` minimises the harm realised in the engine's physics until ``horizon_s`` under the given ``count``, the
+    ``others`` following their scripts, and all vehicles that are not in there (learners) braking fully. ``pairwise``
+    is the paper's closed form: everybody else brakes fully, and no velocities are exchanged. ``predicted_harm`` [n] is
+    what each of them expects (m2/s2). Raises ``InvalidInput`` for an unknown mode or count, and, when an episode
+    begins, in ``coupled`` mode for another vehicle's script whose command is not fixed at the alert.
     """
 
     def __init__(self, mode: Mode = "coupled", *, count: HarmCount = "first", horizon_s: float = 8.0) -> None:
         if mode not in ("coupled", "pairwise"):
             raise InvalidInput(f"e_v2x_bm mode {mode!r}: must be 'coupled' or 'pairwise'")
+        check_count(count)
         self.name = "e_v2x_bm" if mode == "coupled" else "e_v2x_bm:pairwise"
         self.predicted_harm: Floats = np.empty(0)
         self.deceleration_mps2: Floats = np.empty(0)  # a* [n]
+        self.others: Mapping[int, Script] = {}
         self._mode = mode
         self._count = count
         self._horizon_s = horizon_s
@@ -40,7 +47,10 @@ class EV2XBM:
             closed = optimise_pairwise(worlds, vehicle)
             best, harm = closed.deceleration_mps2, closed.harm
         else:
-            coupled = optimise_coupled(worlds, vehicle, count=self._count, horizon_s=self._horizon_s)
+            others = self._others_mps2(worlds, vehicle)
+            coupled = optimise_coupled(
+                worlds, vehicle, count=self._count, horizon_s=self._horizon_s, others_mps2=others
+            )
             best, harm = coupled.deceleration_mps2, coupled.harm
         self.deceleration_mps2 = place(self.deceleration_mps2, rows, best)
         self.predicted_harm = place(self.predicted_harm, rows, harm)
@@ -48,3 +58,25 @@ class EV2XBM:
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """``-a*``, [n] m/s2."""
         return -recall(self.deceleration_mps2, worlds.n, self.name)
+
+    def decides_before(self, vehicle: int) -> bool:
+        """Whether the choice does not wait for that of ``vehicle``."""
+        return self._mode == "pairwise" or vehicle not in self.others
+
+    def _others_mps2(self, worlds: Worlds, vehicle: int) -> Floats:
+        """What every vehicle will do, [n, N] m/s2; only the columns of the others are meant."""
+        command = -worlds.vehicles.braking_capacity_mps2
+        for i, script in self.others.items():
+            if i == vehicle:
+                continue
+            if not (is_state_free(script) or (isinstance(script, EV2XBM) and script.decides_before(vehicle))):
+                name = getattr(script, "name", type(script).__name__)
+                raise InvalidInput(
+                    f"agent {self.name!r}: vehicle_{i + 1} is driven by {name!r}, whose command is not fixed at the"
+                    f" alert before vehicle_{vehicle + 1} chooses; take e_v2x_bm:pairwise, which needs nobody's"
+                    " command, for one of the two"
+                )
+            asked = copy.deepcopy(script)  # what it remembers of running episodes is not disturbed
+            asked.begin(worlds, i, np.arange(worlds.n))
+            command[:, i] = asked.act(worlds, i)
+        return command

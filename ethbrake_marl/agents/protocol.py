@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.starts import Script
 
 
 @runtime_checkable
-class Agent(Protocol):
-    """Drives one vehicle in every world of a batch of ``n``; one object per vehicle."""
+class Agent(Script, Protocol):
+    """A ``Script`` with a name: ``begin`` and ``act`` for one vehicle in every world of a batch of ``n``."""
 
     name: str
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """New episodes start in these rows of the batch.
-
-        ``worlds`` holds those rows only (``len(rows)`` worlds), in their state at the alert. The first call of a
-        batch has ``rows = 0..n-1``; later ones, after an automatic reset, any subset.
-        """
-
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Wanted signed acceleration of ``vehicle`` (index from 0) in every world of the batch, [n] m/s2."""
 
 
 @runtime_checkable
@@ -32,6 +24,13 @@ class PredictingAgent(Protocol):
     """An agent that also states, when an episode begins, which harm it expects."""
 
     predicted_harm: Floats  # [n] m2/s2, filled by ``begin``
+
+
+@runtime_checkable
+class LookingAhead(Protocol):
+    """An agent whose choice depends on what the other vehicles do; whoever knows their scripts sets them."""
+
+    others: Mapping[int, Script]  # by vehicle index; vehicles without an entry brake fully
 
 
 def place(stored: Floats, rows: Ints, values: Floats) -> Floats:

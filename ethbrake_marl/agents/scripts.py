@@ -46,6 +46,7 @@ class CopyLeader:
     """
 
     name = "copy_leader"
+    state_free = True
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Nothing to remember."""
@@ -66,6 +67,7 @@ class GentlestFront:
     """
 
     name = "gentlest_front"
+    state_free = True  # once the episode has begun
 
     def __init__(self) -> None:
         self._deceleration_mps2: Floats = np.empty(0)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.actions import checked_action
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.driving import scripted
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.rewards import RewardParams
+from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario, load_scenario
 
 
@@ -23,7 +23,7 @@ def make_engine(
     n: int,
     *,
     learners: Sequence[str | int] | None = None,
-    reward: str | RewardParams = "harm",
+    reward: Reward = "harm",
     observation: ObservationSpec | None = None,
     seed: int = 0,
 ) -> Engine:
@@ -35,13 +35,19 @@ def make_engine(
     if isinstance(n, bool) or not isinstance(n, int | np.integer) or not n >= 1:
         raise InvalidInput(f"number of worlds = {n!r}: must be a whole number, at least 1")
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    if observation is not None and not isinstance(observation, ObservationSpec):
+        raise InvalidInput(
+            f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1)"
+        )
+    if learners is not None and not isinstance(learners, Iterable):
+        raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
     if learners is not None:
         loaded = loaded.with_learners(learners)
     return Engine(
         loaded,
         int(n),
         learners=loaded.learners,
-        scripts={i: make_agent(script, horizon_s=loaded.horizon_s) for i, script in loaded.scripts.items()},
+        scripts=scripted(loaded),
         reward=reward,
         observation=observation,
         seed=seed,

@@ -18,7 +18,7 @@ from ethbrake_marl.envs.spaces import action_box, feature_box
 from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.observations import Observations, ObservationSpec
-from ethbrake_marl.rewards import RewardParams
+from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario
 
 Infos = dict[str, dict[str, Any]]
@@ -41,7 +41,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         scenario: str | Path | Scenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str | int] | None = None,
-        reward: str | RewardParams = "harm",
+        reward: Reward = "harm",
         observation: ObservationSpec | None = None,
     ) -> None:
         check_render_mode(render_mode)
@@ -109,6 +109,10 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
             return {index[agent]: action for agent, action in actions.items()}
         except KeyError as unknown:
             raise unknown_name("agent", unknown.args[0], self.possible_agents) from None
+        except AttributeError:
+            raise InvalidInput(
+                f"step: actions = {actions!r}: must be a mapping such as {{'vehicle_2': [-1.0]}}"
+            ) from None
 
     def _observations(self) -> dict[str, Observations]:
         every = self.engine.observe_all(self._vehicles)[0]

@@ -35,6 +35,10 @@ def restart(engine: Engine, seed: int | None, options: Mapping[str, Any] | None)
     Raises ``InvalidInput``, with nothing changed, for a seed that is not a whole number >= 0, or a bad initial state.
     """
     check_seed(seed)
+    if not (options is None or isinstance(options, Mapping)):
+        raise InvalidInput(
+            f"reset: options = {options!r}: must be None or a mapping, for instance {{'{INITIAL_STATE}': ...}}"
+        )
     warn_of_unknown(options or ())
     worlds = None
     if options and INITIAL_STATE in options:

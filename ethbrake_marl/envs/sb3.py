@@ -20,7 +20,7 @@ from ethbrake_marl.envs.spaces import action_box, feature_box
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations, ObservationSpec
 from ethbrake_marl.physics import Bools, Ints, Worlds, concatenate
-from ethbrake_marl.rewards import RewardParams
+from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario, initial_state_worlds
 
 Rewards = NDArray[np.float32]
@@ -31,7 +31,7 @@ def make_sb3_vec_env(
     n_envs: int,
     seed: int | None = 0,
     learners: Sequence[str | int] | None = None,
-    reward: str | RewardParams = "harm",
+    reward: Reward = "harm",
     observation: ObservationSpec | None = None,
 ) -> EthBrakeVecEnv:
     """``n_envs`` worlds for Stable-Baselines3; arguments as ``parallel_env``. ``seed=None``: fresh entropy."""
@@ -75,10 +75,16 @@ class EthBrakeVecEnv(VecEnv):
         return [self._next_seed] * self.num_envs
 
     def reset(self) -> Observations:
-        """Start an episode in every world, with the seed and options set before (``seed``, ``set_options``)."""
-        restart_from(self.engine, self._next_seed, self._given_worlds())
+        """Start an episode in every world, with the seed and options set before (``seed``, ``set_options``).
+
+        Options hold for one reset; unusable ones are an ``InvalidInput`` of that reset, and the next one is without.
+        """
+        try:
+            worlds = self._given_worlds()
+        finally:
+            self._reset_options()
+        restart_from(self.engine, self._next_seed, worlds)
         self._next_seed = None
-        self._reset_options()
         self._return[:], self._steps[:] = 0.0, 0
         self._started = True
         self._begun = report(self.engine).values

@@ -15,7 +15,7 @@ from ethbrake_marl.envs.restart import check_seed, restart
 from ethbrake_marl.envs.spaces import action_box, feature_box
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations, ObservationSpec
-from ethbrake_marl.rewards import RewardParams
+from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario
 
 
@@ -37,7 +37,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         scenario: str | Path | Scenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str | int] | None = None,
-        reward: str | RewardParams = "harm",
+        reward: Reward = "harm",
         observation: ObservationSpec | None = None,
     ) -> None:
         check_render_mode(render_mode)

@@ -19,7 +19,7 @@ from ethbrake_marl.envs.spaces import action_box, feature_box
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations, ObservationSpec
 from ethbrake_marl.physics import Bools, Floats
-from ethbrake_marl.rewards import RewardParams
+from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario
 
 _MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
@@ -41,7 +41,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         scenario: str | Path | Scenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str | int] | None = None,
-        reward: str | RewardParams = "harm",
+        reward: Reward = "harm",
         observation: ObservationSpec | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
     ) -> None:
@@ -76,7 +76,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         if not self._started:
             raise InvalidInput("step: no episode is running; call reset first")
         engine, before = self.engine, self.engine.ended
-        step = engine.step(actions)
+        step = engine.step(self._without_ignored(actions, before))
         renewed = step.ended if self.autoreset_mode is AutoresetMode.SAME_STEP else before
         infos: dict[str, Any] = {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and renewed.any():
@@ -86,6 +86,15 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         infos |= batch_info(report(engine, step), self.learner, every, ~renewed)
         reward = step.reward[:, self.learner].copy()
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
+
+    def _without_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
+        """The actions with those that the autoreset mode ignores replaced: their worlds had ended ``before``."""
+        ignoring = self.autoreset_mode is AutoresetMode.NEXT_STEP and before.any()
+        if not ignoring or np.shape(actions)[:1] != (self.num_envs,):
+            return actions
+        heeded = np.array(actions)
+        heeded[before] = 0.0
+        return heeded
 
     def _final_infos(self, step: Step) -> dict[str, Any]:
         """The last observation and infos of the episodes that ended with this step."""

@@ -45,7 +45,7 @@ class EpisodeRecord:
 
 
 def record_episode(
-    world: Worlds, agent: Agent, *, scenario: Scenario, vehicle: int | None = None, sample_s: float = SAMPLE_S
+    world: Worlds, agent: Agent, *, scenario: Scenario, vehicle: int | str | None = None, sample_s: float = SAMPLE_S
 ) -> EpisodeRecord:
     """Record ``agent`` driving ``vehicle`` through one world (n = 1, at t = 0), exactly as ``evaluate`` runs it.
 
@@ -85,7 +85,7 @@ def _samples(segments: list[Segment], sample_s: float) -> Iterator[tuple[Floats,
         start = float(before.time_s[0])
         count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
         times = np.linspace(start, end, count + 1)
-        distance = float(before.vehicles.speed_limit_mps[0, 0]) * (end - start) + 1.0
+        distance = _farthest(before, end - start) + 1.0
         copies = _with_post(before, distance).take(np.zeros(count + 1, np.int64))
         moved, _ = advance(copies, _ahead(-1.0, command), until_s=times)
         position, gaps, speeds = front + (distance - moved.gaps_m[:, 0]), moved.gaps_m[:, 1:], moved.speeds_mps[:, 1:]
@@ -94,6 +94,17 @@ def _samples(segments: list[Segment], sample_s: float) -> Iterator[tuple[Floats,
         columns = (times, gaps, speeds, _positions(position, gaps), in_force)
         yield tuple(column[rows] for column in columns)
         front = float(position[-1])
+
+
+def _farthest(world: Worlds, duration_s: float) -> float:
+    """More than Vehicle 1 can travel, m: ``T sqrt(2 E / m_1)``, had it all the energy E that the line can ever have.
+
+    Impacts and brakes only take energy; driving adds at most ``m a v`` per second, and never above the speed limit.
+    """
+    vehicles = world.vehicles
+    driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s
+    energy = float((vehicles.mass_t * (world.speeds_mps**2 / 2.0 + driving)).sum())
+    return 1.01 * duration_s * math.sqrt(2.0 * energy / float(vehicles.mass_t[0, 0]))
 
 
 def _positions(front: Floats, gaps: Floats) -> Floats:

@@ -10,7 +10,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS, PaperRow, paper_rows
+from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS, PAPER_ROWS, PaperRow
 from ethbrake_marl.evaluation.parameters import parameter_line
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.evaluation.table import SummaryRow
@@ -88,7 +88,7 @@ def our_lines(rows: Sequence[SummaryRow]) -> list[Line]:
 def paper_blocks(rows: Sequence[SummaryRow]) -> list[tuple[str, list[Line]]]:
     """The paper's tables that belong beside these rows, as (table, lines)."""
     blocks: dict[str, list[Line]] = {}
-    for paper in paper_rows(rows[0].parameters["scenario"]) if rows else ():
+    for paper in PAPER_ROWS if rows and rows[0].beside_paper else ():
         blocks.setdefault(paper.table, []).append(_paper_line(paper))
     return list(blocks.items())
 

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount, Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate
 from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.starts import check_alert
 
 CHUNK = 10_000  # worlds advanced together: bounds memory, changes no result
 
@@ -88,23 +89,21 @@ def evaluate(
     agents: Mapping[str, Agent],
     *,
     scenario: Scenario,
-    vehicle: int | None = None,
+    vehicle: int | str | None = None,
     seed: int | None = None,
     chunk: int = CHUNK,
     on_progress: Progress | None = None,
 ) -> Evaluation:
     """Let each agent drive ``vehicle`` through every world once, from the alert to the episode's end.
 
-    ``vehicle`` is an index (0 = front), by default the scenario's only learner; all others follow the scenario's
-    scripts (see ``agents.driving``). A world's outcome depends neither on ``chunk`` nor on the other worlds, and the
-    given agents are left as they are. ``seed`` is noted, not used. Raises ``InvalidInput`` for worlds that do not fit
-    the scenario, no agents, or a second learner that nobody drives.
+    ``vehicle`` is a name (``vehicle_2``) or an index (0 = front), by default the scenario's only learner; all others
+    follow the scenario's scripts (see ``agents.driving``). A world's outcome depends neither on ``chunk`` nor on the
+    other worlds, and the given agents are left as they are. ``seed`` is noted, not used. Raises ``InvalidInput`` for
+    worlds that do not fit the scenario or are not at the alert, no agents, or a second learner that nobody drives.
     """
+    _check_request(worlds, agents, scenario, chunk)
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
-    if not agents:
-        raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
-    if not chunk >= 1:
-        raise InvalidInput(f"evaluate: chunk = {chunk}; at least 1 world at a time is needed")
+    check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
     driven = controlled_vehicle(scenario, vehicle)
     outcomes = {}
     for name, agent in agents.items():
@@ -118,7 +117,28 @@ def evaluate(
     return Evaluation(scenario, driven, sample.worlds, sample.index, seed, outcomes)
 
 
-def controlled_vehicle(scenario: Scenario, vehicle: int | None) -> int:
+def _check_request(worlds: object, agents: object, scenario: object, chunk: object) -> None:
+    """Refuse arguments of ``evaluate`` that are not what they must be."""
+    if not isinstance(worlds, Worlds | Sample):
+        raise InvalidInput(
+            f"evaluate: worlds = {worlds!r}: must be worlds or a sample, as scenario.sample(n, seed) gives"
+        )
+    if not isinstance(scenario, Scenario):
+        raise InvalidInput(f"evaluate: scenario = {scenario!r}: must be a Scenario, as load_scenario(name) gives")
+    if not isinstance(agents, Mapping):
+        raise InvalidInput(
+            f"evaluate: agents = {agents!r}: must be a mapping, for instance {{'coast': make_agent('coast')}}"
+        )
+    if not agents:
+        raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
+    for name, agent in agents.items():
+        if not isinstance(agent, Agent):
+            raise InvalidInput(f"evaluate: agent {name!r} = {agent!r}: must be an agent, as make_agent(name) gives")
+    if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or not chunk >= 1:
+        raise InvalidInput(f"evaluate: chunk = {chunk!r}; a whole number of worlds, at least 1 at a time, is needed")
+
+
+def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
     """Index of the vehicle to drive: the given one, or the scenario's only learner; raises ``InvalidInput``."""
     learners = scenario.learners
     names = ", ".join(scenario.vehicle_names[i] for i in learners)
@@ -129,8 +149,12 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | None) -> int:
                 " agents drive"
             )
         return learners[0]
-    if isinstance(vehicle, bool) or not 0 <= vehicle < scenario.vehicles:
-        raise InvalidInput(f"vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
+    if isinstance(vehicle, str):
+        if vehicle not in scenario.vehicle_names:
+            raise unknown_name("vehicle", vehicle, scenario.vehicle_names)
+        vehicle = scenario.vehicle_names.index(vehicle)
+    if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < scenario.vehicles:
+        raise InvalidInput(f"vehicle = {vehicle!r}: must be a name or an index from 0 to {scenario.vehicles - 1}")
     if set(learners) - {vehicle}:
         raise InvalidInput(
             f"scenario {scenario.name!r}: {names} learn, but only {scenario.vehicle_names[vehicle]} is driven;"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+from ethbrake_marl.evaluation.paper import is_papers_test
 from ethbrake_marl.evaluation.parameters import parameters
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, rate, relative_decrease
@@ -30,6 +31,7 @@ class SummaryRow:
     predicted_harm: Estimate | None  # where the agent predicts
     policy_share: float | None  # share of worlds in which a hybrid drove by its policy
     parameters: dict[str, Any]
+    beside_paper: bool = False  # these are results of the test that the paper's rows are about
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
@@ -55,7 +57,9 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> list[Summa
     """One row per agent, in the order of the evaluation; compared with ``baseline`` where that was evaluated."""
     conditions = parameters(evaluation)
     reference = evaluation.outcomes.get(baseline)
-    return [_row(agent, outcome, reference, conditions) for agent, outcome in evaluation.outcomes.items()]
+    beside = is_papers_test(evaluation)
+    rows = (_row(agent, outcome, reference, conditions) for agent, outcome in evaluation.outcomes.items())
+    return [replace(row, beside_paper=beside) for row in rows]
 
 
 def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: dict[str, Any]) -> SummaryRow:

@@ -22,7 +22,7 @@ from safetensors import SafetensorError
 from ethbrake_marl.durable_files import new_folder, write_file
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.learning.forward import Actor, Float32s
-from ethbrake_marl.learning.manifest import Manifest, observation_schema
+from ethbrake_marl.learning.manifest import Manifest, content_sha256, observation_schema
 from ethbrake_marl.learning.networks import TensorRow, tensor_table
 from ethbrake_marl.learning.strict_json import parse_strict_json
 from ethbrake_marl.observations import ObservationSpec
@@ -56,13 +56,15 @@ class Policy:
 
 
 def make_policy(tensors: Mapping[str, Float32s], **manifest: Any) -> Policy:
-    """Build a policy from ``tensors`` and the fields of ``Manifest`` (all but the hash, which is computed).
+    """Build a policy from ``tensors`` and the fields of ``Manifest`` (all but the hashes, which are computed).
 
     Raises ``InvalidInput`` naming the tensor or field that does not fit.
     """
     data = _serialise(tensors)
     try:
-        checked = Manifest(**manifest, weights_sha256=hashlib.sha256(data).hexdigest())
+        draft = Manifest(**manifest, weights_sha256=hashlib.sha256(data).hexdigest(), manifest_sha256="0" * 64)
+        own = content_sha256(draft.model_dump(mode="json"))
+        checked = draft.model_copy(update={"manifest_sha256": own})
         return Policy(checked, _tensors(data, checked))
     except ValidationError as error:
         raise InvalidInput(f"policy: {_first_line(error)}") from None
@@ -97,7 +99,11 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
 def _bundle_folder(path: Path) -> Path:
     for folder in (path, path / "policy"):
-        if (folder / MANIFEST).exists() or (folder / WEIGHTS).exists():
+        try:
+            found = (folder / MANIFEST).exists() or (folder / WEIGHTS).exists()
+        except OSError as error:
+            raise InvalidInput(f"{str(path)!r:.120}: cannot be read ({error.strerror})") from None
+        if found:
             if folder.is_symlink():
                 raise CorruptBundle(f"{folder}: is a symbolic link; give the folder it points to")
             return folder
@@ -133,12 +139,18 @@ def _read(path: Path, limit: int) -> bytes:
 def _manifest(path: Path) -> Manifest:
     data = _read(path, MANIFEST_LIMIT_BYTES)
     try:
-        parse_strict_json(data)
+        content = parse_strict_json(data)
         manifest = Manifest.model_validate_json(data)
     except ValidationError as error:
         raise CorruptBundle(f"{path}: {_first_line(error)}") from None
     except ValueError as error:
         raise CorruptBundle(f"{path}: {error}") from None
+    found = content_sha256(content)
+    if found != manifest.manifest_sha256:
+        raise CorruptBundle(
+            f"{path}: its content has SHA-256 {found}, but it says {manifest.manifest_sha256}; it was changed after it"
+            " was saved"
+        )
     if manifest.observation != observation_schema(manifest.observation.spec):
         raise CorruptBundle(
             f"{path}: observation: features or their scaling are not those of this version of the package;"

@@ -35,7 +35,7 @@ class Progress:
     """How far a training is."""
 
     steps: int
-    total_steps: int
+    total_steps: int  # at the end: the wanted ones, rounded up to whole updates
     updates: int
     wall_s: float
     metrics: Mapping[str, float]  # of the last evaluation, and the mean return of recent episodes
@@ -85,8 +85,14 @@ class BetweenUpdates(BaseCallback):
 
     @property
     def total_steps(self) -> int:
-        """Decisions after which the training ends."""
+        """Decisions that are wanted; the training ends after the first update at or beyond them."""
         return self._recipe.total_steps
+
+    @property
+    def planned_steps(self) -> int:
+        """Decisions at that end: whole rollouts."""
+        rollout = self.model.n_envs * self.model.n_steps
+        return -(-self.total_steps // rollout) * rollout
 
     def _on_rollout_start(self) -> None:
         self._after_update()
@@ -138,4 +144,4 @@ class BetweenUpdates(BaseCallback):
             episodes = self.model.ep_info_buffer or ()
             if episodes:
                 metrics["episode_return"] = sum(float(e["r"]) for e in episodes) / len(episodes)
-            self._on_progress(Progress(course.steps, self.total_steps, course.updates, course.wall_s, metrics))
+            self._on_progress(Progress(course.steps, self.planned_steps, course.updates, course.wall_s, metrics))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Annotated, Literal
+import re
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
@@ -13,6 +15,8 @@ from ethbrake_marl.observations import ObservationSpec
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Neighbours = Annotated[int, Field(ge=0, le=64)]
+
+_VEHICLE = re.compile(r"vehicle_[1-9][0-9]?")
 
 
 class _Strict(BaseModel):
@@ -37,7 +41,7 @@ class Manifest(_Strict):
     """Everything about a policy but its tensors; ``action`` is a fraction of the own capacity, -1 = full braking."""
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
-    format_version: Literal[1] = 1
+    format_version: Literal[2] = 2
     algorithm: Literal["ppo"]
     network: NetworkSpec
     observation: ObservationSchema
@@ -49,6 +53,7 @@ class Manifest(_Strict):
     steps: Annotated[int, Field(ge=0)]
     versions: dict[str, str]
     weights_sha256: Sha256
+    manifest_sha256: Sha256  # of everything above, see ``content_sha256``
 
     @model_validator(mode="after")
     def _one_input_per_feature(self) -> Manifest:
@@ -56,6 +61,30 @@ class Manifest(_Strict):
         if features != inputs:
             raise ValueError(f"{features} observation features for a network that takes {inputs}")
         return self
+
+    @model_validator(mode="after")
+    def _learners_of_the_scenario(self) -> Manifest:
+        for name in self.learners:
+            if _VEHICLE.fullmatch(name) is None:
+                raise ValueError(f"learners: {name!r} is no vehicle; vehicles are vehicle_1, vehicle_2, ...")
+        if len(set(self.learners)) < len(self.learners):
+            raise ValueError(f"learners: {', '.join(self.learners)}: each vehicle learns once")
+        vehicles, roles = self.scenario.get("vehicles"), self.scenario.get("roles")
+        for name in self.learners:
+            if isinstance(vehicles, int) and int(name.removeprefix("vehicle_")) > vehicles:
+                raise ValueError(f"learners: {name}: the scenario has {vehicles} vehicles")
+            if isinstance(roles, dict) and roles.get(name) != "learner":
+                raise ValueError(f"learners: {name}: does not learn in the scenario's roles")
+        return self
+
+
+def content_sha256(content: Mapping[str, Any]) -> str:
+    """SHA-256 of a manifest's plain content without its own hash: sorted keys, no blanks, ASCII.
+
+    It binds names, architecture and weights together, against accidents and edits; it is no signature.
+    """
+    hashed = {key: value for key, value in content.items() if key != "manifest_sha256"}
+    return hashlib.sha256(json.dumps(hashed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def observation_schema(spec: ObservationSpec) -> ObservationSchema:

@@ -43,18 +43,6 @@ class TensorRow:
     sb3_name: str
 
 
-def paper_network(observation_size: int, action_size: int = 1) -> NetworkSpec:
-    """Build the paper's network: policy 256-256, value 256-256-128, ReLU."""
-    return NetworkSpec(
-        observation_size=observation_size,
-        action_size=action_size,
-        policy_hidden=(256, 256),
-        value_hidden=(256, 256, 128),
-        activation="relu",
-        output="clip",
-    )
-
-
 def tensor_table(spec: NetworkSpec) -> tuple[TensorRow, ...]:
     """List every tensor of ``spec``, all float32; weights are [outputs, inputs] as in ``y = W x + b``."""
     rows = [

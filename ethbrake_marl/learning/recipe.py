@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,7 +11,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.learning.networks import Activation, NetworkSpec, Width
 from ethbrake_marl.rewards import RewardParams
-from ethbrake_marl.scenario.yaml_loading import Document, read_yaml
+from ethbrake_marl.scenario.consistency import refuse
+from ethbrake_marl.scenario.shipped_files import shipped_folder
+from ethbrake_marl.scenario.validation_messages import explain
+from ethbrake_marl.scenario.yaml_loading import Document, YamlPath, read_yaml
 
 ROLLOUT_LIMIT = 2**24  # decisions held in memory between two updates
 
@@ -106,9 +108,10 @@ class TrainingRecipe(_Part):
     def _whole_batches(self) -> TrainingRecipe:
         rollout = self.n_envs * self.n_steps
         if not rollout <= ROLLOUT_LIMIT:
-            raise ValueError(f"n_envs x n_steps = {rollout} decisions per update; at most {ROLLOUT_LIMIT}")
+            right = f"n_envs x n_steps = {rollout} decisions per update; at most {ROLLOUT_LIMIT}"
+            refuse(("n_envs",), self.n_envs, right)
         if rollout % self.batch_size:
-            raise ValueError(f"batch_size = {self.batch_size}: must divide n_envs x n_steps = {rollout}")
+            refuse(("batch_size",), self.batch_size, f"must divide n_envs x n_steps = {rollout}")
         return self
 
     def replace(self, **changes: Any) -> TrainingRecipe:
@@ -133,12 +136,7 @@ def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
 
 def shipped_recipes() -> dict[str, Path]:
     """Name -> file of every recipe that comes with the package: the checkout's ``train/``, or the installed copy."""
-    package = Path(__file__).resolve().parents[1]
-    checkout, installed = package.parent / "train", package / "_data" / "train"
-    folder = checkout if (package.parent / "pyproject.toml").is_file() and checkout.is_dir() else installed
-    if not folder.is_dir():
-        raise InvalidInput(f"the shipped recipes are missing: neither {checkout} nor {installed} exists; reinstall")
-    return {file.stem: file for file in sorted(folder.glob("*.yaml"))}
+    return {file.stem: file for file in sorted(shipped_folder("train", "recipes").glob("*.yaml"))}
 
 
 def _checked(document: Document) -> TrainingRecipe:
@@ -147,32 +145,25 @@ def _checked(document: Document) -> TrainingRecipe:
     try:
         return TrainingRecipe.model_validate(document.content)
     except ValidationError as error:
-        raise _explained(error, document) from None
+        raise explain(error, document, RecipeWording()) from None
 
 
-def _explained(error: ValidationError, document: Document) -> InvalidInput:
-    """The first defect, unknown keys before all others: file, line, path inside it, value, what would be right."""
-    defects = sorted(error.errors(include_url=False), key=lambda defect: defect["type"] != "extra_forbidden")
-    first, path = defects[0], defects[0]["loc"]
-    line = document.line_of(path)
-    place = f"{document.file}: " if line is None else f"{document.file}, line {line}: "
-    name = ".".join(str(part) for part in path)
-    if first["type"] == "extra_forbidden":
-        return InvalidInput(f"{place}{name}: unknown key; {_hint(path)}")
-    if first["type"] == "missing":
-        return InvalidInput(f"{place}{name}: missing")
-    reason = first["msg"].removeprefix("Value error, ").replace("Input should", "must")
-    given = first["input"]
-    value = "" if isinstance(given, dict | BaseModel) else f" = {given!r:.60}"
-    return InvalidInput(f"{place}{name}{value}: {reason}" if path else f"{place}{reason}")
+class RecipeWording:
+    """The ``Wording`` of messages about a recipe."""
 
+    def known(self, path: YamlPath) -> list[str]:
+        """The keys of the part in which ``path`` ends."""
+        model: type[BaseModel] = TrainingRecipe
+        for part in path[:-1]:
+            inner = model.model_fields[str(part)].annotation
+            if isinstance(inner, type) and issubclass(inner, BaseModel):
+                model = inner
+        return list(model.model_fields)
 
-def _hint(path: tuple[str | int, ...]) -> str:
-    model: type[BaseModel] = TrainingRecipe
-    for part in path[:-1]:
-        inner = model.model_fields[str(part)].annotation
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
-            model = inner
-    known = list(model.model_fields)
-    close = get_close_matches(str(path[-1]), known, n=1)
-    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
+    def needed(self, path: YamlPath) -> str:
+        """Where an example stands."""
+        return "it is needed; every key is in the shipped recipe ppo"
+
+    def owner(self, path: YamlPath) -> str:
+        """Nobody's: a recipe knows no vehicles."""
+        return ""

@@ -96,10 +96,10 @@ def create_run(path: Path, *, force: bool = False) -> RunDirectory:
     try:
         path.mkdir(parents=True)
     except FileExistsError:
-        other = "" if run.status.is_file() else ", and is no run"
-        raise AlreadyExists(
-            f"{path}: is there already{other}; give another name{'' if other else ' or force'}"
-        ) from None
+        if not run.status.is_file():
+            raise AlreadyExists(f"{path}: is there already, and is no run; give another name") from None
+        replace = "replace it with force (--force; make run ARGS=--force)"
+        raise AlreadyExists(f"{path}: is there already; give another name (--name), or {replace}") from None
     return run
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
@@ -30,9 +28,3 @@ def tensors_of(policy: ActorCriticPolicy, spec: NetworkSpec) -> dict[str, Float3
     """Copy the policy's weights under the names of our table."""
     state = policy.state_dict()
     return {row.name: state[row.sb3_name].detach().cpu().numpy().astype(np.float32) for row in tensor_table(spec)}
-
-
-def load_tensors(policy: ActorCriticPolicy, spec: NetworkSpec, tensors: Mapping[str, Float32s]) -> None:
-    """Put ``tensors`` into ``policy``, all of them."""
-    table = tensor_table(spec)
-    policy.load_state_dict({row.sb3_name: torch.from_numpy(np.array(tensors[row.name])) for row in table}, strict=True)

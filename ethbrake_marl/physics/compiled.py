@@ -6,8 +6,10 @@ stale machine code. Here the cache folder carries a hash of every kernel source 
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
+import shutil
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -24,7 +26,7 @@ _MARK = b"@compiled"
 
 @cache
 def cache_folder() -> Path:
-    """Folder of the compiled kernels: the user's cache, or a temporary one where that cannot be written."""
+    """Folder of the compiled kernels: the user's cache, or where that cannot be written one for this process alone."""
     digest = hashlib.sha256(numba.__version__.encode())
     for source in sorted(_PACKAGE.rglob("*.py")):
         text = source.read_bytes()
@@ -37,7 +39,9 @@ def cache_folder() -> Path:
         with tempfile.TemporaryFile(dir=folder):
             return folder
     except OSError:
-        return Path(tempfile.mkdtemp(prefix="ethbrake_marl-"))
+        temporary = Path(tempfile.mkdtemp(prefix="ethbrake_marl-"))
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        return temporary
 
 
 def compiled(function: Function) -> Function:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.shipped_files import shipped_folder
 from ethbrake_marl.scenario.yaml_loading import read_yaml
 
 _SUFFIXES = (".yaml", ".yml")
@@ -26,14 +27,7 @@ def scenario_folder() -> Path:
 
     Raises ``InvalidInput`` when neither is there, which means that the installation is damaged.
     """
-    package = Path(__file__).resolve().parents[1]
-    checkout = package.parent / "scenarios"
-    installed = package / "_data" / "scenarios"
-    if (package.parent / "pyproject.toml").is_file() and checkout.is_dir():
-        return checkout
-    if not installed.is_dir():
-        raise InvalidInput(f"the shipped scenarios are missing: neither {checkout} nor {installed} exists; reinstall")
-    return installed
+    return shipped_folder("scenarios", "scenarios")
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:

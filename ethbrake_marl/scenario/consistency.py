@@ -16,7 +16,13 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.flow_text import flow_text
 from ethbrake_marl.scenario.quantities import QuantityRule
-from ethbrake_marl.scenario.scripts import LEARNER, constant_deceleration, is_state_free, parse_agent_spec
+from ethbrake_marl.scenario.scripts import (
+    LEARNER,
+    STATE_FREE,
+    constant_deceleration,
+    is_state_free,
+    parse_agent_spec,
+)
 from ethbrake_marl.scenario.yaml_loading import YamlPath
 
 if TYPE_CHECKING:
@@ -42,11 +48,25 @@ def check_entries(rule: QuantityRule, value: Any, vehicles: int | None) -> None:
             refuse((index,) if listed else (), entry, f"must be {rule.interval}{overlap}")
 
 
-def complete_roles(given: Mapping[str, str] | None, vehicles: int) -> dict[str, str]:
+class Roles(dict[str, str]):
+    """Vehicle -> ``learner`` or a script; like the rest of a scenario it cannot be changed."""
+
+    def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
+        raise InvalidInput("roles of a scenario are frozen; use scenario.replace(roles=...) or scenario.with_learners")
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    update = setdefault = pop = popitem = clear = _refuse
+
+    def __reduce__(self) -> tuple[type[Roles], tuple[dict[str, str]]]:
+        """Copy and pickle through the constructor."""
+        return Roles, (dict(self),)
+
+
+def complete_roles(given: Mapping[str, str] | None, vehicles: int) -> Roles:
     """A role for every vehicle in order: full braking where none is given; by default vehicle_2 learns."""
     roles = {"vehicle_2": LEARNER} if given is None else given
     names = [f"vehicle_{i + 1}" for i in range(vehicles)]
-    return {name: roles.get(name, "full_brake") for name in names}
+    return Roles({name: roles.get(name, "full_brake") for name in names})
 
 
 def check_roles(roles: Mapping[str, str], vehicles: int) -> None:
@@ -79,7 +99,7 @@ def check_whole(scenario: Scenario) -> None:
             right = f"must not be above speed_limit_mps of vehicle_{i + 1}, {flow_text(_plain(limits[i]))} m/s"
             refuse(_path(scenario, "speeds_mps", i), speed, right)
     _check_constant_scripts(scenario)
-    if scenario.early_impacts == "reject":
+    if scenario.early_impacts == "reject" and scenario.learners:
         _check_rejection(scenario)
 
 
@@ -93,12 +113,11 @@ def _check_constant_scripts(scenario: Scenario) -> None:
 
 
 def _check_rejection(scenario: Scenario) -> None:
-    if not scenario.learners:
-        refuse(("early_impacts",), "reject", "needs a learner: early means before the first learner may act; use keep")
     for i, script in scenario.scripts.items():
         if not is_state_free(script):
-            name = parse_agent_spec(script)[0]
-            right = f"{name} depends on the state; with early_impacts: reject only full_brake, coast and constant:a do"
+            close = get_close_matches(parse_agent_spec(script)[0], STATE_FREE, n=1)
+            hint = f"; did you mean {close[0]}?" if close else ""
+            right = f"with early_impacts: reject a script must be full_brake, coast or constant:a{hint}"
             refuse(("roles", f"vehicle_{i + 1}"), script, right)
 
 

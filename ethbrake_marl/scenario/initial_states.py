@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-import re
-from collections.abc import Mapping
+import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,12 +14,14 @@ from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds, make_worlds
+from ethbrake_marl.scenario.numerals import parse_numeral
 from ethbrake_marl.scenario.quantities import QUANTITIES, suggestion
 from ethbrake_marl.scenario.schema import Scenario
 
 Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
 
-_NUMBER = re.compile(r"\s*[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\s*")
+SIZE_LIMIT = 64 << 20  # bytes of a table
+
 _ALWAYS_IN_A_TABLE = ("gaps_m", "speeds_mps")
 
 
@@ -29,6 +31,7 @@ class _Naming:
 
     where: str
     kind: Literal["file", "table", "state"]
+    lines: Sequence[int] = ()  # of a file: on which each row begins
 
     def entry(self, entry: Entry) -> str:
         field, index = entry
@@ -39,7 +42,8 @@ class _Naming:
     def value(self, entry: Entry, row: int) -> str:
         if self.kind == "state":
             return f"{self.where}: {self.entry(entry)}"
-        return f"{self.where}, {f'line {row + 2}' if self.kind == 'file' else f'row {row}'}, {self.entry(entry)}"
+        place = f"line {self.lines[row]}" if self.kind == "file" else f"row {row}"
+        return f"{self.where}, {place}, {self.entry(entry)}"
 
 
 def table_columns(scenario: Scenario) -> dict[str, Entry]:
@@ -55,21 +59,22 @@ def read_initial_states(path: str | Path, scenario: Scenario) -> Worlds:
     """Read worlds from a CSV file with a header line; columns as ``worlds_from_table``.
 
     Raises ``InvalidInput`` with file, line and column for an unknown, repeated or missing column, a value that is
-    not a number or out of range, a row of another length, or a file without rows.
+    not a number or out of range, a row of another length, a file without rows, or one beyond ``SIZE_LIMIT``.
     """
     file = Path(path)
-    header, rows = _read_csv(file)
+    header, rows, lines = _read_csv(file)
     entries = _known_columns(header, scenario, f"{file}, line 1")
     table = np.empty((len(rows), len(header)))
     for r, row in enumerate(rows):
         if len(row) != len(header):
-            raise InvalidInput(f"{file}, line {r + 2}: {len(row)} values, but the header has {len(header)} columns")
+            raise InvalidInput(f"{file}, line {lines[r]}: {len(row)} values, but the header has {len(header)} columns")
         for c, text in enumerate(row):
-            if not _NUMBER.fullmatch(text):
-                raise InvalidInput(f"{file}, line {r + 2}, column {header[c]}: {text!r} is not a number")
-            table[r, c] = float(text)
+            number = parse_numeral(text.strip())
+            if number is None:
+                raise InvalidInput(f"{file}, line {lines[r]}, column {header[c]}: {text!r:.60} is not a number")
+            table[r, c] = number
     given = {entry: table[:, c] for c, entry in enumerate(entries)}
-    return _worlds(given, scenario, _Naming(str(file), "file"))
+    return _worlds(given, scenario, _Naming(str(file), "file", lines))
 
 
 def worlds_from_table(columns: Mapping[str, ArrayLike], scenario: Scenario) -> Worlds:
@@ -143,14 +148,17 @@ def _check_together(full: Mapping[str, Floats], scenario: Scenario, naming: _Nam
         latency, speed, limit = (full[f][:, index] for f in ("latency_s", "speeds_mps", "speed_limit_mps"))
         right = f"must be below the scenario's horizon_s ({scenario.horizon_s:g} s)"
         _require(latency < scenario.horizon_s, naming, ("latency_s", index), latency, right)
-        right = f"must not be above speed_limit_mps of vehicle_{index + 1}, {limit.min():g} m/s"
-        _require(speed <= limit, naming, ("speeds_mps", index), speed, right)
+        good = speed <= limit
+        limit_mps = limit[np.argmin(good)]  # of the world that the message is about
+        right = f"must not be above speed_limit_mps of vehicle_{index + 1}, {limit_mps:g} m/s"
+        _require(good, naming, ("speeds_mps", index), speed, right)
 
 
 def _require(good: Bools, naming: _Naming, entry: Entry, column: Floats, right: str) -> None:
+    """Refuse the first world for which ``good`` does not hold."""
     if not good.all():
         row = int(np.argmin(good))
-        raise InvalidInput(f"{naming.value(entry, row)} = {column[row]:g}: {right}")
+        raise InvalidInput(f"{naming.value(entry, row)} = {column[row]:.12g}: {right}")
 
 
 def _known_columns(header: list[str], scenario: Scenario, where: str) -> list[Entry]:
@@ -179,15 +187,27 @@ def _numbers(what: str, value: ArrayLike) -> Floats:
     return array.astype(np.float64)
 
 
-def _read_csv(file: Path) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a CSV file, unchecked; there is at least one row."""
+def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
+    """Header and rows of a CSV file, unchecked, and the line on which each row begins; there is at least one row."""
+    rows: list[list[str]] = []
+    lines: list[int] = []
     try:
-        with file.open(encoding="utf-8-sig", newline="") as stream:
-            lines = list(csv.reader(stream, strict=True))
+        with file.open("rb") as stream:
+            data = stream.read(SIZE_LIMIT + 1)
+        if len(data) > SIZE_LIMIT:
+            raise ValueError(f"larger than {SIZE_LIMIT >> 20} MiB, the limit for a table")
+        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
+        begins = 1
+        for row in reader:
+            rows.append(row)
+            lines.append(begins)
+            begins = reader.line_num + 1
     except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
         raise InvalidInput(f"{file}: cannot be read as CSV: {error}") from None
-    if not lines or not lines[0]:
+    while rows and not rows[-1]:
+        rows.pop()  # blank lines at the end
+    if not rows or not rows[0]:
         raise InvalidInput(f"{file}, line 1: must name the columns, for instance gap_1_m,gap_2_m,speed_1_mps,...")
-    if len(lines) == 1:
+    if len(rows) == 1:
         raise InvalidInput(f"{file}: has a header but no rows; one row is one world")
-    return [name.strip() for name in lines[0]], lines[1:]
+    return [name.strip() for name in rows[0]], rows[1:], lines[1:]

@@ -29,6 +29,8 @@ CHANNELS: dict[str, int] = {"list": 0, "training": 1}
 MOST_ATTEMPTS = 1000  # draws of one world before its scenario is declared unusable
 _PATIENCE = 10  # attempts of a whole list before one world is tried to its end
 
+MOST_AT_ONCE = 10_000_000  # worlds of one sample; a longer list is drawn in parts
+
 _MOST_WORLDS = 2**62  # their numbers are 64-bit integers
 _NUMBERS_PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
@@ -61,7 +63,7 @@ def draw_list(scenario: Scenario, n: int, seed: int, *, first: int = 0, channel:
     seed = int(seed)
     index = np.arange(first, first + n, dtype=np.int64)
     worlds = _draw(scenario, seed, channel, 0, index)
-    if scenario.early_impacts == "keep":
+    if scenario.early_impacts == "keep" or not scenario.learners:
         return Sample(worlds, index, 0)
     early = early_impact(scenario, worlds)
     if not early.any():
@@ -72,7 +74,8 @@ def draw_list(scenario: Scenario, n: int, seed: int, *, first: int = 0, channel:
 def early_impact(scenario: Scenario, worlds: Worlds) -> Bools:
     """Which worlds have an impact before (or just when) the first learner may act: [n].
 
-    Vehicles follow their state-free scripts and learners coast, which nobody can change before that moment.
+    Vehicles follow their state-free scripts and learners coast, which nobody can change before that moment. Needs a
+    learner: without one no impact is early, and ``draw_list`` refuses nothing.
     """
     vehicles = worlds.vehicles
     command = np.zeros(worlds.speeds_mps.shape)
@@ -143,6 +146,8 @@ def _check_request(n: int, seed: int, first: int, channel: str) -> None:
     for name, value, least in (("n", n, 1), ("seed", seed, 0), ("first", first, 0)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or not value >= least:
             raise InvalidInput(f"sample: {name} = {value!r}: must be a whole number, at least {least}")
+    if not n <= MOST_AT_ONCE:
+        raise InvalidInput(f"sample: n = {n}: at most {MOST_AT_ONCE:,} worlds at once; draw a longer list in parts")
     if not int(first) + int(n) <= _MOST_WORLDS:
         raise InvalidInput(f"sample: first = {first!r}: a list has {_MOST_WORLDS} worlds")
     if channel not in CHANNELS:

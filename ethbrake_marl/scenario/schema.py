@@ -14,6 +14,7 @@ from ethbrake_marl.scenario.consistency import check_entries, check_roles, check
 from ethbrake_marl.scenario.distributions import Choice, Normal, Quantity, Uniform
 from ethbrake_marl.scenario.quantities import QUANTITIES
 from ethbrake_marl.scenario.sampling import Channel, Sample, draw_list
+from ethbrake_marl.scenario.scenario_wording import ScenarioWording
 from ethbrake_marl.scenario.scripts import LEARNER
 from ethbrake_marl.scenario.validation_messages import explain
 from ethbrake_marl.scenario.yaml_loading import Document
@@ -180,7 +181,7 @@ def _build(scenario: Scenario, document: Document) -> None:
     try:
         BaseModel.__init__(scenario, **document.content)
     except ValidationError as error:
-        raise explain(error, document, Scenario.model_fields) from None
+        raise explain(error, document, ScenarioWording(Scenario.model_fields)) from None
 
 
 def _plain(value: Any) -> Any:

@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.worlds import Floats
+from ethbrake_marl.scenario.numerals import parse_numeral
 
 LEARNER = "learner"
+STATE_FREE = ("full_brake", "coast", "constant")  # names of the scripts whose command never depends on the state
 
 _SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
 
@@ -41,11 +43,8 @@ def constant_deceleration(spec: str) -> float | None:
     name, argument = parse_agent_spec(spec)
     if name != "constant":
         return None
-    try:
-        deceleration = float(argument or "")
-    except ValueError:
-        deceleration = math.nan
-    if not math.isfinite(deceleration):
+    deceleration = parse_numeral(argument or "")
+    if deceleration is None or not math.isfinite(deceleration):
         raise InvalidInput(
             f"agent {spec!r}: constant needs a finite deceleration in m/s2 after the colon, for instance constant:3.5"
         )

@@ -46,7 +46,7 @@ def _comment(key: str) -> str:
     rule = QUANTITIES.get(key)
     if rule is None:
         return str(Scenario.model_fields[key].description)
-    return f"{rule.meaning}; {rule.interval}"
+    return f"{rule.meaning}; {rule.interval}{', below horizon_s' if key == 'latency_s' else ''}"
 
 
 def _value(value: object) -> str:

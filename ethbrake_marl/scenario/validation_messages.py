@@ -1,21 +1,19 @@
-"""One clear message for whatever pydantic found in a scenario: where, value, what would be right."""
+"""One clear message for whatever pydantic found in a YAML file: where, value, what would be right."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
-from typing import Any
+from typing import Any, Protocol
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario.distributions import DISTRIBUTIONS, Choice, NormalShape
+from ethbrake_marl.scenario.distributions import DISTRIBUTIONS
 from ethbrake_marl.scenario.flow_text import flow_text
-from ethbrake_marl.scenario.quantities import QUANTITIES, suggestion
+from ethbrake_marl.scenario.numerals import parse_numeral
+from ethbrake_marl.scenario.quantities import suggestion
 from ethbrake_marl.scenario.yaml_loading import Document, YamlPath
 
-_NUMBER_IN_QUOTES = re.compile(r"\s*[-+.]?[0-9].*")
 _QUANTITY = "must be a number, {uniform: [low, high]}, {normal: {mean, sd, low, high}} or {choice: [a, b, ...]}"
 _RIGHT = {
     "finite_number": "must be a finite number",
@@ -28,24 +26,34 @@ _RIGHT = {
     "string_pattern_mismatch": "must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or digit",
     "quantity": _QUANTITY,
 }
-_INSIDE = {
-    "uniform": ("uniform",),
-    "normal": tuple(NormalShape.model_fields),
-    "choice": tuple(Choice.model_fields),
-}
 
 
-def explain(error: ValidationError, document: Document, keys: Iterable[str]) -> InvalidInput:
-    """The error for a document that does not fit the schema; ``keys`` are the known top-level keys.
+class Wording(Protocol):
+    """What messages know of the keys of one kind of file."""
+
+    def known(self, path: YamlPath) -> list[str]:
+        """The keys that may stand where ``path`` ends."""
+        ...
+
+    def needed(self, path: YamlPath) -> str:
+        """What is needed at ``path``, where it is missing."""
+        ...
+
+    def owner(self, path: YamlPath) -> str:
+        """Whose value stands at ``path``, in words; empty where that needs no saying."""
+        ...
+
+
+def explain(error: ValidationError, document: Document, wording: Wording) -> InvalidInput:
+    """The error for a document that does not fit its schema.
 
     The first defect is shown, unknown keys before all others, and "(and k more)" counts the rest. A missing key
     that an unknown one was probably meant to be is not counted.
     """
-    known = list(keys)
     # A default that needs another field is not made after an error elsewhere: no defect of its own.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
     unknown = [d for d in details if d["type"] == "extra_forbidden"]
-    meant = " ".join(suggestion(str(d["loc"][-1]), known) for d in unknown)
+    meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(_path(d))) for d in unknown)
     rest = [d for d in details if d not in unknown and not (d["type"] == "missing" and f" {d['loc'][-1]}" in meant)]
     shown = (unknown + rest)[0]
     more = len(unknown) + len(rest) - 1
@@ -53,7 +61,7 @@ def explain(error: ValidationError, document: Document, keys: Iterable[str]) -> 
     absent = shown["type"] == "missing" and len(path) == 1
     line = None if absent else document.line_of(path)
     where = document.file if line is None else f"{document.file}, line {line}"
-    return InvalidInput(f"{where}: {_describe(shown, path, known)}{f' (and {more} more)' if more else ''}")
+    return InvalidInput(f"{where}: {_describe(shown, path, wording)}{f' (and {more} more)' if more else ''}")
 
 
 def _path(detail: ErrorDetails) -> YamlPath:
@@ -62,52 +70,39 @@ def _path(detail: ErrorDetails) -> YamlPath:
     return (*keys, *detail.get("ctx", {}).get("at", ()))
 
 
-def _describe(detail: ErrorDetails, path: YamlPath, known: list[str]) -> str:
-    place = _place(path)
+def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
+    place = _place(path, wording)
     if detail["type"] == "extra_forbidden":
-        inside = _known_inside(path, known)
+        inside = wording.known(path)
         if path[-1] in inside:
             return f"{place}: does not go with what stands beside it; a quantity has one distribution"
         hint = suggestion(str(path[-1]), inside) or f"known: {', '.join(inside)}"
         return f"{place}: unknown key; {hint}"
     if detail["type"] == "missing":
-        return f"{place}: missing; {_meaning(path)}"
+        return f"{place}: missing; {wording.needed(path)}"
     ctx = detail.get("ctx", {})
-    value = ctx["value"] if "value" in ctx else flow_text(detail["input"], 60)
-    return f"{place}{f' = {value}' if value else ''}: {_right(detail)}"
+    value = ctx["value"] if "value" in ctx else _shown(detail)
+    return f"{place}{f' = {value}' if value else ''}: {_right(detail)}".removeprefix(": ")
 
 
-def _place(path: YamlPath) -> str:
+def _shown(detail: ErrorDetails) -> str:
+    """The value, unless the whole file is meant; a number keeps the point that makes it wrong."""
+    given = detail["input"]
+    if isinstance(given, BaseModel) or not detail["loc"]:
+        return ""
+    return repr(given) if detail["type"] == "int_type" and isinstance(given, float) else flow_text(given, 60)
+
+
+def _place(path: YamlPath, wording: Wording) -> str:
     text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).removeprefix(".")
-    rule = QUANTITIES.get(str(path[0])) if len(path) > 1 else None
-    owner = rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
+    owner = wording.owner(path)
     return f"{text} ({owner})" if owner else text
-
-
-def _known_inside(path: YamlPath, known: list[str]) -> list[str]:
-    """The keys that may stand where ``path`` ends: at the top, in a distribution, or in its parameters."""
-    if len(path) == 1:
-        return known
-    outer = path[-2]
-    return list(_INSIDE[outer]) if outer == "normal" else sorted({*DISTRIBUTIONS, "weights"})
-
-
-def _meaning(path: YamlPath) -> str:
-    key = path[-1]
-    if isinstance(key, int):
-        return "two numbers [low, high] are needed"
-    rule = QUANTITIES.get(key)
-    if rule is None and len(path) > 1:
-        return "a number is needed, as in {normal: {mean: 20, sd: 1, low: 18, high: 22}}"
-    if rule is None:
-        return f"it is needed, for instance {key}: my-scenario"
-    return f"the {rule.meaning} is needed, for instance {key}: {rule.example}"
 
 
 def _right(detail: ErrorDetails) -> str:
     kind, given = detail["type"], detail["input"]
     if kind == "float_type":
-        quoted = isinstance(given, str) and _NUMBER_IN_QUOTES.fullmatch(given)
+        quoted = isinstance(given, str) and parse_numeral(given) is not None
         return (
             "must be a number, not text; write it without quotes" if quoted else f"must be a number{_or_more(detail)}"
         )
@@ -119,7 +114,7 @@ def _right(detail: ErrorDetails) -> str:
         return f"must be {detail['ctx']['expected'].replace(chr(39), '')}"
     if kind == "quantity":
         return f"{_QUANTITY}{_misspelt(given)}"
-    text = str(detail["msg"])
+    text = str(detail["msg"]).removeprefix("Value error, ")
     return _RIGHT.get(kind, text.replace("Input should", "must").replace("must be a valid", "must be a"))
 
 

@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 import yaml
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.scenario.numerals import parse_numeral
 
 SIZE_LIMIT = 64 * 1024  # bytes
 DEPTH_LIMIT = 16  # mappings and lists inside each other
@@ -26,7 +27,6 @@ _NULL = {"", "~", "null", "Null", "NULL"}
 _BOOLEAN = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
 _INTEGER = re.compile(r"(?P<decimal>[-+]?[0-9]+)|0o(?P<octal>[0-7]+)|0x(?P<hexadecimal>[0-9a-fA-F]+)")
 _BASES = {"decimal": 10, "octal": 8, "hexadecimal": 16}
-_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _NOT_FINITE = re.compile(r"(?P<sign>[-+]?)\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 _LARGEST_INTEGER = 2**63
 
@@ -201,8 +201,8 @@ class _Builder:
             return _BOOLEAN[text]
         if integer := _INTEGER.fullmatch(text):
             return self._integer(integer)
-        if _FLOAT.fullmatch(text):
-            return float(text)
+        if (number := parse_numeral(text)) is not None:
+            return number
         if special := _NOT_FINITE.fullmatch(text):
             sign = special["sign"]
             return float("nan") if sign is None else float(f"{sign}inf")

@@ -13,9 +13,10 @@ from typing import Literal
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.driving import drive, introduce, scripted
 from ethbrake_marl.agents.e_v2x_bm import EV2XBM
 from ethbrake_marl.agents.protocol import Agent, place
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
@@ -28,11 +29,14 @@ class HybridAgent:
 
     ``bound`` says which ``H*`` and ``a*``; ``count`` which harm counts. After ``begin``, ``chosen_policy`` [n] says
     who drives; ``policy_harm`` [n] and ``bound_harm`` [n] were compared and ``predicted_harm`` [n] is the lower one.
+    Raises ``InvalidInput`` for an unknown ``bound`` or ``count``, and for what is not an agent.
     """
 
     def __init__(
         self, policy: Agent, scenario: Scenario, *, bound: Bound = "coupled", count: HarmCount = "first"
     ) -> None:
+        if not isinstance(policy, Agent):
+            raise InvalidInput(f"hybrid: {policy!r} is not an agent; load_policy(path) or make_agent(name) makes one")
         self.policy = policy
         self.backup = EV2XBM(bound, count=count, horizon_s=scenario.horizon_s)
         self.scenario = scenario
@@ -56,13 +60,16 @@ class HybridAgent:
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Choose for these rows; ``worlds`` holds those rows only, at the alert."""
-        self.policy.begin(worlds, vehicle, rows)
-        self.backup.begin(worlds, vehicle, rows)
+        policy_harm = self._harm(worlds, self._rehearsal, vehicle)
+        scripts = scripted(self.scenario, but=vehicle)
+        for agent in (self.policy, self.backup):
+            introduce(agent, vehicle, scripts)
+            agent.begin(worlds, vehicle, rows)
         bound = self.backup.predicted_harm[rows]
         if self.bound == "coupled":
             bound = self._harm(worlds, FixedCommand(-self.backup.deceleration_mps2[rows]), vehicle)
         self.bound_harm = place(self.bound_harm, rows, bound)
-        self.policy_harm = place(self.policy_harm, rows, self._harm(worlds, self._rehearsal, vehicle))
+        self.policy_harm = place(self.policy_harm, rows, policy_harm)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """Wanted signed acceleration of the chosen strategy, [n] m/s2."""

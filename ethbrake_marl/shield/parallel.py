@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,20 +43,29 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         count: HarmCount = "first",
         agents: Sequence[str] | None = None,
     ) -> None:
-        super().__init__(env)
         if mode not in MODES:
             raise unknown_name("shield mode", mode, MODES)
-        engine = getattr(env.unwrapped, "engine", None)
+        engine = getattr(getattr(env, "unwrapped", None), "engine", None)
         if not isinstance(engine, Engine):
             raise InvalidInput(f"HybridShield: {env} is not one of this package's environments (eb.parallel_env)")
+        super().__init__(env)
         self._engine = engine
         names = engine.scenario.vehicle_names
-        shielded = tuple(names[i] for i in engine.learners) if agents is None else tuple(agents)
+        shielded = tuple(names[i] for i in engine.learners) if agents is None else _names(agents)
+        if len(engine.learners) != 1:
+            learners = ", ".join(names[i] for i in engine.learners) or "none"
+            raise InvalidInput(
+                f"HybridShield: the environment has {len(engine.learners)} learners ({learners}), mode {mode!r} needs"
+                " exactly one learner: to roll out the policy, every other vehicle must follow a script; pass"
+                " learners=['vehicle_2'] to parallel_env"
+            )
         if len(shielded) != 1 or shielded[0] not in names or names.index(shielded[0]) not in engine.learners:
             raise InvalidInput(f"HybridShield: shields exactly one learner in mode {mode!r}; got {shielded}")
         self.mode = mode
         self.shielded = shielded[0]
         self._vehicle = names.index(self.shielded)
+        if not (isinstance(policy, Agent) or callable(policy)):
+            raise InvalidInput(f"HybridShield: policy = {policy!r}: must be an agent or a policy (eb.load_policy)")
         agent = policy if isinstance(policy, Agent) else LearnedAgent(policy)
         self.hybrid = HybridAgent(agent, engine.scenario, bound=bound, count=count)
         engine.on_begin.append(self._begin)
@@ -73,6 +82,12 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         infos[agent]["shield"] = self._info(proposed, float(applied[0]))
         return observations, rewards, terminations, truncations, infos
 
+    def close(self) -> None:
+        """Let go of the environment: it no longer asks this shield when an episode starts."""
+        if self._begin in self._engine.on_begin:
+            self._engine.on_begin.remove(self._begin)
+        super().close()
+
     def _begin(self, worlds: Worlds, rows: Ints) -> None:
         self.hybrid.begin(worlds, self._vehicle, rows)
 
@@ -87,3 +102,9 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
             "policy_harm": float(self.hybrid.policy_harm[0]),
             "bound_harm": float(self.hybrid.bound_harm[0]),
         }
+
+
+def _names(agents: object) -> tuple[Any, ...]:
+    if isinstance(agents, str) or not isinstance(agents, Iterable):
+        raise InvalidInput(f"HybridShield: agents = {agents!r}: must be a list of names, for instance ['vehicle_2']")
+    return tuple(agents)

@@ -184,3 +184,59 @@ def test_coupled__finds_a_kink_to_nine_digits():
     assert best.deceleration_mps2[0] == 2.9  # beyond its brakes: as hard as it can
     assert best.harm[0] == pytest.approx(16 - 2 * 0.9 * 8, abs=1e-12)
     assert math.isclose(optimise_pairwise(world, 1).spares_front_mps2[0], 3.0)
+
+
+def test_coupled__looks_into_more_than_the_most_promising_cell():
+    # In this world the least harm hides in a cell of the grid that is not the most promising one: 1.13 less.
+    rng = np.random.default_rng(3)
+    worlds = make_worlds(
+        rng.uniform(0.5, 12, (250, 4)),
+        rng.uniform(10, 30, (250, 5)),
+        braking_capacity_mps2=rng.uniform(3, 9, (250, 5)),
+        driving_capacity_mps2=3,
+        latency_s=rng.uniform(0, 1.2, (250, 5)),
+        mass_t=rng.uniform(1, 20, (250, 5)),
+        restitution=rng.uniform(0, 1, 250),
+    )
+    assert optimise_coupled(worlds.take([191]), 2, count="total").harm[0] < 1048.2
+
+
+def test_coupled__is_steady_around_its_optimum():
+    worlds = random_worlds(150, seed=21)
+    best = optimise_coupled(worlds, 1)
+    for off in (-1e-9, 1e-9):
+        beside = np.clip(best.deceleration_mps2 + off, 0, 7)
+        assert np.abs(realised(worlds, 1, beside).first_impact_harm.sum(axis=1) - best.harm).max() < 1e-6
+
+
+def test_lowest_minima__keeps_the_six_lowest():
+    depths = [7, 3, 6, 1, 5, 2, 4]
+    zigzag = [value for depth in depths for value in (9, depth)] + [9]
+    bracket, harm, _ = lowest_minima(samples(range(len(zigzag)), zigzag))
+    assert harm.tolist() == [1, 2, 3, 4, 5, 6]
+    assert bracket[:, 1].tolist() == [2 * depths.index(depth) + 1 for depth in harm]
+
+
+def test_coupled__is_not_worse_than_a_grid_when_the_others_brake_gently():
+    worlds = random_worlds(100, seed=27)
+    others = -worlds.vehicles.braking_capacity_mps2
+    others[:, 2] = -3.0
+    least = np.full(worlds.n, np.inf)
+    for share in np.linspace(0, 1, 401):
+        command = others.copy()
+        command[:, 1] = -7.0 * share
+        least = np.minimum(least, advance(worlds, command, until_s=8.0)[1].first_impact_harm.sum(axis=1))
+    assert np.all(optimise_coupled(worlds, 1, others_mps2=others).harm <= least + 1e-9)
+
+
+def test_coupled__takes_the_middle_of_the_interval_that_the_others_commands_leave():
+    worlds = random_worlds(200, seed=25, gap=(9, 16))
+    others = -worlds.vehicles.braking_capacity_mps2
+    others[:, 2] = -4.5
+    gentle = random_worlds(200, seed=25, gap=(9, 16))
+    gentle.vehicles.braking_capacity_mps2[:, 2] = 4.5
+    closed, best = optimise_pairwise(gentle, 1), optimise_coupled(worlds, 1, others_mps2=others)
+    free = closed.harm == 0
+    assert 10 < free.sum() < 190
+    assert np.array_equal(best.deceleration_mps2[free], closed.deceleration_mps2[free])
+    assert np.all(best.harm[free] == 0)

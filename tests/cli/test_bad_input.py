@@ -29,7 +29,7 @@ SCENARIO_DEFECTS = [
     ("\ngaps_m: {uniform: [5, 10]}", "\ngaps_m: [-1, 7]", ["gaps_m", "-1"]),
     ("\nlatency_s: [0, 0.5, 0.8]", "\nlatency_s: [0, 9, 0.8]", ["latency_s", "9", "horizon_s"]),
     ("\n  vehicle_3: full_brake\n", "\n  vehicle_3: full_brake\n  vehicle_4: coast\n", ["vehicle_4", "3"]),
-    ("\n  vehicle_3: full_brake\n", "\n  vehicle_3: ful_brake\n", ["ful_brake", "full_brake"]),
+    ("\n  vehicle_3: full_brake\n", "\n  vehicle_3: ful_brake\n", ["ful_brake", "did you mean full_brake?"]),
     ("\nname: mine", "\nname: mine\nname: mine", ["name", "mine.yaml"]),
     ("\nvehicles: 3", "\nvehicles: [", ["mine.yaml", "line"]),
 ]
@@ -39,6 +39,33 @@ SCENARIO_DEFECTS = [
 def test_scenario_validate__a_defect_is_named_with_its_file(ethbrake, scenario_file, old, new, fragments):
     path = scenario_file(old, new)
     refused(ethbrake("scenario", "validate", path), str(path), *fragments)
+
+
+IMPOSSIBLE_ROLES = [
+    ("vehicle_3", "full_break", "unknown agent 'full_break'; did you mean 'full_brake'?"),
+    ("vehicle_3", "gentlest_front:4", "gentlest_front takes no argument"),
+    ("vehicle_1", "copy_leader", "vehicle_1 has no vehicle in front of it"),
+]
+
+
+@pytest.mark.parametrize(("role", "script", "reason"), IMPOSSIBLE_ROLES)
+@pytest.mark.parametrize("command", ["validate", "run", "train", "evaluate"])
+def test_scenario__a_script_that_cannot_play_is_named_with_its_line(
+    ethbrake, scenario_file, tmp_path, command, role, script, reason
+):
+    path = scenario_file(f"\n  {role}: full_brake\n", f"\n  {role}: {script}\n")
+    path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
+    line = path.read_text().splitlines().index(f"  {role}: {script}") + 1
+    arguments = ["scenario", "validate", path] if command == "validate" else [command, "--scenario", path]
+    output = ["--output", tmp_path / "new"] if command in ("run", "train") else []
+    refused(ethbrake(*arguments, *output), f"{path}, line {line}: roles.{role} = {script}: ", reason)
+    assert not (tmp_path / "new").exists()
+
+
+def test_scenario__a_script_with_a_state_is_in_order_when_early_impacts_are_kept(ethbrake, scenario_file):
+    path = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: e_v2x_bm\n")
+    path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
+    assert ethbrake("scenario", "validate", path).out.startswith("OK  mine: 3 vehicles, learners: vehicle_2;")
 
 
 @pytest.mark.parametrize("command", ["run", "train", "evaluate"])
@@ -68,12 +95,17 @@ def test_long_command__a_defect_of_the_scenario_is_found_before_any_work(ethbrak
         (["--agents", "ppo@runs/nothing-here"], ["runs/nothing-here"]),
         (["--agents", "hybrid@runs/nothing-here"], ["runs/nothing-here"]),
         (["--episodes", "0"], ["0"]),
+        (["--episodes", "100000000000000"], ["100000000000000", "at most 10,000,000"]),
         (["--episodes", "many"], ["--episodes"]),
         (["--seed", "-1"], ["-1"]),
         (["--count", "both"], ["--count", "both", "first", "total"]),
         (["--vehicle", "vehicle_4"], ["vehicle_4", "vehicle_3"]),
         (["--initial-states", "nowhere.csv"], ["nowhere.csv"]),
+        (["--agents", "ppo@" + 5000 * "a"], ["cannot be read", "File name too long"]),
         (["--per-world", "nowhere/out.csv"], ["nowhere"]),
+        (["--per-world", "/proc/out.csv"], ["/proc/out.csv", "cannot be written"]),
+        (["--per-world", 300 * "a"], ["cannot be written", "File name too long"]),
+        (["--per-world", "/dev/null", "--force"], ["/dev/null", "a device or a pipe"]),
         (["--frobnicate"], ["--frobnicate"]),
     ],
 )
@@ -90,6 +122,8 @@ def test_evaluate__a_bad_option_is_refused_in_one_line(ethbrake, arguments, frag
         (["--seed", "-1"], ["seed", "-1"]),
         (["--name", "a/b"], ["a/b"]),
         (["--name", ".."], [".."]),
+        (["--name", 300 * "a"], ["up to 128"]),
+        (["--output", "/proc/x"], ["/proc/x", "No such file"]),
     ],
 )
 @pytest.mark.parametrize("command", ["run", "train"])
@@ -120,8 +154,8 @@ def test_recipe__an_unknown_key_is_named_with_a_suggestion(ethbrake, tiny_recipe
 
 def test_scenario_with_two_learners__evaluate_and_run_ask_who_is_driven(ethbrake, scenario_file, tmp_path):
     path = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: learner\n")
-    refused(ethbrake("evaluate", "--scenario", path, "--episodes", "5"), "2 learners", "vehicle_2, vehicle_3")
-    refused(ethbrake("run", "--scenario", path, "--output", tmp_path / "new"), "2 learners")
+    for command in (["evaluate", "--episodes", "5"], ["run", "--output", tmp_path / "new"]):
+        refused(ethbrake(*command, "--scenario", path), "2 learners (vehicle_2, vehicle_3)", "--vehicle vehicle_2")
     assert not (tmp_path / "new").exists()
 
 
@@ -141,6 +175,10 @@ def test_initial_states__a_defect_is_named_by_line_and_column(ethbrake, tmp_path
     answer = ethbrake("evaluate", "--initial-states", path, "--per-world", tmp_path / "out.csv")
     refused(answer, str(path), *fragments)
     assert not (tmp_path / "out.csv").exists()
+
+
+def test_initial_states__an_endless_device_is_not_read_to_its_end(ethbrake):
+    refused(ethbrake("evaluate", "--initial-states", "/dev/zero"), "/dev/zero", "larger than 64 MiB")
 
 
 def test_initial_states__do_not_go_with_a_drawn_list(ethbrake, tmp_path):
@@ -178,6 +216,25 @@ def test_existing_folder__that_is_no_run_is_kept_even_with_force(ethbrake, tiny_
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
 
 
+def test_agents__one_that_cannot_drive_is_refused_before_another_works(ethbrake, monkeypatch):
+    monkeypatch.setattr("ethbrake_marl.cli.evaluate", lambda *args, **kwargs: pytest.fail("worked"))
+    refused(ethbrake("evaluate", "--agents", "e_v2x_bm,constant:99", "--episodes", "5"), "constant:99", "7 m/s2")
+
+
+def test_output__below_a_file_is_refused_in_one_line(ethbrake, tiny_recipe, tmp_path):
+    (tmp_path / "worlds.csv").write_text("precious")
+    answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "5", "--output", tmp_path / "worlds.csv" / "x")
+    refused(answer, "worlds.csv", "Not a directory")
+
+
+def test_memory__that_is_not_there_is_said_in_one_line(ethbrake, monkeypatch):
+    def short(*args: object, **kwargs: object) -> None:
+        raise MemoryError("Unable to allocate 9 TiB")
+
+    monkeypatch.setattr("ethbrake_marl.cli.choose_worlds", short)
+    refused(ethbrake("evaluate"), "not enough memory (Unable to allocate 9 TiB)", "fewer worlds")
+
+
 def test_per_world__an_existing_file_is_refused_before_the_work(ethbrake, tmp_path, monkeypatch):
     path = tmp_path / "out.csv"
     path.write_text("precious")
@@ -206,6 +263,7 @@ def test_scenario_new__overwrites_only_with_force(ethbrake, tmp_path):
         (["scenario", "new", "Not Good"], ["Not Good"]),
         (["scenario", "new", "mine", "--based-on", "paper-randm"], ["paper-randm", "did you mean"]),
         (["scenario", "new", "mine", "--output", "nowhere"], ["nowhere"]),
+        (["scenario", "new", "mine", "--output", "/proc"], ["/proc/mine.yaml", "cannot be written"]),
         (["doctor", "please"], ["please"]),
     ],
 )

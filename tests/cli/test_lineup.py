@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.experiment import run_folder
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.lineup import choose_worlds, make_lineup
+from ethbrake_marl.lineup import check_agents, choose_worlds, make_lineup
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent
 
@@ -33,6 +33,22 @@ def test_lineup__the_hybrids_bound_and_count_are_as_asked(finished_run, spec, bo
     assert (agent.bound, agent.count) == (bound, "total")
 
 
+def test_check_agents__a_constant_above_the_capacity_of_any_world_is_refused_before_the_work():
+    scenario = SCENARIO.replace(braking_capacity_mps2={"uniform": [5, 7]})
+    worlds = scenario.sample(500, 7).worlds
+    check_agents(make_lineup(["e_v2x_bm", "constant:5", "gentlest_front"], scenario), worlds, scenario)
+    capacity = worlds.vehicles.braking_capacity_mps2[:, 1]
+    between = (capacity[0] + capacity.min()) / 2  # the first world could, another could not
+    with pytest.raises(InvalidInput, match="above the braking capacity"):
+        check_agents(make_lineup([f"constant:{between}"], scenario), worlds, scenario)
+
+
+def test_check_agents__leaves_the_agents_as_they_are():
+    lineup = make_lineup(["e_v2x_bm"], SCENARIO)
+    check_agents(lineup, SCENARIO.sample(3, 7).worlds, SCENARIO)
+    assert lineup["e_v2x_bm"].predicted_harm.size == 0
+
+
 def test_worlds__are_the_list_of_the_seed():
     sample, seed = choose_worlds(SCENARIO, episodes=5, seed=9)
     assert seed == 9
@@ -49,7 +65,7 @@ def test_run_folder__by_default_says_scenario_recipe_and_seed():
     assert run_folder(SCENARIO, recipe, output=Path("/elsewhere/x")) == Path("/elsewhere/x")
 
 
-@pytest.mark.parametrize("name", ["", "..", "a/b", "-x", "a b"])
+@pytest.mark.parametrize("name", ["", "..", "a/b", "-x", "a b", "a" * 129])
 def test_run_folder__a_name_is_one_plain_folder(name):
     with pytest.raises(InvalidInput, match="run name"):
         run_folder(SCENARIO, load_recipe("ppo"), name=name)

@@ -16,19 +16,27 @@ from typing import Any
 
 import pytest
 
+from ethbrake_marl import results_folder
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.evaluation import evaluate, summarise
+from ethbrake_marl.evaluation.figures import learning_curve
+from ethbrake_marl.learning.bundle import load_policy
+from ethbrake_marl.lineup import make_lineup
+from ethbrake_marl.results_folder import write_figures
+from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.terminal import Bars
 
 ROOT = Path(__file__).resolve().parents[2]
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo", "hybrid"]
 
 
-def program(source: str) -> subprocess.CompletedProcess[str]:
+def program(source: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Runs Python source in a process of its own."""
     return subprocess.run(
         [sys.executable, "-c", source],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
         capture_output=True,
-        text=True,
+        encoding=environment.get("PYTHONIOENCODING", "utf-8"),
         timeout=60,
         check=False,
     )
@@ -45,8 +53,8 @@ def test_run__leaves_results_figures_report_and_policy(finished_run):
     pictures = [finished_run / f"{name}.png" for name in ("learning_curve", "harm_against_gap", "trajectories")]
     assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in pictures)
     assert (finished_run / "report.html").read_text().count("data:image/png;base64,") == 3
-    assert run_json(finished_run)["status"] == "finished"
-    assert run_json(finished_run)["steps"] == 256
+    ended = run_json(finished_run)
+    assert (ended["status"], ended["stage"], ended["steps"], ended["reason"]) == ("finished", "report", 256, None)
 
 
 def test_run__results_agree_in_json_csv_and_per_world(finished_run):
@@ -105,6 +113,36 @@ def test_train__names_its_folder_after_scenario_recipe_and_seed(ethbrake, tiny_r
     assert (folder / "policy" / "manifest.json").is_file()
     assert ethbrake("train", "--recipe", tiny_recipe, "--steps", "128", "--name", "mine").status == 0
     assert run_json(Path("runs/mine"))["status"] == "finished"
+
+
+def test_run__vehicle_chooses_among_several_learners(ethbrake, tiny_recipe, scenario_file, tmp_path):
+    scenario = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: learner\n")
+    chosen = ["--scenario", scenario, "--vehicle", "vehicle_3", "--episodes", "20", "--output", tmp_path / "new"]
+    answer = ethbrake("run", "--recipe", tiny_recipe, *chosen, "--json")
+    assert answer.status == 0
+    assert {row["parameters"]["controlled_vehicle"] for row in json.loads(answer.out)} == {"vehicle_3"}
+
+
+def test_run__the_learning_curve_has_the_lines_of_its_references(monkeypatch, finished_run, tmp_path):
+    scenario = load_scenario("paper-random")
+    specs = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise"]
+    agents = {**make_lineup(specs, scenario), "ppo": LearnedAgent(load_policy(finished_run), "ppo")}
+    result = evaluate(scenario.sample(5, 7), agents, scenario=scenario, seed=7)
+    drawn = []
+    monkeypatch.setattr(
+        results_folder, "learning_curve", lambda *a, **k: drawn.append(learning_curve(*a, **k)) or drawn[0]
+    )
+    course = [{"steps": 0.0, "first_impact_harm": 30.0, "total_harm": 33.0, "collision_rate": 1.0}]
+    write_figures(tmp_path, result, summarise(result), course=course, course_caption="", agents=agents)
+    labels = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert labels == ["policy", "full_brake", "e_v2x_bm"]
+
+
+def test_train__progress_ends_at_the_number_that_it_announces(ethbrake, tiny_recipe, tmp_path):
+    answer = ethbrake("train", "--recipe", tiny_recipe, "--steps", "200", "--output", tmp_path / "new")
+    assert answer.status == 0
+    assert "256 of 256\n" in answer.err
+    assert "of 200" not in answer.err
 
 
 def test_train__several_learners_share_a_policy(ethbrake, tiny_recipe, scenario_file, tmp_path):
@@ -192,10 +230,40 @@ def test_command_line__exit_status_and_streams_of_the_program():
     assert (process.returncode, process.stdout, process.stderr.count("\n")) == (2, "", 1)
 
 
+def test_kernels__a_temporary_cache_is_removed_at_the_end(tmp_path):
+    process = program(
+        "from ethbrake_marl.physics.compiled import cache_folder; print(cache_folder(), cache_folder().is_dir())",
+        NUMBA_CACHE_DIR="/dev/null/x",
+        TMPDIR=str(tmp_path),
+    )
+    assert process.stdout.startswith(str(tmp_path / "ethbrake_marl-")) and process.stdout.endswith(" True\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_command_line__a_full_disk_behind_stdout_is_one_line():
+    process = program(
+        "import os, sys; from ethbrake_marl.cli import main; sys.argv[1:] = ['scenario', 'list'];"
+        "os.dup2(os.open('/dev/full', os.O_WRONLY), 1); main()"
+    )
+    assert (process.returncode, process.stderr) == (2, "ethbrake: error: output: No space left on device\n")
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
+def test_command_line__a_table_on_a_narrow_stdout_is_still_printed(encoding):
+    process = program(
+        "import sys; from ethbrake_marl.cli import main;"
+        "sys.argv[1:] = ['evaluate', '--episodes', '5', '--agents', 'coast']; main()",
+        PYTHONIOENCODING=encoding,
+    )
+    assert process.returncode == 0, process.stderr
+    assert "coast" in process.stdout
+
+
 def test_evaluate__needs_no_torch_and_help_neither():
     process = program(
         "import sys; from ethbrake_marl.cli import run_command;"
-        "run_command(['--help']); run_command(['evaluate', '--episodes', '5', '--agents', 'coast']);"
+        "assert run_command(['--help']) == 0;"
+        "assert run_command(['evaluate', '--episodes', '5', '--agents', 'coast']) == 0;"
         "sys.exit(', '.join(sorted({'torch', 'stable_baselines3', 'matplotlib'} & set(sys.modules))) or None)"
     )
     assert process.returncode == 0, process.stderr

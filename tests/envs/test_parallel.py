@@ -244,3 +244,67 @@ def test_aec__plays_the_same_episode_in_turns(make: Any) -> None:
 
 def test_aec__converts_back_to_the_parallel_environment() -> None:
     assert isinstance(aec_to_parallel(env(scenario=FIVE)), EthBrakeParallelEnv)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"reward": 5}, "reward = 5: must be a name"),
+        ({"observation": "x"}, "observation = 'x': must be an ObservationSpec"),
+        ({"learners": 5}, "learners = 5: must be a list of vehicles"),
+    ],
+)
+def test_settings__that_cannot_be_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(InvalidInput, match=message):
+        parallel_env(**settings)
+
+
+@pytest.mark.parametrize("options", [5, ["initial_state"], "initial_state"])
+def test_reset__options_that_are_no_mapping_are_refused(options: Any) -> None:
+    with pytest.raises(InvalidInput, match=r"reset: options = .*: must be None or a mapping"):
+        parallel_env().reset(options=options)
+
+
+def test_step__actions_that_are_no_mapping_or_of_nobody_are_refused() -> None:
+    environment = started()
+    for actions_ in (None, [0.5]):
+        with pytest.raises(InvalidInput, match=r"step: actions = .*: must be a mapping"):
+            environment.step(actions_)  # type: ignore[arg-type]
+    with pytest.raises(UnknownName, match="unknown agent 1"):
+        environment.step({1: act(0.0)})  # type: ignore[dict-item]
+
+
+def test_reset__that_fails_leaves_the_episode_running() -> None:
+    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "constant:5"}
+    environment, twin = (started(PAPER.replace(roles=roles)) for _ in range(2))
+    environment.step({"vehicle_2": act(0.0)})
+    twin.step({"vehicle_2": act(0.0)})
+    with pytest.raises(InvalidInput, match="constant:5"):
+        environment.reset(
+            seed=3, options={"initial_state": {"braking_capacity_mps2": 4, "gaps_m": 3, "speeds_mps": 20}}
+        )
+    mine, its = environment.step({"vehicle_2": act(-0.5)}), twin.step({"vehicle_2": act(-0.5)})
+    assert mine[1:4] == its[1:4]
+    assert (mine[0]["vehicle_2"] == its[0]["vehicle_2"]).all()
+    assert (environment.reset()[0]["vehicle_2"] == twin.reset()[0]["vehicle_2"]).all()
+
+
+def test_learners__may_be_none_where_early_impacts_are_rejected() -> None:
+    environment = parallel_env("paper-random", learners=[])
+    _, infos = environment.reset(seed=0)
+    assert infos["vehicle_1"]["time_s"] == 0.0
+    while environment.agents:
+        environment.step({})
+
+
+def test_rewards__do_not_tell_the_harm_before_the_first_decision() -> None:
+    # 1 m apart, braking against coasting: they meet at sqrt(2/6) s with w = 6 t, harm 12, before 0.6 s.
+    early = CRASH.replace(gaps_m=1, latency_s=[0, 0.6], horizon_s=3, early_impacts="keep")
+    environment = parallel_env(early)
+    _, infos = environment.reset(seed=0)
+    assert infos["vehicle_2"]["world_first_impact_harm"] == near(12.0)
+    told = 0.0
+    while environment.agents:
+        _, rewards, _, _, infos = environment.step({"vehicle_2": act(-1.0)})
+        told += rewards["vehicle_2"]
+    assert -told == near(infos["vehicle_2"]["world_first_impact_harm"] - 12.0)

@@ -220,3 +220,12 @@ def test_make_sb3_vec_env__is_a_vec_env_of_the_named_scenario() -> None:
     assert isinstance(env, EthBrakeVecEnv)
     assert (env.engine.scenario.name, env.engine.reward.terminal) == ("paper-delay-high", 10.0)
     env.close()
+
+
+def test_set_options__that_cannot_be_used_fail_one_reset_only() -> None:
+    env = make_sb3_vec_env(PAPER, 2, seed=4)
+    expected = make_sb3_vec_env(PAPER, 2, seed=4).reset()
+    env.set_options([{"initial_state": {"gaps_m": -1}}] * 2)
+    with pytest.raises(InvalidInput):
+        env.reset()
+    assert (env.reset() == expected).all()

@@ -211,3 +211,21 @@ def test_make_vec__gymnasiums_own_vectorization_works_too(mode: str) -> None:
         observation = env.step(action)[0]
         assert np.array_equal(observation[1], alone.step(action[1])[0])
     env.close()
+
+
+@pytest.mark.parametrize("ignored", [np.nan, 5.0])
+def test_next_step__an_ignored_action_may_be_anything(ignored: float) -> None:
+    env = made("NextStep", 3, SHORT)
+    env.reset(seed=0)
+    braking = np.array([[-1.0], [0.0], [0.0]], np.float32)
+    ended = np.zeros(3, np.bool_)
+    while not ended.any():
+        _, _, terminated, truncated, _ = env.step(braking)
+        ended = terminated | truncated
+    assert ended.tolist() == [True, False, False]
+    given = np.where(ended[:, np.newaxis], np.float32(ignored), np.float32(0.0))
+    _, rewards, *_ = env.step(given)
+    assert rewards[0] == 0.0
+    assert np.isnan(given).any() == np.isnan(ignored)  # the caller's array stays as it is
+    with pytest.raises(InvalidInput, match="action of vehicle_2"):
+        env.step(given)

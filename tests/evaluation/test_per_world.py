@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import csv
+import os
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import Evaluation, check_target, evaluate, write_per_world_csv
+from ethbrake_marl.evaluation.output_files import write_output
 from ethbrake_marl.scenario import Scenario, worlds_from_table
 
 
@@ -84,6 +87,33 @@ def test_per_world__overwrites_only_by_force(tmp_path: Path, evaluation: Evaluat
     write_per_world_csv(path, evaluation, force=True)
     assert path.read_text().startswith("agent,world,gap_1_m")
     assert [file.name for file in tmp_path.iterdir()] == ["out.csv"]
+
+
+def test_check_target__force_replaces_plain_files_only(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "mine").write_text("precious")
+    (tmp_path / "link").symlink_to(tmp_path / "mine")
+    (tmp_path / "dangling").symlink_to(tmp_path / "nothing")
+    for name, message in (("pipe", "a device or a pipe"), ("link", "symbolic link"), ("dangling", "symbolic link")):
+        for force in (False, True):
+            with pytest.raises(InvalidInput, match=message):
+                check_target(tmp_path / name, force=force)
+    assert stat.S_ISFIFO((tmp_path / "pipe").lstat().st_mode)
+    with pytest.raises(InvalidInput, match="a device or a pipe"):
+        check_target("/dev/null", force=True)
+
+
+def test_check_target__refuses_before_the_work_what_a_write_would_refuse(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match=r"out.csv: cannot be written \("):
+        check_target("/proc/out.csv")
+    with pytest.raises(InvalidInput, match=r"cannot be written \(File name too long\)"):
+        check_target(tmp_path / ("a" * 300))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_write_output__takes_the_longest_name_there_is(tmp_path: Path) -> None:
+    write_output(tmp_path / ("a" * 255), b"content")
+    assert (tmp_path / ("a" * 255)).read_bytes() == b"content"
 
 
 def test_check_target__refuses_a_folder_and_a_missing_folder(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import Evaluation, record_episode
+from ethbrake_marl.evaluation import Evaluation, evaluate, record_episode
 from ethbrake_marl.scenario import Scenario, initial_state_worlds
 
 IMPACT_S = 0.5 + 0.25 / 3.0  # see PAIR
@@ -104,3 +104,19 @@ def test_record__bad_input_is_refused(evaluation: Evaluation) -> None:
     for sample_s in (0.0, -0.1, float("nan"), float("inf")):
         with pytest.raises(InvalidInput, match="sample_s"):
             record_episode(evaluation.worlds.take([0]), agent, scenario=scenario, sample_s=sample_s)
+
+
+def test_record__a_vehicle_pushed_above_its_speed_limit_goes_on() -> None:
+    scenario = Scenario(
+        name="pushed", vehicles=2, gaps_m=5, speeds_mps=[20, 25], braking_capacity_mps2=6, driving_capacity_mps2=3,
+        mass_t=[1.5, 10], latency_s=[0, 0.5], speed_limit_mps=[20, 30], time_step_s=1.0,
+        roles={"vehicle_1": "coast", "vehicle_2": "learner"},
+    )  # fmt: skip
+    worlds, agent = scenario.sample(1, 0).worlds, make_agent("coast")
+    final = evaluate(worlds, {"coast": agent}, scenario=scenario).outcome("coast").final
+    record = record_episode(worlds, agent, scenario=scenario)
+    assert (record.speeds_mps[-1] > 24.0).all()  # momentum: 280/11.5 = 24.35 m/s in the mean
+    np.testing.assert_array_equal(record.speeds_mps[-1], final.speeds_mps[0], strict=True)
+    np.testing.assert_array_equal(record.gaps_m[-1], final.gaps_m[0], strict=True)
+    # Struck at 1 s by 5 m/s, e = 0.1.
+    np.testing.assert_allclose(record.positions_m[-1, 0], 20.0 + 7.0 * (20.0 + 1.1 * 5.0 * 10.0 / 11.5), rtol=1e-12)

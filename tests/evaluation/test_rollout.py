@@ -11,6 +11,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, Outcome, evaluate
+from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import Scenario
 
 
@@ -159,7 +160,7 @@ def test_evaluate__bad_input_is_refused(paper_random: Scenario, gap_agent: objec
         evaluate(worlds, {}, scenario=paper_random)
     with pytest.raises(InvalidInput, match="chunk = 0"):
         evaluate(worlds, agents, scenario=paper_random, chunk=0)
-    with pytest.raises(InvalidInput, match="vehicle = 3: must be an index from 0 to 2"):
+    with pytest.raises(InvalidInput, match="vehicle = 3: must be a name or an index from 0 to 2"):
         evaluate(worlds, agents, scenario=paper_random, vehicle=3)
     with pytest.raises(InvalidInput, match="has 0 learners"):
         evaluate(worlds, agents, scenario=paper_random.replace(roles={}, early_impacts="keep"))
@@ -200,3 +201,36 @@ def test_import__evaluation_does_not_load_what_only_figures_and_report_need() ->
     program = f"import sys, ethbrake_marl.evaluation; sys.exit(str(set({heavy!r}) & set(sys.modules)))"
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
     assert result.stderr.strip() == "set()"
+
+
+def test_evaluate__takes_the_vehicle_by_name(paper_random: Scenario) -> None:
+    worlds, agents = paper_random.sample(3, 0), {"coast": make_agent("coast")}
+    by_name = evaluate(worlds, agents, scenario=paper_random, vehicle="vehicle_2")
+    assert by_name.vehicle == 1
+    assert_same(by_name.outcome("coast"), evaluate(worlds, agents, scenario=paper_random).outcome("coast"))
+    with pytest.raises(InvalidInput, match="unknown vehicle 'vehicle_9'"):
+        evaluate(worlds, agents, scenario=paper_random, vehicle="vehicle_9")
+
+
+def test_evaluate__refuses_worlds_that_are_not_at_the_alert(paper_random: Scenario) -> None:
+    worlds = paper_random.sample(3, 0).worlds
+    later, _ = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=0.1)
+    with pytest.raises(InvalidInput, match=r"world 0 is at 0\.1 s; episodes start at the alert"):
+        evaluate(later, {"b": make_agent("full_brake")}, scenario=paper_random)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"worlds": 5}, "worlds = 5: must be worlds or a sample"),
+        ({"scenario": "paper-random"}, "scenario = 'paper-random': must be a Scenario"),
+        ({"agents": ["full_brake"]}, r"agents = \['full_brake'\]: must be a mapping"),
+        ({"agents": {"a": "full_brake"}}, "agent 'a' = 'full_brake': must be an agent"),
+        ({"chunk": 2.5}, r"chunk = 2\.5; a whole number"),
+        ({"vehicle": 1.5}, r"vehicle = 1\.5: must be a name or an index"),
+    ],
+)
+def test_evaluate__says_what_is_not_what_it_must_be(paper_random: Scenario, wrong: dict, message: str) -> None:
+    given = {"worlds": paper_random.sample(1, 0), "agents": {"b": make_agent("full_brake")}, "scenario": paper_random}
+    with pytest.raises(InvalidInput, match=message):
+        evaluate(**{**given, **wrong})

@@ -9,9 +9,9 @@ from rich.console import Console
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, rich_table, summarise
-from ethbrake_marl.evaluation.paper import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST, paper_rows
+from ethbrake_marl.evaluation.paper import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST
 from ethbrake_marl.evaluation.parameters import parameter_line, parameters
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
 
 ALWAYS = {
     "agent", "episodes", "collisions", "horizon_ends", "collision_rate", "collision_rate_interval",
@@ -150,6 +150,22 @@ def test_paper_rows__agree_with_themselves() -> None:
     assert avoided["E-V2X-BM"] + avoided["Standalone DRL"] == 2000
 
 
-def test_paper_rows__stand_only_beside_the_random_test() -> None:
-    assert paper_rows("paper-random") == paper_rows("paper-random-early") == PAPER_ROWS
-    assert paper_rows("paper-scenario-1") == ()
+def _beside_paper(scenario: Scenario, *, vehicle: int = 1, seed: int | None = 7) -> bool:
+    agents = {"full_brake": make_agent("full_brake")}
+    driven = scenario.with_learners([vehicle])
+    (row,) = summarise(evaluate(driven.sample(2, 7), agents, scenario=driven, seed=seed))
+    assert ("paper, " in markdown_table([row])) is row.beside_paper
+    return row.beside_paper
+
+
+def test_paper_rows__stand_only_beside_the_shipped_random_tests() -> None:
+    shown = {entry.name for entry in list_scenarios() if _beside_paper(load_scenario(entry.name))}
+    assert shown == {"paper-random", "paper-random-early"}
+
+
+def test_paper_rows__need_the_values_the_driver_and_the_list_and_not_the_name(paper_random: Scenario) -> None:
+    assert _beside_paper(paper_random.replace(title="Mine"))
+    assert not _beside_paper(paper_random.replace(gaps_m={"uniform": [6, 7]}))
+    assert not _beside_paper(paper_random.replace(roles={"vehicle_2": "learner", "vehicle_3": "constant:3"}))
+    assert not _beside_paper(paper_random, vehicle=2)
+    assert not _beside_paper(paper_random, seed=None)  # worlds that were given

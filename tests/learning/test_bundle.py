@@ -17,6 +17,7 @@ import safetensors.numpy
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
 from ethbrake_marl.learning import bundle
 from ethbrake_marl.learning.bundle import Policy, load_policy, make_policy, save_policy
+from ethbrake_marl.learning.manifest import content_sha256
 
 Spoil = Callable[[Path], None]
 
@@ -26,8 +27,8 @@ class _Payload:
         return (exec, ("raise RuntimeError('code of the bundle was run')",))
 
 
-def _edit(**changes: Any) -> Spoil:
-    """Change manifest fields; a dotted key ``a__b`` goes one level down."""
+def _edit(*, rehash: bool = True, **changes: Any) -> Spoil:
+    """Change manifest fields, a dotted key ``a__b`` one level down; its hash agrees, unless not ``rehash``."""
 
     def spoil(folder: Path) -> None:
         manifest = json.loads((folder / "manifest.json").read_bytes())
@@ -37,6 +38,8 @@ def _edit(**changes: Any) -> Spoil:
             for name in outer:
                 target = target[name]
             target[last] = value
+        if rehash:
+            manifest["manifest_sha256"] = content_sha256(manifest)
         (folder / "manifest.json").write_text(json.dumps(manifest))
 
     return spoil
@@ -129,7 +132,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: Extra inputs"),
     "dotted_algorithm": (_edit(algorithm="subprocess.Popen"), r"manifest.json: algorithm: Input should be 'ppo'"),
     "dotted_activation": (_edit(network__activation="torch.nn.ReLU"), r"manifest.json: network.activation"),
-    "future_version": (_edit(format_version=2), r"manifest.json: format_version: Input should be 1"),
+    "future_version": (_edit(format_version=3), r"manifest.json: format_version: Input should be 2"),
     "wrong_type": (_edit(steps="many"), r"manifest.json: steps: Input should be a valid integer"),
     "giant_layer": (_edit(network__policy_hidden=[10**9]), r"manifest.json: network.policy_hidden.0"),
     "many_layers": (_edit(network__value_hidden=[1] * 9), r"manifest.json: network.value_hidden"),
@@ -139,6 +142,21 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     ),
     "other_features": (_edit(observation__features=[f"own.{k}" for k in range(27)]), r"manifest.json: observation: "),
     "other_scaling": (_edit(observation__scaling_sha256="0" * 64), r"manifest.json: observation: features or their"),
+    "older_version": (_edit(format_version=1), r"manifest.json: format_version: Input should be 2"),
+    "other_activation": (_edit(rehash=False, network__activation="tanh"), r"manifest.json: its content has SHA-256"),
+    "other_output": (_edit(rehash=False, network__output="tanh"), r"manifest.json: its content has SHA-256"),
+    "other_steps": (_edit(rehash=False, steps=999_999_999), r"manifest.json: its content has SHA-256"),
+    "other_reward": (_edit(rehash=False, reward={"jerk": 1.0}), r"manifest.json: its content has SHA-256"),
+    "no_vehicle": (_edit(learners=["car_2"]), r"manifest.json: learners: 'car_2' is no vehicle"),
+    "learner_twice": (_edit(learners=["vehicle_2"] * 2), r"manifest.json: learners: .*each vehicle learns once"),
+    "learner_beyond_the_line": (
+        _edit(learners=["vehicle_9"], scenario={"name": "x", "vehicles": 3}),
+        r"manifest.json: learners: vehicle_9: the scenario has 3 vehicles",
+    ),
+    "learner_with_a_script": (
+        _edit(scenario={"name": "x", "roles": {"vehicle_2": "coast"}}),
+        r"manifest.json: learners: vehicle_2: does not learn",
+    ),
     "hash_not_hex": (_edit(weights_sha256="x" * 64), r"manifest.json: weights_sha256"),
     "bit_flip": (
         lambda f: _replace(f / "weights.safetensors", lambda d: d[:-3] + bytes([d[-3] ^ 1]) + d[-2:]),
@@ -307,7 +325,7 @@ def test_save_policy__leaves_nothing_when_it_fails(
 
 def test_make_policy__refuses_what_it_could_not_load(policy: Policy) -> None:
     fields = {name: getattr(policy.manifest, name) for name in type(policy.manifest).model_fields}
-    del fields["weights_sha256"]
+    del fields["weights_sha256"], fields["manifest_sha256"]
     with pytest.raises(InvalidInput, match=r"policy: steps: Input should be greater"):
         make_policy(policy.tensors, **{**fields, "steps": -1})
     with pytest.raises(InvalidInput, match=r"policy: tensor 'policy.0.bias' holds a number that is not finite"):

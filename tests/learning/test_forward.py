@@ -9,17 +9,22 @@ from torch import nn
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.forward import Actor, dense
-from ethbrake_marl.learning.networks import NetworkSpec, paper_network, tensor_table
+from ethbrake_marl.learning.networks import NetworkSpec, tensor_table
+from ethbrake_marl.learning.recipe import load_recipe
 
 Tensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
+
+
+def _papers_network(observation_size: int) -> NetworkSpec:
+    return load_recipe("ppo-paper").network.spec(observation_size)
 
 
 def _observations(n: int, size: int) -> np.ndarray:
     return np.random.default_rng(1).uniform(-2.0, 2.0, (n, size)).astype(np.float32)
 
 
-def test_paper_network__has_the_tables_tensors() -> None:
-    shapes = {row.name: row.shape for row in tensor_table(paper_network(27))}
+def test_tensor_table__of_the_papers_network_has_the_tables_tensors() -> None:
+    shapes = {row.name: row.shape for row in tensor_table(_papers_network(27))}
     assert shapes == {
         "policy.0.weight": (256, 27),
         "policy.0.bias": (256,),
@@ -84,7 +89,7 @@ def test_actor__action_is_bitwise_independent_of_the_batch_around_it(activation:
 
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 def test_actor__agrees_with_torch(activation: str, random_tensors: Tensors) -> None:
-    spec = paper_network(27).model_copy(update={"activation": activation})
+    spec = _papers_network(27).model_copy(update={"activation": activation})
     tensors, seen = random_tensors(spec), _observations(1000, 27)
     function = nn.functional.relu if activation == "relu" else torch.tanh
     x = torch.from_numpy(seen)
@@ -99,7 +104,7 @@ def test_actor__agrees_with_torch(activation: str, random_tensors: Tensors) -> N
 
 
 def test_actor__empty_batch_gives_no_action(random_tensors: Tensors) -> None:
-    spec = paper_network(4)
+    spec = _papers_network(4)
     assert Actor(spec, random_tensors(spec))(np.empty((0, 4), np.float32)).shape == (0, 1)
 
 
@@ -114,6 +119,6 @@ def test_actor__empty_batch_gives_no_action(random_tensors: Tensors) -> None:
     ],
 )
 def test_actor__refuses_what_it_cannot_mean(observation: np.ndarray, message: str, random_tensors: Tensors) -> None:
-    spec = paper_network(4)
+    spec = _papers_network(4)
     with pytest.raises(InvalidInput, match=message):
         Actor(spec, random_tensors(spec))(observation)

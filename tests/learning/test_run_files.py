@@ -48,7 +48,9 @@ def test_new_folder__does_not_take_a_name_that_was_taken_meanwhile(tmp_path: Pat
 def test_create_run__refuses_what_exists(tmp_path: Path) -> None:
     run = create_run(tmp_path / "runs" / "first")
     run.write_json(run.status, {"status": "finished"})
-    with pytest.raises(AlreadyExists, match="first: is there already; give another name or force"):
+    with pytest.raises(
+        AlreadyExists, match=r"first: is there already; give another name .*--force; make run ARGS=--force"
+    ):
         create_run(run.path)
     assert run.status.is_file()
 

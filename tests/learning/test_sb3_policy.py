@@ -7,8 +7,13 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from ethbrake_marl.learning.forward import Actor
-from ethbrake_marl.learning.networks import NetworkSpec, paper_network
-from ethbrake_marl.learning.sb3_policy import load_tensors, policy_arguments, tensors_of
+from ethbrake_marl.learning.networks import NetworkSpec
+from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.sb3_policy import policy_arguments, tensors_of
+
+
+def _papers_network(observation_size: int) -> NetworkSpec:
+    return load_recipe("ppo-paper").network.spec(observation_size)
 
 
 def _policy(spec: NetworkSpec, seed: int) -> ActorCriticPolicy:
@@ -22,7 +27,7 @@ def _policy(spec: NetworkSpec, seed: int) -> ActorCriticPolicy:
 
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 def test_tensors_of__our_forward_pass_gives_sb3s_deterministic_action(activation: str) -> None:
-    spec = paper_network(27).model_copy(update={"activation": activation})
+    spec = _papers_network(27).model_copy(update={"activation": activation})
     policy = _policy(spec, 0)
     seen = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 27)).astype(np.float32)
     expected, _ = policy.predict(seen, deterministic=True)
@@ -32,25 +37,14 @@ def test_tensors_of__our_forward_pass_gives_sb3s_deterministic_action(activation
 
 
 def test_tensors_of__holds_every_weight_once() -> None:
-    spec = paper_network(27)
+    spec = _papers_network(27)
     policy = _policy(spec, 0)
     assert sum(t.size for t in tensors_of(policy, spec).values()) == sum(p.numel() for p in policy.parameters())
     assert tensors_of(policy, spec)["policy.log_std"].tolist() == [-0.5]
 
 
-def test_load_tensors__restores_actor_and_critic() -> None:
-    spec = paper_network(5)
-    source, target = _policy(spec, 1), _policy(spec, 2)
-    load_tensors(target, spec, tensors_of(source, spec))
-    seen = torch.linspace(-1.0, 1.0, 50).reshape(10, 5)
-    assert torch.equal(target.predict_values(seen), source.predict_values(seen))
-    assert np.array_equal(
-        target.predict(seen.numpy(), deterministic=True)[0], source.predict(seen.numpy(), deterministic=True)[0]
-    )
-
-
 def test_tensors_of__is_a_copy() -> None:
-    spec = paper_network(5)
+    spec = _papers_network(5)
     policy = _policy(spec, 1)
     before = tensors_of(policy, spec)
     kept = before["policy.0.weight"].copy()

@@ -4,29 +4,35 @@ Vehicles are added one behind the other. Each new one gets its own motion (laten
 time on a grid of 1/8 s; its initial gap is then the way by which it gains on the vehicle before it until then. Every
 number of such a world is a multiple of a power of two with few digits, so a double holds it exactly and a correct kernel
 must find the same bits as rational arithmetic.
+
+Lines of many vehicles are rare finds (a chain of impacts soon leaves the grid), so the worlds used by the tests are kept in
+``tests/golden/manufactured_worlds.json``; ``python -m tests.physics.manufacture`` writes that file anew (minutes).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
 from ethbrake_marl.physics import Worlds, make_worlds
-from tests.physics.exact_simulator import Irrational, Line, Outcome, Rationals, simulate
+from tests.physics.exact_simulator import Unexact, Line, Outcome, Rationals, simulate
 
 GRID = 1 << 14  # every state on the way is a multiple of 1 / GRID: squares and products then fit in 53 bits
 FAR = Fraction(1 << 20)
 CAPACITY_MPS2 = 16.0
+GOLDEN = Path(__file__).parents[1] / "golden" / "manufactured_worlds.json"
+COUNTS = {2: 300, 3: 200, 4: 150, 5: 100}
 MASSES = (  # touching neighbours weigh a power of two together, so that common speeds are dyadic
     (1, 1, 2, 4, 8), (2, 2, 4, 8, 16), (1, 3, 1, 3, 1), (3, 1, 3, 1, 3), (3, 5, 3, 5, 3), (7, 1, 7, 1, 7), (1, 7, 1, 7, 1),
     (1, 1, 1, 1, 1), (8, 4, 2, 1, 1), (2, 6, 2, 6, 2), (1, 15, 1, 15, 1), (6, 2, 6, 2, 6),
 )  # fmt: skip
-RESTITUTIONS = (0, Fraction(1, 4), Fraction(1, 2), Fraction(3, 4), 1)
-COMMANDS = (-8, -4, -2, -2, -1, Fraction(-1, 2), 0, 0, Fraction(1, 2), 1, 2, 4)
+RESTITUTIONS = (0, 0, Fraction(1, 4), Fraction(1, 2), Fraction(3, 4), 1)
+COMMANDS = (-8, -4, -2, -2, -1, Fraction(-1, 2), 0, 0, 0, 0, 0, 0, Fraction(1, 2), 1, 2, 4)
 
 
 @dataclass(frozen=True)
@@ -39,12 +45,38 @@ class Case:
 
 
 def manufactured(seed: int, N: int, count: int) -> list[Case]:
-    """``count`` worlds of ``N`` vehicles, each with at least one contact at a chosen time."""
+    """``count`` worlds of ``N`` vehicles, each with contacts at chosen times."""
+    return collect(attempt, seed, N, count)
+
+
+def pressed(seed: int, N: int, count: int) -> list[Case]:
+    """``count`` worlds of ``N`` vehicles that touch at the start: resting contact, holding brakes, release."""
+    return collect(press, seed, N, count)
+
+
+def collect(build: Callable[[np.random.Generator, int], Iterator[Case]], seed: int, N: int, count: int) -> list[Case]:
     rng = np.random.default_rng([seed, N])
     cases: list[Case] = []
     while len(cases) < count:
-        cases += attempt(rng, N)
-    return cases[:count]
+        cases += build(rng, N)
+    return cases
+
+
+def press(rng: np.random.Generator, N: int) -> Iterator[Case]:
+    """A line that starts at one speed, often 0, with most gaps closed."""
+    start = Fraction(int(rng.choice([0, 0, 0, 2, 4, 12])))
+    mass = MASSES[rng.integers(len(MASSES))][:N]
+    line = Line((), (), (), (), (), (), Fraction(RESTITUTIONS[rng.integers(len(RESTITUTIONS))]))
+    for k in range(N):
+        command = Fraction(COMMANDS[rng.integers(len(COMMANDS))])
+        latency = eighths(rng, 0, 8) if rng.random() < 0.5 else Fraction(0)
+        limit = Fraction(int(rng.choice([16, 16, 20])))
+        gap = eighths(rng, 0, 8) if rng.random() < 0.2 else Fraction(0)
+        line = append(line, start, command, latency, Fraction(mass[k]), limit, gap=gap if k else None)
+    outcome = run(line, Fraction(4))
+    kinds = ("held", "standstill", "released", "limit", "impact")
+    if outcome is not None and outcome.kinds["joined"] and any(outcome.kinds[kind] for kind in kinds):
+        yield Case(line, Fraction(4), outcome)
 
 
 def attempt(rng: np.random.Generator, N: int) -> Iterator[Case]:
@@ -53,8 +85,9 @@ def attempt(rng: np.random.Generator, N: int) -> Iterator[Case]:
     line = Line((), (), (), (), (), (), Fraction(RESTITUTIONS[rng.integers(len(RESTITUTIONS))]))
     last = Fraction(0)
     for k in range(N):
-        contact = last + eighths(rng, 0, 9)
-        placed = add_vehicle(rng, line, Fraction(mass[k]), contact)
+        contact = last + Fraction(int(rng.choice([0, 1, 1, 2, 2, 3, 4, 6])), 8)
+        tries = (add_vehicle(rng, line, Fraction(mass[k]), contact) for _ in range(12))
+        placed = next((found for found in tries if found is not None), None)
         if placed is None:
             return
         line, last = placed, contact if k else last
@@ -73,7 +106,8 @@ def add_vehicle(rng: np.random.Generator, line: Line, mass: Fraction, contact: F
     own = (min(speed, limit), command, latency, mass, limit)
     if not line.speeds:
         return append(line, *own)
-    if rng.random() < 0.15:  # a touch: as fast as the vehicle before it at the contact
+    if rng.random() < 0.07:  # a touch: as fast as the vehicle before it at the contact, and slowing down
+        own = (own[0], Fraction(-8), Fraction(0), *own[3:])
         far = run(append(line, *own, gap=FAR), contact)
         speed = own[0] if far is None else own[0] + far.speeds[-2] - far.speeds[-1]
         own = (min(max(speed, Fraction(0)), limit), *own[1:])
@@ -82,7 +116,7 @@ def add_vehicle(rng: np.random.Generator, line: Line, mass: Fraction, contact: F
         return None
     placed = append(line, *own, gap=FAR - far.gaps[-1])
     met = run(placed, contact)
-    early = run(placed, contact - Fraction(1, 1024)) if contact > 0 else met
+    early = run(placed, contact - Fraction(1, 64)) if contact > 0 else met
     pair = len(placed.gaps) - 1
     if met is None or early is None or any(hit.pair == pair and hit.time < contact for hit in met.hits):
         return None
@@ -106,10 +140,10 @@ def append(line: Line, speed: Fraction, command: Fraction, latency: Fraction, ma
 def run(line: Line, until: Fraction) -> Outcome | None:
     """The exact outcome, or None unless every number on the way is a multiple of 1 / GRID."""
     try:
-        outcome = simulate(line, until)
-    except Irrational:
+        outcome = simulate(line, until, grid=GRID)
+    except Unexact:
         return None
-    return outcome if GRID % outcome.grid == 0 and len(outcome.hits) < 60 else None
+    return outcome if len(outcome.hits) < 60 else None
 
 
 def eighths(rng: np.random.Generator, low: int, high: int) -> Fraction:
@@ -119,9 +153,7 @@ def eighths(rng: np.random.Generator, low: int, high: int) -> Fraction:
 
 def worlds_of(lines: Sequence[Line]) -> Worlds:
     """The lines as one batch; their numbers must be doubles."""
-    rows = {
-        name: [floats(getattr(line, name)) for line in lines] for name in ("gaps", "speeds", "latency", "mass", "limit")
-    }
+    rows = {name: [floats(getattr(line, name)) for line in lines] for name in ("gaps", "speeds", "latency", "mass", "limit")}
     return make_worlds(
         rows["gaps"],
         rows["speeds"],
@@ -142,6 +174,26 @@ def floats(row: Rationals) -> list[float]:
     return [float(x) for x in row]
 
 
-def distinct_times(case: Case) -> bool:
-    """Whether no two impacts of the case happen at one instant."""
-    return all(a.time < b.time for a, b in pairwise(case.outcome.hits))
+def stored() -> list[Case]:
+    """The manufactured worlds of the golden file, with their exact outcomes computed anew."""
+    cases = []
+    for *rows, restitution, until in json.loads(GOLDEN.read_text("utf-8"))["worlds"]:
+        line = Line(*(tuple(map(Fraction, row)) for row in rows), Fraction(restitution))
+        cases.append(Case(line, Fraction(until), simulate(line, Fraction(until), grid=GRID)))
+    return cases
+
+
+def write_golden() -> None:
+    """Manufacture the worlds of the golden file."""
+    rows = []
+    for N, count in COUNTS.items():
+        for case in manufactured(20, N, count)[:count]:
+            line = case.line
+            numbers = (line.gaps, line.speeds, line.command, line.latency, line.mass, line.limit)
+            rows.append(json.dumps([*map(floats, numbers), float(line.restitution), float(case.until)]))
+    columns = "gaps_m, speeds_mps, command_mps2, latency_s, mass_t, speed_limit_mps, restitution, until_s"
+    GOLDEN.write_text('{"columns": "%s", "worlds": [\n%s\n]}\n' % (columns, ",\n".join(rows)), "utf-8")
+
+
+if __name__ == "__main__":
+    write_golden()

@@ -7,15 +7,16 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.learning.recipe import shipped_recipes
 from ethbrake_marl.scenario import (
     Scenario,
-    catalogue,
     list_scenarios,
     load_scenario,
     new_scenario_text,
     parse_yaml,
     scenario_folder,
     scenario_json_schema,
+    shipped_files,
 )
 from ethbrake_marl.scenario.flow_text import flow_text
 
@@ -167,7 +168,7 @@ def test_docs__the_mistakes_are_answered_as_printed(old, new):
 
 
 def test_folder__of_an_installed_package_is_inside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(catalogue, "__file__", str(tmp_path / "ethbrake_marl" / "scenario" / "catalogue.py"))
+    monkeypatch.setattr(shipped_files, "_PACKAGE", tmp_path / "ethbrake_marl")
     with pytest.raises(InvalidInput, match=r"the shipped scenarios are missing: .*reinstall"):
         scenario_folder()
     installed = tmp_path / "ethbrake_marl" / "_data" / "scenarios"
@@ -176,3 +177,18 @@ def test_folder__of_an_installed_package_is_inside_it(tmp_path: Path, monkeypatc
     assert scenario_folder() == installed
     (tmp_path / "pyproject.toml").touch()
     assert scenario_folder() == tmp_path / "scenarios"
+
+
+def test_folder__of_recipes_follows_the_same_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(shipped_files, "_PACKAGE", tmp_path / "ethbrake_marl")
+    with pytest.raises(InvalidInput, match=r"the shipped recipes are missing: .*reinstall"):
+        shipped_recipes()
+    installed = tmp_path / "ethbrake_marl" / "_data" / "train"
+    installed.mkdir(parents=True)
+    (installed / "mine.yaml").touch()
+    assert shipped_recipes() == {"mine": installed / "mine.yaml"}
+
+
+def test_new__says_that_a_latency_must_be_below_the_horizon():
+    (line,) = (line for line in new_scenario_text("mine").splitlines() if "3600" in line and "commands" in line)
+    assert line.endswith("below horizon_s")

@@ -64,6 +64,13 @@ def test_csv__optional_columns_in_any_order_with_a_byte_order_mark(tmp_path: Pat
         (HEADER + ",latency_3_s\n10,8,20,18,20,8\n", "line 2, column latency_3_s = 8: must be below the scenario's ho"),
         (HEADER + ",restitution\n10,8,20,18,20,1.1\n", "line 2, column restitution = 1.1"),
         (HEADER + '\n"10,8,20,18,20\n', "cannot be read as CSV"),
+        (HEADER + '\n"1\n0",8,20,18,20\n', "line 2, column gap_1_m: '1\\n0' is not a number"),
+        (HEADER + '\n"10\n",8,20,18,20\n10,-8,20,18,20\n', "line 4, column gap_2_m = -8"),
+        (HEADER + '\n"10\n",8,20,18,20\n10,8\n', "line 4: 2 values"),
+        (
+            HEADER + ",speed_limit_1_mps\n10,8,20,18,20,20\n10,8,35,18,20,30\n",
+            "line 3, column speed_1_mps = 35: must not be above speed_limit_mps of vehicle_1, 30 m/s",
+        ),
         (HEADER + "\n", "has a header but no rows"),
         ("", "line 1: must name the columns"),
     ],
@@ -74,6 +81,20 @@ def test_csv__defects_name_file_line_and_column(tmp_path: Path, text: str, messa
         read_initial_states(path, PAPER)
     assert str(caught.value).startswith(str(path))
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("end", ["", "\n", "\n\n", "\r\n\r\n"])
+def test_csv__blank_lines_at_the_end_are_nothing(tmp_path: Path, end: str):
+    assert read_initial_states(write(tmp_path, f"{HEADER}\n10,8,20,18,20{end}"), PAPER).n == 1
+
+
+def test_csv__beyond_the_limit_is_not_read_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = write(tmp_path, f"{HEADER}\n10,8,20,18,20\n")
+    monkeypatch.setattr("ethbrake_marl.scenario.initial_states.SIZE_LIMIT", path.stat().st_size)
+    assert read_initial_states(path, PAPER).n == 1
+    for endless in (write(tmp_path, f"{HEADER}\n10,8,20,18,20\n\n"), Path("/dev/zero")):
+        with pytest.raises(InvalidInput, match=r"larger than 0 MiB, the limit for a table"):
+            read_initial_states(endless, PAPER)
 
 
 def test_csv__that_is_missing_or_not_text(tmp_path: Path):

@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Vehicles, Worlds
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import Scenario, load_scenario, sampling
 from ethbrake_marl.scenario.quantities import BLOCK, QUANTITIES
 from ethbrake_marl.scenario.sampling import uniform_numbers
 
@@ -176,6 +176,15 @@ def test_early_impacts__a_scenario_that_always_collides_early_fails_soon():
         closing_pair({"uniform": [1, 2]}).sample(10_000, 0)
 
 
+def test_early_impacts__giving_up_costs_few_draws(monkeypatch):
+    drawn = []
+    draw = sampling._draw
+    monkeypatch.setattr(sampling, "_draw", lambda *args: drawn.append(len(args[-1])) or draw(*args))
+    with pytest.raises(InvalidInput, match="1000 draws of world 0"):
+        closing_pair({"uniform": [1, 2]}).sample(500, 0)
+    assert sum(drawn) == 10 * 500 + 990  # ten attempts of all, then one world to its end
+
+
 def test_early_impacts__scripts_are_followed_and_learners_coast():
     # With the front vehicle coasting nothing closes; braking at 2 m/s2 it comes 1 m closer within 1 s.
     assert closing_pair(0.5).replace(roles={"vehicle_1": "coast", "vehicle_2": "learner"}).sample(1, 0).rejected == 0
@@ -202,6 +211,8 @@ def test_early_impacts__the_first_learner_counts():
         ({"n": 0, "seed": 1}, "n = 0: must be a whole number, at least 1"),
         ({"n": 2.0, "seed": 1}, "n = 2.0"),
         ({"n": True, "seed": 1}, "n = True"),
+        ({"n": 10_000_001, "seed": 1}, "n = 10000001: at most 10,000,000 worlds at once"),
+        ({"n": 10**14, "seed": 1}, "n = 100000000000000: at most"),
         ({"n": 1, "seed": -1}, "seed = -1: must be a whole number, at least 0"),
         ({"n": 1, "seed": None}, "seed = None"),
         ({"n": 1, "seed": 1, "first": -1}, "first = -1"),

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import copy
 import pickle
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +36,36 @@ def test_defaults__are_the_labelled_ones():
     assert scenario.restitution == 0.1
     assert scenario.early_impacts == "keep"
     assert scenario.roles == {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "full_brake"}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda roles: roles.__setitem__("vehicle_3", "learner"),
+        lambda roles: roles.__delitem__("vehicle_3"),
+        lambda roles: roles.__ior__({"vehicle_3": "learner"}),
+        lambda roles: roles.update(vehicle_3="learner"),
+        lambda roles: roles.setdefault("vehicle_4", "learner"),
+        lambda roles: roles.pop("vehicle_3"),
+        lambda roles: roles.popitem(),
+        lambda roles: roles.clear(),
+    ],
+)
+@pytest.mark.parametrize("given", [{}, {"roles": {"vehicle_2": "learner"}}])
+def test_roles__cannot_be_changed(given: dict[str, Any], change: Callable[[Any], object]):
+    scenario = build(**given)
+    with pytest.raises(InvalidInput, match=r"roles of a scenario are frozen; use scenario.replace"):
+        change(scenario.roles)
+    assert scenario.learners == (1,)
+
+
+def test_roles__survive_copies():
+    scenario = build()
+    for again in (copy.deepcopy(scenario), pickle.loads(pickle.dumps(scenario)), scenario.replace(title="Mine")):
+        assert again.roles == scenario.roles
+        with pytest.raises(InvalidInput, match="frozen"):
+            again.roles["vehicle_3"] = "learner"
+    assert type(scenario.model_dump()["roles"]) is dict
 
 
 def test_python__arguments_raise_the_same_errors():

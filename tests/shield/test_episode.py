@@ -86,3 +86,63 @@ def test_bad_input__is_refused():
     shielded.reset(seed=0)
     with pytest.raises(InvalidInput, match="vehicle_2"):
         shielded.step({"vehicle_2": np.array([1.5])})
+
+
+class Counting:
+    """Full braking that counts the episodes it began."""
+
+    name = "counting"
+
+    def __init__(self):
+        self.begun = 0
+
+    def begin(self, worlds, vehicle, rows):
+        self.begun += len(rows)
+
+    def act(self, worlds, vehicle):
+        return -worlds.vehicles.braking_capacity_mps2[:, vehicle]
+
+
+def test_begin__the_prediction_does_not_disturb_the_policy():
+    policy = Counting()
+    HybridAgent(policy, SCENARIO).begin(WORLDS, 1, np.arange(WORLDS.n))
+    assert policy.begun == WORLDS.n
+
+
+@pytest.mark.parametrize(("bound", "count"), [("pairwise", "frist"), ("coupled", "both"), ("couple", "first")])
+def test_hybrid__refuses_an_unknown_bound_or_count(bound, count):
+    with pytest.raises(InvalidInput, match="must be"):
+        HybridAgent(make_agent("full_brake"), SCENARIO, bound=bound, count=count)
+
+
+def test_wrapper__refuses_two_learners_and_leaves_the_environment_usable():
+    env = parallel_env(learners=["vehicle_2", "vehicle_3"])
+    with pytest.raises(InvalidInput, match=r"2 learners \(vehicle_2, vehicle_3\).*exactly one learner"):
+        HybridShield(env, make_agent("full_brake"), agents=["vehicle_2"])
+    env.reset(seed=0)
+
+
+def test_wrapper__closed_lets_go_of_the_environment():
+    env, policy = parallel_env(), Counting()
+    shielded = HybridShield(env, policy)
+    shielded.reset(seed=0)
+    begun = shielded.hybrid.policy.begun
+    shielded.close()
+    env.reset(seed=1)
+    assert begun == 1 and shielded.hybrid.policy.begun == 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"env": None}, "None is not one of this package's environments"),
+        ({"policy": None}, "policy = None: must be an agent or a policy"),
+        ({"agents": 5}, "agents = 5: must be a list of names"),
+        ({"agents": "vehicle_2"}, "agents = 'vehicle_2': must be a list of names"),
+        ({"mode": 5}, "unknown shield mode 5"),
+    ],
+)
+def test_wrapper__says_what_is_not_what_it_must_be(wrong, message):
+    given = {"env": parallel_env(), "policy": make_agent("full_brake")}
+    with pytest.raises(InvalidInput, match=message):
+        HybridShield(**{**given, **wrong})

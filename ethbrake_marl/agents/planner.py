@@ -1,0 +1,142 @@
+"""A planner: at every decision it searches the rest of the episode in the engine's physics, and drives the first step."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Mapping
+
+import numpy as np
+
+from ethbrake_marl.agents.others import fixed_commands
+from ethbrake_marl.agents.pairwise import optimise_pairwise
+from ethbrake_marl.agents.profile_search import MOST_PHASES
+from ethbrake_marl.agents.profiles import (
+    TIME_STEP_S,
+    ProfileProblem,
+    Profiles,
+    constant_profiles,
+    profile_problem,
+    search_profiles,
+)
+from ethbrake_marl.agents.protocol import place
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.starts import Script
+
+CANDIDATES = 256  # per world and decision
+ROUND = 256  # candidates between two looks at the clock
+_CONSTANTS = 15
+_ARGUMENT = re.compile(r"(?P<number>[0-9]+(\.[0-9]+)?)(?P<unit>ms)?")
+
+
+class Planner:
+    """Receding horizon: the own profile is searched anew at each decision, the ``others`` following their scripts.
+
+    Each search starts from the plan so far, from constants and, at first, from the pairwise optimum. ``argument`` is the
+    number of candidates per world and decision (deterministic), or a time like ``20ms`` per world and decision
+    (as many rounds of candidates as fit, at least one; depends on the machine). ``predicted_harm`` [n] is that of the
+    first plan (m2/s2), and more is not done if the others do as expected. Vehicles that are not in ``others`` (learners) are
+    taken to brake fully. Raises ``InvalidInput`` for any other argument or an unknown count and, when an episode begins,
+    for another vehicle's script whose command is not fixed at the alert.
+    """
+
+    def __init__(self, argument: str | None = None, *, count: HarmCount = "first", horizon_s: float = 8.0) -> None:
+        check_count(count)
+        self.others: Mapping[int, Script] = {}
+        self.name = "planner" if argument is None else f"planner:{argument}"
+        self.predicted_harm: Floats = np.empty(0)
+        self._candidates, self._milliseconds = _budget(argument)
+        self._count: HarmCount = count
+        self._horizon_s = horizon_s
+        self._latency_s: Floats = np.empty(0)
+        self._others_mps2: Floats = np.empty((0, 0))  # [n, N]
+        self._plan = Profiles(np.zeros((0, MOST_PHASES), np.int64), np.zeros((0, MOST_PHASES, 1)))
+        self._planned_s: Floats = np.empty(0)  # [n] when the plan begins
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Make the first plan of these rows' episodes."""
+        others = {i: script for i, script in self.others.items() if i != vehicle}
+        command = fixed_commands(others, worlds, f"agent {self.name!r}")
+        problem = self._problem(worlds, vehicle, command)
+        pairwise = -optimise_pairwise(worlds, vehicle).deceleration_mps2
+        found = self._search(problem, constant_profiles(problem, pairwise[:, np.newaxis, np.newaxis]))
+        self.predicted_harm = place(self.predicted_harm, rows, found[1])
+        self._latency_s = place(self._latency_s, rows, worlds.vehicles.latency_s[:, vehicle])
+        self._planned_s = place(self._planned_s, rows, np.maximum(self._latency_s[rows], worlds.time_s))
+        more = self._latency_s.size - len(self._plan.ends)
+        self._plan = Profiles(*(np.pad(part, [(0, more)] + [(0, 0)] * (part.ndim - 1)) for part in self._plan))
+        if self._others_mps2.shape[1] != worlds.N:
+            self._others_mps2 = np.zeros((self._latency_s.size - more, worlds.N))
+        self._others_mps2 = np.pad(self._others_mps2, ((0, more), (0, 0)))
+        self._others_mps2[rows] = command
+        self._store(rows, found[0])
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The first command of the new plans, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
+        n = worlds.n
+        if n > self._latency_s.size or np.isnan(self._latency_s[:n]).any():
+            raise InvalidInput(f"agent {self.name!r}: act on {n} worlds, but begin was not called for each of them")
+        moving = (worlds.speeds_mps != 0.0).any(axis=1)
+        due = (worlds.time_s > self._planned_s[:n]) & (worlds.time_s < self._horizon_s) & moving
+        rows = np.flatnonzero(due)
+        if rows.size:
+            now = worlds.take(rows)
+            problem = self._problem(now, vehicle, self._others_mps2[rows])
+            self._store(rows, self._search(problem, self._rest(rows, now.time_s, problem))[0])
+            self._planned_s[rows] = now.time_s
+        return self._plan.commands_mps2[:n, 0, 0].copy()
+
+    def _problem(self, worlds: Worlds, vehicle: int, others: Floats) -> ProfileProblem:
+        return profile_problem(worlds, [vehicle], count=self._count, horizon_s=self._horizon_s, others_mps2=others)
+
+    def _rest(self, rows: Ints, time_s: Floats, problem: ProfileProblem) -> Profiles:
+        """What is left of the plans of ``rows`` from ``time_s`` on."""
+        passed = np.rint((time_s - self._planned_s[rows]) / TIME_STEP_S).astype(np.int64)[:, np.newaxis]
+        ends = np.maximum(self._plan.ends[rows] - passed, 0)
+        ends = np.minimum(ends, problem.last_step[:, np.newaxis])
+        ends[:, -1] = problem.last_step
+        return Profiles(ends, self._plan.commands_mps2[rows])
+
+    def _store(self, rows: Ints, plan: Profiles) -> None:
+        self._plan.ends[rows] = plan.ends
+        self._plan.commands_mps2[rows] = plan.commands_mps2
+
+    def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
+        """The best plans found from these and from constants, with their harm under the own count."""
+        stop = time.perf_counter() + 1e-3 * self._milliseconds * problem.n
+        seed = 0
+        while True:
+            given = _with_constants(problem, plan)
+            found = search_profiles(problem, given, budget=self._candidates, seed=seed)
+            plan, seed = found.profiles, seed + 1
+            if time.perf_counter() >= stop:
+                return plan, found.harm(self._count)
+
+
+def _with_constants(problem: ProfileProblem, plan: Profiles) -> Profiles:
+    """Each world's plan, then constants: [n * Q]."""
+    low, high = problem.bounds[:, np.newaxis, :, 0], problem.bounds[:, np.newaxis, :, 1]
+    share = np.linspace(0.0, 1.0, _CONSTANTS)[:, np.newaxis]
+    constants = constant_profiles(problem, low + share * (high - low))
+    n, K = plan.ends.shape
+    ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
+    commands = constants.commands_mps2.reshape(n, -1, K, 1)
+    commands = np.concatenate([plan.commands_mps2[:, np.newaxis], commands], axis=1)
+    return Profiles(ends.reshape(-1, K), commands.reshape(-1, K, 1))
+
+
+def _budget(argument: str | None) -> tuple[int, float]:
+    """Candidates per decision (or round), and milliseconds (0: exactly one round)."""
+    if argument is None:
+        return CANDIDATES, 0.0
+    match = _ARGUMENT.fullmatch(argument)
+    if match is not None and match["unit"] is None and match["number"].isdigit() and int(argument) >= 1:
+        return int(argument), 0.0
+    if match is not None and match["unit"] == "ms" and float(match["number"]) > 0.0:
+        return ROUND, float(match["number"])
+    raise InvalidInput(
+        f"agent 'planner:{argument}': the argument must be a number of candidates per decision, for instance 256, or a"
+        " time per decision, for instance 20ms"
+    )

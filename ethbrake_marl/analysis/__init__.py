@@ -1,0 +1,1 @@
+"""What was avoidable, the least harm that is known, and how far an agent is from it."""

@@ -1,0 +1,215 @@
+"""The least harm known in each world: search over whole profiles of the controlled vehicles, in the engine's physics.
+
+What is found is realised harm: an upper bound of the true minimum, never below it. See docs/best-harm.md.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ethbrake_marl.agents.coupled import optimise_coupled
+from ethbrake_marl.agents.driving import scripted
+from ethbrake_marl.agents.others import fixed_commands
+from ethbrake_marl.agents.profiles import (
+    Found,
+    ProfileProblem,
+    Profiles,
+    Words,
+    constant_profiles,
+    follow_profiles,
+    profile_problem,
+    search_profiles,
+)
+from ethbrake_marl.analysis.best_harm_table import Best, BestHarmTable, join_tables, load_table, save_table
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.scenario import Sample, Scenario
+
+BUDGET = 100_000  # candidates per world and count
+CHUNK = 200  # worlds between two reports of progress
+CONSTANTS = 29  # even grid of constant commands from which every search also starts
+
+Progress = Callable[[int, int], None]  # worlds done, of how many
+
+
+def best_harm(
+    scenario: Scenario,
+    worlds: Worlds,
+    *,
+    counts: Sequence[HarmCount] = COUNTS,
+    vehicles: Sequence[int] | None = None,
+    budget: int = BUDGET,
+    seed: int = 0,
+    threads: int | None = None,
+) -> BestHarmTable:
+    """Search every world (at t = 0) for the profiles of least harm, once per count.
+
+    ``vehicles`` are the controlled ones (default: the scenario's learners); all others follow their scripts, which must
+    be state-free. With both counts, each may take the other's result. The result is never worse than the best constant
+    deceleration of a controlled vehicle (other controlled ones braking fully), and not than the same search with one of
+    them alone. It does not depend on ``threads`` (default: every core) or on the batch. Raises ``InvalidInput`` for no
+    vehicle, a script that depends on the state, no count, or a budget below 1.
+    """
+    if not counts or not set(counts) <= set(COUNTS) or len(set(counts)) != len(counts):
+        raise InvalidInput(f"counts {tuple(counts)}: must be first, total, or both")
+    chosen = scenario.learners if vehicles is None else tuple(vehicles)
+    workers = _cores() if threads is None else threads
+    search = _Search(scenario, worlds, scripted_commands(scenario, worlds, chosen), budget, seed, workers)
+    found: list[Found] = []
+    for count in counts:
+        found.append(search.best(chosen, count, [earlier.profiles for earlier in found]))
+    rows = np.arange(worlds.n)
+    best: dict[HarmCount, Best] = {}
+    for count in counts:
+        harms = np.stack([result.harm(count) for result in found])
+        pick = np.argmin(harms, axis=0)
+        ends = np.stack([result.profiles.ends for result in found])[pick, rows]
+        commands = np.stack([result.profiles.commands_mps2 for result in found])[pick, rows]
+        best[count] = Best(harms[pick, rows], Profiles(ends, commands))
+    names = [scenario.vehicle_names[i] for i in chosen]
+    header = {"scenario": scenario.name, "vehicles": names, "budget": budget, "search_seed": seed}
+    return BestHarmTable(search.problem(chosen, counts[0]).identity, best, header)
+
+
+def search_list(
+    scenario: Scenario,
+    sample: Sample,
+    *,
+    counts: Sequence[HarmCount] = COUNTS,
+    vehicles: Sequence[int] | None = None,
+    budget: int = BUDGET,
+    seed: int = 0,
+    threads: int | None = None,
+    chunks: Path | None = None,
+    on_progress: Progress | None = None,
+) -> BestHarmTable:
+    """``best_harm`` of a long list, ``CHUNK`` worlds at a time, resumable.
+
+    With ``chunks``, a folder, each finished chunk is kept there as a file, and a later call with the same question takes
+    it from there. A file that answers another question is computed anew and replaced.
+    """
+    parts = []
+    n = sample.worlds.n
+    for first in range(0, n, CHUNK):
+        rows = np.arange(first, min(first + CHUNK, n))
+        worlds = sample.worlds.take(rows)
+        part = None
+        file = None if chunks is None else chunks / f"{first:07d}.npz"
+        question = {"counts": list(counts), "budget": budget, "search_seed": seed}
+        if file is not None and file.is_file():
+            part = _answer(file, scenario, worlds, vehicles, question)
+        if part is None:
+            part = best_harm(
+                scenario, worlds, counts=counts, vehicles=vehicles, budget=budget, seed=seed, threads=threads
+            )
+            if file is not None:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                save_table(file, part)
+        parts.append(part)
+        if on_progress is not None:
+            on_progress(int(rows[-1]) + 1, n)
+    return join_tables(parts)
+
+
+def _answer(
+    file: Path, scenario: Scenario, worlds: Worlds, vehicles: Sequence[int] | None, question: dict[str, object]
+) -> BestHarmTable | None:
+    """What a kept chunk says, if it is whole and of this very question."""
+    try:
+        table = load_table(file)
+    except CorruptBundle:
+        return None
+    asked = {"counts": list(table.best), **{key: table.header.get(key) for key in ("budget", "search_seed")}}
+    same = asked == question and np.array_equal(table.identity, world_identity(scenario, worlds, vehicles))
+    return table if same else None
+
+
+def world_identity(scenario: Scenario, worlds: Worlds, vehicles: Sequence[int] | None = None) -> Words:
+    """What tells the problem in one world (at t = 0) from that in any other, [n]; see ``agents.profiles.identities``."""
+    chosen = scenario.learners if vehicles is None else tuple(vehicles)
+    return _Search(scenario, worlds, scripted_commands(scenario, worlds, chosen), 1, 0, 1).problem(chosen).identity
+
+
+def realised_harm(scenario: Scenario, worlds: Worlds, best: Best, vehicles: Sequence[int]) -> tuple[Floats, Floats]:
+    """First-impact and total harm [n] of the stored profiles, driven again in these worlds."""
+    others = scripted_commands(scenario, worlds, vehicles)
+    return follow_profiles(_Search(scenario, worlds, others, 1, 0, 1).problem(vehicles), best.profiles)
+
+
+def scripted_commands(scenario: Scenario, worlds: Worlds, vehicles: Sequence[int]) -> Floats:
+    """The commands [n, N] of all vehicles but ``vehicles``; full braking in the columns of these.
+
+    Raises ``InvalidInput`` for a script whose command is not fixed at the alert.
+    """
+    others = {i: script for i, script in scripted(scenario).items() if i not in vehicles}
+    return fixed_commands(others, worlds, f"scenario {scenario.name!r}, search for the best profiles")
+
+
+def _cores() -> int:
+    return os.cpu_count() or 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """Searches in given worlds."""
+
+    scenario: Scenario
+    worlds: Worlds
+    others: Floats  # [n, N]
+    budget: int
+    seed: int
+    threads: int
+
+    def problem(
+        self, vehicles: Sequence[int], count: HarmCount = "first", deciders: Sequence[int] | None = None
+    ) -> ProfileProblem:
+        return profile_problem(
+            self.worlds,
+            vehicles,
+            count=count,
+            horizon_s=self.scenario.horizon_s,
+            time_step_s=self.scenario.time_step_s,
+            others_mps2=self.others,
+            deciders=deciders,
+        )
+
+    def best(
+        self,
+        vehicles: Sequence[int],
+        count: HarmCount,
+        given: Sequence[Profiles] = (),
+        deciders: Sequence[int] | None = None,
+    ) -> Found:
+        """The best profiles that start from constants, from ``given``, and from each vehicle's own best profile."""
+        problem = self.problem(vehicles, count, deciders)
+        low, high = problem.bounds[:, np.newaxis, :, 0], problem.bounds[:, np.newaxis, :, 1]
+        share = np.linspace(0.0, 1.0, CONSTANTS)[:, np.newaxis]
+        starts = [constant_profiles(problem, low + share * (high - low)), *given]
+        if len(vehicles) == 1:
+            coupled = optimise_coupled(
+                self.worlds, vehicles[0], count=count, horizon_s=self.scenario.horizon_s, others_mps2=self.others
+            )
+            starts.insert(0, constant_profiles(problem, -coupled.deceleration_mps2[:, np.newaxis, np.newaxis]))
+        else:
+            for c, vehicle in enumerate(vehicles):
+                alone = self.best([vehicle], count, (), vehicles if deciders is None else deciders).profiles
+                commands = np.broadcast_to(low, (*alone.ends.shape, len(vehicles))).copy()
+                commands[..., c] = alone.commands_mps2[..., 0]
+                starts.append(Profiles(alone.ends, commands))
+        return search_profiles(
+            problem, _joined(starts, problem.n), budget=self.budget, seed=self.seed, threads=self.threads
+        )
+
+
+def _joined(parts: list[Profiles], n: int) -> Profiles:
+    """Several given profiles of each world, [n * Q_j] each, as one list [n * Q] world by world."""
+    ends = np.concatenate([part.ends.reshape(n, -1, part.ends.shape[-1]) for part in parts], axis=1)
+    shape = (n, -1, *parts[0].commands_mps2.shape[1:])
+    commands = np.concatenate([part.commands_mps2.reshape(shape) for part in parts], axis=1)
+    return Profiles(ends.reshape(-1, ends.shape[-1]), commands.reshape(-1, *commands.shape[2:]))

@@ -1,0 +1,157 @@
+"""Tables of best known harm: small files that are looked up by what a world is, never by its place in a list."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.profiles import Profiles, Words, pad_profiles
+from ethbrake_marl.durable_files import write_file
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import Bools, Floats
+
+TABLE_FORMAT = 1
+TOLERANCE = 1e-6  # an agent must be this much (m2/s2) below the table to replace its value
+_COUNTS: tuple[HarmCount, ...] = ("first", "total")
+
+
+class Best(NamedTuple):
+    """The least harm known under one count."""
+
+    harm: Floats  # [n] m2/s2
+    profiles: Profiles  # [n] that do it; all ends 0 where only the harm is known
+
+
+@dataclass(frozen=True, slots=True)
+class BestHarmTable:
+    """The least harm known in n worlds, for one or both counts, and how it was found (``header``)."""
+
+    identity: Words  # [n]
+    best: Mapping[HarmCount, Best]
+    header: Mapping[str, Any]
+
+    def rows(self, identity: Words) -> NDArray[np.int64]:
+        """Row of each world, -1 where it is not in the table."""
+        order = np.argsort(self.identity, kind="stable")
+        place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
+        rows = order[place]
+        return np.where(self.identity[rows] == identity, rows, -1)
+
+    def harm(self, identity: Words, count: HarmCount) -> Floats:
+        """Best known harm of each world (m2/s2), NaN where it is not in the table."""
+        rows = self.rows(identity)
+        if count not in self.best:
+            return np.full(rows.shape, np.nan)
+        return np.where(rows >= 0, self.best[count].harm[rows], np.nan)
+
+    def improved(
+        self, identity: Words, count: HarmCount, harm: Floats, profiles: Profiles | None = None
+    ) -> tuple[BestHarmTable, Bools]:
+        """The table with every value replaced that ``harm`` [m] undercuts by more than ``TOLERANCE``; and where it did.
+
+        ``profiles`` [m] are what did it; without them only the harm is known there. Worlds that are not in the table
+        change nothing. Raises ``InvalidInput`` for a count that the table does not hold, or shapes that do not fit.
+        """
+        if count not in self.best:
+            raise InvalidInput(f"table of {', '.join(self.best)}: holds no {count!r} harm")
+        if harm.shape != identity.shape:
+            raise InvalidInput(f"improve: {harm.shape} harms for {identity.shape} worlds")
+        rows = self.rows(identity)
+        old = self.best[count]
+        better = (rows >= 0) & (harm < old.harm[rows] - TOLERANCE)
+        at = rows[better]
+        new_harm = old.harm.copy()
+        new_harm[at] = harm[better]
+        if profiles is None:
+            profiles = Profiles(
+                np.zeros((len(harm), 1), np.int64), np.zeros((len(harm), 1, old.profiles.commands_mps2.shape[2]))
+            )
+        kept, new = pad_profiles([old.profiles, profiles], 1)
+        kept.ends[at] = new.ends[better]
+        kept.commands_mps2[at] = new.commands_mps2[better]
+        return replace(self, best={**self.best, count: Best(new_harm, kept)}), better
+
+
+def join_tables(parts: list[BestHarmTable]) -> BestHarmTable:
+    """One table of all the worlds; the header is the first one's."""
+    counts = [count for count in _COUNTS if all(count in part.best for part in parts)]
+    best: dict[HarmCount, Best] = {}
+    for count in counts:
+        padded = pad_profiles([part.best[count].profiles for part in parts], 1)
+        profiles = Profiles(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
+        best[count] = Best(np.concatenate([part.best[count].harm for part in parts]), profiles)
+    return BestHarmTable(np.concatenate([part.identity for part in parts]), best, parts[0].header)
+
+
+def table_bytes(table: BestHarmTable) -> bytes:
+    """The table as a compressed .npz without pickles. Only the phases in use are kept, bytes of like weight together."""
+    arrays: dict[str, NDArray[Any]] = {
+        "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
+        "identity": table.identity.astype("<u8"),
+    }
+    for count, best in table.best.items():
+        ends, commands = best.profiles
+        used = _used(ends)
+        inside = np.arange(ends.shape[1]) < used[:, np.newaxis]
+        arrays[f"{count}_harm"] = best.harm.astype("<f8")
+        arrays[f"{count}_phases"] = used.astype("<u2")
+        arrays[f"{count}_ends"] = ends[inside].astype("<u2")
+        flat = np.ascontiguousarray(commands[inside], "<f8")
+        arrays[f"{count}_commands"] = flat.view(np.uint8).reshape(*flat.shape, 8).transpose(2, 0, 1).copy()
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)  # type: ignore[arg-type]  # numpy's stub forgets the name
+    return buffer.getvalue()
+
+
+def save_table(path: Path, table: BestHarmTable) -> None:
+    """Write the table in one step."""
+    write_file(path, table_bytes(table))
+
+
+def load_table(path: Path) -> BestHarmTable:
+    """Read a table. Raises ``InvalidInput`` if there is no file and ``CorruptBundle`` if it is not a table."""
+    if not path.is_file():
+        raise InvalidInput(f"{path}: there is no such table of best known harm")
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            header = json.loads(arrays["header"].tobytes())
+            if header.pop("format") != TABLE_FORMAT:
+                raise CorruptBundle(f"{path}: is a table of another format; this version reads {TABLE_FORMAT}")
+            counts = [count for count in _COUNTS if f"{count}_harm" in arrays]
+            best = {count: _read_best(arrays, count) for count in counts}
+            return BestHarmTable(arrays["identity"].astype(np.uint64), best, header)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        if isinstance(error, CorruptBundle):
+            raise
+        raise CorruptBundle(f"{path}: is not a table of best known harm ({error})") from error
+
+
+def _read_best(arrays: Mapping[str, NDArray[Any]], count: HarmCount) -> Best:
+    used = arrays[f"{count}_phases"].astype(np.int64)
+    planes = arrays[f"{count}_commands"]
+    flat = np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f8")[..., 0].astype(np.float64)
+    width = max(int(used.max(initial=1)), 1)
+    inside = np.arange(width) < used[:, np.newaxis]
+    ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, flat.shape[1]))
+    ends[inside] = arrays[f"{count}_ends"]
+    commands[inside] = flat
+    last = np.maximum(used - 1, 0)
+    rows = np.arange(len(used))
+    ends = np.where(inside, ends, ends[rows, last][:, np.newaxis])
+    commands = np.where(inside[..., np.newaxis], commands, commands[rows, last][:, np.newaxis])
+    return Best(arrays[f"{count}_harm"].astype(np.float64), Profiles(ends, commands))
+
+
+def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many phases each profile uses, [n]; 0 where there is none."""
+    used: NDArray[np.int64] = np.argmax(ends == ends[:, -1:], axis=1) + 1
+    return np.where(ends[:, -1] > 0, used, 0)

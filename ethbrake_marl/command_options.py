@@ -1,0 +1,28 @@
+"""Options that several commands share: one place for their names, types and help."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ScenarioOption = Annotated[
+    str, typer.Option("--scenario", metavar="NAME|PATH", help="A shipped scenario, or a path to a YAML file.")
+]
+RecipeOption = Annotated[
+    str, typer.Option("--recipe", metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file.")
+]
+StepsOption = Annotated[int | None, typer.Option(help="Training steps (decisions).", show_default="the recipe's")]
+TrainingSeedOption = Annotated[
+    int | None, typer.Option("--seed", help="Seed of the training alone.", show_default="the recipe's")
+]
+NameOption = Annotated[
+    str | None, typer.Option(help="Folder of the run inside runs/.", show_default="SCENARIO-RECIPE-seedSEED")
+]
+OutputOption = Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the run, instead of --name.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace what is already there.")]
+VehicleOption = Annotated[
+    str | None, typer.Option(help="Who is driven; other learners brake fully.", show_default="the learner")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout.")]

@@ -1,0 +1,161 @@
+"""How far each agent stays from the best that is known: which collisions nobody avoids, and regret world by world.
+
+Three vehicles, Vehicle 2 driven, the others braking fully: for these it is proven world by world whether some command
+avoids every collision (``analysis.avoidability``), and the least harm known is that proof's witness (harm 0), or the
+result of a search (``analysis.best_harm``), or what an agent of the same evaluation achieved, whichever is least.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.analysis.avoidability import avoidability
+from ethbrake_marl.analysis.best_harm_shipped import best_known
+from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
+from ethbrake_marl.evaluation.statistics import Estimate, mean, rate, relative_decrease
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.scenario import Scenario
+
+COUNTS: tuple[HarmCount, HarmCount] = ("first", "total")
+TOLERANCE = 1e-6  # m2/s2; less than this below the best known harm is rounding
+Source = Literal["witness", "table", "agents", "below_table"]
+
+_VEHICLES, _DRIVEN = 3, 1
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What is known of each world before anybody drives: [n] each."""
+
+    avoidable: Bools  # some admissible command of Vehicle 2 avoids every collision
+    reason: NDArray[np.str_]  # why not: "front", "rear"; "" where avoidable
+    first_impact_harm: Floats  # least known (m2/s2): 0 where avoidable, else a table's; NaN in no table
+    total_harm: Floats
+
+    @property
+    def known(self) -> Bools:
+        """Worlds whose best is known for both counts, without looking at any agent."""
+        return np.isfinite(self.first_impact_harm) & np.isfinite(self.total_harm)
+
+
+@dataclass(frozen=True, slots=True)
+class Regrets:
+    """The limits after all agents of one evaluation drove, [n] each."""
+
+    limits: Limits
+    first_impact_harm: Floats  # best known, the agents of this evaluation among them (m2/s2)
+    total_harm: Floats
+    source: NDArray[np.str_]  # where these come from; see ``Source``
+
+    def best(self, count: HarmCount) -> Floats:
+        """Best known harm under one count, [n] m2/s2."""
+        return self.first_impact_harm if count == "first" else self.total_harm
+
+    def regret(self, outcome: Outcome, count: HarmCount) -> Floats:
+        """The outcome's harm minus the best known, [n] m2/s2, never negative."""
+        return outcome.ledger.world_harm(count) - self.best(count)
+
+    def below(self, outcome: Outcome) -> Bools:
+        """Worlds in which the outcome is below what was known before, in either count, by more than rounding, [n]."""
+        first, total = self.limits.first_impact_harm, self.limits.total_harm
+        return (outcome.first_impact_harm < first - TOLERANCE) | (outcome.total_harm < total - TOLERANCE)
+
+
+@dataclass(frozen=True, slots=True)
+class Distance:
+    """One agent's summary: what was avoidable, and how far it stayed from the best known; all None if unknown."""
+
+    unavoidable_rate: Estimate | None = None  # of the worlds, whoever drives
+    avoidable_collision_rate: Estimate | None = None  # worlds that collided and need not have
+    best_known_first: Estimate | None = None  # mean best known harm (m2/s2)
+    best_known_total: Estimate | None = None
+    regret_first: Estimate | None = None  # mean harm above the best known (m2/s2)
+    regret_total: Estimate | None = None
+    realised_first: Estimate | None = None  # (full_brake - agent) / (full_brake - best known)
+    realised_total: Estimate | None = None
+    known_best_share: float | None = None  # worlds whose best is known without the agents of this evaluation
+    below_best_known: int | None = None  # worlds in which the agent is below it
+
+    def estimates(self) -> dict[str, Estimate | None]:
+        """The estimates by their names in JSON; ``mean_regret`` and ``realised_share`` are of first-impact harm."""
+        return {
+            "unavoidable_rate": self.unavoidable_rate,
+            "avoidable_collision_rate": self.avoidable_collision_rate,
+            "best_known_first_impact_harm": self.best_known_first,
+            "best_known_total_harm": self.best_known_total,
+            "mean_regret": self.regret_first,
+            "mean_regret_first": self.regret_first,
+            "mean_regret_total": self.regret_total,
+            "realised_share": self.realised_first,
+            "realised_share_first": self.realised_first,
+            "realised_share_total": self.realised_total,
+        }
+
+
+def limits_do_not_apply(scenario: Scenario, vehicle: int) -> str | None:
+    """Why nothing is proven for this line-up, as a clause; None when it is."""
+    if scenario.vehicles != _VEHICLES:
+        return f"{scenario.vehicles} vehicles; avoidability is proven for {_VEHICLES}"
+    if vehicle != _DRIVEN:
+        return f"{scenario.vehicle_names[vehicle]} is driven; avoidability is proven for {scenario.vehicle_names[1]}"
+    for i in (0, 2):
+        script = scenario.scripts.get(i, "full_brake")
+        if script != "full_brake":
+            return f"{scenario.vehicle_names[i]} follows {script}; avoidability is proven where it follows full_brake"
+    return None
+
+
+def known_limits(worlds: Worlds, scenario: Scenario, vehicle: int) -> Limits | None:
+    """The limits of worlds at the alert; None where ``limits_do_not_apply``."""
+    if limits_do_not_apply(scenario, vehicle) is not None:
+        return None
+    proof = avoidability(worlds, vehicle)
+    first, total = (best_known(worlds, scenario, count, vehicles=(vehicle,)) for count in COUNTS)
+    zero = np.zeros(worlds.n)
+    return Limits(
+        proof.avoidable, proof.reason, np.where(proof.avoidable, zero, first), np.where(proof.avoidable, zero, total)
+    )
+
+
+def assess(evaluation: Evaluation) -> Regrets | None:
+    """Best known harm of every world, the agents of this evaluation included; None where nothing is proven."""
+    limits = known_limits(evaluation.worlds, evaluation.scenario, evaluation.vehicle)
+    if limits is None:
+        return None
+    outcomes = evaluation.outcomes.values()
+    first = np.fmin.reduce([limits.first_impact_harm, *(outcome.first_impact_harm for outcome in outcomes)])
+    total = np.fmin.reduce([limits.total_harm, *(outcome.total_harm for outcome in outcomes)])
+    regrets = Regrets(limits, first, total, np.zeros(0, np.str_))
+    below = np.logical_or.reduce([regrets.below(outcome) for outcome in outcomes])
+    source = np.select([limits.avoidable, ~limits.known, below], ["witness", "agents", "below_table"], "table")
+    return Regrets(limits, first, total, source)
+
+
+def distance(regrets: Regrets | None, outcome: Outcome, full_brake: Outcome | None) -> Distance:
+    """One agent's distance to the best known, against ``full_brake`` in the same worlds.
+
+    ``1 - regret / regret of full braking`` is the share of the achievable reduction of harm that the agent realised; it
+    is None without full braking, when that has no regret, or when the best of some world is not known beforehand.
+    """
+    if regrets is None:
+        return Distance()
+    avoidable, known = regrets.limits.avoidable, regrets.limits.known
+    first, total = regrets.regret(outcome, "first"), regrets.regret(outcome, "total")
+    reference = full_brake if bool(known.all()) else None
+    return Distance(
+        unavoidable_rate=rate(int((~avoidable).sum()), len(avoidable)),
+        avoidable_collision_rate=rate(int((outcome.collided & avoidable).sum()), len(avoidable)),
+        best_known_first=mean(regrets.first_impact_harm),
+        best_known_total=mean(regrets.total_harm),
+        regret_first=mean(first),
+        regret_total=mean(total),
+        realised_first=relative_decrease(first, regrets.regret(reference, "first")) if reference else None,
+        realised_total=relative_decrease(total, regrets.regret(reference, "total")) if reference else None,
+        known_best_share=float(known.mean()),
+        below_best_known=int(regrets.below(outcome).sum()),
+    )

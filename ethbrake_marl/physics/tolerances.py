@@ -1,0 +1,24 @@
+"""The published tolerances of the physics, in one table; tests and reports compare with these and with nothing else.
+
+``eps`` is the spacing of doubles at 1, 2^-52. "Round" is one simultaneous resolution of a cluster: a chain of touching
+vehicles may need several at one instant. Sums over a cluster are taken over its vehicles, ``v`` before and ``v+`` after.
+"""
+
+from __future__ import annotations
+
+EPS = 2.0**-52
+
+MOMENTUM_EPS = 4.0  # |sum m v+ - sum m v| <= 4 eps sum m max(|v|, |v+|), each round
+RESTITUTION_EPS = 8.0  # |separation speed - e closing speed| <= 8 eps of the pair's largest |v|, an isolated pair
+ENERGY_EPS = 8.0  # sum m v+^2 <= (1 + 8 eps) sum m v^2, each round (speeds over ground)
+CLUSTER_EPS = 8.0  # each v+ of a cluster against the exact law: 8 eps of its largest |v|, each round
+
+GAP_M = 1e-9  # a gap never lies below -1e-9 m between events, and differs so little from its closed form
+CONTACT_TIME_EPS = 8.0  # relative, of a pair's contact time and closing speed: 8 eps (1 + (w^2 + 2 |b| g) / D)
+SPLIT = 1e-12  # a segment that is split: relative change of gaps, speeds and harm, to their largest values in the world
+
+# A contact is decided by the sign of ``D - touch^2`` and by its time against the segment's end. The kernel may decide
+# otherwise than exact arithmetic only where these come closer to zero than the following; there it must agree with a
+# segment that is a little longer.
+DISCRIMINANT_EPS = 32.0  # of the scale w^2 + 2 |b| g, or of squared speeds and |b| ways where events lie before
+END_EPS = 64.0  # of the way the pair's vehicles make in the segment, plus the gap; for the gap at the segment's end

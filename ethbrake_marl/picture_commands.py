@@ -1,0 +1,98 @@
+"""The commands ``ethbrake picture ...``: parse, draw, write a PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ethbrake_marl.command_options import ForceOption, ScenarioOption, VehicleOption
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import check_target
+from ethbrake_marl.evaluation.output_files import write_output
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.lineup import LIST_SEED, load_driven, make_lineup
+from ethbrake_marl.terminal import interruptible, progress_bars, say
+
+PICTURE_ENDING = ".png"
+
+picture_app = typer.Typer(
+    rich_markup_mode=None,
+    help="Draw what is critical in a scenario, or what one world asks for.",
+    epilog="Example: ethbrake picture criticality --output map.png",
+)
+
+PictureOption = Annotated[Path, typer.Option("--output", metavar="FILE.png", help="The picture to write.")]
+
+
+@picture_app.command(
+    "criticality",
+    epilog="Example: ethbrake picture criticality --scenario paper-distance --agent e_v2x_bm --output map.png",
+)
+def picture_criticality(
+    output: PictureOption,
+    scenario: ScenarioOption = "paper-distance",
+    agent: Annotated[str, typer.Option(help="Who drives; any agent of `ethbrake evaluate`.")] = "e_v2x_bm",
+    count: Annotated[HarmCount, typer.Option(help="Harm that the agent minimises, if it does.")] = "first",
+    cells: Annotated[int | None, typer.Option(help="Worlds along each gap.", show_default="81")] = None,
+    gaps: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="LOW HIGH", help="Range of both gaps (m).", show_default="the scenario's"),
+    ] = None,
+    force: ForceOption = False,
+) -> None:
+    """Harm of an agent over both gaps, with the boundary of what is avoidable.
+
+    Everything else must be a fixed number in the scenario.
+    """
+    target = _target(output, force=force)
+    # Here and below: matplotlib takes a second to load, and most commands draw nothing.
+    from ethbrake_marl.evaluation.criticality import CELLS, criticality_figure, criticality_map
+    from ethbrake_marl.evaluation.figure_style import png_bytes
+
+    chosen = load_driven(scenario, None)
+    lineup = make_lineup([agent], chosen, count=count)
+    with interruptible("nothing was written"), progress_bars() as bars:
+        found = criticality_map(
+            chosen,
+            lineup,
+            cells=CELLS if cells is None else cells,
+            gap_range_m=gaps,
+            on_progress=lambda name, done, total: bars.show(name, done, total),
+        )
+    write_output(target, png_bytes(criticality_figure(found)), force=force)
+    say(f"picture: {target}")
+
+
+@picture_app.command(
+    "deceleration",
+    epilog="Example: ethbrake picture deceleration --scenario paper-scenario-1 --world 0 --output curve.png",
+)
+def picture_deceleration(
+    output: PictureOption,
+    scenario: ScenarioOption = "paper-scenario-1",
+    world: Annotated[int, typer.Option(help="Number of the world in the list.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the list.")] = LIST_SEED,
+    vehicle: VehicleOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Harm of one world against the constant deceleration of one vehicle: predicted, realised, and the best known."""
+    target = _target(output, force=force)
+    from ethbrake_marl.evaluation.deceleration_curve import deceleration_figure
+    from ethbrake_marl.evaluation.figure_style import png_bytes
+
+    chosen = load_driven(scenario, vehicle)
+    sample = chosen.sample(1, seed, first=world)
+    figure = deceleration_figure(
+        chosen, sample.worlds, chosen.learners[0], title=f"{chosen.name}, world {world} of the list of seed {seed}"
+    )
+    write_output(target, png_bytes(figure), force=force)
+    say(f"picture: {target}")
+
+
+def _target(output: Path, *, force: bool) -> Path:
+    """The file to write, checked before any work; only PNG is written."""
+    if output.suffix.lower() != PICTURE_ENDING:
+        raise InvalidInput(f"{output}: pictures are written as PNG; give a name that ends in {PICTURE_ENDING}")
+    return check_target(output, force=force)

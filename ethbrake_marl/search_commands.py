@@ -1,0 +1,92 @@
+"""The command ``ethbrake best-harm``: parse, search, print; the table it may write is resumable."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ethbrake_marl.analysis.best_harm import BUDGET, search_list
+from ethbrake_marl.analysis.best_harm_table import BestHarmTable, save_table
+from ethbrake_marl.command_options import ForceOption, JsonOption, ScenarioOption
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import check_target
+from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable
+from ethbrake_marl.terminal import interruptible, progress_bars, say, write_json
+
+TABLE_ENDING = ".npz"
+
+
+def best_harm_command(
+    scenario: ScenarioOption = "paper-random",
+    episodes: Annotated[int, typer.Option(help="Worlds of the list.")] = EPISODES,
+    seed: Annotated[int, typer.Option(help="Seed of the list.")] = LIST_SEED,
+    count: Annotated[
+        HarmCount | None, typer.Option(help="Harm to minimise: first impacts only, or all.", show_default="both")
+    ] = None,
+    vehicles: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,...", help="Who is controlled, together.", show_default="the learners"),
+    ] = None,
+    budget: Annotated[int, typer.Option(help="Candidate profiles per world and count.")] = BUDGET,
+    search_seed: Annotated[int, typer.Option(help="Seed of the search.")] = 0,
+    threads: Annotated[
+        int | None, typer.Option(help="Worlds searched at once; changes no result.", show_default="every core")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option(metavar="FILE.npz", help="Also write the table of every world to this file.")
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Search every world for the profile of least harm.
+
+    The other vehicles follow their scripts. With --output, finished parts are kept beside the file, and the same
+    command goes on where it was interrupted.
+    """
+    if output is not None:
+        check_target(output, force=force)
+        if output.suffix != TABLE_ENDING:
+            raise InvalidInput(f"{output}: a table ends in {TABLE_ENDING}")
+    chosen = load_runnable(scenario)
+    names = None if vehicles is None else [name.strip() for name in vehicles.split(",")]
+    controlled = None if names is None else chosen.with_learners(names).learners
+    sample = chosen.sample(episodes, seed)
+    parts = None if output is None else output.with_name(f".{output.name}.parts")
+    kept = "nothing was written" if parts is None else f"{parts} keeps what was found; the same command goes on"
+    with interruptible(kept), progress_bars() as bars:
+        table = search_list(
+            chosen,
+            sample,
+            counts=COUNTS if count is None else (count,),
+            vehicles=controlled,
+            budget=budget,
+            seed=search_seed,
+            threads=threads,
+            chunks=parts,
+            on_progress=lambda done, total: bars.show("best harm", done, total),
+        )
+    table = BestHarmTable(table.identity, table.best, {**table.header, "episodes": episodes, "list_seed": seed})
+    if output is not None and parts is not None:
+        save_table(output, table)
+        shutil.rmtree(parts)
+        say(f"every world: {output}")
+    figures = best_harm_figures(table)
+    if as_json:
+        write_json(figures)
+        return
+    for name, value in figures.items():
+        typer.echo(f"{name:36} {value:.4f}" if isinstance(value, float) else f"{name:36} {value}")
+
+
+def best_harm_figures(table: BestHarmTable) -> dict[str, object]:
+    """What was asked, the mean best known harm under each count (m2/s2), and the share of worlds without any."""
+    figures: dict[str, object] = dict(table.header)
+    for count, best in table.best.items():
+        name = "best_known_first_impact_harm" if count == "first" else "best_known_total_harm"
+        figures[name] = float(best.harm.mean())
+        figures["harmless_rate"] = float((best.harm == 0.0).mean())
+    return figures

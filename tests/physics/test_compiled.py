@@ -1,0 +1,94 @@
+"""How kernels are compiled: strictly, without the lock, and never from stale machine code."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numba
+import pytest
+
+from ethbrake_marl.physics import compiled
+from ethbrake_marl.physics.compiled import cache_folder
+from ethbrake_marl.physics.compiled import compiled as compile_kernel
+
+needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
+
+
+@pytest.fixture(autouse=True)
+def _own_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    cache_folder.cache_clear()
+    yield
+    cache_folder.cache_clear()
+
+
+@needs_compiler
+def test_compiled__is_strict_and_releases_the_lock():
+    kernel = compile_kernel(lambda x: x + 1.0)
+    options = kernel.targetoptions
+    assert options["fastmath"] is False and options["nogil"] is True and options["error_model"] == "numpy"
+    assert options["nopython"] is True and "parallel" not in options
+
+
+@needs_compiler
+def test_compiled__divides_by_zero_as_ieee_does():
+    assert compile_kernel(lambda x: 1.0 / x)(0.0) == float("inf")
+
+
+def test_compiled__leaves_the_cache_setting_of_others_alone(monkeypatch):
+    monkeypatch.setattr(numba.core.config, "CACHE_DIR", "/somewhere")
+    compile_kernel(lambda x: x)
+    assert numba.core.config.CACHE_DIR == "/somewhere"
+
+
+@needs_compiler
+def test_compiled__is_kept_in_the_folder_of_these_sources():
+    kernel = compile_kernel(lambda x: x * 2.0)
+    assert Path(kernel.stats.cache_path).is_relative_to(cache_folder())
+
+
+def test_cache_folder__is_in_the_named_place(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "numba"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache_folder().parent == tmp_path / "numba" / "ethbrake_marl" and cache_folder().is_dir()
+    cache_folder.cache_clear()
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    assert cache_folder().parent == tmp_path / "xdg" / "ethbrake_marl"
+    cache_folder.cache_clear()
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    assert cache_folder().parent == tmp_path / ".cache" / "ethbrake_marl"
+
+
+def test_cache_folder__that_cannot_be_written_is_replaced_by_a_temporary_one(monkeypatch, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder", "utf-8")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(blocked))
+    folder = cache_folder()
+    assert folder.is_dir() and folder.name.startswith("ethbrake_marl-") and tmp_path not in folder.parents
+    folder.rmdir()
+
+
+def test_cache_folder__changes_with_any_kernel_source_and_with_numba_and_with_nothing_else(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    package = tmp_path / "package"
+    shutil.copytree(Path(compiled.__file__).parents[1], package, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(compiled, "_PACKAGE", package)
+
+    def folder() -> Path:
+        cache_folder.cache_clear()
+        return cache_folder()
+
+    first = folder()
+    assert folder() == first and len(first.name) == 16
+    (package / "plain.py").write_text("value = 1\n", "utf-8")
+    assert folder() == first
+    for name in ("physics/events.py", "physics/segment.py"):
+        before = folder()
+        source = package / name
+        source.write_text(source.read_text("utf-8") + "\n# a change\n", "utf-8")
+        assert folder() != before, name
+    before = folder()
+    monkeypatch.setattr(numba, "__version__", "0.0")
+    assert folder() != before

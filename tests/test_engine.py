@@ -1,0 +1,112 @@
+"""The engine: a reset or renewal that fails leaves everything as it was; worlds start at the alert."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import advance
+from ethbrake_marl.scenario import initial_state_worlds, load_scenario
+
+PAPER = load_scenario("paper-random").replace(early_impacts="keep")
+
+
+def engine(n=2, third=None, seed=0):
+    scripts = {0: make_agent("full_brake"), 2: third or make_agent("constant:5")}
+    return Engine(PAPER, n, learners=(1,), scripts=scripts, seed=seed)
+
+
+def state(running):
+    packed = running.packed
+    return [packed.state.tolist(), packed.params.tolist(), running.wanted_mps2.tolist(), running.ended.tolist()]
+
+
+def too_weak(n):
+    """Worlds in which vehicle 3 cannot brake with 5 m/s2."""
+    given = {"gaps_m": 3, "braking_capacity_mps2": 4, "speeds_mps": 20}
+    return initial_state_worlds(given, PAPER).take(np.zeros(n, np.int64))
+
+
+class Remembering:
+    """Brakes with 5 m/s2, asked at every step; refuses to begin when told so."""
+
+    name = "remembering"
+    refuses = False
+
+    def begin(self, worlds, vehicle, rows):
+        if self.refuses:
+            raise InvalidInput("remembering: will not begin")
+
+    def act(self, worlds, vehicle):
+        return np.full(worlds.n, -5.0)
+
+
+@pytest.mark.parametrize("third", [None, Remembering()])
+def test_reset__that_fails_leaves_the_running_episodes_alone(third):
+    running, twin = engine(third=third), engine(third=third)
+    for one in (running, twin):
+        one.step({1: np.zeros(2)})
+    before = state(running)
+    with pytest.raises(InvalidInput, match=r"constant:5|vehicle_3"):
+        running.reset(seed=9, worlds=too_weak(2))
+    assert state(running) == before
+    assert running.seed == 0
+    running.step({1: np.zeros(2)})
+    twin.step({1: np.zeros(2)})
+    assert state(running) == state(twin)
+    running.reset()
+    twin.reset()
+    assert state(running) == state(twin)
+
+
+def test_renew__that_fails_leaves_the_running_episodes_and_the_stream_alone():
+    script = Remembering()
+    running, twin = engine(third=script), engine(third=Remembering())
+    before = state(running)
+    script.refuses = True
+    with pytest.raises(InvalidInput, match="will not begin"):
+        running.renew(np.array([1]))
+    assert state(running) == before
+    script.refuses = False
+    running.renew(np.array([1]))
+    twin.renew(np.array([1]))
+    assert state(running) == state(twin)
+
+
+def test_renew__a_watcher_that_fails_leaves_the_running_episodes_alone():
+    running = engine()
+    before = state(running)
+
+    def refuse(worlds, rows):
+        raise InvalidInput("watcher: no")
+
+    running.on_begin.append(refuse)
+    for start in (lambda: running.renew(np.array([0])), running.reset):
+        with pytest.raises(InvalidInput, match="watcher"):
+            start()
+        assert state(running) == before
+
+
+def test_renew__leaves_what_the_other_rows_wanted():
+    class ByTheClock(Remembering):
+        def act(self, worlds, vehicle):
+            return -worlds.time_s
+
+    running = engine(third=ByTheClock())
+    wanted = running.step({1: np.zeros(2)}).command_mps2
+    running.renew(np.array([1]))
+    assert running.wanted_mps2[0].tolist() == wanted[0].tolist()
+    assert running.wanted_mps2[1, 2] == 0.0
+
+
+def test_reset__takes_worlds_at_the_alert_only():
+    worlds = PAPER.sample(2, 0).worlds
+    late, _ = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=[0.0, 0.3])
+    with pytest.raises(InvalidInput, match=r"world 1 is at 0.3 s; episodes start at the alert"):
+        engine().reset(worlds=late)
+    worlds.pair_hit[0, 1] = True
+    with pytest.raises(InvalidInput, match="world 0 is after an impact"):
+        engine().reset(worlds=worlds)
