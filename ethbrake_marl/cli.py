@@ -208,7 +208,8 @@ def evaluate_command(
     """Compare agents on the same fixed list of worlds.
 
     Agents: full_brake, coast, constant:A (deceleration in m/s2), copy_leader, gentlest_front, e_v2x_bm,
-    e_v2x_bm:pairwise; and of a run or a policy bundle: ppo@PATH, hybrid@PATH, hybrid:pairwise@PATH.
+    e_v2x_bm:pairwise, planner, best_harm; ladder: all of these but constant; and of a run or a policy bundle: ppo@PATH,
+    hybrid@PATH, hybrid:pairwise@PATH.
     """
     if per_world is not None:
         check_target(per_world, force=force)

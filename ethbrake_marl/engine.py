@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.actions import checked_action
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.harm import Ledger
-from ethbrake_marl.observations import Observations, ObservationSpec, observe_packed
+from ethbrake_marl.observations import Observations, ObservationSpec, observe_packed, scaling
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.packed import (
     NO_ROWS,
@@ -46,7 +46,8 @@ from ethbrake_marl.starts import Script, Start, Stream, check_alert, is_state_fr
 from ethbrake_marl.stepping import (
     BAD_ACTION,
     ENDED,
-    FACTS_WIDTH,
+    FLAG_ROWS,
+    HARM_ROWS,
     SAFE_END,
     START,
     STEP_FIRST_HARM,
@@ -62,8 +63,7 @@ Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 _RUNNING = ("_state", "_params", "_clock", "_wanted", "_potential")
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """What one step brought, for every world of the batch."""
 
     reward: Floats  # [n, N]
@@ -74,7 +74,7 @@ class Step:
     safe_end: Bools  # [n] the episode ended with this step without any collision
     command_mps2: Floats  # [n, N] wanted by each vehicle in this step
     params: RewardParams
-    further: dict[str, Floats] = field(default_factory=dict)  # terms that the harm does not tell
+    further: dict[str, Floats]  # terms that the harm does not tell
 
     @property
     def ended(self) -> Bools:
@@ -128,6 +128,7 @@ class Engine:
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
         self.reward = reward_params(reward)
         self.observation = observation or ObservationSpec()
+        self._scaling = scaling(self.observation)
         self.on_begin: list[OnBegin] = []
         self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
         self._learner_index = np.array(self.learners, np.int64)
@@ -226,7 +227,7 @@ class Engine:
         state, params = self._state, self._params
         if rows is not None:
             state, params = state[rows], params[rows]
-        return observe_packed(state, params, vehicles, self.observation)
+        return observe_packed(state, params, vehicles, self._scaling)
 
     def step(self, actions: Actions) -> Step:
         """Advance every running episode by one time step.
@@ -239,22 +240,25 @@ class Engine:
             worlds = self.worlds
             for vehicle, script in self._remembering.items():
                 self._wanted[:, vehicle] = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
-        reward, facts = np.empty(self._wanted.shape), np.empty((self.n, FACTS_WIDTH))
+        reward = np.empty(self._wanted.shape)
+        harm, flags = np.empty((HARM_ROWS, self.n)), np.empty((FLAG_ROWS, self.n), np.uint8)
         world, status = step_worlds(
             self._state, self._params, self._clock, columns, self._learner_index, self._settings, NO_ROWS,
-            self._wanted, reward, facts,
+            self._wanted, reward, harm, flags,
         )  # fmt: skip
         if status != DONE:
             self._fail(world, status, columns)
+        end = flags.view(np.bool_)
         step = Step(
             reward,
-            facts[:, TERMINATED] == 1.0,
-            facts[:, TRUNCATED] == 1.0,
-            facts[:, STEP_FIRST_HARM],
-            facts[:, STEP_TOTAL_HARM],
-            facts[:, SAFE_END] == 1.0,
+            end[TERMINATED],
+            end[TRUNCATED],
+            harm[STEP_FIRST_HARM],
+            harm[STEP_TOTAL_HARM],
+            end[SAFE_END],
             self._wanted.copy(),
             self.reward,
+            {},
         )
         if self._moves_reward or self.reward.shaping > 0.0:
             self._add_further_terms(step)
@@ -263,7 +267,7 @@ class Engine:
     def _columns(self, actions: Actions) -> Floats:
         """The learners' actions as [n, L]; their range is checked where they are used."""
         shape = (self.n, len(self.learners))
-        if not isinstance(actions, Mapping):
+        if isinstance(actions, np.ndarray) or not isinstance(actions, Mapping):
             given = np.asarray(actions)
             if given.shape != shape or given.dtype.kind not in "fiu":
                 return checked_action(actions, shape, "the learners")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,27 +107,35 @@ def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations
     if not 0 <= vehicle < worlds.N:
         raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{worlds.N - 1}")
     packed = pack(worlds)
-    return observe_packed(packed.state, packed.params, np.array([vehicle]), spec)[:, 0].copy()
+    return observe_packed(packed.state, packed.params, np.array([vehicle]), scaling(spec))[:, 0].copy()
 
 
-def observe_packed(state: Floats, params: Floats, vehicles: Ints, spec: ObservationSpec) -> Observations:
-    """Observations of several vehicles in worlds given as rows of ``physics.packed``, [n, len(vehicles), F]."""
-    per_unit, low, high, offsets = _scaling(spec)
-    observation = np.empty((state.shape[0], len(vehicles), spec.size), np.float32)
-    _observe_rows(state, params, vehicles, offsets, per_unit, low, high, observation)
-    return observation
+class Scaling(NamedTuple):
+    """A specification as the kernel wants it."""
+
+    offsets: Ints  # of the neighbours in the line
+    per_unit: Floats  # [F] 1 / scale
+    low: Floats  # [F]
+    high: Floats  # [F]
 
 
 @cache
-def _scaling(spec: ObservationSpec) -> tuple[Floats, Floats, Floats, Ints]:
-    """1 / scale, low and high of every feature in order, and the neighbours' offsets in the line."""
+def scaling(spec: ObservationSpec) -> Scaling:
+    """Offsets of the neighbours and scaling of every feature, in order; made once, not to be changed."""
     features = spec.features
-    return (
+    return Scaling(
+        np.array([offset for _, offset in spec.sides], np.int64),
         np.array([1.0 / f.scale for f in features]),
         np.array([f.low for f in features]),
         np.array([f.high for f in features]),
-        np.array([offset for _, offset in spec.sides], np.int64),
     )
+
+
+def observe_packed(state: Floats, params: Floats, vehicles: Ints, scale: Scaling) -> Observations:
+    """Observations of several vehicles in worlds given as rows of ``physics.packed``, [n, len(vehicles), F]."""
+    observation = np.empty((len(state), len(vehicles), len(scale.low)), np.float32)
+    _observe_rows(state, params, vehicles, *scale, observation)
+    return observation
 
 
 @compiled

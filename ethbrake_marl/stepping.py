@@ -6,6 +6,7 @@ Worlds are rows of ``physics.packed``; ``clock`` [n, 4] holds what an episode ne
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ethbrake_marl.actions import command_of
 from ethbrake_marl.physics import Floats, Ints
@@ -40,13 +41,16 @@ STEP = 1  # steps taken
 LAST_STEP = 2  # the step that ends at the horizon
 ENDED = 3  # 1 once the episode has ended
 CLOCK_WIDTH = 4
-# columns of facts: what a step brought to a world
+# rows of step_harm: what the step brought to each world
 STEP_FIRST_HARM = 0
 STEP_TOTAL_HARM = 1
-TERMINATED = 2
-TRUNCATED = 3
-SAFE_END = 4  # the episode ended with this step, without any collision
-FACTS_WIDTH = 5
+HARM_ROWS = 2
+# rows of flags: how the step ended each episode, if it did
+TERMINATED = 0
+TRUNCATED = 1
+SAFE_END = 2  # without any collision
+FLAG_ROWS = 3
+Flags = NDArray[np.uint8]  # truth values; to hand over an array of booleans takes longer than to step a world
 # places in settings
 TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT = range(5)
 BAD_ACTION = -1
@@ -55,9 +59,9 @@ BAD_ACTION = -1
 @compiled
 def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to functions costs more than the work
     state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
-    wanted: Floats, reward: Floats, facts: Floats,
+    wanted: Floats, reward: Floats, step_harm: Floats, flags: Flags,
 ) -> tuple[int, int]:  # fmt: skip
-    """Advance every running world by one step, in place (state, clock, wanted); fills ``reward`` and ``facts``.
+    """Advance every running world by one step, in place (state, clock, wanted); fills the last three arrays.
 
     ``actions`` [n, L] become the learners' commands in ``wanted`` [n, N]; nothing is moved if one of them is not in
     [-1, 1]. Returns a world and what went wrong there (BAD_ACTION or a status of the kernel), or (-1, DONE).
@@ -74,8 +78,10 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     P = N - 1
     table = np.zeros((TABLE_ROWS, N))
     for k in range(n):
-        for f in range(FACTS_WIDTH):
-            facts[k, f] = 0.0
+        for f in range(HARM_ROWS):
+            step_harm[f, k] = 0.0
+        for f in range(FLAG_ROWS):
+            flags[f, k] = 0
         for i in range(N):
             reward[k, i] = 0.0
         if clock[k, ENDED] == 1.0:
@@ -116,14 +122,14 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             first_harm += table[FIRST_HARM, p]
             total_harm += table[TOTAL_HARM, p]
             impacts += state[k, harm + 2 * P + p]
-        facts[k, STEP_FIRST_HARM] = first_harm
-        facts[k, STEP_TOTAL_HARM] = total_harm
+        step_harm[STEP_FIRST_HARM, k] = first_harm
+        step_harm[STEP_TOTAL_HARM, k] = total_harm
         if at_rest or at_horizon:
             clock[k, ENDED] = 1.0
-            facts[k, TERMINATED] = 1.0 if at_rest else 0.0
-            facts[k, TRUNCATED] = 0.0 if at_rest else 1.0
-            facts[k, SAFE_END] = 1.0 if impacts == 0.0 else 0.0
-        shared = settings[TERMINAL_WEIGHT] * facts[k, SAFE_END]
+            flags[TERMINATED, k] = at_rest
+            flags[TRUNCATED, k] = not at_rest
+            flags[SAFE_END, k] = impacts == 0.0
+        shared = settings[TERMINAL_WEIGHT] if flags[SAFE_END, k] == 1 else 0.0
         shared -= settings[HARM_WEIGHT] * (total_harm if settings[HARM_IS_TOTAL] == 1.0 else first_harm)
         for i in range(N):
             reward[k, i] = shared

@@ -1,4 +1,4 @@
-"""A planner: at every decision it searches the rest of the episode in the engine's physics, and drives the first step."""
+"""A planner: at every decision it searches the rest of the episode in the engine's physics, and drives one step."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _ARGUMENT = re.compile(r"(?P<number>[0-9]+(\.[0-9]+)?)(?P<unit>ms)?")
 class Planner:
     """Receding horizon: the own profile is searched anew at each decision, the ``others`` following their scripts.
 
-    Each search starts from the plan so far, from constants and, at first, from the pairwise optimum. ``argument`` is the
-    number of candidates per world and decision (deterministic), or a time like ``20ms`` per world and decision
+    Each search starts from the plan so far, from constants and, at first, from the pairwise optimum. ``argument`` is
+    the number of candidates per world and decision (deterministic), or a time like ``20ms`` per world and decision
     (as many rounds of candidates as fit, at least one; depends on the machine). ``predicted_harm`` [n] is that of the
-    first plan (m2/s2), and more is not done if the others do as expected. Vehicles that are not in ``others`` (learners) are
-    taken to brake fully. Raises ``InvalidInput`` for any other argument or an unknown count and, when an episode begins,
-    for another vehicle's script whose command is not fixed at the alert.
+    first plan (m2/s2); no more is done if the others do as expected. Vehicles that are not in ``others`` (learners)
+    are taken to brake fully. Raises ``InvalidInput`` for any other argument or an unknown count and, when an episode
+    begins, for another vehicle's script whose command is not fixed at the alert.
     """
 
     def __init__(self, argument: str | None = None, *, count: HarmCount = "first", horizon_s: float = 8.0) -> None:

@@ -34,7 +34,7 @@ from ethbrake_marl.physics.segment import (
 Words = NDArray[np.uint64]
 
 OTHER_WEIGHT = 1e-8  # of the other count in the value that is minimised: it decides between equal harms
-# columns of clock: first decision (s), time step (s), number of steps, horizon (s), restitution, 1 to minimise total harm
+# columns of clock: first decision (s), time step (s), number of steps, horizon (s), restitution, 1 for total harm
 START, TIME_STEP, LAST_STEP, HORIZON, RESTITUTION, HARM_IS_TOTAL = range(6)
 CLOCK_WIDTH = 6
 
@@ -120,7 +120,7 @@ def run_segment(
 @compiled
 def at_rest(table: Floats) -> bool:
     """Whether the episode has ended: everything stands and no command would move it."""
-    for i in range(table.shape[1]):
+    for i in range(table.shape[1]):  # noqa: SIM110  # all() is not compiled
         if table[SPEED, i] != 0.0 or table[COMMAND, i] > 0.0:
             return False
     return True

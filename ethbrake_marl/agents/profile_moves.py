@@ -1,7 +1,7 @@
 """Random profiles and random changes of profiles, compiled, from one small random stream per world.
 
-``bounds`` [C, 2] are the smallest and the largest command of each controlled vehicle (m/s2); the other letters are those
-of ``profile_motion``.
+``bounds`` [C, 2] are the smallest and the largest command of each controlled vehicle (m/s2); the other letters are
+those of ``profile_motion``.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def draw_profile(random: Words, bounds: Floats, ends: Ints, commands: Floats, la
 
 @compiled
 def draw_change(random: Words, bounds: Floats, active: int, change: Floats) -> int:
-    """Fill ``change`` [CHANGE_WIDTH] at random for a profile whose first ``active`` phases matter; returns the phase."""
+    """Fill ``change`` [CHANGE_WIDTH] at random, for one of the first ``active`` phases; returns the phase."""
     u = draw(random)
     phase, vehicle = draw_below(random, active), draw_below(random, bounds.shape[0])
     sign = 1.0 if draw(random) < 0.5 else -1.0

@@ -1,8 +1,8 @@
 """The search for the profile of least harm in one world, compiled: one call per world, no Python inside.
 
-Method: given profiles (constants among them) and random ones are tried; the best of them, all different, are improved by
-random changes of any size, each success being repeated twice as large; after each round the better half goes on. The
-last one is divided into more phases and improved further, at the end decision by decision, exactly as the engine runs.
+Method: given profiles (constants among them) and random ones are tried; the best of them, all different, are improved
+by random changes of any size, each success being repeated twice as large; after each round the better half goes on.
+The last one is divided into more phases and improved further, at the end decision by decision, as the engine runs.
 Letters as in ``profile_motion``; Q given profiles, M of them and of the random ones improved.
 """
 
@@ -61,7 +61,7 @@ def search_world(
     states = np.zeros((K + 1, start.shape[0]))
     states[0] = start
     M = SMALLEST_FIELD
-    while 2 * M * PER_PROFILE <= budget and M < LARGEST_FIELD:
+    while budget >= 2 * M * PER_PROFILE and M < LARGEST_FIELD:
         M *= 2
     field = Field(np.zeros((M, K), np.int64), np.zeros((M, K, C)), np.zeros(M, np.int64), np.full(M, math.inf))
     drawn = max(int(DRAWN_SHARE * budget) - seed_ends.shape[0], 0)

@@ -1,7 +1,7 @@
 """Profiles of commands for many worlds: the problem that a search solves, what it finds, and what a profile does.
 
-Worlds are independent: a world's result does not depend on its batch, its place in it, or the number of threads. Threads
-run at the same time because the kernels release Python's lock.
+Worlds are independent: a world's result does not depend on its batch, its place in it, or the number of threads.
+Threads run at the same time because the kernels release Python's lock.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
 
 
 def constant_profiles(problem: ProfileProblem, commands_mps2: Floats) -> Profiles:
-    """Profiles [n * Q] that hold the given commands [n, Q, C], divided into the phases in which a search changes them."""
+    """Profiles [n * Q] that hold the given commands [n, Q, C], divided into phases for a search to change."""
     n, Q, C = commands_mps2.shape
     borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
     ends = np.minimum(borders, problem.last_step[:, np.newaxis])

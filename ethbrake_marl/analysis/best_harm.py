@@ -91,8 +91,8 @@ def search_list(
 ) -> BestHarmTable:
     """``best_harm`` of a long list, ``CHUNK`` worlds at a time, resumable.
 
-    With ``chunks``, a folder, each finished chunk is kept there as a file, and a later call with the same question takes
-    it from there. A file that answers another question is computed anew and replaced.
+    With ``chunks``, a folder, each finished chunk is kept there as a file, and a later call with the same question
+    takes it from there. A file that answers another question is computed anew and replaced.
     """
     parts = []
     n = sample.worlds.n
@@ -131,7 +131,7 @@ def _answer(
 
 
 def world_identity(scenario: Scenario, worlds: Worlds, vehicles: Sequence[int] | None = None) -> Words:
-    """What tells the problem in one world (at t = 0) from that in any other, [n]; see ``agents.profiles.identities``."""
+    """What tells the problem in one world (at t = 0) from that in any other, [n]: ``agents.profiles.identities``."""
     chosen = scenario.learners if vehicles is None else tuple(vehicles)
     return _Search(scenario, worlds, scripted_commands(scenario, worlds, chosen), 1, 0, 1).problem(chosen).identity
 

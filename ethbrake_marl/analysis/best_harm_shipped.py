@@ -33,9 +33,9 @@ def best_known(
 ) -> Floats:
     """The least harm known in each world (at t = 0), [n] m2/s2; NaN where no shipped table holds it.
 
-    Worlds are recognised by everything their harm depends on: state, parameters, the others' scripts, time step, horizon
-    and the controlled ``vehicles`` (default: the scenario's learners). Raises ``InvalidInput`` for scripts that depend
-    on the state, as no search knows them.
+    Worlds are recognised by everything their harm depends on: state, parameters, the others' scripts, time step,
+    horizon and the controlled ``vehicles`` (default: the scenario's learners). Raises ``InvalidInput`` for a script
+    whose command is not fixed at the alert, as no search knows it.
     """
     check_count(count)
     identity = world_identity(scenario, worlds, vehicles)

@@ -93,7 +93,7 @@ def join_tables(parts: list[BestHarmTable]) -> BestHarmTable:
 
 
 def table_bytes(table: BestHarmTable) -> bytes:
-    """The table as a compressed .npz without pickles. Only the phases in use are kept, bytes of like weight together."""
+    """The table as a compressed .npz without pickles: only the phases in use, bytes of like weight together."""
     arrays: dict[str, NDArray[Any]] = {
         "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
         "identity": table.identity.astype("<u8"),

@@ -65,18 +65,18 @@ def only_learner(engine: Engine) -> int:
     return engine.learners[0]
 
 
-def learner_columns(engine: Engine, actions: Mapping[int, Any]) -> Floats:
-    """The learners' actions of one world as [1, L], from an action [1] for each by vehicle index.
+def learner_columns(learners: Sequence[str], actions: Mapping[str, Any]) -> Floats:
+    """The learners' actions of one world as [1, L], from an action [1] for each by name.
 
     Raises ``InvalidInput`` naming the vehicle whose action is missing or misshapen; the engine checks the range.
     """
-    columns = np.empty((1, len(engine.learners)))
-    for c, vehicle in enumerate(engine.learners):
-        if vehicle not in actions:
-            raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
-        action = np.asarray(actions[vehicle])
+    columns = np.empty((1, len(learners)))
+    for c, name in enumerate(learners):
+        if name not in actions:
+            raise InvalidInput(f"step: no action for the learner {name}")
+        action = np.asarray(actions[name])
         if action.shape != (1,) or action.dtype.kind not in "fiu":
-            action = checked_action(actions[vehicle], (1,), f"vehicle_{vehicle + 1}")
+            action = checked_action(actions[name], (1,), name)
         columns[0, c] = action[0]
     return columns
 

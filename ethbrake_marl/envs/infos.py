@@ -30,7 +30,7 @@ AT_ANY_TIME = (
     "collided",
 )
 AFTER_A_STEP = (*AT_ANY_TIME, "wanted_command_mps2", "applied_action")
-_COLLIDED, _ACTION = AFTER_A_STEP.index("collided"), AFTER_A_STEP.index("applied_action")
+_COLLIDED = AT_ANY_TIME.index("collided")
 
 
 class Report(NamedTuple):
@@ -83,14 +83,28 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 def plain_infos(told: Report, vehicles: list[int] | slice) -> list[dict[str, Any]]:
     """Infos of these vehicles, world by world, as plain numbers; ``applied_action`` is an array [1] of its own."""
     rows: list[list[Any]] = told.values[:, vehicles].reshape(-1, len(AFTER_A_STEP)).tolist()
-    for values in rows:
-        values[_COLLIDED] = values[_COLLIDED] == 1.0
     if told.terms is None:
+        for values in rows:
+            values[_COLLIDED] = values[_COLLIDED] == 1.0
         return [dict(zip(AT_ANY_TIME, values, strict=False)) for values in rows]
     infos: list[dict[str, Any]] = []
-    for values in rows:
-        values[_ACTION] = np.array([values[_ACTION]], np.float32)
-        infos.append(dict(zip(AFTER_A_STEP, values, strict=True), reward_terms={}))
+    for time, applied, first, total, world_first, world_total, collided, wanted, action in rows:
+        applied_action = np.empty(1, np.float32)
+        applied_action[0] = action
+        infos.append(
+            {
+                "time_s": time,
+                "applied_command_mps2": applied,
+                "first_impact_harm": first,
+                "total_harm": total,
+                "world_first_impact_harm": world_first,
+                "world_total_harm": world_total,
+                "collided": collided == 1.0,
+                "wanted_command_mps2": wanted,
+                "applied_action": applied_action,
+                "reward_terms": {},
+            }
+        )
     for name, term in told.terms.items():
         for info, value in zip(infos, term[:, vehicles].ravel().tolist(), strict=True):
             info["reward_terms"][name] = value

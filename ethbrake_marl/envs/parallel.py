@@ -49,7 +49,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
         self.possible_agents = list(self.engine.scenario.vehicle_names)
         self.agents: list[str] = []
-        self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
+        self._learners = [self.possible_agents[i] for i in self.engine.learners]
         self._vehicles = np.arange(len(self.possible_agents))
         features = self.engine.observation.features
         self.observation_spaces = {agent: feature_box(features) for agent in self.possible_agents}
@@ -81,16 +81,17 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         """Advance by one time step. Raises ``InvalidInput`` naming the agent whose action is missing or unusable."""
         if not self.agents:
             raise InvalidInput("step: no episode is running; call reset first")
-        step = self.engine.step(learner_columns(self.engine, self._by_index(actions)))
+        self._check_agents(actions)
+        step = self.engine.step(learner_columns(self._learners, actions))
         agents = self.possible_agents
-        rewards = dict(zip(agents, step.reward[0].tolist(), strict=True))
+        (rewards,) = step.reward.tolist()
         terminated, truncated = step.terminated.item(), step.truncated.item()
         infos = self._infos(report(self.engine, step))
         if terminated or truncated:
             self.agents = []
         return (
             self._observations(),
-            rewards,
+            {agent: rewards[i] for i, agent in enumerate(agents)},
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, truncated),
             infos,
@@ -103,23 +104,25 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         state: Observations = full_state(self.engine.worlds, self.engine.scenario)[0].copy()
         return state
 
-    def _by_index(self, actions: Mapping[str, Any]) -> dict[int, Any]:
-        index = self._index
+    def _check_agents(self, actions: Mapping[str, Any]) -> None:
         try:
-            return {index[agent]: action for agent, action in actions.items()}
-        except KeyError as unknown:
-            raise unknown_name("agent", unknown.args[0], self.possible_agents) from None
+            known = actions.keys() <= self.action_spaces.keys()
         except AttributeError:
             raise InvalidInput(
                 f"step: actions = {actions!r}: must be a mapping such as {{'vehicle_2': [-1.0]}}"
             ) from None
 
+        if not known:
+            unknown = next(agent for agent in actions if agent not in self.action_spaces)
+            raise unknown_name("agent", unknown, self.possible_agents)
+
     def _observations(self) -> dict[str, Observations]:
-        every = self.engine.observe_all(self._vehicles)[0]
-        return {agent: every[i].copy() for i, agent in enumerate(self.possible_agents)}
+        every = self.engine.observe_all(self._vehicles)
+        return {agent: every[0, i] for i, agent in enumerate(self.possible_agents)}
 
     def _infos(self, told: Report) -> Infos:
-        return dict(zip(self.possible_agents, plain_infos(told, slice(None)), strict=True))
+        infos = plain_infos(told, slice(None))
+        return {agent: infos[i] for i, agent in enumerate(self.possible_agents)}
 
 
 parallel_env = EthBrakeParallelEnv

@@ -44,6 +44,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         self.render_mode = render_mode
         self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
         self.learner = only_learner(self.engine)
+        self._name = self.engine.scenario.vehicle_names[self.learner]
         self.observation_space = feature_box(self.engine.observation.features)
         self.action_space = action_box()
         self._running = False
@@ -64,7 +65,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         """Advance by one time step."""
         if not self._running:
             raise InvalidInput("step: no episode is running; call reset first")
-        step = self.engine.step(learner_columns(self.engine, {self.learner: action}))
+        step = self.engine.step(learner_columns((self._name,), {self._name: action}))
         self._running = not step.ended[0]
         info = plain_infos(report(self.engine, step), [self.learner])[0]
         reward = float(step.reward[0, self.learner])

@@ -1,7 +1,7 @@
 """Harm against the constant deceleration of one vehicle in one world: predicted, realised, and the best known.
 
 The prediction is the closed form of E-V2X-BM, which treats the pairs as independent; the realised curves are the same
-decelerations in the engine. All other vehicles brake fully from their latencies on.
+decelerations in the engine, where the other vehicles follow their scripts.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents.coupled import optimise_coupled
 from ethbrake_marl.agents.pairwise import optimise_pairwise, pairwise_breakpoints, pairwise_harm
+from ethbrake_marl.analysis.best_harm import scripted_commands
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.figure_style import COLOURS, GREY, add_caption, new_figure, style_axes
 from ethbrake_marl.evaluation.parameters import quantities, quantity_line
@@ -54,10 +55,11 @@ class DecelerationCurve:
     regimes: dict[str, NDArray[np.str_]]  # per pair of the vehicle ("front pair", "rear pair"): [K] how it first meets
 
 
-def deceleration_curve(world: Worlds, vehicle: int, horizon_s: float, *, points: int = POINTS) -> DecelerationCurve:
+def deceleration_curve(scenario: Scenario, world: Worlds, vehicle: int, *, points: int = POINTS) -> DecelerationCurve:
     """The three harms of one world at evenly spaced decelerations of ``vehicle``, and at those of the closed form.
 
-    Raises ``InvalidInput`` unless there is exactly one world and ``points`` is at least 2.
+    The prediction lets all others brake fully; in the simulation they follow the scenario's scripts. Raises
+    ``InvalidInput`` unless there is exactly one world, ``points`` is at least 2 and no script depends on the state.
     """
     if world.n != 1:
         raise InvalidInput(f"deceleration curve: {world.n} worlds given; exactly one is drawn")
@@ -66,9 +68,9 @@ def deceleration_curve(world: Worlds, vehicle: int, horizon_s: float, *, points:
     capacity = float(world.vehicles.braking_capacity_mps2[0, vehicle])
     special = np.append(pairwise_breakpoints(world, vehicle)[0], optimise_pairwise(world, vehicle).deceleration_mps2)
     at = np.union1d(np.linspace(0.0, capacity, points), special)
-    others = -world.vehicles.braking_capacity_mps2
-    first, total = forecast(world, others, vehicle, -at[None, :], horizon_s)
-    deceleration = np.repeat(-others, at.size, axis=0)
+    others = scripted_commands(scenario, world, [vehicle])
+    first, total = forecast(world, others, vehicle, -at[None, :], scenario.horizon_s)
+    deceleration = np.repeat(world.vehicles.braking_capacity_mps2, at.size, axis=0)
     deceleration[:, vehicle] = at
     copies = world.take(np.zeros(at.size, np.int64))
     contacts = pairwise_harm(copies, deceleration)
@@ -107,12 +109,12 @@ def deceleration_figure(scenario: Scenario, world: Worlds, vehicle: int, *, titl
     lines the best known harm of any profile, where it is known. Below: how each pair alone first meets. Raises
     ``InvalidInput`` unless exactly one world is given.
     """
-    curve = deceleration_curve(world, vehicle, scenario.horizon_s)
+    curve = deceleration_curve(scenario, world, vehicle)
     figure = new_figure(8.0, 5.4)
     axes, strips = figure.subplots(2, 1, sharex=True, height_ratios=(5.0, 0.45 * len(curve.regimes)))
     style_axes(axes)
     _draw_curves(axes, curve)
-    _mark_chosen(axes, curve, world, vehicle, scenario.horizon_s)
+    _mark_chosen(axes, curve, scenario, world, vehicle)
     _mark_best_known(axes, known_limits(world, scenario, vehicle))
     axes.set_xlim(0.0, float(curve.deceleration_mps2[-1]))
     axes.set_ylabel("Harm (m²/s²)", fontsize=9)
@@ -121,12 +123,21 @@ def deceleration_figure(scenario: Scenario, world: Worlds, vehicle: int, *, titl
     strips.set_xlabel(f"Constant deceleration of Vehicle {vehicle + 1} (m/s²)", fontsize=9)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False, fontsize=8.5)
     conditions = (
-        f"{quantity_line(quantities(world))}. All other vehicles brake fully. Harm until {scenario.horizon_s:g} s;"
-        " realised: in the simulation, with velocity exchange and every later impact. Dotted: where the way changes in"
-        " which a pair first meets."
+        f"{quantity_line(quantities(world))}. Harm until {scenario.horizon_s:g} s. Predicted: each pair alone, all"
+        " others braking fully. Realised: in the simulation, with velocity exchange and every later impact; other"
+        f" vehicles: {_scripts(scenario, vehicle)}. Dotted: where the way changes in which a pair first meets."
     )
     add_caption(figure, conditions)
     return figure
+
+
+def _scripts(scenario: Scenario, vehicle: int) -> str:
+    """What the others do, each script once."""
+    scripts = [scenario.scripts.get(i, "full_brake") for i in range(scenario.vehicles) if i != vehicle]
+    if len(set(scripts)) == 1:
+        return scripts[0]
+    others = [f"Vehicle {i + 1}" for i in range(scenario.vehicles) if i != vehicle]
+    return ", ".join(f"{name} {script}" for name, script in zip(others, scripts, strict=True))
 
 
 def _draw_curves(axes: Axes, curve: DecelerationCurve) -> None:
@@ -144,7 +155,7 @@ def _draw_curves(axes: Axes, curve: DecelerationCurve) -> None:
     axes.set_ylim(-0.02 * largest, 1.05 * largest + 1e-3)
 
 
-def _mark_chosen(axes: Axes, curve: DecelerationCurve, world: Worlds, vehicle: int, horizon_s: float) -> None:
+def _mark_chosen(axes: Axes, curve: DecelerationCurve, scenario: Scenario, world: Worlds, vehicle: int) -> None:
     """The decelerations that E-V2X-BM takes: by the closed form, and coupled under either count."""
     chosen = float(optimise_pairwise(world, vehicle).deceleration_mps2[0])
     k = int(np.searchsorted(curve.deceleration_mps2, chosen))
@@ -154,8 +165,9 @@ def _mark_chosen(axes: Axes, curve: DecelerationCurve, world: Worlds, vehicle: i
         [chosen], [predicted], color=_PREDICTED, marker="D", markersize=6, linestyle="none", clip_on=False, zorder=6,
         label=f"a* = {chosen:.3f} m/s², closed form: predicts {predicted:.2f}, realises {realised:.2f}",
     )  # fmt: skip
+    others = scripted_commands(scenario, world, [vehicle])
     for (count, name, colour, _), marker, size in zip(_COUNTS, ("o", "s"), (6, 10), strict=True):
-        best = optimise_coupled(world, vehicle, count=count, horizon_s=horizon_s)
+        best = optimise_coupled(world, vehicle, count=count, horizon_s=scenario.horizon_s, others_mps2=others)
         chosen, harm = float(best.deceleration_mps2[0]), float(best.harm[0])
         axes.plot(
             [chosen], [harm], color=colour, marker=marker, markersize=size, markerfacecolor="none", linestyle="none",

@@ -45,12 +45,16 @@ def cache_folder() -> Path:
 
 
 def compiled(function: Function) -> Function:
-    """Compile ``function`` with numba: no fast-math, no bounds checks, releases the GIL, cached on disk."""
+    """Compile ``function`` with numba: no fast-math, no bounds checks, releases the GIL, cached on disk.
+
+    What a kernel calls becomes part of it (``forceinline``): a call would count references to its arrays, atomically,
+    which cost more than half of the physics.
+    """
     config: Any = numba_config  # its settings are made at run time
     before = config.CACHE_DIR
     config.CACHE_DIR = str(cache_folder())
     try:
-        kernel: Any = numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy")(function)
-        return cast(Function, kernel)
+        compiler: Any = numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy", forceinline=True)
+        return cast(Function, compiler(function))
     finally:
         config.CACHE_DIR = before

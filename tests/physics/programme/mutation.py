@@ -243,7 +243,7 @@ class Worker:
         """The suites must pass without a mutant, or nothing would mean anything."""
         for file in sorted({quick_files(name) for name in (*QUICK, "segment.py")}):
             if quick_run(self.folder, file) != "passed":
-                raise SystemExit(f"the quick suite fails without any mutant: {' '.join(file)}")
+                raise RuntimeError(f"the quick suite fails without any mutant: {' '.join(file)}")
 
 
 def preload() -> None:
