@@ -34,9 +34,10 @@ from ethbrake_marl.physics.segment import (
 Words = NDArray[np.uint64]
 
 OTHER_WEIGHT = 1e-8  # of the other count in the value that is minimised: it decides between equal harms
-# columns of clock: first decision (s), time step (s), number of steps, horizon (s), restitution, 1 for total harm
-START, TIME_STEP, LAST_STEP, HORIZON, RESTITUTION, HARM_IS_TOTAL = range(6)
-CLOCK_WIDTH = 6
+# columns of clock: first decision (s), time step (s), number of steps, horizon (s), restitution, 1 to minimise total
+# harm, 1 to advance decision by decision
+START, TIME_STEP, LAST_STEP, HORIZON, RESTITUTION, HARM_IS_TOTAL, STEPWISE = range(7)
+CLOCK_WIDTH = 7
 
 
 class Setting(NamedTuple):
@@ -127,15 +128,20 @@ def at_rest(table: Floats) -> bool:
 
 
 @compiled
-def follow(
-    world: Setting, ends: Ints, commands: Floats, states: Floats, phase: int, bound: float, stepwise: bool
-) -> tuple[float, int]:
+def follow_whole(world: Setting, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
+    """``follow`` a profile from its first phase on."""
+    phase = min(0, ends.shape[0])  # 0, but no literal, for which everything would be compiled a second time
+    return follow(world, ends, commands, states, phase, bound)
+
+
+@compiled
+def follow(world: Setting, ends: Ints, commands: Floats, states: Floats, phase: int, bound: float) -> tuple[float, int]:
     """Follow a profile from the start of ``phase`` on; ``states[k]`` [K + 1, S] is the state at the start of phase k.
 
     ``ends`` [K], ``commands`` [K, C]. Gives up as soon as the value is not below ``bound``: harm never falls again.
-    ``stepwise`` advances decision by decision, as the engine does, to the same bits; otherwise phase by phase, which
-    is several times faster and differs by rounding. Returns the value and the number of phases up to the end of the
-    episode; -1 for that number if the kernel failed.
+    With ``clock[STEPWISE]`` it advances decision by decision, as the engine does, to the same bits; otherwise phase by
+    phase, which is several times faster and differs by rounding. Returns the value and the number of phases up to the
+    end of the episode; -1 for that number if the kernel failed.
     """
     table, harm, latency, clock, controlled = world.table, world.harm, world.latency, world.clock, world.controlled
     no_rows = np.empty((0, ROW_WIDTH))
@@ -147,7 +153,7 @@ def follow(
         if ends[k] > begin:
             for c in range(controlled.shape[0]):
                 table[COMMAND, controlled[c]] = commands[k, c]
-            length = 1 if stepwise else ends[k] - begin
+            length = 1 if clock[STEPWISE] == 1.0 else ends[k] - begin
             for step in range(begin, ends[k], length):
                 time, until = time_of(clock, step), time_of(clock, step + length)
                 if run_segment(table, harm, latency, clock[RESTITUTION], time, until, no_rows) != DONE:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.profile_motion import LAST_STEP, Setting, follow
+from ethbrake_marl.agents.profile_motion import LAST_STEP, STEPWISE, Setting, follow, follow_whole
 from ethbrake_marl.agents.profile_moves import (
     AMOUNT,
     CHANGE_WIDTH,
@@ -73,18 +73,19 @@ def search_world(
         split_phases(field.ends[0], field.commands[0], used, K, min(ATTENTION_STEPS, int(world.clock[LAST_STEP])))
         field.phases[0] = K
         rest = budget - drawn - rounds - stepwise
-        field.values[0] = improve(world, field.ends[0], field.commands[0], states, rest, False)
+        field.values[0] = improve(world, field.ends[0], field.commands[0], states, rest)
+    world.clock[STEPWISE] = 1.0
     used = select_stepwise(world, seed_ends, seed_commands, states, field, ends, commands)
     if used == 0:
         return 0
-    improve(world, ends[:used], commands[:used], states, stepwise, True)
+    improve(world, ends[:used], commands[:used], states, stepwise)
     return compact(ends[:used], commands[:used], used)
 
 
 @compiled
-def improve(world: Setting, ends: Ints, commands: Floats, states: Floats, budget: int, stepwise: bool) -> float:
+def improve(world: Setting, ends: Ints, commands: Floats, states: Floats, budget: int) -> float:
     """Better and better neighbours of a profile, in place, until ``budget`` candidates have run; its value."""
-    value, active = follow(world, ends, commands, states, 0, math.inf, stepwise)
+    value, active = follow_whole(world, ends, commands, states, math.inf)
     if active < 0:
         return math.inf
     new_ends, new_commands, new_states = ends.copy(), commands.copy(), states.copy()
@@ -101,7 +102,7 @@ def improve(world: Setting, ends: Ints, commands: Floats, states: Floats, budget
                 break
             new_states[phase] = states[phase]
             spent += 1
-            new_value, reached = follow(world, new_ends, new_commands, new_states, phase, value, stepwise)
+            new_value, reached = follow(world, new_ends, new_commands, new_states, phase, value)
             if reached < 0 or not new_value < value:
                 break
             value, active = new_value, reached
@@ -130,7 +131,7 @@ def gather(world: Setting, seed_ends: Ints, seed_commands: Floats, states: Float
             used = int(np.argmax(ends == last)) + 1
         else:
             draw_profile(world.random, world.bounds, ends[:used], commands[:used], last)
-        value, reached = follow(world, ends[:used], commands[:used], states, 0, field.values[worst], False)
+        value, reached = follow_whole(world, ends[:used], commands[:used], states, field.values[worst])
         if reached < 0 or not value < field.values[worst] or np.min(np.abs(field.values - value)) < SAME:
             continue
         field.ends[worst] = ends
@@ -154,7 +155,7 @@ def halve(world: Setting, states: Floats, budget: int, field: Field) -> None:
             used = field.phases[m]
             if used > 0:
                 each = budget // (rounds * left)
-                field.values[m] = improve(world, field.ends[m, :used], field.commands[m, :used], states, each, False)
+                field.values[m] = improve(world, field.ends[m, :used], field.commands[m, :used], states, each)
         sort(field, left)
         if left == 1:
             return
@@ -189,7 +190,7 @@ def select_stepwise(
             continue
         its_ends = seed_ends[s - SMALLEST_FIELD] if given else field.ends[s, :n]
         its_commands = seed_commands[s - SMALLEST_FIELD] if given else field.commands[s, :n]
-        value, reached = follow(world, its_ends, its_commands, states, 0, least, True)
+        value, reached = follow_whole(world, its_ends, its_commands, states, least)
         if reached > 0 and value < least:
             least, used = value, n
             ends[:n] = its_ends

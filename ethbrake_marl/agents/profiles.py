@@ -22,10 +22,11 @@ from ethbrake_marl.agents.profile_motion import (
     LAST_STEP,
     RESTITUTION,
     START,
+    STEPWISE,
     TIME_STEP,
     Setting,
     Words,
-    follow,
+    follow_whole,
 )
 from ethbrake_marl.agents.profile_search import MOST_PHASES, search_world
 from ethbrake_marl.errors import InvalidInput, PhysicsError
@@ -126,7 +127,7 @@ def profile_problem(
     clock = np.empty((worlds.n, CLOCK_WIDTH))
     clock[:, START], clock[:, TIME_STEP], clock[:, HORIZON] = first, time_step_s, horizon_s
     clock[:, LAST_STEP] = np.ceil((horizon_s - first) / time_step_s - 1e-9)
-    clock[:, RESTITUTION], clock[:, HARM_IS_TOTAL] = v.restitution, count == "total"
+    clock[:, RESTITUTION], clock[:, HARM_IS_TOTAL], clock[:, STEPWISE] = v.restitution, count == "total", 0.0
     bounds = np.stack([-v.braking_capacity_mps2[:, chosen], v.driving_capacity_mps2[:, chosen]], axis=2)
     after, impacts = advance(worlds, command, until_s=first)
     start = [after.speeds_mps, after.gaps_m, after.pair_hit, impacts.first_impact_harm, impacts.total_harm]
@@ -279,7 +280,7 @@ def make_setting(
     table[COMMAND] = command
     table[MASS] = mass
     table[LIMIT] = limit
-    return Setting(table, np.zeros((2, N - 1)), latency, clock, vehicles, bounds, random)
+    return Setting(table, np.zeros((2, N - 1)), latency, clock.copy(), vehicles, bounds, random)
 
 
 @compiled
@@ -311,7 +312,8 @@ def follow_worlds(
         world = make_setting(clock[k], bounds[k], command[k], latency[k], mass[k], limit[k], vehicles, no_random)
         states = np.zeros((ends.shape[1] + 1, start.shape[1]))
         states[0] = start[k]
-        if follow(world, ends[k], commands[k], states, 0, math.inf, True)[1] < 0:
+        world.clock[STEPWISE] = 1.0
+        if follow_whole(world, ends[k], commands[k], states, math.inf)[1] < 0:
             return k
         for p in range(mass.shape[1] - 1):
             first[k] += world.harm[0, p]

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
+from ethbrake_marl.physics.parallel import by_parts
 from ethbrake_marl.physics.segment import (
     COMMAND,
     COUNT,
@@ -120,15 +123,17 @@ def advance(
     *,
     until_s: ArrayLike | None = None,
     record: bool = False,
+    threads: int = 1,
 ) -> tuple[Worlds, Impacts]:
     """Advance ``worlds`` exactly, each under its constant command, and report the impacts on the way.
 
     ``command_mps2`` [n, N] is the signed acceleration each vehicle wants; it is ignored before the vehicle's
     latency has elapsed, also when that falls inside the segment. Give either ``duration_s`` or the absolute end
-    ``until_s`` (scalar or [n]). The result of a world does not depend on the batch it is in. Inputs are left alone.
+    ``until_s`` (scalar or [n]). The result of a world does not depend on the batch it is in, nor on ``threads``, which
+    pay from about 10,000 worlds on. Inputs are left alone.
 
-    Raises ``InvalidInput`` for a command that is not finite or exceeds a vehicle's capacity, or an end before the
-    worlds' time; ``PhysicsError`` if a check inside the kernel fails.
+    Raises ``InvalidInput`` for a command that is not finite or exceeds a vehicle's capacity, an end before the worlds'
+    time, or ``threads`` below 1; ``PhysicsError`` if a check inside the kernel fails.
     """
     vehicles = worlds.vehicles
     command = _shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
@@ -144,24 +149,48 @@ def advance(
         )  # fmt: skip
         shape = worlds.gaps_m.shape
         first_harm, total_harm, count = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
-        rows = np.empty((capacity, ROW_WIDTH))
-        recorded, world, status = advance_worlds(
+        arrays = (
             after.gaps_m, after.speeds_mps, after.time_s, after.pair_hit, after.command_mps2, command, until,
             vehicles.braking_capacity_mps2, vehicles.driving_capacity_mps2, vehicles.latency_s, vehicles.mass_t,
-            vehicles.speed_limit_mps, vehicles.restitution, first_harm, total_harm, count, rows,
+            vehicles.speed_limit_mps, vehicles.restitution, first_harm, total_harm, count,
         )  # fmt: skip
-        if status != DONE:
-            raise _failure(worlds, command, until, world, status)
-        if not record or recorded <= capacity:
-            kept = _impact_rows(rows[:recorded]) if record else None
-            return after, Impacts(first_harm, total_harm, count, kept)
-        capacity = recorded
+        parts = by_parts(partial(_advance_part, arrays, capacity), worlds.n, threads)
+        for part in parts:
+            if part.status != DONE:
+                raise _failure(worlds, command, until, part.world, part.status)
+        if not record:
+            return after, Impacts(first_harm, total_harm, count)
+        most = max(part.recorded for part in parts)
+        if most <= capacity:
+            return after, Impacts(first_harm, total_harm, count, _impact_rows(parts))
+        capacity = most
+
+
+class _Part(NamedTuple):
+    """How the kernel fared on a part of the worlds."""
+
+    first: int  # world of the whole batch with which the part begins
+    rows: Floats  # the impacts that fit; worlds are counted from ``first``
+    recorded: int  # all impacts
+    world: int  # where a check failed, counted from the batch's first world
+    status: int
+
+
+def _advance_part(arrays: tuple[NDArray[Any], ...], capacity: int, part: slice) -> _Part:
+    """Advance the worlds of ``part`` in place."""
+    if part.stop - part.start < len(arrays[0]):
+        arrays = tuple(array[part] for array in arrays)
+    rows = np.empty((capacity, ROW_WIDTH))
+    recorded, world, status = advance_worlds(*arrays, rows)
+    return _Part(part.start, rows, recorded, part.start + world, status)
 
 
 def _shaped(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> Floats:
     given = np.asarray(value, np.float64)
     if given.shape == shape:
         return np.ascontiguousarray(given)
+    if given.ndim == 0:
+        return np.full(shape, given)
     try:
         return np.ascontiguousarray(np.broadcast_to(given, shape))
     except ValueError:
@@ -180,9 +209,11 @@ def _failure(worlds: Worlds, command: Floats, until: Floats, k: int, status: int
     return PhysicsError(f"world {k}: {reason} between {worlds.time_s[k]:g} s and {until[k]:g} s")
 
 
-def _impact_rows(rows: Floats) -> ImpactRows:
+def _impact_rows(parts: list[_Part]) -> ImpactRows:
+    rows = np.concatenate([part.rows[: part.recorded] for part in parts])
+    first = np.repeat([part.first for part in parts], [part.recorded for part in parts])
     return ImpactRows(
-        rows[:, ROW_WORLD].astype(np.int64),
+        first + rows[:, ROW_WORLD].astype(np.int64),
         rows[:, ROW_PAIR].astype(np.int64),
         rows[:, ROW_TIME].copy(),
         rows[:, ROW_CLOSING].copy(),

@@ -49,6 +49,7 @@ QUICK = {
     "harm.py": ("tests/test_harm.py", "tests/physics/test_invariants.py"),
 }
 COMPILED = ("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py")
+PYTEST = ("-x", "-q", "-p", "no:cacheprovider", "--rootdir=.")
 SLOW = ("tests/physics/test_against_reference.py",)
 
 
@@ -200,9 +201,11 @@ def _run_pytest(folder: Path, files: tuple[str, ...]) -> None:
     os.dup2(null, 2)
     os.chdir(folder)
     sys.dont_write_bytecode = True
+    for name in [name for name in sys.modules if name.split(".")[0] == "tests"]:
+        del sys.modules[name]  # those of the working tree
     code = 3
     try:
-        code = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--rootdir", str(folder), *files]))
+        code = int(pytest.main([*PYTEST, "-W", "ignore::pytest.PytestAssertRewriteWarning", *files]))
     finally:
         os._exit(code)
 
@@ -211,7 +214,7 @@ def compiled_run(folder: Path) -> str:
     """The compiled suite in a process of its own."""
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "0", "NUMBA_CACHE_DIR": str(folder / "numba")}
     ignored = [f"--ignore={name}" for name in SLOW]
-    command = [sys.executable, "-B", "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *ignored, *COMPILED]
+    command = [sys.executable, "-B", "-m", "pytest", *PYTEST, *ignored, *COMPILED]
     try:
         done = subprocess.run(
             command, cwd=folder, env=environment, capture_output=True, timeout=COMPILED_LIMIT_S, check=False

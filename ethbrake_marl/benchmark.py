@@ -1,0 +1,284 @@
+"""What this machine does per second of processor time: the figures of ``ethbrake bench``.
+
+Every rate is the median over repetitions of work done per second of this process's own processor time, on one core and
+after a first round that is not counted (it compiles and fills caches). Other processes on the machine therefore count
+little, though not nothing: they share caches and memory. ``relative`` sets a rate of world-steps against a loop so simple
+that hardly anything can make it slower but the machine (``calibration``), measured in the same run.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents.coupled import optimise_coupled
+from ethbrake_marl.agents.pairwise import optimise_pairwise
+from ethbrake_marl.envs.build import make_engine
+from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.harm import empty_ledger
+from ethbrake_marl.physics import Floats, Worlds, advance, forecast
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.scenario import load_scenario
+
+SCENARIO = "paper-random"
+SEED = 7
+STEP_S = 0.1
+SHARE = 0.75  # of its braking capacity, with which a learner brakes
+WORLD_STEPS = "world-steps/s"
+MOST_STEPS = 1000  # by then every world is at rest, or none will be
+
+Work = Callable[[], int]  # does some work and says how much it was
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How long to look: repetitions of each measurement, and processor seconds of each at least."""
+
+    repetitions: int
+    seconds: float
+
+
+QUICK = Effort(3, 0.1)
+FULL = Effort(7, 0.4)
+
+
+@dataclass(frozen=True, slots=True)
+class Speed:
+    """One measured figure."""
+
+    name: str
+    workload: str
+    worlds: int  # at once
+    vehicles: int  # in each world
+    unit: str
+    value: float  # median over repetitions
+    lowest: float
+    highest: float
+    floor: float | None = None  # what this project promises on one core of a machine of today: at least (seconds: at most)
+    relative: float | None = None  # rate of world-steps over that of the calibration
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Where the figures come from."""
+
+    processor: str
+    cores_usable: int
+    cores: int
+    load: float  # processes that were running, mean over the last minute
+    python: str
+    numpy: str
+    numba: str
+    ethbrake_marl: str
+
+    def __str__(self) -> str:
+        """The machine in words."""
+        return (
+            f"{self.processor}, {self.cores_usable} of {self.cores} cores usable, load {self.load:.1f};"
+            f" Python {self.python}, numpy {self.numpy}, numba {self.numba}, ethbrake_marl {self.ethbrake_marl}"
+        )
+
+
+def this_machine() -> Machine:
+    """The machine on which this runs."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return Machine(
+        _processor(),
+        usable,
+        os.cpu_count() or 1,
+        os.getloadavg()[0],
+        platform.python_version(),
+        version("numpy"),
+        version("numba"),
+        eb.__version__,
+    )
+
+
+def _processor() -> str:
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text("utf-8").splitlines() if information.is_file() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
+
+
+def rates(work: Work, effort: Effort) -> Floats:
+    """Units of work per second of processor time, one for each repetition, ascending."""
+    work()
+    found = []
+    for _ in range(effort.repetitions):
+        done, spent, begin = 0, 0.0, time.process_time()
+        while spent < effort.seconds:
+            done += work()
+            spent = time.process_time() - begin
+        found.append(done / spent)
+    return np.sort(found)
+
+
+def measure(effort: Effort) -> Iterator[Speed]:
+    """Every figure, one after the other; how many there are: ``len(BENCHMARKS)``."""
+    calibration = None
+    for benchmark in BENCHMARKS:
+        speed = benchmark(effort)
+        calibration = speed.value if calibration is None else calibration
+        yield replace(speed, relative=speed.value / calibration) if speed.unit == WORLD_STEPS else speed
+
+
+def _rate(
+    name: str, workload: str, unit: str, make: Callable[[int], Work], n: int, floor: float | None, effort: Effort
+) -> Speed:
+    found = rates(make(n), effort)
+    low, middle, high = float(found[0]), float(np.median(found)), float(found[-1])
+    return Speed(name, workload, n, load_scenario(SCENARIO).vehicles, unit, middle, low, high, floor)
+
+
+def first_decisions(n: int) -> Worlds:
+    """Worlds of the scenario's training stream at their first decision."""
+    return make_engine(SCENARIO, n, seed=SEED).worlds
+
+
+def braking(n: int, share: float) -> Work:
+    """Worlds from their first decision until all are at rest; Vehicle 2 brakes with a share of its capacity."""
+    worlds = first_decisions(n)
+    command = -worlds.vehicles.braking_capacity_mps2
+    command[:, 1] *= share
+    return until_rest(worlds, command)
+
+
+def until_rest(worlds: Worlds, command_mps2: Floats) -> Work:
+    """``advance`` and the ledger, step by step under constant commands, until all worlds are at rest."""
+    after, steps = worlds, 0
+    while after.speeds_mps.any() and steps < MOST_STEPS:
+        after, steps = advance(after, command_mps2, STEP_S)[0], steps + 1
+
+    def work() -> int:
+        now, ledger = worlds, empty_ledger(worlds)
+        for _ in range(steps):
+            now, impacts = advance(now, command_mps2, STEP_S)
+            ledger = ledger.add(impacts)
+        return steps * worlds.n
+
+    return work
+
+
+def stepping(n: int, steps: int = 100) -> Work:
+    """The engine: dynamics, ledger, rewards, ends of episodes, the learner's observation, and new episodes."""
+    engine = make_engine(SCENARIO, n, seed=SEED)
+    learners = np.array(engine.learners)
+    actions = np.full((n, len(learners)), -SHARE)
+
+    def work() -> int:
+        for _ in range(steps):
+            ended = engine.step(actions).ended
+            engine.renew(np.flatnonzero(ended))
+            engine.observe_all(learners)
+        return steps * n
+
+    return work
+
+
+def _sb3(n: int, steps: int = 100) -> Work:
+    environment = eb.make_sb3_vec_env(SCENARIO, n, seed=SEED)  # imports torch, hence only now
+    environment.reset()
+    actions = np.full((n, 1), -SHARE, np.float32)
+
+    def work() -> int:
+        for _ in range(steps):
+            environment.step(actions)
+        return steps * n
+
+    return work
+
+
+def _pettingzoo(n: int, episodes: int = 20) -> Work:
+    environment = parallel_env(SCENARIO)
+    actions = {f"vehicle_{i + 1}": np.array([-SHARE], np.float32) for i in environment.engine.learners}
+    environment.reset(seed=SEED)
+
+    def work() -> int:
+        steps = 0
+        for _ in range(episodes):
+            environment.reset()
+            while environment.agents:
+                environment.step(actions)
+                steps += 1
+        return steps * n
+
+    return work
+
+
+def _sampling(n: int) -> Work:
+    scenario = load_scenario(SCENARIO)
+    return lambda: scenario.sample(n, SEED).worlds.n
+
+
+def _pairwise(n: int) -> Work:
+    worlds = load_scenario(SCENARIO).sample(n, SEED).worlds
+    return lambda: len(optimise_pairwise(worlds, 1).harm)
+
+
+def _coupled(n: int) -> Work:
+    worlds = load_scenario(SCENARIO).sample(n, SEED).worlds
+    return lambda: len(optimise_coupled(worlds, 1).harm)
+
+
+def _forecast(n: int, candidates: int = 16) -> Work:
+    scenario = load_scenario(SCENARIO)
+    worlds = scenario.sample(n, SEED).worlds
+    command = -worlds.vehicles.braking_capacity_mps2
+    tried = command[:, [1]] * np.linspace(0.0, 1.0, candidates)
+    return lambda: forecast(worlds, command, 1, tried, scenario.horizon_s)[0].size
+
+
+def _calibration(n: int) -> Work:
+    speeds, ways = np.full((n, 3), 20.0), np.zeros((n, 3))
+    return lambda: brake_apart(speeds, ways, 1000)
+
+
+@compiled
+def brake_apart(speeds: Floats, ways: Floats, steps: int) -> int:
+    """The calibration: vehicles that brake without seeing each other, and start again when at rest."""
+    for _ in range(steps):
+        for k in range(speeds.shape[0]):
+            for i in range(speeds.shape[1]):
+                after = max(speeds[k, i] - 0.5, 0.0)
+                ways[k, i] += 0.05 * (speeds[k, i] + after)
+                speeds[k, i] = after if after > 0.0 else 20.0
+    return steps * speeds.shape[0]
+
+
+START = """
+import time, ethbrake_marl
+environment = ethbrake_marl.parallel_env()
+environment.reset(seed=7)
+environment.step({"vehicle_2": [-1.0]})
+print(time.process_time())
+"""
+
+
+def _start(effort: Effort) -> Speed:
+    """A fresh interpreter, from its own start to the end of the first step; the kernels' cache is warm."""
+    call = (sys.executable, "-c", START)
+    subprocess.run(call, check=True, capture_output=True)
+    found = np.sort([_child_seconds(call) for _ in range(effort.repetitions)])
+    name, workload = "import and first step", "fresh interpreter, `parallel_env()`, reset, one step; kernels compiled before"
+    return Speed(name, workload, 1, 3, "s", float(np.median(found)), float(found[0]), float(found[-1]), 2.0)
+
+
+def _child_seconds(call: tuple[str, ...]) -> float:
+    """Processor seconds of a process, from its start to its end."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(call, check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
