@@ -1,9 +1,9 @@
 """What this machine does per second of processor time: the figures of ``ethbrake bench``.
 
 Every rate is the median over repetitions of work done per second of this process's own processor time, on one core and
-after a first round that is not counted (it compiles and fills caches). Other processes on the machine therefore count
-little, though not nothing: they share caches and memory. ``relative`` sets a rate of world-steps against a loop so simple
-that hardly anything can make it slower but the machine (``calibration``), measured in the same run.
+after a first round that does not count (it compiles and fills caches). Programs that run beside it therefore weigh
+little, though not nothing: caches and memory are shared. ``relative`` sets a rate of world-steps against the
+calibration, a loop so simple that hardly anything but the machine can make it slower, measured in the same run.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Speed:
     value: float  # median over repetitions
     lowest: float
     highest: float
-    floor: float | None = None  # what this project promises on one core of a machine of today: at least (seconds: at most)
+    floor: float | None = None  # what the project aims at: at least this (for seconds: at most)
     relative: float | None = None  # rate of world-steps over that of the calibration
 
 
@@ -243,7 +243,7 @@ def _forecast(n: int, candidates: int = 16) -> Work:
 
 def _calibration(n: int) -> Work:
     speeds, ways = np.full((n, 3), 20.0), np.zeros((n, 3))
-    return lambda: brake_apart(speeds, ways, 1000)
+    return lambda: int(brake_apart(speeds, ways, 1000))
 
 
 @compiled
@@ -258,27 +258,54 @@ def brake_apart(speeds: Floats, ways: Floats, steps: int) -> int:
     return steps * speeds.shape[0]
 
 
-START = """
-import time, ethbrake_marl
+_START = """
+import ethbrake_marl
 environment = ethbrake_marl.parallel_env()
 environment.reset(seed=7)
 environment.step({"vehicle_2": [-1.0]})
-print(time.process_time())
 """
 
 
 def _start(effort: Effort) -> Speed:
-    """A fresh interpreter, from its own start to the end of the first step; the kernels' cache is warm."""
-    call = (sys.executable, "-c", START)
-    subprocess.run(call, check=True, capture_output=True)
-    found = np.sort([_child_seconds(call) for _ in range(effort.repetitions)])
-    name, workload = "import and first step", "fresh interpreter, `parallel_env()`, reset, one step; kernels compiled before"
-    return Speed(name, workload, 1, 3, "s", float(np.median(found)), float(found[0]), float(found[-1]), 2.0)
+    """A fresh interpreter that makes one world and steps it once; the kernels' cache is warm."""
+    _child_seconds()
+    found = np.sort([_child_seconds() for _ in range(effort.repetitions)])
+    low, middle, high = float(found[0]), float(np.median(found)), float(found[-1])
+    workload = "a fresh interpreter: import, parallel_env, reset, step; kernels compiled before"
+    return Speed("import and first step", workload, 1, 3, "s", middle, low, high, 2.0)
 
 
-def _child_seconds(call: tuple[str, ...]) -> float:
-    """Processor seconds of a process, from its start to its end."""
+def _child_seconds() -> float:
+    """Processor seconds of that interpreter, from its start to its end."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(call, check=True, capture_output=True)
+    subprocess.run([sys.executable, "-c", _START], check=True, capture_output=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+_BRAKING = "first decision to rest in steps of 0.1 s; Vehicle 2 brakes with {:g} of its capacity, all others fully"
+_DRIVING = "Vehicle 2 brakes with 0.75 of its capacity; new episodes as old ones end"
+
+
+def _advance_of(n: int, share: float) -> Callable[[Effort], Speed]:
+    name = f"advance and ledger, braking {share:.0%}"
+    return partial(_rate, name, _BRAKING.format(share), WORLD_STEPS, partial(braking, share=share), n, 15e6)
+
+
+# The calibration comes first: the others are set against it.
+BENCHMARKS: tuple[Callable[[Effort], Speed], ...] = (
+    partial(_rate, "calibration", "constant deceleration, no event", WORLD_STEPS, _calibration, 1024, None),
+    _advance_of(1024, SHARE),
+    _advance_of(1024, 1.0),
+    _advance_of(4096, SHARE),
+    _advance_of(4096, 1.0),
+    partial(_rate, "engine step", _DRIVING, WORLD_STEPS, stepping, 1024, 8e6),
+    partial(_rate, "engine step", _DRIVING, WORLD_STEPS, stepping, 4096, 8e6),
+    partial(_rate, "Stable-Baselines3 VecEnv", _DRIVING, WORLD_STEPS, _sb3, 512, 4e6),
+    partial(_rate, "PettingZoo parallel", "whole episodes, resets included", WORLD_STEPS, _pettingzoo, 1, 80e3),
+    _start,
+    partial(_rate, "sampling", "a list of worlds, refused draws included", "worlds/s", _sampling, 10_000, None),
+    partial(_rate, "E-V2X-BM pairwise", "one optimum per world", "worlds/s", _pairwise, 10_000, None),
+    partial(_rate, "E-V2X-BM coupled", "one optimum per world", "worlds/s", _coupled, 1000, None),
+    partial(_rate, "forecast", "16 constant commands per world, to the horizon", "runs/s", _forecast, 1000, None),
+)

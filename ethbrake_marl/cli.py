@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
+from ethbrake_marl.bench_commands import bench_command
 from ethbrake_marl.command_options import (
     ForceOption,
     JsonOption,
@@ -75,6 +76,7 @@ scenario_app = typer.Typer(
 app.add_typer(scenario_app, name="scenario")
 app.add_typer(picture_app, name="picture")
 app.command("best-harm", epilog="Example: ethbrake best-harm --episodes 200 --budget 20000 --json")(best_harm_command)
+app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
 
 _KEPT = "if the training had begun, the run's folder keeps the last good policy"
 

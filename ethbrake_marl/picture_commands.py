@@ -46,7 +46,7 @@ def picture_criticality(
 
     Everything else must be a fixed number in the scenario.
     """
-    target = _target(output, force=force)
+    target = picture_target(output, force=force)
     # Here and below: matplotlib takes a second to load, and most commands draw nothing.
     from ethbrake_marl.evaluation.criticality import CELLS, criticality_figure, criticality_map
     from ethbrake_marl.evaluation.figure_style import png_bytes
@@ -78,7 +78,7 @@ def picture_deceleration(
     force: ForceOption = False,
 ) -> None:
     """Harm of one world against the constant deceleration of one vehicle: predicted, realised, and the best known."""
-    target = _target(output, force=force)
+    target = picture_target(output, force=force)
     from ethbrake_marl.evaluation.deceleration_curve import deceleration_figure
     from ethbrake_marl.evaluation.figure_style import png_bytes
 
@@ -91,7 +91,7 @@ def picture_deceleration(
     say(f"picture: {target}")
 
 
-def _target(output: Path, *, force: bool) -> Path:
+def picture_target(output: Path, *, force: bool) -> Path:
     """The file to write, checked before any work; only PNG is written."""
     if output.suffix.lower() != PICTURE_ENDING:
         raise InvalidInput(f"{output}: pictures are written as PNG; give a name that ends in {PICTURE_ENDING}")

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from ethbrake_marl.analysis.best_harm import BUDGET, search_list
-from ethbrake_marl.analysis.best_harm_table import BestHarmTable, save_table
+from ethbrake_marl.analysis.best_harm_table import BestHarmTable, load_table, save_table
 from ethbrake_marl.command_options import ForceOption, JsonOption, ScenarioOption
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
@@ -36,6 +36,9 @@ def best_harm_command(
     threads: Annotated[
         int | None, typer.Option(help="Worlds searched at once; changes no result.", show_default="every core")
     ] = None,
+    start: Annotated[
+        Path | None, typer.Option(metavar="FILE.npz", help="A table to start from; no world gets worse than there.")
+    ] = None,
     output: Annotated[
         Path | None, typer.Option(metavar="FILE.npz", help="Also write the table of every world to this file.")
     ] = None,
@@ -54,6 +57,7 @@ def best_harm_command(
     chosen = load_runnable(scenario)
     names = None if vehicles is None else [name.strip() for name in vehicles.split(",")]
     controlled = None if names is None else chosen.with_learners(names).learners
+    known = None if start is None else load_table(start)
     sample = chosen.sample(episodes, seed)
     parts = None if output is None else output.with_name(f".{output.name}.parts")
     kept = "nothing was written" if parts is None else f"{parts} keeps what was found; the same command goes on"
@@ -66,6 +70,7 @@ def best_harm_command(
             budget=budget,
             seed=search_seed,
             threads=threads,
+            known=known,
             chunks=parts,
             on_progress=lambda done, total: bars.show("best harm", done, total),
         )
@@ -84,7 +89,7 @@ def best_harm_command(
 
 def best_harm_figures(table: BestHarmTable) -> dict[str, object]:
     """What was asked, the mean best known harm under each count (m2/s2), and the share of worlds without any."""
-    figures: dict[str, object] = dict(table.header)
+    figures: dict[str, object] = {key: value for key, value in table.header.items() if key != "after"}
     for count, best in table.best.items():
         name = "best_known_first_impact_harm" if count == "first" else "best_known_total_harm"
         figures[name] = float(best.harm.mean())

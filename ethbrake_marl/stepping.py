@@ -78,13 +78,13 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     P = N - 1
     table = np.zeros((TABLE_ROWS, N))
     for k in range(n):
-        for f in range(HARM_ROWS):
-            step_harm[f, k] = 0.0
-        for f in range(FLAG_ROWS):
-            flags[f, k] = 0
-        for i in range(N):
-            reward[k, i] = 0.0
         if clock[k, ENDED] == 1.0:
+            for f in range(HARM_ROWS):
+                step_harm[f, k] = 0.0
+            for f in range(FLAG_ROWS):
+                flags[f, k] = 0
+            for i in range(N):
+                reward[k, i] = 0.0
             continue
         for c in range(learners.shape[0]):
             i = learners[c]
@@ -124,11 +124,11 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             impacts += state[k, harm + 2 * P + p]
         step_harm[STEP_FIRST_HARM, k] = first_harm
         step_harm[STEP_TOTAL_HARM, k] = total_harm
-        if at_rest or at_horizon:
-            clock[k, ENDED] = 1.0
-            flags[TERMINATED, k] = at_rest
-            flags[TRUNCATED, k] = not at_rest
-            flags[SAFE_END, k] = impacts == 0.0
+        over = at_rest or at_horizon
+        clock[k, ENDED] = 1.0 if over else 0.0
+        flags[TERMINATED, k] = at_rest
+        flags[TRUNCATED, k] = over and not at_rest
+        flags[SAFE_END, k] = over and impacts == 0.0
         shared = settings[TERMINAL_WEIGHT] if flags[SAFE_END, k] == 1 else 0.0
         shared -= settings[HARM_WEIGHT] * (total_harm if settings[HARM_IS_TOTAL] == 1.0 else first_harm)
         for i in range(N):

@@ -10,15 +10,9 @@ import numpy as np
 
 from ethbrake_marl.agents.others import fixed_commands
 from ethbrake_marl.agents.pairwise import optimise_pairwise
+from ethbrake_marl.agents.profile_problem import TIME_STEP_S, ProfileProblem, profile_problem
 from ethbrake_marl.agents.profile_search import MOST_PHASES
-from ethbrake_marl.agents.profiles import (
-    TIME_STEP_S,
-    ProfileProblem,
-    Profiles,
-    constant_profiles,
-    profile_problem,
-    search_profiles,
-)
+from ethbrake_marl.agents.profiles import Profiles, constant_profiles, search_profiles
 from ethbrake_marl.agents.protocol import place
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
@@ -66,7 +60,7 @@ class Planner:
         self._latency_s = place(self._latency_s, rows, worlds.vehicles.latency_s[:, vehicle])
         self._planned_s = place(self._planned_s, rows, np.maximum(self._latency_s[rows], worlds.time_s))
         more = self._latency_s.size - len(self._plan.ends)
-        self._plan = Profiles(*(np.pad(part, [(0, more)] + [(0, 0)] * (part.ndim - 1)) for part in self._plan))
+        self._plan = self._plan.grown(self._latency_s.size)
         if self._others_mps2.shape[1] != worlds.N:
             self._others_mps2 = np.zeros((self._latency_s.size - more, worlds.N))
         self._others_mps2 = np.pad(self._others_mps2, ((0, more), (0, 0)))

@@ -89,7 +89,7 @@ def restore(table: Floats, harm: Floats, state: Floats) -> None:
 @compiled
 def time_of(clock: Floats, step: int) -> float:
     """Time at which a step begins (s), as the engine counts; the last one ends at the horizon."""
-    return clock[HORIZON] if step >= clock[LAST_STEP] else clock[START] + step * clock[TIME_STEP]
+    return float(clock[HORIZON] if step >= clock[LAST_STEP] else clock[START] + step * clock[TIME_STEP])
 
 
 @compiled

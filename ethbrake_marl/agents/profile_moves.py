@@ -107,10 +107,10 @@ def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -
     begin = ends[k - 1] if k > 0 else 0
     if kind == SET_COMMAND:
         commands[k, c] = amount
-        return amount != before
+        return bool(amount != before)
     if kind == COMMAND_CHANGE:
         commands[k, c] = allowed(before + amount, low, high)
-        return commands[k, c] != before
+        return bool(commands[k, c] != before)
     if k == ends.shape[0] - 1:
         return False
     here, there = ends[k] - begin, ends[k + 1] - ends[k]
@@ -119,11 +119,11 @@ def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -
             return False
         commands[k, c] = allowed(before + amount, low, high)
         commands[k + 1, c] = allowed(commands[k + 1, c] - (commands[k, c] - before) * here / there, low, high)
-        return commands[k, c] != before
+        return bool(commands[k, c] != before)
     end = min(max(ends[k] + int(amount), begin), ends[k + 1])
     moved = end != ends[k]
     ends[k] = end
-    return moved
+    return bool(moved)
 
 
 @compiled

@@ -31,8 +31,8 @@ def make_agent(spec: str, *, count: HarmCount = "first", horizon_s: float = 8.0)
     """A fresh agent for one vehicle in one batch.
 
     ``full_brake``, ``coast``, ``constant:a`` (deceleration in m/s2, negative = drive), ``copy_leader``,
-    ``gentlest_front``, ``e_v2x_bm`` (= ``e_v2x_bm:coupled``), ``e_v2x_bm:pairwise``, ``planner``, ``planner:candidates``,
-    ``planner:20ms`` (a time per decision), and what was registered.
+    ``gentlest_front``, ``e_v2x_bm`` (= ``e_v2x_bm:coupled``), ``e_v2x_bm:pairwise``, ``planner``,
+    ``planner:candidates``, ``planner:20ms`` (a time per decision), and what was registered.
     Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, count or horizon.
     """
     check_count(count)

@@ -9,17 +9,9 @@ import numpy as np
 from ethbrake_marl.agents.coupled import optimise_coupled
 from ethbrake_marl.agents.others import fixed_commands
 from ethbrake_marl.agents.profile_motion import START
+from ethbrake_marl.agents.profile_problem import TIME_STEP_S, ProfileProblem, profile_problem
 from ethbrake_marl.agents.profile_search import MOST_PHASES
-from ethbrake_marl.agents.profiles import (
-    TIME_STEP_S,
-    ProfileProblem,
-    Profiles,
-    constant_profiles,
-    follow_profiles,
-    pad_profiles,
-    profile_problem,
-    search_profiles,
-)
+from ethbrake_marl.agents.profiles import Profiles, constant_profiles, follow_profiles, pad_profiles, search_profiles
 from ethbrake_marl.agents.protocol import place
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
@@ -68,7 +60,7 @@ class BestHarm:
             profiles = self._search(worlds, vehicle, others, profiles, unknown)
         first, total = follow_profiles(problem, profiles)
         self.predicted_harm = place(self.predicted_harm, rows, first if self._count == "first" else total)
-        self.searched = place(self.searched, rows, 1.0 - known)
+        self.searched = place(self.searched, rows, (~known).astype(np.float64))
         self._start_s = place(self._start_s, rows, problem.clock[:, START])
         self._profiles = _placed(self._profiles, rows, profiles, self._start_s.size)
 
@@ -78,7 +70,7 @@ class BestHarm:
             raise InvalidInput(f"agent {self.name!r}: act on {worlds.n} worlds, but begin was not called for each")
         passed = (worlds.time_s - self._start_s[: worlds.n]) / TIME_STEP_S
         step = np.maximum(np.floor(passed + 1e-6), 0.0).astype(np.int64)
-        return Profiles(*(part[: worlds.n] for part in self._profiles)).at(step)[:, 0]
+        return self._profiles.take(slice(worlds.n)).at(step)[:, 0]
 
     def _problem(self, worlds: Worlds, vehicle: int, others: Floats) -> ProfileProblem:
         return profile_problem(worlds, [vehicle], count=self._count, horizon_s=self._horizon_s, others_mps2=others)
@@ -104,8 +96,7 @@ def _without(others: Mapping[int, Script], vehicle: int) -> dict[int, Script]:
 def _placed(stored: Profiles, rows: Ints, profiles: Profiles, n: int) -> Profiles:
     """The stored profiles, now of ``n`` rows, with those of ``rows`` replaced."""
     stored, profiles = pad_profiles([stored, profiles], 1)
-    more = n - len(stored.ends)
-    grown = Profiles(*(np.pad(part, [(0, more)] + [(0, 0)] * (part.ndim - 1)) for part in stored))
+    grown = stored.grown(n)
     grown.ends[rows] = profiles.ends
     grown.commands_mps2[rows] = profiles.commands_mps2
     return grown

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +15,15 @@ import numpy as np
 from ethbrake_marl.agents.coupled import optimise_coupled
 from ethbrake_marl.agents.driving import scripted
 from ethbrake_marl.agents.others import fixed_commands
+from ethbrake_marl.agents.profile_motion import Words
+from ethbrake_marl.agents.profile_problem import ProfileProblem, profile_problem
+from ethbrake_marl.agents.profile_search import MOST_PHASES
 from ethbrake_marl.agents.profiles import (
     Found,
-    ProfileProblem,
     Profiles,
-    Words,
     constant_profiles,
     follow_profiles,
-    profile_problem,
+    pad_profiles,
     search_profiles,
 )
 from ethbrake_marl.analysis.best_harm_table import Best, BestHarmTable, join_tables, load_table, save_table
@@ -47,14 +48,16 @@ def best_harm(
     budget: int = BUDGET,
     seed: int = 0,
     threads: int | None = None,
+    known: BestHarmTable | None = None,
 ) -> BestHarmTable:
     """Search every world (at t = 0) for the profiles of least harm, once per count.
 
-    ``vehicles`` are the controlled ones (default: the scenario's learners); all others follow their scripts, which must
-    be state-free. With both counts, each may take the other's result. The result is never worse than the best constant
-    deceleration of a controlled vehicle (other controlled ones braking fully), and not than the same search with one of
-    them alone. It does not depend on ``threads`` (default: every core) or on the batch. Raises ``InvalidInput`` for no
-    vehicle, a script that depends on the state, no count, or a budget below 1.
+    ``vehicles`` are the controlled ones (default: the scenario's learners); all others follow their scripts. With both
+    counts, each may take the other's result. The result is never worse than the best constant deceleration of a
+    controlled vehicle (other controlled ones braking fully), than the same search with one of them alone, or than what
+    is ``known`` (a table with these vehicles), from which the search then starts. It does not depend on ``threads``
+    (default: every core) or on the batch. Raises ``InvalidInput`` for no vehicle, a script whose command is not fixed
+    at the alert, no count, or a budget below 1.
     """
     if not counts or not set(counts) <= set(COUNTS) or len(set(counts)) != len(counts):
         raise InvalidInput(f"counts {tuple(counts)}: must be first, total, or both")
@@ -62,8 +65,12 @@ def best_harm(
     workers = _cores() if threads is None else threads
     search = _Search(scenario, worlds, scripted_commands(scenario, worlds, chosen), budget, seed, workers)
     found: list[Found] = []
+    identity = search.problem(chosen).identity
     for count in counts:
-        found.append(search.best(chosen, count, [earlier.profiles for earlier in found]))
+        given = [earlier.profiles for earlier in found]
+        if known is not None:
+            given.append(_startable(known.profiles(identity, count, search.problem(chosen).last_step)[0]))
+        found.append(search.best(chosen, count, given))
     rows = np.arange(worlds.n)
     best: dict[HarmCount, Best] = {}
     for count in counts:
@@ -74,7 +81,18 @@ def best_harm(
         best[count] = Best(harms[pick, rows], Profiles(ends, commands))
     names = [scenario.vehicle_names[i] for i in chosen]
     header = {"scenario": scenario.name, "vehicles": names, "budget": budget, "search_seed": seed}
-    return BestHarmTable(search.problem(chosen, counts[0]).identity, best, header)
+    table = BestHarmTable(identity, best, header)
+    return table if known is None else _merged(table, known)
+
+
+def _merged(table: BestHarmTable, known: BestHarmTable) -> BestHarmTable:
+    """The table, with what is ``known`` to do less harm; its header says what came before."""
+    for count in [count for count in table.best if count in known.best]:
+        nowhere = np.zeros(len(table.identity), np.int64)
+        kept, has_profile = known.profiles(table.identity, count, nowhere + 1)
+        kept.ends[~has_profile] = 0
+        table, _ = table.improved(table.identity, count, known.harm(table.identity, count), kept)
+    return replace(table, header={**table.header, "after": dict(known.header)})
 
 
 def search_list(
@@ -86,6 +104,7 @@ def search_list(
     budget: int = BUDGET,
     seed: int = 0,
     threads: int | None = None,
+    known: BestHarmTable | None = None,
     chunks: Path | None = None,
     on_progress: Progress | None = None,
 ) -> BestHarmTable:
@@ -101,12 +120,20 @@ def search_list(
         worlds = sample.worlds.take(rows)
         part = None
         file = None if chunks is None else chunks / f"{first:07d}.npz"
-        question = {"counts": list(counts), "budget": budget, "search_seed": seed}
+        before = {} if known is None else {"after": dict(known.header)}
+        question = {"counts": list(counts), "budget": budget, "search_seed": seed, **before}
         if file is not None and file.is_file():
             part = _answer(file, scenario, worlds, vehicles, question)
         if part is None:
             part = best_harm(
-                scenario, worlds, counts=counts, vehicles=vehicles, budget=budget, seed=seed, threads=threads
+                scenario,
+                worlds,
+                counts=counts,
+                vehicles=vehicles,
+                budget=budget,
+                seed=seed,
+                threads=threads,
+                known=known,
             )
             if file is not None:
                 file.parent.mkdir(parents=True, exist_ok=True)
@@ -125,7 +152,7 @@ def _answer(
         table = load_table(file)
     except CorruptBundle:
         return None
-    asked = {"counts": list(table.best), **{key: table.header.get(key) for key in ("budget", "search_seed")}}
+    asked = {"counts": list(table.best), **{key: table.header[key] for key in question if key in table.header}}
     same = asked == question and np.array_equal(table.identity, world_identity(scenario, worlds, vehicles))
     return table if same else None
 
@@ -207,9 +234,21 @@ class _Search:
         )
 
 
+def _startable(profiles: Profiles) -> Profiles:
+    """Those with as few phases as a search can start from; the others hold their first command."""
+    ends, commands = pad_profiles([profiles], MOST_PHASES)[0]
+    last = ends[:, -1:]
+    short = ends[:, MOST_PHASES - 1 : MOST_PHASES] == last
+    return Profiles(
+        np.where(short, ends[:, :MOST_PHASES], last),
+        np.where(short[..., np.newaxis], commands[:, :MOST_PHASES], commands[:, :1]),
+    )
+
+
 def _joined(parts: list[Profiles], n: int) -> Profiles:
     """Several given profiles of each world, [n * Q_j] each, as one list [n * Q] world by world."""
-    ends = np.concatenate([part.ends.reshape(n, -1, part.ends.shape[-1]) for part in parts], axis=1)
-    shape = (n, -1, *parts[0].commands_mps2.shape[1:])
+    parts = pad_profiles(parts, MOST_PHASES)
+    ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in parts], axis=1)
+    shape = (n, -1, MOST_PHASES, parts[0].commands_mps2.shape[2])
     commands = np.concatenate([part.commands_mps2.reshape(shape) for part in parts], axis=1)
-    return Profiles(ends.reshape(-1, ends.shape[-1]), commands.reshape(-1, *commands.shape[2:]))
+    return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, *shape[2:]))

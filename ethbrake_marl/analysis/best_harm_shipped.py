@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.agents.profiles import ProfileProblem, Profiles, pad_profiles
+from ethbrake_marl.agents.profile_problem import ProfileProblem
+from ethbrake_marl.agents.profiles import Profiles, pad_profiles
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.replay import SEARCH_BUDGET, BestHarm
@@ -47,17 +48,13 @@ def best_known(
 
 def shipped_profiles(problem: ProfileProblem, count: HarmCount) -> tuple[Profiles, Bools]:
     """Kept profiles of a problem with one controlled vehicle, [n], and where there is one, [n]."""
-    ends = np.broadcast_to(problem.last_step[:, np.newaxis], (problem.n, 1)).copy()
-    profiles, known = Profiles(ends, np.zeros((problem.n, 1, 1))), np.zeros(problem.n, np.bool_)
+    last_step = problem.last_step
+    profiles, known = Profiles(last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, 1))), np.zeros(problem.n, bool)
     for table in shipped_tables():
-        rows = table.rows(problem.identity)
-        if count not in table.best or not (rows >= 0).any():
-            continue
-        kept = table.best[count].profiles
-        here = (rows >= 0) & (kept.ends[rows, -1] > 0)
+        kept, here = table.profiles(problem.identity, count, last_step)
         profiles, kept = pad_profiles([profiles, kept], 1)
-        profiles.ends[here] = kept.ends[rows[here]]
-        profiles.commands_mps2[here] = kept.commands_mps2[rows[here]]
+        profiles.ends[here] = kept.ends[here]
+        profiles.commands_mps2[here] = kept.commands_mps2[here]
         known |= here
     return profiles, known
 

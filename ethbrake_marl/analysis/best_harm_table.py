@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.profiles import Profiles, Words, pad_profiles
+from ethbrake_marl.agents.profile_motion import Words
+from ethbrake_marl.agents.profiles import Profiles, pad_profiles
 from ethbrake_marl.durable_files import write_file
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.physics import Bools, Floats
+from ethbrake_marl.physics import Bools, Floats, Ints
 
 TABLE_FORMAT = 1
 TOLERANCE = 1e-6  # an agent must be this much (m2/s2) below the table to replace its value
@@ -52,6 +53,18 @@ class BestHarmTable:
         if count not in self.best:
             return np.full(rows.shape, np.nan)
         return np.where(rows >= 0, self.best[count].harm[rows], np.nan)
+
+    def profiles(self, identity: Words, count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
+        """Kept profiles [n], and where there is one [n]; coasting elsewhere. ``last_step`` [n] ends each of them."""
+        rows = self.rows(identity)
+        if count not in self.best:
+            controlled = next(iter(self.best.values())).profiles.commands_mps2.shape[2]
+            coasting = Profiles(last_step[:, np.newaxis].copy(), np.zeros((len(rows), 1, controlled)))
+            return coasting, np.zeros(len(rows), np.bool_)
+        kept = self.best[count].profiles.take(rows)
+        known = (rows >= 0) & (kept.ends[:, -1] > 0)
+        ends = np.where(known[:, np.newaxis], kept.ends, last_step[:, np.newaxis])
+        return Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], kept.commands_mps2, 0.0)), known
 
     def improved(
         self, identity: Words, count: HarmCount, harm: Floats, profiles: Profiles | None = None
@@ -108,7 +121,7 @@ def table_bytes(table: BestHarmTable) -> bytes:
         flat = np.ascontiguousarray(commands[inside], "<f8")
         arrays[f"{count}_commands"] = flat.view(np.uint8).reshape(*flat.shape, 8).transpose(2, 0, 1).copy()
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)  # type: ignore[arg-type]  # numpy's stub forgets the name
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
 
 

@@ -80,9 +80,9 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
             out[k, i, 8] = action_of(wanted[k, i], params[k, params_at(0, N) + i], params[k, params_at(1, N) + i])
 
 
-def plain_infos(told: Report, vehicles: list[int] | slice) -> list[dict[str, Any]]:
-    """Infos of these vehicles, world by world, as plain numbers; ``applied_action`` is an array [1] of its own."""
-    rows: list[list[Any]] = told.values[:, vehicles].reshape(-1, len(AFTER_A_STEP)).tolist()
+def plain_infos(told: Report, vehicles: Ints | None = None) -> list[dict[str, Any]]:
+    """Infos of these vehicles (None: of all), world by world, as plain numbers; ``applied_action`` is an array [1]."""
+    rows: list[list[Any]] = _of(told.values, vehicles).reshape(-1, len(AFTER_A_STEP)).tolist()
     if told.terms is None:
         for values in rows:
             values[_COLLIDED] = values[_COLLIDED] == 1.0
@@ -106,9 +106,14 @@ def plain_infos(told: Report, vehicles: list[int] | slice) -> list[dict[str, Any
             }
         )
     for name, term in told.terms.items():
-        for info, value in zip(infos, term[:, vehicles].ravel().tolist(), strict=True):
+        for info, value in zip(infos, _of(term, vehicles).ravel().tolist(), strict=True):
             info["reward_terms"][name] = value
     return infos
+
+
+def _of(values: Floats, vehicles: Ints | None) -> Floats:
+    """The columns of these vehicles, [n, len(vehicles), ...]."""
+    return values if vehicles is None else values.take(vehicles, axis=1)
 
 
 def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools | None) -> dict[str, Any]:

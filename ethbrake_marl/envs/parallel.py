@@ -121,7 +121,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         return {agent: every[0, i] for i, agent in enumerate(self.possible_agents)}
 
     def _infos(self, told: Report) -> Infos:
-        infos = plain_infos(told, slice(None))
+        infos = plain_infos(told)
         return {agent: infos[i] for i, agent in enumerate(self.possible_agents)}
 
 

@@ -140,7 +140,7 @@ class EthBrakeVecEnv(VecEnv):
     def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
         """Fill in the infos of the rows whose world has ended, before the next episodes start."""
         rows, final = self._rows(ended), self._observe(ended)
-        told = plain_infos(report(self.engine, rows=ended), list(self.engine.learners))
+        told = plain_infos(report(self.engine, rows=ended), self._learners)
         truncated = self._by_row(step.truncated)[rows].tolist()
         for row, info, cut, seen, gained, steps in zip(
             rows, told, truncated, final, self._return[rows].tolist(), self._steps[rows].tolist(), strict=True
@@ -162,7 +162,7 @@ class EthBrakeVecEnv(VecEnv):
         """The infos with which the running episodes began, row by row; made when they are asked for."""
         if not self._started:
             return [{} for _ in range(self.num_envs)]
-        return plain_infos(Report(self._begun, None), list(self.engine.learners))
+        return plain_infos(Report(self._begun, None), self._learners)
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:
@@ -174,7 +174,7 @@ class EthBrakeVecEnv(VecEnv):
         return every.reshape(-1, every.shape[2])
 
     def _by_row(self, worlds: Bools) -> Bools:
-        return np.repeat(worlds, len(self.engine.learners))
+        return worlds.repeat(len(self._learners))
 
     def _given_worlds(self) -> Worlds | None:
         """The worlds that the options of the rows ask for; None for the stream's."""

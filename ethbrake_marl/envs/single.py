@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.envs.build import check_render_mode, learner_columns, make_engine, only_learner
@@ -44,6 +45,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         self.render_mode = render_mode
         self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
         self.learner = only_learner(self.engine)
+        self._column = np.array([self.learner])
         self._name = self.engine.scenario.vehicle_names[self.learner]
         self.observation_space = feature_box(self.engine.observation.features)
         self.action_space = action_box()
@@ -59,7 +61,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         restart(self.engine, seed, options)
         super().reset(seed=seed)
         self._running = True
-        return self._observe(), plain_infos(report(self.engine), [self.learner])[0]
+        return self._observe(), plain_infos(report(self.engine), self._column)[0]
 
     def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Advance by one time step."""
@@ -67,7 +69,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
             raise InvalidInput("step: no episode is running; call reset first")
         step = self.engine.step(learner_columns((self._name,), {self._name: action}))
         self._running = not step.ended[0]
-        info = plain_infos(report(self.engine, step), [self.learner])[0]
+        info = plain_infos(report(self.engine, step), self._column)[0]
         reward = float(step.reward[0, self.learner])
         return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info
 

@@ -95,7 +95,7 @@ def avoidability_boundary(scenario: Scenario, range_1_m: Range, range_2_m: Range
     outside the range. None where ``limits_do_not_apply``.
     """
     vehicle = controlled_vehicle(scenario, None)
-    if limits_do_not_apply(scenario, vehicle) is not None:
+    if limits_do_not_apply(_worlds_at(scenario, *np.array([range_1_m, range_2_m])), scenario, vehicle) is not None:
         return None
 
     def avoidable(gap_1_m: Floats, gap_2_m: Floats) -> Bools:

@@ -17,11 +17,10 @@ from ethbrake_marl.analysis.avoidability import avoidability
 from ethbrake_marl.analysis.best_harm_shipped import best_known
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate, relative_decrease
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.scenario import Scenario
 
-COUNTS: tuple[HarmCount, HarmCount] = ("first", "total")
 TOLERANCE = 1e-6  # m2/s2; less than this below the best known harm is rounding
 Source = Literal["witness", "table", "agents", "below_table"]
 
@@ -33,7 +32,7 @@ class Limits:
     """What is known of each world before anybody drives: [n] each."""
 
     avoidable: Bools  # some admissible command of Vehicle 2 avoids every collision
-    reason: NDArray[np.str_]  # why not: "front", "rear"; "" where avoidable
+    reason: NDArray[np.str_]  # why not: "early", "front" or "rear"; "" where avoidable
     first_impact_harm: Floats  # least known (m2/s2): 0 where avoidable, else a table's; NaN in no table
     total_harm: Floats
 
@@ -97,7 +96,7 @@ class Distance:
         }
 
 
-def limits_do_not_apply(scenario: Scenario, vehicle: int) -> str | None:
+def limits_do_not_apply(worlds: Worlds, scenario: Scenario, vehicle: int) -> str | None:
     """Why nothing is proven for this line-up, as a clause; None when it is."""
     if scenario.vehicles != _VEHICLES:
         return f"{scenario.vehicles} vehicles; avoidability is proven for {_VEHICLES}"
@@ -107,19 +106,20 @@ def limits_do_not_apply(scenario: Scenario, vehicle: int) -> str | None:
         script = scenario.scripts.get(i, "full_brake")
         if script != "full_brake":
             return f"{scenario.vehicle_names[i]} follows {script}; avoidability is proven where it follows full_brake"
+    latency_s = worlds.vehicles.latency_s
+    if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():
+        return f"{scenario.vehicle_names[0]} may brake later than {scenario.vehicle_names[_DRIVEN]}; nothing is proven then"
     return None
 
 
 def known_limits(worlds: Worlds, scenario: Scenario, vehicle: int) -> Limits | None:
     """The limits of worlds at the alert; None where ``limits_do_not_apply``."""
-    if limits_do_not_apply(scenario, vehicle) is not None:
+    if limits_do_not_apply(worlds, scenario, vehicle) is not None:
         return None
     proof = avoidability(worlds, vehicle)
     first, total = (best_known(worlds, scenario, count, vehicles=(vehicle,)) for count in COUNTS)
-    zero = np.zeros(worlds.n)
-    return Limits(
-        proof.avoidable, proof.reason, np.where(proof.avoidable, zero, first), np.where(proof.avoidable, zero, total)
-    )
+    avoidable = proof.avoidable
+    return Limits(avoidable, proof.reason_name, np.where(avoidable, 0.0, first), np.where(avoidable, 0.0, total))
 
 
 def assess(evaluation: Evaluation) -> Regrets | None:

@@ -178,10 +178,10 @@ class _Part(NamedTuple):
 
 def _advance_part(arrays: tuple[NDArray[Any], ...], capacity: int, part: slice) -> _Part:
     """Advance the worlds of ``part`` in place."""
-    if part.stop - part.start < len(arrays[0]):
-        arrays = tuple(array[part] for array in arrays)
+    whole = part.stop - part.start == len(arrays[0])
     rows = np.empty((capacity, ROW_WIDTH))
-    recorded, world, status = advance_worlds(*arrays, rows)
+    mine = (*arrays, rows) if whole else (*(array[part] for array in arrays), rows)
+    recorded, world, status = advance_worlds(*mine)
     return _Part(part.start, rows, recorded, part.start + world, status)
 
 

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents import make_agent, optimise_coupled
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.planner import Planner
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.scenario import Scenario, load_scenario
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return load_scenario("paper-random")
+
+
+@pytest.fixture(scope="module")
+def worlds(scenario: Scenario) -> Worlds:
+    return scenario.sample(10, seed=3).worlds
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_planner__does_no_more_harm_than_its_first_plan_and_improves_on_constants(
+    scenario: Scenario, worlds: Worlds, count: HarmCount
+) -> None:
+    agent = make_agent("planner:150", count=count)
+    harm = drive(worlds, agent, scenario, 1).ledger.world_harm(count)
+    assert isinstance(agent, Planner)
+    assert (harm <= agent.predicted_harm + 1e-4).all()
+    assert harm.mean() < 0.7 * optimise_coupled(worlds, 1, count=count).harm.mean()
+
+
+def test_planner__is_deterministic_and_a_world_does_not_depend_on_its_batch(scenario: Scenario, worlds: Worlds) -> None:
+    whole = drive(worlds, Planner("40"), scenario, 1).ledger.world_harm("first")
+    rows = np.array([6, 1])
+    part = drive(worlds.take(rows), Planner("40"), scenario, 1).ledger.world_harm("first")
+    assert np.array_equal(part, whole[rows])
+
+
+def test_planner__with_a_time_per_decision_plans_at_least_one_round(scenario: Scenario, worlds: Worlds) -> None:
+    few = worlds.take(np.arange(2))
+    harm = drive(few, make_agent("planner:0.5ms"), scenario, 1).ledger.world_harm("first")
+    assert (harm <= optimise_coupled(few, 1).harm + 1e-2).all()
+
+
+def test_planner__knows_what_the_others_do(scenario: Scenario, worlds: Worlds) -> None:
+    gentle = scenario.replace(roles={**scenario.roles, "vehicle_3": "constant:3"})
+    agent = Planner("60")
+    harm = drive(worlds, agent, gentle, 1).ledger.world_harm("first")
+    assert (harm <= agent.predicted_harm + 1e-4).all()
+
+
+def test_planner__starts_new_episodes_in_some_rows(worlds: Worlds) -> None:
+    agent = Planner("20")
+    agent.begin(worlds, 1, np.arange(worlds.n))
+    before = agent.act(worlds, 1)
+    rows = np.array([8, 2])
+    agent.begin(worlds.take(rows), 1, rows)
+    assert np.array_equal(agent.act(worlds, 1), before)
+    with pytest.raises(InvalidInput, match="begin was not called"):
+        Planner("20").act(worlds, 1)
+
+
+@pytest.mark.parametrize("argument", ["0", "-5", "fast", "0ms", "1.5", "5s", ""])
+def test_planner__refuses_a_budget_that_is_none(argument: str) -> None:
+    with pytest.raises(InvalidInput, match="candidates per decision"):
+        Planner(argument)

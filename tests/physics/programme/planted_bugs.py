@@ -1,0 +1,204 @@
+"""Twenty bugs that such a simulator could have: each is planted in a copy of the repository, and some test must turn red.
+
+``make planted-bugs`` (or ``python -m tests.physics.programme.planted_bugs [--jobs J] [--only WORD]``). A bug is a textual
+patch of the kernel or the ledger. It is applied to a temporary copy, never to the working tree; there the fast suite runs
+(``tests/physics``, ``tests/golden``, ``tests/test_harm.py``) until its first failure. A patch that does not fit the code any
+more is an error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+from tests.physics.programme.mutation import ROOT, copy_repository
+
+SUITE = ("tests/physics", "tests/golden", "tests/test_harm.py")
+LIMIT_S = 900.0
+
+EVENTS, IMPACT, SEGMENT, ADVANCE = (f"ethbrake_marl/physics/{name}.py" for name in ("events", "impact", "segment", "advance"))
+HARM = "ethbrake_marl/harm.py"
+
+
+class Patch(NamedTuple):
+    """Replace ``old``, which must stand in the file exactly once, by ``new``."""
+
+    file: str
+    old: str
+    new: str
+
+
+BUGS: dict[str, tuple[Patch, ...]] = {
+    "wrong sign in eq. (13)": (
+        Patch(
+            IMPACT,
+            "table[SPEED, i] = pooled + bounce * (pooled - table[SPEED, i])",
+            "table[SPEED, i] -= (1.0 + bounce) * (pooled - table[SPEED, i])",
+        ),
+    ),
+    "masses swapped in an impact": (
+        Patch(IMPACT, "rest += table[MASS, i] *", "rest += table[MASS, head + end - 1 - i] *"),
+    ),
+    "root missed: a pair that opens now never meets": (
+        Patch(EVENTS, "    if pressing > 0.0:\n        speed = math.sqrt(", "    if pressing > 1e9:\n        speed = math.sqrt("),
+    ),
+    "textbook root that loses its digits": (
+        Patch(
+            EVENTS,
+            "return 2.0 * gap / (closing + speed), speed",
+            "return (gap / closing if pressing == 0.0 else (speed - closing) / pressing), speed",
+        ),
+    ),
+    "bounce-back clamped at standstill": (
+        Patch(
+            IMPACT,
+            "table[SPEED, i] = pooled + bounce * (pooled - table[SPEED, i])",
+            "table[SPEED, i] = max(pooled + bounce * (pooled - table[SPEED, i]), 0.0)",
+        ),
+    ),
+    "late latency: counted from the segment's start": (
+        Patch(ADVANCE, "table[ONSET, i] = latency[k, i] - time[k]", "table[ONSET, i] = latency[k, i]"),
+    ),
+    "latency rounded up to the end of the step": (
+        Patch(
+            ADVANCE,
+            "table[ONSET, i] = latency[k, i] - time[k]",
+            "table[ONSET, i] = latency[k, i] - time[k] if latency[k, i] <= time[k] else duration",
+        ),
+    ),
+    "every impact counted as a first one": (
+        Patch(SEGMENT, "if table[HIT, p] == 0.0:", "if table[HIT, p] >= 0.0:"),
+    ),
+    "harm counted while vehicles merely touch": (
+        Patch(
+            IMPACT,
+            "table[STRUCK, p] = 1.0 if table[CLOSING, p] > TOUCH_SPEED_MPS else 0.0",
+            "table[STRUCK, p] = 1.0 if table[GAP, p] <= 0.0 else 0.0",
+        ),
+    ),
+    "plastic threshold ignored": (
+        Patch(IMPACT, "bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0", "bounce = restitution"),
+    ),
+    "holding brake slips": (
+        Patch(EVENTS, "        return command, -command\n", "        return 0.0, 0.0\n"),
+    ),
+    "common acceleration of a block not weighted by mass": (
+        Patch(IMPACT, "        mass = table[MASS, i]\n", "        mass = 1.0\n"),
+    ),
+    "braking passes through standstill": (
+        Patch(EVENTS, "        if after <= 0.0:\n", "        if after <= -1e9:\n"),
+        Patch(EVENTS, "== (acceleration < 0.0) and speed != 0.0:", "== (acceleration < 0.0) and command > 0.0:"),
+    ),
+    "speed limit overshot": (
+        Patch(EVENTS, "        if after >= limit:\n", "        if after >= 2.0 * limit:\n"),
+        Patch(EVENTS, "reach = (limit - speed) / acceleration", "reach = (2.0 * limit - speed) / acceleration"),
+    ),
+    "gap not put to zero at contact": (
+        Patch(SEGMENT, "            table[GAP, p] = 0.0\n            continue", "            table[GAP, p] = 1e-9\n            continue"),
+    ),
+    "contact at the very end of a segment dropped": (
+        Patch(
+            SEGMENT,
+            "        if resolve_impacts(table, restitution):\n            return IMPACT, now\n        if now >= duration:\n"
+            "            return DONE, now\n",
+            "        if now >= duration:\n            return DONE, now\n        if resolve_impacts(table, restitution):\n"
+            "            return IMPACT, now\n",
+        ),
+    ),
+    "restitution e used as 1 - e": (
+        Patch(ADVANCE, "advance_table(table, restitution[k],", "advance_table(table, 1.0 - restitution[k],"),
+    ),
+    "restitution with the wrong sign": (
+        Patch(ADVANCE, "advance_table(table, restitution[k],", "advance_table(table, -restitution[k],"),
+    ),
+    "simultaneous impacts resolved pair after pair": (
+        Patch(
+            IMPACT,
+            "while last < pairs and table[GAP, last] <= 0.0:",
+            "while last < pairs and table[GAP, last] <= 0.0 and last == first:",
+        ),
+    ),
+    "shares of harm given to the wrong vehicle": (
+        Patch(HARM, "return rear_mass / (front_mass + rear_mass) * harm", "return front_mass / (front_mass + rear_mass) * harm"),
+    ),
+}  # fmt: skip
+
+
+def plant(folder: Path, patches: tuple[Patch, ...]) -> None:
+    """Apply the patches of one bug; raises ``ValueError`` when one does not fit."""
+    for patch in patches:
+        file = folder / patch.file
+        text = file.read_text("utf-8")
+        if text.count(patch.old) != 1:
+            raise ValueError(f"{patch.file}: {patch.old!r} stands there {text.count(patch.old)} times, not once")
+        file.write_text(text.replace(patch.old, patch.new), "utf-8")
+
+
+def first_red(folder: Path) -> str:
+    """The first test that fails in ``folder``, or an empty string."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "numba"), "NUMBA_DISABLE_JIT": "0"}
+    command = [sys.executable, "-B", "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--rootdir=.", *SUITE]
+    try:
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    except subprocess.TimeoutExpired:
+        return f"no end after {LIMIT_S:.0f} s"
+    if done.returncode == 0:
+        return ""
+    found = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    if found is None:
+        raise RuntimeError(f"the suite could not run: {done.stdout[-500:]}{done.stderr[-500:]}")
+    return found.group(1)
+
+
+def try_bug(name: str) -> str:
+    """The test that finds one planted bug, or an empty string."""
+    folder = Path(tempfile.mkdtemp(prefix="planted-"))
+    try:
+        copy_repository(folder)
+        plant(folder, BUGS[name])
+        return first_red(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def check_patches() -> list[str]:
+    """What is wrong with the list itself, without running anything."""
+    wrong = []
+    for name, patches in BUGS.items():
+        for patch in patches:
+            count = (ROOT / patch.file).read_text("utf-8").count(patch.old)
+            if count != 1:
+                wrong.append(f"{name}: {patch.file} holds {patch.old!r} {count} times, not once")
+    return wrong
+
+
+def main() -> int:
+    """Plant every bug and print which test finds it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--only", default="", help="only bugs whose name contains this")
+    given = parser.parse_args()
+    for wrong in (misfits := check_patches()):
+        print(f"ERROR  {wrong}")
+    if misfits:
+        return 1
+    names = [name for name in BUGS if given.only in name]
+    found = 0
+    with ThreadPoolExecutor(given.jobs) as pool:
+        for name, red in zip(names, pool.map(try_bug, names), strict=True):
+            found += bool(red)
+            print(f"{'found ' if red else 'MISSED'}  {name:52s} {red}", flush=True)
+    print(f"planted bugs: {found}/{len(names)} found: {'PASS' if found == len(names) else 'FAIL'}")
+    return 0 if found == len(names) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
