@@ -17,7 +17,7 @@ WORLDS = (1, 4, 16, 64, 256, 1024, 4096, 16_384, 65_536)
 VEHICLES = (2, 3, 5, 8, 12, 20, 30, 50)
 EFFORT = Effort(5, 0.1)
 
-_LINES = 256  # worlds, where the number of vehicles varies
+_LINES = 2048  # worlds, where the number of vehicles varies
 _REPEATED = 20
 EMERGENCY, ENGINE, APART = "whole emergency, impacts included", "engine step", "first step, all vehicles apart"
 
@@ -94,11 +94,13 @@ def scaling_figure(by_worlds: Sequence[Cost], by_vehicles: Sequence[Cost], capti
 
 
 def _draw(axes: Axes, points: Sequence[tuple[str, int, float]]) -> None:
-    """A line for each series, and from the last point of each a line of slope 1."""
+    """A line for each series, and through the last point of each a line of slope 1."""
     style_axes(axes)
-    for number, what in enumerate(dict.fromkeys(name for name, _, _ in points)):
-        counts, costs = np.array([(count, cost) for name, count, cost in points if name == what]).T
+    series = dict.fromkeys(name for name, _, _ in points)
+    lines = {what: np.array([point[1:] for point in points if point[0] == what]).T for what in series}
+    for number, (what, (counts, costs)) in enumerate(lines.items()):
         axes.loglog(counts, costs, label=what, **series_style(number))
+    for number, (counts, costs) in enumerate(lines.values()):
         label = "proportional" if number == 0 else None
         axes.loglog(counts, costs[-1] / counts[-1] * counts, color=GREY, linewidth=0.8, label=label, zorder=1)
     axes.legend(frameon=False, fontsize=8, loc="upper left")

@@ -60,58 +60,65 @@ def search_world(
     K, C = commands.shape
     states = np.zeros((K + 1, start.shape[0]))
     states[0] = start
-    M = SMALLEST_FIELD
+    M, rounds = SMALLEST_FIELD, 3
     while budget >= 2 * M * PER_PROFILE and M < LARGEST_FIELD:
         M *= 2
+        rounds += 1
     field = Field(np.zeros((M, K), np.int64), np.zeros((M, K, C)), np.zeros(M, np.int64), np.full(M, math.inf))
     drawn = max(int(DRAWN_SHARE * budget) - seed_ends.shape[0], 0)
-    rounds, stepwise = int(ROUNDS_SHARE * budget), int(STEPWISE_SHARE * budget)
+    in_rounds, stepwise = int(ROUNDS_SHARE * budget), int(STEPWISE_SHARE * budget)
     gather(world, seed_ends, seed_commands, states, drawn, field)
-    halve(world, states, rounds, field)
-    if field.phases[0] > 0 and field.values[0] > 0.0:
-        used = compact(field.ends[0, : field.phases[0]], field.commands[0, : field.phases[0]], field.phases[0])
-        split_phases(field.ends[0], field.commands[0], used, K, min(ATTENTION_STEPS, int(world.clock[LAST_STEP])))
-        field.phases[0] = K
-        rest = budget - drawn - rounds - stepwise
-        field.values[0] = improve(world, field.ends[0], field.commands[0], states, rest)
-    world.clock[STEPWISE] = 1.0
-    used = select_stepwise(world, seed_ends, seed_commands, states, field, ends, commands)
-    if used == 0:
-        return 0
-    improve(world, ends[:used], commands[:used], states, stepwise)
-    return compact(ends[:used], commands[:used], used)
+    for stage in range(rounds + 2):
+        left = max(M >> stage, 1)
+        each = in_rounds // (rounds * left)
+        if stage == rounds:
+            divide(world, field)
+            each = budget - drawn - in_rounds - stepwise
+        elif stage == rounds + 1:
+            select_stepwise(world, seed_ends, seed_commands, states, field)
+            each = stepwise
+        # The only place that calls improve, which is the larger part of what is compiled here.
+        for m in range(left):
+            used = field.phases[m]
+            if used > 0 and field.values[0] > 0.0:
+                field.values[m] = improve(world, field.ends[m, :used], field.commands[m, :used], states, each)
+        sort(field, left)
+    used = field.phases[0]
+    ends[:] = field.ends[0]
+    commands[:] = field.commands[0]
+    return compact(ends[:used], commands[:used], used) if used > 0 else 0
 
 
 @compiled
 def improve(world: Setting, ends: Ints, commands: Floats, states: Floats, budget: int) -> float:
     """Better and better neighbours of a profile, in place, until ``budget`` candidates have run; its value."""
-    value, active = follow_whole(world, ends, commands, states, math.inf)
-    if active < 0:
-        return math.inf
     new_ends, new_commands, new_states = ends.copy(), commands.copy(), states.copy()
     change = np.zeros(CHANGE_WIDTH)
-    spent = 0
-    for _ in range(4 * budget):  # a change that changes nothing costs no candidate
+    value, active, spent, phase, again = math.inf, 0, -1, 0, False  # the first candidate is the profile itself
+    for _ in range(4 * budget + 1):  # a change that changes nothing costs no candidate
         if spent >= budget or value <= 0.0:
             break
-        phase = draw_change(world.random, world.bounds, active, change)
-        while spent < budget:
+        if spent >= 0:
+            if not again:
+                phase = draw_change(world.random, world.bounds, active, change)
             new_ends[:] = ends
             new_commands[:] = commands
+            again = False
             if not apply_change(change, world.bounds, new_ends, new_commands):
-                break
+                continue
             new_states[phase] = states[phase]
-            spent += 1
-            new_value, reached = follow(world, new_ends, new_commands, new_states, phase, value)
-            if reached < 0 or not new_value < value:
-                break
-            value, active = new_value, reached
-            ends[:] = new_ends
-            commands[:] = new_commands
-            states[phase + 1 : reached + 1] = new_states[phase + 1 : reached + 1]
-            if change[KIND] == SET_COMMAND:
-                break
-            change[AMOUNT] *= 2.0
+        spent += 1
+        new_value, reached = follow(world, new_ends, new_commands, new_states, phase, value)
+        if reached < 0 or not new_value < value:
+            if active == 0:
+                return math.inf
+            continue
+        value, active = new_value, reached
+        ends[:] = new_ends
+        commands[:] = new_commands
+        states[phase + 1 : reached + 1] = new_states[phase + 1 : reached + 1]
+        change[AMOUNT] *= 2.0
+        again = spent > 0 and change[KIND] != SET_COMMAND
     ends[active - 1 :] = int(world.clock[LAST_STEP])  # the episode is over by then
     return value
 
@@ -139,28 +146,9 @@ def gather(world: Setting, seed_ends: Ints, seed_commands: Floats, states: Float
         field.phases[worst] = used
         field.values[worst] = value
         if value <= 0.0:
-            return
+            break
         worst = int(np.argmax(field.values))
-
-
-@compiled
-def halve(world: Setting, states: Floats, budget: int, field: Field) -> None:
-    """Improve the field, keep its better half, and so on to the last one, which ends in the first place."""
-    left = field.values.shape[0]
-    rounds = 1
-    while left >> rounds:
-        rounds += 1
-    while field.values.min() > 0.0:
-        for m in range(left):
-            used = field.phases[m]
-            if used > 0:
-                each = budget // (rounds * left)
-                field.values[m] = improve(world, field.ends[m, :used], field.commands[m, :used], states, each)
-        sort(field, left)
-        if left == 1:
-            return
-        left //= 2
-    sort(field, left)
+    sort(field, field.values.shape[0])
 
 
 @compiled
@@ -174,27 +162,41 @@ def sort(field: Field, left: int) -> None:
 
 
 @compiled
-def select_stepwise(
-    world: Setting, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Field, ends: Ints, commands: Floats
-) -> int:
-    """Fill ``ends`` and ``commands`` with the best of the field and of the given profiles; its number of phases.
+def divide(world: Setting, field: Field) -> None:
+    """Give the best of the field as many phases as there may be."""
+    used = field.phases[0]
+    if used > 0 and field.values[0] > 0.0:
+        K = field.ends.shape[1]
+        used = compact(field.ends[0, :used], field.commands[0, :used], used)
+        split_phases(field.ends[0], field.commands[0], used, K, min(ATTENTION_STEPS, int(world.clock[LAST_STEP])))
+        field.phases[0] = K
 
-    They are compared decision by decision: rounding may decide on which side of a jump a profile lands.
+
+@compiled
+def select_stepwise(world: Setting, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Field) -> None:
+    """From now on advance decision by decision; put the best of the field and the given profiles in the first place.
+
+    Rounding may decide on which side of a jump a profile lands.
     """
+    world.clock[STEPWISE] = 1.0
     Q, K = seed_ends.shape
-    least, used = math.inf, 0
+    best_ends, best_commands = np.zeros(K, np.int64), np.zeros(field.commands.shape[1:])
+    least, size = math.inf, 0
     for s in range(SMALLEST_FIELD + Q):
         given = s >= SMALLEST_FIELD
         n = K if given else field.phases[s]
         if n == 0:
             continue
-        its_ends = seed_ends[s - SMALLEST_FIELD] if given else field.ends[s, :n]
-        its_commands = seed_commands[s - SMALLEST_FIELD] if given else field.commands[s, :n]
-        value, reached = follow_whole(world, its_ends, its_commands, states, least)
+        ends = seed_ends[s - SMALLEST_FIELD] if given else field.ends[s, :n]
+        commands = seed_commands[s - SMALLEST_FIELD] if given else field.commands[s, :n]
+        value, reached = follow_whole(world, ends, commands, states, least)
         if reached > 0 and value < least:
-            least, used = value, n
-            ends[:n] = its_ends
-            commands[:n] = its_commands
+            least, size = value, n
+            best_ends[:n] = ends
+            best_commands[:n] = commands
             if value <= 0.0:
                 break
-    return used
+    field.ends[0] = best_ends
+    field.commands[0] = best_commands
+    field.phases[0] = size
+    field.values[0] = least

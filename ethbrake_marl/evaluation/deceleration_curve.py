@@ -59,7 +59,7 @@ def deceleration_curve(scenario: Scenario, world: Worlds, vehicle: int, *, point
     """The three harms of one world at evenly spaced decelerations of ``vehicle``, and at those of the closed form.
 
     The prediction lets all others brake fully; in the simulation they follow the scenario's scripts. Raises
-    ``InvalidInput`` unless there is exactly one world, ``points`` is at least 2 and no script depends on the state.
+    ``InvalidInput`` unless there is exactly one world, ``points`` is at least 2 and every script is fixed at the alert.
     """
     if world.n != 1:
         raise InvalidInput(f"deceleration curve: {world.n} worlds given; exactly one is drawn")

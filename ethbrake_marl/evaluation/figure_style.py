@@ -16,7 +16,7 @@ DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", "--", "-.", (0, (1
 GREY = "#555555"
 DPI = 150
 
-_CHARACTERS_PER_INCH = 19.0  # of a caption
+_CHARACTERS_PER_INCH = 17.0  # of a caption
 
 
 def series_style(number: int) -> dict[str, object]:

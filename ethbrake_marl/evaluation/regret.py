@@ -108,7 +108,8 @@ def limits_do_not_apply(worlds: Worlds, scenario: Scenario, vehicle: int) -> str
             return f"{scenario.vehicle_names[i]} follows {script}; avoidability is proven where it follows full_brake"
     latency_s = worlds.vehicles.latency_s
     if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():
-        return f"{scenario.vehicle_names[0]} may brake later than {scenario.vehicle_names[_DRIVEN]}; nothing is proven then"
+        front, driven = scenario.vehicle_names[: _DRIVEN + 1]
+        return f"{front} may brake later than {driven}; nothing is proven then"
     return None
 
 
