@@ -13,13 +13,16 @@ ARGS ?=
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean
+.PHONY: help venv run test lint check clean test-physics planted-bugs mutation
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
 	@echo "make test [ARGS=...]  the test suite, without the tests marked long"
 	@echo "make lint             ruff, ruff format --check, mypy --strict"
 	@echo "make check            lint and test"
+	@echo "make test-physics     the long programme on the physics: one line per gate"
+	@echo "make planted-bugs     plant 20 bugs in copies of the code; each must turn a test red"
+	@echo "make mutation [ARGS=] mutation testing of physics and harm (ARGS='--sample 100')"
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make clean            remove $(VENV), caches and builds (runs/ stays)"
 	@echo "TORCH_INDEX=URL       take torch from this index (CPU builds: https://download.pytorch.org/whl/cpu)"
@@ -78,6 +81,18 @@ lint: $(STAMP)
 
 check: lint
 	@$(MAKE) --no-print-directory test
+
+test-physics: $(STAMP)
+	@echo "== long programme on the physics"
+	@$(BIN)/python -m tests.physics.programme $(ARGS)
+
+planted-bugs: $(STAMP)
+	@echo "== planted bugs"
+	@$(BIN)/python -m tests.physics.programme.planted_bugs $(ARGS)
+
+mutation: $(STAMP)
+	@echo "== mutation testing"
+	@$(BIN)/python -m tests.physics.programme.mutation $(ARGS)
 
 clean:
 	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist

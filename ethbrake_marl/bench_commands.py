@@ -83,9 +83,9 @@ def _watched(measurements: Iterable[Measured], total: int) -> list[Measured]:
 def speed_table(speeds: Sequence[Speed]) -> Table:
     """One line for each figure: what, how many worlds at once, the median, its range, and the aim."""
     table = Table(caption="Medians over repetitions, and their range. Aim: at least, for seconds at most.")
-    table.add_column("per second of processor time")
-    for title in ("worlds at once", "median", "range", "vehicle-steps", "aim"):
-        table.add_column(title, justify="right", no_wrap=title != "worlds at once")
+    table.add_column("per CPU-second", overflow="fold")
+    for title in ("worlds", "median", "range", "x vehicles", "aim"):
+        table.add_column(title, justify="right", no_wrap=True)
     for speed in speeds:
         steps = speed.unit == WORLD_STEPS
         table.add_row(

@@ -34,6 +34,7 @@ from ethbrake_marl.scenario import load_scenario
 
 SCENARIO = "paper-random"
 SEED = 7
+_VEHICLES = 3
 STEP_S = 0.1
 SHARE = 0.75  # of its braking capacity, with which a learner brakes
 WORLD_STEPS = "world-steps/s"
@@ -126,21 +127,31 @@ def rates(work: Work, effort: Effort) -> Floats:
     return np.sort(found)
 
 
+@dataclass(frozen=True, slots=True)
+class Benchmark:
+    """A figure before it is measured."""
+
+    name: str
+    workload: str
+    unit: str
+    worlds: int
+    floor: float | None
+    look: Callable[[Effort], Floats]  # one value for each repetition, ascending
+
+    def measure(self, effort: Effort) -> Speed:
+        """Measure it now."""
+        found = self.look(effort)
+        low, middle, high = float(found[0]), float(np.median(found)), float(found[-1])
+        return Speed(self.name, self.workload, self.worlds, _VEHICLES, self.unit, middle, low, high, self.floor)
+
+
 def measure(effort: Effort) -> Iterator[Speed]:
-    """Every figure, one after the other; how many there are: ``len(BENCHMARKS)``."""
+    """Every figure of ``BENCHMARKS``, one after the other."""
     calibration = None
     for benchmark in BENCHMARKS:
-        speed = benchmark(effort)
+        speed = benchmark.measure(effort)
         calibration = speed.value if calibration is None else calibration
         yield replace(speed, relative=speed.value / calibration) if speed.unit == WORLD_STEPS else speed
-
-
-def _rate(
-    name: str, workload: str, unit: str, make: Callable[[int], Work], n: int, floor: float | None, effort: Effort
-) -> Speed:
-    found = rates(make(n), effort)
-    low, middle, high = float(found[0]), float(np.median(found)), float(found[-1])
-    return Speed(name, workload, n, load_scenario(SCENARIO).vehicles, unit, middle, low, high, floor)
 
 
 def first_decisions(n: int) -> Worlds:
@@ -255,7 +266,7 @@ def brake_apart(speeds: Floats, ways: Floats, steps: int) -> int:
                 after = max(speeds[k, i] - 0.5, 0.0)
                 ways[k, i] += 0.05 * (speeds[k, i] + after)
                 speeds[k, i] = after if after > 0.0 else 20.0
-    return steps * speeds.shape[0]
+    return steps * len(speeds)
 
 
 _START = """
@@ -266,13 +277,10 @@ environment.step({"vehicle_2": [-1.0]})
 """
 
 
-def _start(effort: Effort) -> Speed:
-    """A fresh interpreter that makes one world and steps it once; the kernels' cache is warm."""
+def _start_seconds(effort: Effort) -> Floats:
+    """Seconds of a fresh interpreter that makes one world and steps it once; the kernels' cache is warm."""
     _child_seconds()
-    found = np.sort([_child_seconds() for _ in range(effort.repetitions)])
-    low, middle, high = float(found[0]), float(np.median(found)), float(found[-1])
-    workload = "a fresh interpreter: import, parallel_env, reset, step; kernels compiled before"
-    return Speed("import and first step", workload, 1, 3, "s", middle, low, high, 2.0)
+    return np.sort([_child_seconds() for _ in range(effort.repetitions)])
 
 
 def _child_seconds() -> float:
@@ -283,29 +291,36 @@ def _child_seconds() -> float:
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-_BRAKING = "first decision to rest in steps of 0.1 s; Vehicle 2 brakes with {:g} of its capacity, all others fully"
-_DRIVING = "Vehicle 2 brakes with 0.75 of its capacity; new episodes as old ones end"
+_BRAKING = "first decision to rest in steps of 0.1 s; Vehicle 2 brakes with {:.0%} of its capacity, all others fully"
+_DRIVING = "Vehicle 2 brakes with 75% of its capacity; new episodes as old ones end"
+_FRESH = "a fresh interpreter: import, parallel_env, reset, step; kernels compiled before"
 
 
-def _advance_of(n: int, share: float) -> Callable[[Effort], Speed]:
-    name = f"advance and ledger, braking {share:.0%}"
-    return partial(_rate, name, _BRAKING.format(share), WORLD_STEPS, partial(braking, share=share), n, 15e6)
+def _rate_of(
+    name: str, workload: str, make: Callable[[int], Work], n: int, floor: float | None = None, unit: str = WORLD_STEPS
+) -> Benchmark:
+    return Benchmark(name, workload, unit, n, floor, lambda effort: rates(make(n), effort))
+
+
+def _advance_of(n: int, share: float) -> Benchmark:
+    name = f"advance and ledger, {share:.0%}"
+    return _rate_of(name, _BRAKING.format(share), partial(braking, share=share), n, 15e6)
 
 
 # The calibration comes first: the others are set against it.
-BENCHMARKS: tuple[Callable[[Effort], Speed], ...] = (
-    partial(_rate, "calibration", "constant deceleration, no event", WORLD_STEPS, _calibration, 1024, None),
+BENCHMARKS: tuple[Benchmark, ...] = (
+    _rate_of("calibration", "constant deceleration, no event", _calibration, 1024),
     _advance_of(1024, SHARE),
     _advance_of(1024, 1.0),
     _advance_of(4096, SHARE),
     _advance_of(4096, 1.0),
-    partial(_rate, "engine step", _DRIVING, WORLD_STEPS, stepping, 1024, 8e6),
-    partial(_rate, "engine step", _DRIVING, WORLD_STEPS, stepping, 4096, 8e6),
-    partial(_rate, "Stable-Baselines3 VecEnv", _DRIVING, WORLD_STEPS, _sb3, 512, 4e6),
-    partial(_rate, "PettingZoo parallel", "whole episodes, resets included", WORLD_STEPS, _pettingzoo, 1, 80e3),
-    _start,
-    partial(_rate, "sampling", "a list of worlds, refused draws included", "worlds/s", _sampling, 10_000, None),
-    partial(_rate, "E-V2X-BM pairwise", "one optimum per world", "worlds/s", _pairwise, 10_000, None),
-    partial(_rate, "E-V2X-BM coupled", "one optimum per world", "worlds/s", _coupled, 1000, None),
-    partial(_rate, "forecast", "16 constant commands per world, to the horizon", "runs/s", _forecast, 1000, None),
+    _rate_of("engine step", _DRIVING, stepping, 1024, 8e6),
+    _rate_of("engine step", _DRIVING, stepping, 4096, 8e6),
+    _rate_of("Stable-Baselines3 VecEnv", _DRIVING, _sb3, 512, 4e6),
+    _rate_of("PettingZoo parallel", "whole episodes, resets included", _pettingzoo, 1, 80e3),
+    Benchmark("import and first step", _FRESH, "s", 1, 2.0, _start_seconds),
+    _rate_of("sampling", "a list of worlds, refused draws included", _sampling, 10_000, unit="worlds/s"),
+    _rate_of("E-V2X-BM pairwise", "one optimum per world", _pairwise, 10_000, unit="worlds/s"),
+    _rate_of("E-V2X-BM coupled", "one optimum per world", _coupled, 1000, unit="worlds/s"),
+    _rate_of("forecast", "16 constant commands per world, to the horizon", _forecast, 1000, unit="runs/s"),
 )

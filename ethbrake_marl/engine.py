@@ -226,7 +226,7 @@ class Engine:
         """Current observations of several vehicles, [n, len(vehicles), F]; only of the worlds ``rows`` if given."""
         state, params = self._state, self._params
         if rows is not None:
-            state, params = state[rows], params[rows]
+            state, params = state.take(rows, axis=0), params.take(rows, axis=0)
         return observe_packed(state, params, vehicles, self._scaling)
 
     def step(self, actions: Actions) -> Step:

@@ -114,9 +114,7 @@ class Scaling(NamedTuple):
     """A specification as the kernel wants it."""
 
     offsets: Ints  # of the neighbours in the line
-    per_unit: Floats  # [F] 1 / scale
-    low: Floats  # [F]
-    high: Floats  # [F]
+    features: Floats  # [3, F] 1 / scale, low, high
 
 
 @cache
@@ -125,24 +123,21 @@ def scaling(spec: ObservationSpec) -> Scaling:
     features = spec.features
     return Scaling(
         np.array([offset for _, offset in spec.sides], np.int64),
-        np.array([1.0 / f.scale for f in features]),
-        np.array([f.low for f in features]),
-        np.array([f.high for f in features]),
+        np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]]),
     )
 
 
 def observe_packed(state: Floats, params: Floats, vehicles: Ints, scale: Scaling) -> Observations:
     """Observations of several vehicles in worlds given as rows of ``physics.packed``, [n, len(vehicles), F]."""
-    observation = np.empty((len(state), len(vehicles), len(scale.low)), np.float32)
+    observation = np.empty((len(state), len(vehicles), scale.features.shape[1]), np.float32)
     _observe_rows(state, params, vehicles, *scale, observation)
     return observation
 
 
 @compiled
 def _observe_rows(
-    state: Floats, params: Floats, observers: Ints, offsets: Ints, per_unit: Floats, low: Floats, high: Floats,
-    out: Observations,
-) -> None:  # fmt: skip
+    state: Floats, params: Floats, observers: Ints, offsets: Ints, features: Floats, out: Observations
+) -> None:
     """Fill ``out`` with the clipped features of each observer, in the order of OWN_FEATURES and NEIGHBOUR_FEATURES.
 
     One long loop on purpose: handing these arrays on to functions made it four times as slow.
@@ -192,7 +187,7 @@ def _observe_rows(
                 value[c + 9] = _fitting_deceleration(own_speed, own_latency, room)
                 c += _NEIGHBOUR
             for c in range(out.shape[2]):
-                out[k, o, c] = min(max(value[c] * per_unit[c], low[c]), high[c])
+                out[k, o, c] = min(max(value[c] * features[0, c], features[1, c]), features[2, c])
 
 
 @compiled

@@ -33,8 +33,8 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("lineup", "results_folder"),
     ("experiment",),
     ("__init__",),
-    ("doctor", "terminal", "command_options"),
-    ("picture_commands", "search_commands"),
+    ("doctor", "terminal", "command_options", "benchmark", "scaling"),
+    ("picture_commands", "search_commands", "bench_commands"),
     ("cli", "__main__"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}

@@ -86,7 +86,12 @@ def search_world(
     used = field.phases[0]
     ends[:] = field.ends[0]
     commands[:] = field.commands[0]
-    return compact(ends[:used], commands[:used], used) if used > 0 else 0
+    if used == 0:
+        return 0
+    used = compact(ends[:used], commands[:used], used)
+    ends[used:] = int(world.clock[LAST_STEP])
+    commands[used:] = commands[used - 1]
+    return used
 
 
 @compiled

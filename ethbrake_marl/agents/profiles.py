@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.profile_motion import LAST_STEP, STEPWISE, Setting, Words, follow_whole
+from ethbrake_marl.agents.profile_motion import STEPWISE, Setting, Words, follow_whole
 from ethbrake_marl.agents.profile_problem import ProfileProblem, seeded
 from ethbrake_marl.agents.profile_search import MOST_PHASES, search_world
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.physics import Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import MASS
 from ethbrake_marl.physics.segment import COMMAND, LIMIT, TABLE_ROWS
@@ -101,21 +101,21 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
     commands = np.ascontiguousarray(given.commands_mps2.reshape(n, -1, MOST_PHASES, C))
     best = Profiles(np.zeros((n, MOST_PHASES), np.int64), np.zeros((n, MOST_PHASES, C)))
     random = seeded(problem.identity, seed)
-    failed = np.full(n, False)
 
-    def work(rows: Ints) -> None:
-        search_worlds(
-            rows, problem.start, problem.clock, problem.bounds, problem.command, problem.latency, problem.mass,
-            problem.limit, problem.vehicles, random, ends, commands, budget, best.ends, best.commands_mps2, failed,
+    def work(k: int) -> int:
+        world = make_setting(
+            problem.clock[k], problem.bounds[k], problem.command[k], problem.latency[k], problem.mass[k],
+            problem.limit[k], problem.vehicles, random[k : k + 1],
         )  # fmt: skip
+        return search_world(world, problem.start[k], ends[k], commands[k], budget, best.ends[k], best.commands_mps2[k])
 
-    if threads == 1 or n == 1:
-        work(np.arange(n))
+    if threads == 1:
+        used = [work(k) for k in range(n)]
     else:
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(work, [np.arange(k, min(k + 1, n)) for k in range(n)]))
-    if failed.any():
-        raise PhysicsError(f"search: world {int(np.argmax(failed))} could not be advanced")
+            used = list(pool.map(work, range(n)))
+    if 0 in used:
+        raise PhysicsError(f"search: world {used.index(0)} could not be advanced")
     return Found(best, *follow_profiles(problem, best))
 
 
@@ -165,24 +165,6 @@ def make_setting(
     table[MASS] = mass
     table[LIMIT] = limit
     return Setting(table, np.zeros((2, N - 1)), latency, clock.copy(), vehicles, bounds, random)
-
-
-@compiled
-def search_worlds(
-    rows: Ints, start: Floats, clock: Floats, bounds: Floats, command: Floats, latency: Floats, mass: Floats,
-    limit: Floats, vehicles: Ints, random: Words, seed_ends: Ints, seed_commands: Floats, budget: int,
-    ends: Ints, commands: Floats, failed: Bools,
-) -> None:  # fmt: skip
-    """Search these rows; fills ``ends`` [n, K], ``commands`` [n, K, C] and ``failed`` [n]."""
-    for k in rows:
-        world = make_setting(
-            clock[k], bounds[k], command[k], latency[k], mass[k], limit[k], vehicles, random[k : k + 1]
-        )
-        used = search_world(world, start[k], seed_ends[k], seed_commands[k], budget, ends[k], commands[k])
-        failed[k] = used == 0
-        for j in range(used, ends.shape[1]):
-            ends[k, j] = clock[k, LAST_STEP]
-            commands[k, j] = commands[k, used - 1]
 
 
 @compiled

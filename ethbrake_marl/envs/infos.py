@@ -45,7 +45,7 @@ def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -
     packed, wanted = engine.packed, engine.wanted_mps2
     state, params = packed.state, packed.params
     if rows is not None:
-        state, params, wanted = state[rows], params[rows], wanted[rows]
+        state, params, wanted = (array.take(rows, axis=0) for array in (state, params, wanted))
     values = np.empty((*wanted.shape, len(AFTER_A_STEP)))
     _report_rows(state, params, wanted, values)
     return Report(values, None if step is None else step.terms)

@@ -105,16 +105,11 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         return state
 
     def _check_agents(self, actions: Mapping[str, Any]) -> None:
-        try:
-            known = actions.keys() <= self.action_spaces.keys()
-        except AttributeError:
-            raise InvalidInput(
-                f"step: actions = {actions!r}: must be a mapping such as {{'vehicle_2': [-1.0]}}"
-            ) from None
-
-        if not known:
-            unknown = next(agent for agent in actions if agent not in self.action_spaces)
-            raise unknown_name("agent", unknown, self.possible_agents)
+        if not isinstance(actions, (dict, Mapping)):  # dict first: it is found out sooner
+            raise InvalidInput(f"step: actions = {actions!r}: must be a mapping such as {{'vehicle_2': [-1.0]}}")
+        for agent in actions:
+            if agent not in self.action_spaces:
+                raise unknown_name("agent", agent, self.possible_agents)
 
     def _observations(self) -> dict[str, Observations]:
         every = self.engine.observe_all(self._vehicles)

@@ -1,7 +1,7 @@
 """The published tolerances of the physics, in one table; tests and reports compare with these and with nothing else.
 
 ``eps`` is the spacing of doubles at 1, 2^-52. "Round" is one simultaneous resolution of a cluster: a chain of touching
-vehicles may need several at one instant. Sums over a cluster are taken over its vehicles, ``v`` before and ``v+`` after.
+vehicles may need several at one instant. Sums run over the vehicles of a cluster, ``v`` is before it and ``v+`` after.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ CLUSTER_EPS = 8.0  # each v+ of a cluster against the exact law: 8 eps of its la
 
 GAP_M = 1e-9  # a gap never lies below -1e-9 m between events, and differs so little from its closed form
 CONTACT_TIME_EPS = 8.0  # relative, of a pair's contact time and closing speed: 8 eps (1 + (w^2 + 2 |b| g) / D)
-SPLIT = 1e-12  # a segment that is split: relative change of gaps, speeds and harm, to their largest values in the world
+# A segment that is split changes gaps, speeds and harm relative to at least 100 m, 30 m/s, 900 m2/s2 by no more than
+SPLIT = 1e-12  # in a world with up to 30 impacts,
+SPLIT_CASCADE = 1e-10  # and beyond: each impact multiplies the rounding of the ones before.
+FEW_IMPACTS = 30
 
 # A contact is decided by the sign of ``D - touch^2`` and by its time against the segment's end. The kernel may decide
 # otherwise than exact arithmetic only where these come closer to zero than the following; there it must agree with a

@@ -16,6 +16,7 @@ COMMANDS = [
     "train",
     "evaluate",
     "doctor",
+    "bench",
     "scenario",
     "scenario list",
     "scenario show",

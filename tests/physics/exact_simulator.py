@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
+from itertools import pairwise
 from math import isqrt
 from typing import NamedTuple
 
@@ -217,7 +218,7 @@ class _Run:
 
     def cluster(self, first: int, last: int) -> None:
         v = self.v[first : last + 1]
-        closing = max((b - a for a, b in zip(v, v[1:], strict=False)), default=ZERO)
+        closing = max((b - a for a, b in pairwise(v)), default=ZERO)
         if closing <= 0:
             return
         e = self.line.restitution if closing >= PLASTIC_MPS else ZERO

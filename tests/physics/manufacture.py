@@ -2,11 +2,11 @@
 
 Vehicles are added one behind the other. Each new one gets its own motion (latency, command, speed limit) and a contact
 time on a grid of 1/8 s; its initial gap is then the way by which it gains on the vehicle before it until then. Every
-number of such a world is a multiple of a power of two with few digits, so a double holds it exactly and a correct kernel
+number of such a world is a multiple of a power of two with few digits: a double holds it exactly, and a correct kernel
 must find the same bits as rational arithmetic.
 
-Lines of many vehicles are rare finds (a chain of impacts soon leaves the grid), so the worlds used by the tests are kept in
-``tests/golden/manufactured_worlds.json``; ``python -m tests.physics.manufacture`` writes that file anew (minutes).
+Lines of many vehicles are rare finds (a chain of impacts soon leaves the grid), so those of the tests are kept
+in ``tests/golden/manufactured_worlds.json``; ``python -m tests.physics.manufacture`` writes it anew.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from ethbrake_marl.physics import Worlds, make_worlds
-from tests.physics.exact_simulator import Unexact, Line, Outcome, Rationals, simulate
+from tests.physics.exact_simulator import Line, Outcome, Rationals, Unexact, simulate
 
 GRID = 1 << 14  # every state on the way is a multiple of 1 / GRID: squares and products then fit in 53 bits
 FAR = Fraction(1 << 20)
@@ -28,8 +28,8 @@ CAPACITY_MPS2 = 16.0
 GOLDEN = Path(__file__).parents[1] / "golden" / "manufactured_worlds.json"
 COUNTS = {2: 300, 3: 200, 4: 150, 5: 100}
 MASSES = (  # touching neighbours weigh a power of two together, so that common speeds are dyadic
-    (1, 1, 2, 4, 8), (2, 2, 4, 8, 16), (1, 3, 1, 3, 1), (3, 1, 3, 1, 3), (3, 5, 3, 5, 3), (7, 1, 7, 1, 7), (1, 7, 1, 7, 1),
-    (1, 1, 1, 1, 1), (8, 4, 2, 1, 1), (2, 6, 2, 6, 2), (1, 15, 1, 15, 1), (6, 2, 6, 2, 6),
+    (1, 1, 2, 4, 8), (2, 2, 4, 8, 16), (1, 3, 1, 3, 1), (3, 1, 3, 1, 3), (3, 5, 3, 5, 3), (7, 1, 7, 1, 7),
+    (1, 7, 1, 7, 1), (1, 1, 1, 1, 1), (8, 4, 2, 1, 1), (2, 6, 2, 6, 2), (1, 15, 1, 15, 1), (6, 2, 6, 2, 6),
 )  # fmt: skip
 RESTITUTIONS = (0, 0, Fraction(1, 4), Fraction(1, 2), Fraction(3, 4), 1)
 COMMANDS = (-8, -4, -2, -2, -1, Fraction(-1, 2), 0, 0, 0, 0, 0, 0, Fraction(1, 2), 1, 2, 4)
@@ -153,7 +153,9 @@ def eighths(rng: np.random.Generator, low: int, high: int) -> Fraction:
 
 def worlds_of(lines: Sequence[Line]) -> Worlds:
     """The lines as one batch; their numbers must be doubles."""
-    rows = {name: [floats(getattr(line, name)) for line in lines] for name in ("gaps", "speeds", "latency", "mass", "limit")}
+    rows = {
+        name: [floats(getattr(line, name)) for line in lines] for name in ("gaps", "speeds", "latency", "mass", "limit")
+    }
     return make_worlds(
         rows["gaps"],
         rows["speeds"],
@@ -192,7 +194,8 @@ def write_golden() -> None:
             numbers = (line.gaps, line.speeds, line.command, line.latency, line.mass, line.limit)
             rows.append(json.dumps([*map(floats, numbers), float(line.restitution), float(case.until)]))
     columns = "gaps_m, speeds_mps, command_mps2, latency_s, mass_t, speed_limit_mps, restitution, until_s"
-    GOLDEN.write_text('{"columns": "%s", "worlds": [\n%s\n]}\n' % (columns, ",\n".join(rows)), "utf-8")
+    worlds = ",\n".join(rows)
+    GOLDEN.write_text(f'{{"columns": "{columns}", "worlds": [\n{worlds}\n]}}\n', "utf-8")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Random segments of two and more vehicles, and where their gaps first close, from closed form alone.
 
 Up to the first contact of a line every vehicle moves on its own: it coasts, then brakes to standstill or drives to its
-limit. A gap is then piecewise quadratic, and the smallest value of each piece tells whether and when the pair meets. Where
-that is too close to call in doubles (a graze, a contact at the very end, vehicles that touch at the start), the
+limit. A gap is then piecewise quadratic, and the smallest value of each piece tells whether and when the pair meets.
+Where that is too close to call in doubles (a graze, a contact at the very end, vehicles that touch at the start), the
 world is *in doubt* and goes to the exact simulator.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +107,7 @@ def meetings(segments: Segments) -> Meeting:
     reach = gaps + fastest * end
     blur = DISCRIMINANT_EPS * EPS * (fastest**2 + 2.0 * CAPACITY_MPS2 * reach)
     result = Meeting(np.full(gaps.shape, np.inf), np.zeros(gaps.shape), gaps.copy(), np.zeros(gaps.shape, bool))
-    for begin, finish in zip(marks, marks[1:], strict=False):
+    for begin, finish in pairwise(marks):
         _piece(motion, gaps, begin, finish, blur, result)
     near_end = (np.abs(_gap(motion, gaps, end)[0]) <= END_EPS * EPS * reach) & ~(result.time < 0.999 * end)
     touching = (gaps == 0.0) & (motion.speed[:, 1:] >= motion.speed[:, :-1])
@@ -198,11 +199,13 @@ def _wrong_gaps(segments: Segments, after: Worlds) -> NDArray[np.bool_]:
     end = np.broadcast_to(segments.duration[:, None], segments.worlds.gaps_m.shape)
     expected = _gap(motion, segments.worlds.gaps_m, end)[0]
     speed = motion.at(np.broadcast_to(segments.duration[:, None], motion.speed.shape))[1]
-    return np.any(np.abs(after.gaps_m - expected) > GAP_M, axis=1) | np.any(np.abs(after.speeds_mps - speed) > GAP_M, axis=1)
+    return np.any(np.abs(after.gaps_m - expected) > GAP_M, axis=1) | np.any(
+        np.abs(after.speeds_mps - speed) > GAP_M, axis=1
+    )
 
 
 def _exact_verdict(segments: Segments, k: int, rows: ImpactRows, mine: Ints) -> str:
-    """"same", "borderline", "missed", "phantom" or "wrong" for world k, by exact arithmetic."""
+    """ "same", "borderline", "missed", "phantom" or "wrong" for world k, by exact arithmetic."""
     line = line_of(segments.worlds, segments.command[k].tolist(), k)
     until = Fraction(float(segments.duration[k]))
     exact = simulate(line, until, bits=160)
@@ -218,7 +221,9 @@ def _exact_verdict(segments: Segments, k: int, rows: ImpactRows, mine: Ints) -> 
     return "missed" if len(kernel) < len(exact.hits) else "phantom"
 
 
-def _borderline(segments: Segments, k: int, kernel: list[tuple[float, int, float]], exact: Outcome, until: Fraction) -> bool:
+def _borderline(
+    segments: Segments, k: int, kernel: list[tuple[float, int, float]], exact: Outcome, until: Fraction
+) -> bool:
     """Whether two counts of hits may differ by rounding: a touch, or a contact at the very end of the segment."""
     if len(kernel) < len(exact.hits):
         odd = exact.hits[len(kernel)]
@@ -253,7 +258,9 @@ def random_segments(rng: np.random.Generator, n: int, N: int) -> Segments:
     limit = np.where(rng.random((n, N)) < 0.3, speeds + rng.uniform(0.0, 3.0, (n, N)), 60.0)
     gaps = rng.uniform(0.0, 1.0, (n, N - 1)) * np.maximum(0.02, duration[:, None] * 10.0)
     draft = Segments(_worlds(rng, gaps, speeds, latency, limit), command, duration)
-    least = meetings(Segments(_worlds(rng, np.full_like(gaps, 1e6), speeds, latency, limit), command, duration)).least - 1e6
+    least = (
+        meetings(Segments(_worlds(rng, np.full_like(gaps, 1e6), speeds, latency, limit), command, duration)).least - 1e6
+    )
     kind = rng.random(gaps.shape)
     share = 1.0 / (N - 1)
     offset = 10.0 ** rng.uniform(-11.0, -1.0, gaps.shape) * rng.choice([-1.0, 1.0], gaps.shape)

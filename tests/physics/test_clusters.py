@@ -1,4 +1,4 @@
-"""The order-free law for many touching vehicles, against rational arithmetic by another formula (min-max, not pooling)."""
+"""The order-free law for many touching vehicles, against rational arithmetic by another formula (min-max)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ def test_cluster__harm_is_that_of_the_exact_rounds():
     _, impacts = advance(before, command, 0.0, record=True)
     rows = impacts.rows
     for k in range(150):
-        exact = [hit for hit in simulate(line_of(before, [0.0] * 6, k), Fraction(0)).hits if hit.closing > Fraction(1, 10**4)]
+        exact = [
+            hit for hit in simulate(line_of(before, [0.0] * 6, k), Fraction(0)).hits if hit.closing > Fraction(1, 10**4)
+        ]
         mine = (rows.world == k) & (rows.closing_speed_mps > 1e-4)
         assert rows.pair[mine].tolist() == [hit.pair for hit in exact]
         np.testing.assert_allclose(rows.closing_speed_mps[mine], [float(h.closing) for h in exact], rtol=0, atol=1e-12)
@@ -51,8 +53,8 @@ def accelerations(command, mass, speed: float) -> Floats:
     """Accelerations of touching vehicles at one speed, from their speeds after 1/64 s."""
     n = len(command)
     worlds = make_worlds(
-        np.zeros(n - 1), np.full(n, speed), braking_capacity_mps2=16, driving_capacity_mps2=16, latency_s=0, mass_t=mass,
-        restitution=0.0, speed_limit_mps=8.0,
+        np.zeros(n - 1), np.full(n, speed), braking_capacity_mps2=16, driving_capacity_mps2=16, latency_s=0,
+        mass_t=mass, restitution=0.0, speed_limit_mps=8.0,
     )  # fmt: skip
     after, impacts = advance(worlds, command, 1.0 / 64.0)
     assert impacts.count.sum() == 0

@@ -48,8 +48,8 @@ def test_scan__finds_what_is_planted():
 def graze(excess_m: float, w: float = 4.0, b: float = -2.0) -> int:
     """Impacts of a pair whose smallest gap would be ``-excess_m``."""
     worlds = make_worlds(
-        [w * w / (2.0 * -b) - excess_m], [10.0, 10.0 + w], braking_capacity_mps2=9, driving_capacity_mps2=9, latency_s=0,
-        mass_t=1, restitution=0.0,
+        [w * w / (2.0 * -b) - excess_m], [10.0, 10.0 + w], braking_capacity_mps2=9, driving_capacity_mps2=9,
+        latency_s=0, mass_t=1, restitution=0.0,
     )  # fmt: skip
     return int(advance(worlds, [0.0, b], 3.0)[1].count[0, 0])
 

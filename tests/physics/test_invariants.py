@@ -72,6 +72,33 @@ def test_impact__a_heavy_vehicle_behind_a_fast_light_one_keeps_its_momentum():
     assert after.speeds_mps[0, 0] == 29.7  # nobody strikes it: not a bit changes
 
 
+@pytest.mark.parametrize(
+    ("speeds", "mass", "e"),
+    [
+        (
+            [16.39952456911204, 15.75974805715059, 20.95326948476989],
+            [2.8732803583387705, 6.81595348368118, 1.3604769656110456],
+            0.9,
+        ),
+        (
+            [0.8101434192213031, 8.398175828005087, 8.274889265517407,
+             13.924489716132891, 11.810988245291215, 5.587596092116025],
+            [7.889487053694922, 4591.572684725916, 5.034824118112325,
+             5.7091832788539785, 3.783523066440141, 7.548945205044989],
+            0.9,
+        ),
+    ],
+)  # fmt: skip
+def test_impact__the_common_speed_of_a_block_is_refined(speeds, mass, e):
+    # among millions of lines those where the plain weighted mean, without its refinement, is off by 4.5 and 5.6 eps
+    before = make_worlds(
+        np.zeros(len(speeds) - 1), speeds, braking_capacity_mps2=9, driving_capacity_mps2=9, latency_s=0, mass_t=mass,
+        restitution=e,
+    )  # fmt: skip
+    after, _ = advance(before, np.zeros(len(speeds)), 0.0)
+    assert momentum_eps(before, after)[0] <= MOMENTUM_EPS
+
+
 def test_impact__a_pair_that_separates_is_left_alone_to_the_last_bit():
     rng = np.random.default_rng(0)
     rear = rng.uniform(0.0, 30.0, 2_000)

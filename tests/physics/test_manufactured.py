@@ -102,7 +102,15 @@ def test_oracle__by_hand():
     from tests.physics.exact_simulator import Hit, Line, simulate
 
     half, whole = Fraction(1, 2), (Fraction(0), Fraction(0))
-    line = Line((Fraction(10),), (Fraction(0), Fraction(10)), whole, whole, (Fraction(2), Fraction(3)), (Fraction(99),) * 2, half)
+    line = Line(
+        (Fraction(10),),
+        (Fraction(0), Fraction(10)),
+        whole,
+        whole,
+        (Fraction(2), Fraction(3)),
+        (Fraction(99),) * 2,
+        half,
+    )
     outcome = simulate(line, Fraction(2))
     assert outcome.hits == [Hit(Fraction(1), 0, Fraction(10), True, Fraction(9), Fraction(-6))]
     assert outcome.gaps == (5,) and outcome.speeds == (9, 4)

@@ -1,4 +1,4 @@
-"""Two events at one instant, and events at the very end of a segment: each kind by hand, in numbers that doubles hold."""
+"""Two events at one instant, and events at the end of a segment: each kind by hand, in numbers that doubles hold."""
 
 from __future__ import annotations
 
@@ -269,6 +269,13 @@ def test_bounces__below_the_plastic_speed_there_is_none_but_harm(closing, e, apa
     worlds, parts = run(line([0.0], [1.0, 1.0 + closing], e=e), [0.0, 0.0], 0.0)
     assert worlds.speeds_mps[0, 0] - worlds.speeds_mps[0, 1] == apart
     assert parts[0].total_harm.tolist() == [[closing * closing]]
+
+
+@pytest.mark.parametrize(("closing", "count"), [(1e-5, 0), (math.nextafter(1e-5, 1.0), 1), (0.5e-5, 0)])
+def test_touch__up_to_its_speed_is_no_impact_but_ends_in_contact(closing, count):
+    worlds, parts = run(line([0.0], [0.0, closing], e=0.5), [0.0, 0.0], 0.0)
+    assert parts[0].count.tolist() == [[count]] and worlds.pair_hit.tolist() == [[bool(count)]]
+    assert worlds.speeds_mps[0, 0] == worlds.speeds_mps[0, 1] == pytest.approx(closing / 2.0)
 
 
 def test_bounces__at_exactly_the_plastic_speed_still_bounce():

@@ -36,9 +36,9 @@ def numbered(n: int, first: int = 0) -> Worlds:
     number = np.arange(first, first + n, dtype=np.float64)
     wide = number[:, None]
     worlds = make_worlds(
-        wide + [0.25, 0.5], wide + [1.0, 2.0, 3.0], braking_capacity_mps2=wide + [4.0, 5.0, 6.0],
-        driving_capacity_mps2=wide + [7.0, 8.0, 9.0], latency_s=wide + 0.125, mass_t=wide + 1.5, speed_limit_mps=wide + 99.0,
-        restitution=number / 1000.0,
+        wide + np.array([0.25, 0.5]), wide + np.array([1.0, 2.0, 3.0]),
+        braking_capacity_mps2=wide + np.array([4.0, 5.0, 6.0]), driving_capacity_mps2=wide + np.array([7.0, 8.0, 9.0]),
+        latency_s=wide + 0.125, mass_t=wide + 1.5, speed_limit_mps=wide + 99.0, restitution=number / 1000.0,
     )  # fmt: skip
     hit = np.stack([number % 2 == 0, number % 3 == 0], axis=1)
     return Worlds(worlds.vehicles, worlds.gaps_m, worlds.speeds_mps, number + 0.75, hit, wide - [1.0, 2.0, 3.0])
@@ -89,7 +89,10 @@ def test_make_worlds__accepts_the_ends_of_every_range():
         ({"gaps": [5.0, float("inf")]}, "gaps_m[0, 1] = inf"),
         ({"speeds": [10.0, -1.0, 1.0]}, "speeds_mps[0, 1] = -1: must be finite and in [0, inf]"),
         ({"speeds": [10.0, float("nan"), 1.0]}, "speeds_mps[0, 1] = nan"),
-        ({"speeds": [[1.0, 2.0, 3.0], [1.0, 2.0, 31.0]]}, "speeds_mps[1, 2] = 31: above this vehicle's speed_limit_mps 30"),
+        (
+            {"speeds": [[1.0, 2.0, 3.0], [1.0, 2.0, 31.0]]},
+            "speeds_mps[1, 2] = 31: above this vehicle's speed_limit_mps 30",
+        ),
         ({"braking_capacity_mps2": 0.0}, "braking_capacity_mps2[0, 0] = 0: must be finite and in (0, inf]"),
         ({"driving_capacity_mps2": -1.0}, "driving_capacity_mps2[0, 0] = -1: must be finite and in [0, inf]"),
         ({"latency_s": [0.0, 0.0, -0.1]}, "latency_s[0, 2] = -0.1: must be finite and in [0, inf]"),

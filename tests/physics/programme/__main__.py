@@ -21,11 +21,9 @@ def main() -> int:
         start = time.monotonic()
         figure = measure()
         failed += not figure.good
-        verdict = "PASS" if figure.good else "FAIL"
-        print(
-            f"{verdict}  {name:50s} {figure.value:<10.3g} <= {figure.threshold:<8.3g} {time.monotonic() - start:6.1f} s  {figure.of}",
-            flush=True,
-        )
+        verdict, seconds = "PASS" if figure.good else "FAIL", time.monotonic() - start
+        measured = f"{figure.value:<10.3g} <= {figure.threshold:<8.3g}"
+        print(f"{verdict}  {name:60s} {measured} {seconds:6.1f} s  {figure.of}", flush=True)
     print(f"{'FAIL' if failed else 'PASS'}: {failed} gates failed, {(time.monotonic() - begin) / 60:.1f} min")
     return 1 if failed else 0
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.harm import empty_ledger, split
-from ethbrake_marl.physics import Impacts, Worlds, advance, concatenate
+from ethbrake_marl.physics import Bools, Floats, Impacts, Worlds, advance, concatenate
 from ethbrake_marl.physics.tolerances import (
     CLUSTER_EPS,
     ENERGY_EPS,
@@ -21,16 +21,17 @@ from ethbrake_marl.physics.tolerances import (
     MOMENTUM_EPS,
     RESTITUTION_EPS,
     SPLIT,
+    SPLIT_CASCADE,
 )
 from tests.physics.exact_simulator import line_of, simulate
 from tests.physics.manufacture import manufactured, pressed, stored
 from tests.physics.measures import energy_rise_eps, momentum_eps, restitution_eps, rounds
 from tests.physics.random_worlds import Batch, Draws, driving_lines, touching_lines
+from tests.physics.runs import once, split_errors, state_bytes
 from tests.physics.segments import Scan, random_segments, scan
 from tests.physics.state_hash import GOLDEN, figures
 from tests.physics.test_clusters import accelerations, exact_accelerations, law_error_eps
 from tests.physics.test_manufactured import at_once, in_steps
-from tests.physics.test_metamorphic import once, state_bytes
 from tests.physics.watched import Watched
 
 CHUNK = 200_000
@@ -302,26 +303,30 @@ def resting() -> Figure:
 # ---------------------------------------------------------------- what must not matter
 
 
-@gate("a segment that is split [relative]")
+_SPLITS: list[tuple[Floats, Bools]] = []
+
+
+def splits() -> list[tuple[Floats, Bools]]:
+    """All split worlds; made once."""
+    if not _SPLITS:
+        _SPLITS.extend(split_errors(N, 60_000 // N, cuts, 91) for N in (2, 3, 5, 10, 20) for cuts in (2, 7, 80))
+    return _SPLITS
+
+
+@gate("a segment that is split, few impacts [relative]")
 def splitting() -> Figure:
-    """Gaps, speeds and harm, relative to at least 100 m, 30 m/s, 900 m2/s2."""
-    worst, worlds = 0.0, 0
-    for N in (2, 3, 5, 10):
-        for cuts in (2, 7, 80):
-            batch = driving_lines(91, 60_000 // N, N)
-            whole, impacts = once(batch)
-            edges = np.sort(np.random.default_rng(cuts).uniform(0.0, 6.0, (cuts, batch.worlds.n)), axis=0)
-            edges[-1], world, total, count = 6.0, batch.worlds, np.zeros(whole.gaps_m.shape), 0
-            for edge in edges:
-                world, part = advance(world, batch.command, until_s=edge)
-                total, count = total + part.total_harm, count + part.count
-            same = (count == impacts.count).all(axis=1)
-            parts = ((world.gaps_m, whole.gaps_m, 100.0), (world.speeds_mps, whole.speeds_mps, 30.0))
-            for mine, theirs, size in (*parts, (total, impacts.total_harm, 900.0)):
-                scale = np.maximum(np.abs(theirs).max(axis=1, keepdims=True), size)
-                worst = max(worst, float((np.abs(mine - theirs) / scale)[same].max()))
-            worlds += int(same.sum())
-    return Figure(worst, SPLIT, f"{worlds:,} worlds in 2, 7 and 80 parts")
+    """Gaps, speeds and harm, relative to at least 100 m, 30 m/s, 900 m2/s2; up to 30 impacts."""
+    worst = max(float(error[few].max()) for error, few in splits() if few.any())
+    return Figure(worst, SPLIT, f"{sum(int(few.sum()) for _, few in splits()):,} worlds in 2, 7 and 80 parts")
+
+
+@gate("a segment that is split, cascades [relative]")
+def splitting_cascades() -> Figure:
+    """The same for worlds with more impacts."""
+    worst = max(float(error[~few].max()) for error, few in splits() if not few.all())
+    return Figure(
+        worst, SPLIT_CASCADE, f"{sum(int((~few).sum()) for _, few in splits()):,} worlds with more than 30 impacts"
+    )
 
 
 @gate("worlds changed by the origin of time")
@@ -336,7 +341,11 @@ def origin() -> Figure:
         vehicles = replace(grid.vehicles, latency_s=grid.vehicles.latency_s + shift)
         moved = replace(grid, vehicles=vehicles, time_s=grid.time_s + shift)
         there, same = advance(moved, batch.command, until_s=6.0 + shift)
-        columns = ((here.gaps_m, there.gaps_m), (here.speeds_mps, there.speeds_mps), (impacts.total_harm, same.total_harm))
+        columns = (
+            (here.gaps_m, there.gaps_m),
+            (here.speeds_mps, there.speeds_mps),
+            (impacts.total_harm, same.total_harm),
+        )
         changed += int(np.any([(a != b).any(axis=1) for a, b in columns], axis=0).sum())
     return Figure(changed, 0, "50,000 worlds, three shifts (positions are not stored: space has no origin)")
 

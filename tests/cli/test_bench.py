@@ -1,0 +1,90 @@
+"""``ethbrake bench``: the table, the JSON, the picture; measuring itself is tested in tests/test_benchmark.py."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ethbrake_marl import bench_commands, benchmark, scaling
+from ethbrake_marl.benchmark import Benchmark, Effort, Speed
+
+SPEEDS = (
+    Speed("engine step", "of a test", 1024, 3, "world-steps/s", 9_876_543.0, 9_000_000.0, 10_000_000.0, 8e6),
+    Speed("import and first step", "of a test", 1, 3, "s", 0.91, 0.9, 0.95, 2.0),
+    Speed("sampling", "of a test", 10_000, 3, "worlds/s", 512.0, 500.0, 540.0),
+)
+
+
+@pytest.fixture
+def efforts(monkeypatch: pytest.MonkeyPatch) -> list[Effort]:
+    """The efforts asked for; nothing is measured."""
+    asked: list[Effort] = []
+
+    def figure(speed: Speed) -> Benchmark:
+        def look(effort: Effort) -> np.ndarray:
+            asked.append(effort)
+            return np.array([speed.lowest, speed.value, speed.highest])
+
+        return Benchmark(speed.name, speed.workload, speed.unit, speed.worlds, speed.floor, look)
+
+    made = tuple(figure(speed) for speed in SPEEDS)
+    for module in (benchmark, bench_commands):
+        monkeypatch.setattr(module, "BENCHMARKS", made)
+    return asked
+
+
+def test_bench__prints_a_table_and_the_machine(ethbrake, efforts):
+    answer = ethbrake("bench")
+    assert answer.status == 0
+    lines = answer.out.splitlines()
+    (engine,) = (line for line in lines if "engine step" in line)
+    assert [cell.strip() for cell in engine.split("│")[1:-1]] == [
+        "engine step", "1,024", "9.88 M world-steps", "9.00 M - 10.0 M", "29.6 M", "8.00 M",
+    ]  # fmt: skip
+    (start,) = (line for line in lines if "import and first step" in line)
+    assert [cell.strip() for cell in start.split("│")[3:-1]] == ["0.91 s", "0.9 - 0.95", "", "2"]
+    assert "512 worlds" in answer.out
+    assert lines[-1].startswith(f"Machine: {benchmark.this_machine().processor}, ")
+    assert efforts == [benchmark.FULL] * 3
+
+
+def test_bench_json__is_pure_and_complete(ethbrake, efforts):
+    answer = ethbrake("bench", "--quick", "--json")
+    assert answer.status == 0
+    found = json.loads(answer.out)
+    assert [figure["name"] for figure in found["figures"]] == [speed.name for speed in SPEEDS]
+    assert found["figures"][0]["value"] == 9_876_543.0 and found["figures"][0]["relative"] == 1.0
+    assert found["machine"]["cores"] >= 1 and found["machine"]["processor"]
+    assert efforts == [benchmark.QUICK] * 3
+    assert "bench: 1 of 3" in answer.err
+
+
+@pytest.fixture
+def few_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scaling with few worlds and vehicles, hardly measured."""
+    shortly = Effort(1, 1e-6)
+    by_worlds, by_vehicles = scaling.costs_by_worlds, scaling.costs_by_vehicles
+    monkeypatch.setattr(scaling, "costs_by_worlds", lambda effort: by_worlds(shortly, (1, 2)))
+    monkeypatch.setattr(scaling, "costs_by_vehicles", lambda effort: by_vehicles(shortly, (2, 3)))
+
+
+def test_bench_scaling__writes_a_picture_once(ethbrake, few_counts, tmp_path: Path):
+    picture = tmp_path / "scaling.png"
+    answer = ethbrake("bench", "--scaling", picture)
+    assert answer.status == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert len(answer.out.splitlines()) == 8 and "ns per vehicle-step" in answer.out
+    assert f"picture: {picture}" in answer.err
+    again = ethbrake("bench", "--scaling", picture)
+    assert again.status == 2 and "is there already" in again.err
+    forced = ethbrake("bench", "--scaling", picture, "--force", "--json")
+    costs = json.loads(forced.out)["costs"]
+    assert len(costs) == 8 and {cost["vehicles"] for cost in costs} == {2, 3}
+
+
+def test_bench_scaling__writes_png_only(ethbrake, tmp_path: Path):
+    answer = ethbrake("bench", "--scaling", tmp_path / "scaling.pdf")
+    assert answer.status == 2 and "pictures are written as PNG" in answer.err
