@@ -10,9 +10,10 @@ from typing import Annotated, TypeVar
 import typer
 from rich.table import Table
 
-from ethbrake_marl.benchmark import BENCHMARKS, FULL, QUICK, WORLD_STEPS, Speed, measure, this_machine
+from ethbrake_marl.benchmark import BENCHMARKS, FULL, QUICK, WORLD_STEPS, Speed, measure
 from ethbrake_marl.command_options import ForceOption, JsonOption
 from ethbrake_marl.evaluation.output_files import write_output
+from ethbrake_marl.machine import this_machine
 from ethbrake_marl.picture_commands import picture_target
 from ethbrake_marl.terminal import interruptible, progress_bars, result_console, say, write_json
 

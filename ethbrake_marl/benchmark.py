@@ -8,8 +8,6 @@ calibration, a loop so simple that hardly anything but the machine can make it s
 
 from __future__ import annotations
 
-import os
-import platform
 import resource
 import subprocess
 import sys
@@ -17,8 +15,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.metadata import version
-from pathlib import Path
 
 import numpy as np
 
@@ -69,49 +65,6 @@ class Speed:
     highest: float
     floor: float | None = None  # what the project aims at: at least this (for seconds: at most)
     relative: float | None = None  # rate of world-steps over that of the calibration
-
-
-@dataclass(frozen=True, slots=True)
-class Machine:
-    """Where the figures come from."""
-
-    processor: str
-    cores_usable: int
-    cores: int
-    load: float  # processes that were running, mean over the last minute
-    python: str
-    numpy: str
-    numba: str
-    ethbrake_marl: str
-
-    def __str__(self) -> str:
-        """The machine in words."""
-        return (
-            f"{self.processor}, {self.cores_usable} of {self.cores} cores usable, load {self.load:.1f};"
-            f" Python {self.python}, numpy {self.numpy}, numba {self.numba}, ethbrake_marl {self.ethbrake_marl}"
-        )
-
-
-def this_machine() -> Machine:
-    """The machine on which this runs."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return Machine(
-        _processor(),
-        usable,
-        os.cpu_count() or 1,
-        os.getloadavg()[0],
-        platform.python_version(),
-        version("numpy"),
-        version("numba"),
-        eb.__version__,
-    )
-
-
-def _processor() -> str:
-    information = Path("/proc/cpuinfo")
-    lines = information.read_text("utf-8").splitlines() if information.is_file() else []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.processor() or platform.machine()
 
 
 def rates(work: Work, effort: Effort) -> Floats:

@@ -18,8 +18,8 @@ from ethbrake_marl.benchmark import (
     braking,
     measure,
     rates,
-    this_machine,
 )
+from ethbrake_marl.machine import this_machine
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.scaling import (
     APART,

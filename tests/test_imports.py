@@ -33,7 +33,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("lineup", "results_folder"),
     ("experiment",),
     ("__init__",),
-    ("doctor", "terminal", "command_options", "benchmark", "scaling"),
+    ("doctor", "terminal", "command_options", "machine", "benchmark", "scaling"),
     ("picture_commands", "search_commands", "bench_commands"),
     ("cli", "__main__"),
 )

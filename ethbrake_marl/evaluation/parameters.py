@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.evaluation.regret import limits_do_not_apply
 from ethbrake_marl.evaluation.rollout import Evaluation
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.scenario.quantities import QUANTITIES
@@ -54,6 +55,7 @@ def parameters(evaluation: Evaluation) -> dict[str, Any]:
         "scripts": scripts,
         "time_step_s": scenario.time_step_s,
         "horizon_s": scenario.horizon_s,
+        "no_limits_because": limits_do_not_apply(evaluation.worlds, scenario, evaluation.vehicle),
         **quantities(evaluation.worlds),
     }
 

@@ -11,10 +11,21 @@ import numpy as np
 
 from ethbrake_marl.evaluation.output_files import check_target, write_output
 from ethbrake_marl.evaluation.parameters import quantity
+from ethbrake_marl.evaluation.regret import Regrets, assess
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
 from ethbrake_marl.scenario.quantities import QUANTITIES
 
 Columns = dict[str, list[Any]]
+
+REGRET_COLUMNS = (
+    "avoidable",
+    "unavoidable_reason",
+    "best_known_first_impact_harm",
+    "best_known_total_harm",
+    "best_known_source",
+    "regret_first_impact_harm",
+    "regret_total_harm",
+)
 
 _ALWAYS = ("gaps_m", "speeds_mps")
 
@@ -27,9 +38,10 @@ def write_per_world_csv(path: str | Path, evaluation: Evaluation, *, force: bool
     check_target(path, force=force)
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    initial = initial_columns(evaluation)
+    initial, regrets = initial_columns(evaluation), assess(evaluation)
     for number, (agent, outcome) in enumerate(evaluation.outcomes.items()):
         columns = {"agent": [agent] * evaluation.worlds.n, **initial, **outcome_columns(outcome)}
+        columns |= regret_columns(outcome, regrets)
         if number == 0:
             writer.writerow(columns)
         writer.writerows(zip(*columns.values(), strict=True))
@@ -47,6 +59,22 @@ def initial_columns(evaluation: Evaluation) -> Columns:
         if field in _ALWAYS or np.ptp(values, axis=0).any():
             columns |= {rule.column_of(i): values[:, i].tolist() for i in range(values.shape[1])}
     return columns
+
+
+def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
+    """What was avoidable and the best known in each world; empty where nothing is proven."""
+    if regrets is None:
+        return {name: [""] * len(outcome.collided) for name in REGRET_COLUMNS}
+    columns = (
+        regrets.limits.avoidable.astype(int),
+        regrets.limits.reason,
+        regrets.first_impact_harm,
+        regrets.total_harm,
+        regrets.source,
+        regrets.regret(outcome, "first"),
+        regrets.regret(outcome, "total"),
+    )
+    return {name: column.tolist() for name, column in zip(REGRET_COLUMNS, columns, strict=True)}
 
 
 def outcome_columns(outcome: Outcome) -> Columns:

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rich import box
-from rich.console import Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
 
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS, PAPER_ROWS, PaperRow
 from ethbrake_marl.evaluation.parameters import parameter_line
+from ethbrake_marl.evaluation.regret import Distance
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.evaluation.table import SummaryRow
 
@@ -24,7 +25,12 @@ _TERMINAL_HEADINGS = (
     "Decrease\nfirst",
     "Decrease\ntotal",
     "Pre-\ndicted",
+    "Regret\nfirst",
+    "Realised\nfirst",
 )
+_ALL = tuple(range(len(_TERMINAL_HEADINGS)))
+_NARROW, _NARROW_WITHOUT = (0, 1, 2, 3, 6, 7), (0, 1, 2, 3, 4, 5)  # with and without a regret to show
+_WIDE = 96  # terminal columns that all of them need
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +56,8 @@ COLUMNS = (
     "Decrease, first-impact",
     "Decrease, total",
     "Predicted harm",
+    "Regret, first-impact",
+    "Realised share, first-impact",
 )
 
 MEANINGS = {
@@ -64,6 +72,11 @@ MEANINGS = {
     " under the first count, so both are shown.",
     "Decrease": "1 − harm / harm of full braking in the same worlds; interval by the delta method, paired by world.",
     "Predicted harm": "What the agent itself expected at the alert, under the count that it minimises.",
+    "Regret": "First-impact harm minus the best known first-impact harm of the same world; mean per world. The best"
+    " known is 0 where a collision is proven avoidable, else the result of a search over whole profiles of Vehicle 2,"
+    " or of an agent in this table that did better. With ≥: the best of some world is known from these agents alone.",
+    "Realised share": "(Full braking − agent) / (full braking − best known), first-impact harm: how much of the"
+    " reduction of harm that is known to be possible the agent brings.",
 }
 
 
@@ -79,6 +92,8 @@ def our_lines(rows: Sequence[SummaryRow]) -> list[Line]:
                 _percent(row.first_decrease, 1),
                 _percent(row.total_decrease, 1),
                 _number(row.predicted_harm),
+                _regret(row.distance),
+                _percent(row.distance.realised_first, 1),
             ),
         )
         for row in rows
@@ -95,18 +110,32 @@ def paper_blocks(rows: Sequence[SummaryRow]) -> list[tuple[str, list[Line]]]:
 
 def rich_table(rows: Sequence[SummaryRow]) -> RenderableType:
     """The table for a terminal of 80 columns or more: ours, then the paper's rows, then the conditions of each."""
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=0, pad_edge=False)
-    table.add_column("Agent", overflow="fold")
-    for heading in _TERMINAL_HEADINGS:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for line in our_lines(rows):
-        table.add_row(Text(line.agent), *(_terminal_cell(k, cell) for k, cell in enumerate(line.cells)))
-    for name, lines in paper_blocks(rows):
-        table.add_section()
-        table.add_row(Text(f"paper, {name}", style="dim"))
-        for line in lines:
-            table.add_row(line.agent, *(cell.value for cell in line.cells))
-    return Group(table, Text(), Text(_conditions(rows), style="dim"))
+    return Group(_TerminalTable(rows), Text(), Text(_conditions(rows), style="dim"))
+
+
+@dataclass(frozen=True, slots=True)
+class _TerminalTable:
+    """The lines of the table; a narrow terminal gets fewer columns."""
+
+    rows: Sequence[SummaryRow]
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        wide = options.max_width >= _WIDE
+        yield self._table(_ALL if wide else _NARROW if limit_lines(self.rows) else _NARROW_WITHOUT)
+
+    def _table(self, shown: Sequence[int]) -> Table:
+        table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=0, pad_edge=False)
+        table.add_column("Agent", overflow="fold")
+        for k in shown:
+            table.add_column(_TERMINAL_HEADINGS[k], justify="right", no_wrap=True)
+        for line in our_lines(self.rows):
+            table.add_row(Text(line.agent), *(_terminal_cell(k, line.cells[k]) for k in shown))
+        for name, lines in paper_blocks(self.rows):
+            table.add_section()
+            table.add_row(Text(f"paper, {name}", style="dim"))
+            for line in lines:
+                table.add_row(line.agent, *(line.cells[k].value for k in shown))
+        return table
 
 
 def _terminal_cell(column: int, cell: Cell) -> Text:
@@ -137,16 +166,46 @@ def _conditions(rows: Sequence[SummaryRow]) -> str:
         f"Ours: {parameter_line(rows[0].parameters)}. Harms are means per world in m²/s²; in brackets or"
         " below a value: its 95 % interval; decreases are relative to full braking."
     ]
+    texts += limit_lines(rows)
     blocks = paper_blocks(rows)
     texts += [f"Paper, {name}: {PAPER_PARAMETERS[name]}." for name, _ in blocks]
     return "\n\n".join([*texts, *([PAPER_NOTE] if blocks else [])])
 
 
+def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
+    """What nobody could avoid in these worlds and the best known harm, as sentences; none where nothing is proven."""
+    found = rows[0].distance if rows else None
+    if found is None or not (found.unavoidable_rate and found.best_known_first and found.best_known_total):
+        return []
+    low, high = (f"{100 * end:.1f}" for end in found.unavoidable_rate.interval or (0.0, 1.0))
+    text = (
+        f"In {100 * found.unavoidable_rate.value:.1f} % [{low}, {high}] of these worlds no command of Vehicle 2 avoids"
+        f" a collision (proven). Best known harm: {found.best_known_first.value:.2f} first-impact,"
+        f" {found.best_known_total.value:.2f} total."
+    )
+    if found.known_best_share is not None and found.known_best_share < 1.0:
+        text += (
+            f" Found beforehand in {100 * found.known_best_share:.1f} % of the worlds; in the others it is the best of"
+            " the agents above, so that regrets are lower bounds and no realised share is stated."
+        )
+    below = {row.agent: row.distance.below_best_known for row in rows if row.distance.below_best_known}
+    if below:
+        counts = ", ".join(f"{agent} in {count:,} worlds" for agent, count in below.items())
+        text += f" Below what was known: {counts}."
+    return [text]
+
+
 def _paper_line(row: PaperRow) -> Line:
     """The paper's figures with the digits that it prints."""
     decrease = NONE if row.harm_decrease is None else f"{100 * row.harm_decrease:.4g} %"
-    cells = (f"{100 * row.collision_rate:.4g} %", f"{row.average_harm:.6g}", NONE, decrease, NONE, NONE)
+    cells = (f"{100 * row.collision_rate:.4g} %", f"{row.average_harm:.6g}", NONE, decrease, *[NONE] * 4)
     return Line(row.agent, tuple(Cell(cell) for cell in cells))
+
+
+def _regret(distance: Distance) -> Cell:
+    cell = _number(distance.regret_first)
+    lower_bound = distance.known_best_share is not None and distance.known_best_share < 1.0
+    return Cell(f"≥ {cell.value}", cell.interval) if lower_bound else cell
 
 
 def _percent(estimate: Estimate | None, digits: int) -> Cell:

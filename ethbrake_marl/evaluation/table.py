@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ethbrake_marl.evaluation.paper import is_papers_test
 from ethbrake_marl.evaluation.parameters import parameters
+from ethbrake_marl.evaluation.regret import Distance, assess, distance
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, rate, relative_decrease
 
@@ -31,6 +32,7 @@ class SummaryRow:
     predicted_harm: Estimate | None  # where the agent predicts
     policy_share: float | None  # share of worlds in which a hybrid drove by its policy
     parameters: dict[str, Any]
+    distance: Distance = field(default_factory=Distance)  # to the best known harm
     beside_paper: bool = False  # these are results of the test that the paper's rows are about
 
     def to_json(self) -> dict[str, Any]:
@@ -49,7 +51,18 @@ class SummaryRow:
             **_named("harm_decrease_total", self.total_decrease),
             **(_named("predicted_harm", self.predicted_harm) if self.predicted_harm else {}),
             **({"policy_share": self.policy_share} if self.policy_share is not None else {}),
+            **self._distance_to_json(),
             "parameters": self.parameters,
+        }
+
+    def _distance_to_json(self) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for name, estimate in self.distance.estimates().items():
+            found |= _named(name, estimate)
+        return {
+            **found,
+            "known_best_share": self.distance.known_best_share,
+            "below_best_known": self.distance.below_best_known,
         }
 
 
@@ -57,9 +70,12 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> list[Summa
     """One row per agent, in the order of the evaluation; compared with ``baseline`` where that was evaluated."""
     conditions = parameters(evaluation)
     reference = evaluation.outcomes.get(baseline)
-    beside = is_papers_test(evaluation)
-    rows = (_row(agent, outcome, reference, conditions) for agent, outcome in evaluation.outcomes.items())
-    return [replace(row, beside_paper=beside) for row in rows]
+    beside, regrets, braking = is_papers_test(evaluation), assess(evaluation), evaluation.outcomes.get(BASELINE)
+    rows = [_row(agent, outcome, reference, conditions) for agent, outcome in evaluation.outcomes.items()]
+    return [
+        replace(row, beside_paper=beside, distance=distance(regrets, evaluation.outcome(row.agent), braking))
+        for row in rows
+    ]
 
 
 def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: dict[str, Any]) -> SummaryRow:

@@ -1,7 +1,7 @@
 """Speed of other simulators, measured as ``ethbrake bench`` measures ours: work per second of processor time.
 
-Runs in an environment of its own, without this project in it: docs/speed.md says how. Prints one line for each, also for
-those that are not installed. The time of all threads counts, so the figures are per second of one core.
+Runs in an environment of its own, without this project in it: docs/speed.md says how. Prints one line for each, also
+for those that are not installed. The time of all threads counts, so the figures are per second of one core.
 """
 
 from __future__ import annotations

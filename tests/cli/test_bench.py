@@ -10,6 +10,7 @@ import pytest
 
 from ethbrake_marl import bench_commands, benchmark, scaling
 from ethbrake_marl.benchmark import Benchmark, Effort, Speed
+from ethbrake_marl.machine import this_machine
 
 SPEEDS = (
     Speed("engine step", "of a test", 1024, 3, "world-steps/s", 9_876_543.0, 9_000_000.0, 10_000_000.0, 8e6),
@@ -47,7 +48,7 @@ def test_bench__prints_a_table_and_the_machine(ethbrake, efforts):
     (start,) = (line for line in lines if "import and first step" in line)
     assert [cell.strip() for cell in start.split("│")[3:-1]] == ["0.91 s", "0.9 - 0.95", "", "2"]
     assert "512 worlds" in answer.out
-    assert lines[-1].startswith(f"Machine: {benchmark.this_machine().processor}, ")
+    assert lines[-1].startswith(f"Machine: {this_machine().processor}, ")
     assert efforts == [benchmark.FULL] * 3
 
 

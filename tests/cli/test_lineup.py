@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents.registry import agent_names
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.experiment import run_folder
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.lineup import check_agents, choose_worlds, make_lineup
+from ethbrake_marl.lineup import LADDER, check_agents, choose_worlds, make_lineup
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent
 
@@ -18,6 +19,19 @@ SCENARIO = load_scenario("paper-random")
 def test_lineup__keeps_order_and_specs():
     lineup = make_lineup(["e_v2x_bm:pairwise", "constant:3.5", "coast"], SCENARIO)
     assert list(lineup) == ["e_v2x_bm:pairwise", "constant:3.5", "coast"]
+
+
+def test_lineup__the_ladder_is_every_rung_that_there_is_in_order():
+    lineup = list(make_lineup(["ladder", "constant:5"], SCENARIO))
+    assert lineup == [*(spec for spec in LADDER if spec.partition(":")[0] in agent_names()), "constant:5"]
+    assert lineup[:6] == ["coast", "copy_leader", "full_brake", "gentlest_front", "e_v2x_bm:pairwise", "e_v2x_bm"]
+
+
+def test_lineup__an_agent_of_the_ladder_is_not_given_again():
+    with pytest.raises(InvalidInput, match="'coast' is given twice"):
+        make_lineup(["ladder", "coast"], SCENARIO)
+    with pytest.raises(InvalidInput, match="did you mean 'ladder'"):
+        make_lineup(["lader"], SCENARIO)
 
 
 def test_lineup__agents_of_a_run_and_of_its_bundle_are_the_same(finished_run):

@@ -12,6 +12,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import Evaluation, check_target, evaluate, write_per_world_csv
 from ethbrake_marl.evaluation.output_files import write_output
+from ethbrake_marl.evaluation.per_world import REGRET_COLUMNS
 from ethbrake_marl.scenario import Scenario, worlds_from_table
 
 
@@ -55,7 +56,7 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
     for name, values in expected.items():
         np.testing.assert_array_equal(column(rows, name), values.astype(float), err_msg=name)
     assert {row["ended"] for row in rows} == {"at_rest"}
-    assert set(rows[0]) == {"agent", "world", "ended", *expected}
+    assert set(rows[0]) == {"agent", "world", "ended", *expected, *REGRET_COLUMNS}
 
 
 def test_per_world__the_initial_columns_make_the_same_worlds_again(tmp_path: Path, evaluation: Evaluation) -> None:

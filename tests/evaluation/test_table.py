@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, rich_table, summarise
+from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, regret, rich_table, summarise
 from ethbrake_marl.evaluation.paper import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST
 from ethbrake_marl.evaluation.parameters import parameter_line, parameters
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
@@ -18,7 +18,12 @@ ALWAYS = {
     "first_impact_harm", "first_impact_harm_interval", "total_harm", "total_harm_interval",
     "first_impact_harm_difference", "first_impact_harm_difference_interval", "total_harm_difference",
     "total_harm_difference_interval", "harm_decrease_first", "harm_decrease_first_interval", "harm_decrease_total",
-    "harm_decrease_total_interval", "parameters",
+    "harm_decrease_total_interval", "unavoidable_rate", "unavoidable_rate_interval", "avoidable_collision_rate",
+    "avoidable_collision_rate_interval", "best_known_first_impact_harm", "best_known_first_impact_harm_interval",
+    "best_known_total_harm", "best_known_total_harm_interval", "mean_regret", "mean_regret_interval",
+    "mean_regret_first", "mean_regret_first_interval", "mean_regret_total", "mean_regret_total_interval",
+    "realised_share", "realised_share_interval", "realised_share_first", "realised_share_first_interval",
+    "realised_share_total", "realised_share_total_interval", "known_best_share", "below_best_known", "parameters",
 }  # fmt: skip
 
 
@@ -95,8 +100,28 @@ def test_rich_table__fits_80_columns_and_shows_both_counts(evaluation: Evaluatio
         assert f"{estimate.interval[0]:.2f}, {estimate.interval[1]:.2f}" in text
     collided = evaluation.outcome("full_brake").collided.mean()
     assert f"full_brake {100 * collided:.1f} % " in " ".join(text.split())
-    decrease = 1 - summarise(evaluation)[2].total_harm.value / row.total_harm.value
-    assert f"{100 * decrease:.1f} %" in text
+    compared = summarise(evaluation)[2]
+    decrease, lost = compared.first_decrease, compared.distance.regret_first
+    assert f"{100 * decrease.value:.1f} %" in text
+    assert f"{lost.value:.2f}" in text
+
+
+def test_rich_table__in_100_columns_has_every_column(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(regret, "best_known", lambda worlds, scenario, count, vehicles: np.zeros(worlds.n))
+    text = printed(evaluation, width=100)
+    row = summarise(evaluation)[2]
+    for share in (row.total_decrease, row.distance.realised_first):
+        assert f"{100 * share.value:.1f} %" in text
+    for value in (row.predicted_harm, row.distance.regret_first):
+        assert f" {value.value:.2f}" in text
+    assert f"In {100 * row.distance.unavoidable_rate.value:.1f} % [" in text
+
+
+def test_rich_table__without_a_limit_keeps_the_decrease_of_total_harm(pair: Scenario) -> None:
+    result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
+    text = printed(result)
+    assert text.count("Decrease") == 2
+    assert "Regret" not in text
 
 
 def test_rich_table__has_the_papers_rows_beside_ours_and_its_conditions(evaluation: Evaluation) -> None:
@@ -126,7 +151,7 @@ def test_markdown_table__a_bar_in_a_name_makes_no_column(pair: Scenario) -> None
 
 def test_markdown_table__every_row_has_every_column(evaluation: Evaluation) -> None:
     rows = [line for line in markdown_table(summarise(evaluation)).splitlines() if line.startswith("|")]
-    assert {line.count("|") for line in rows} == {8}
+    assert {line.count("|") for line in rows} == {10}
     assert len(rows) == 2 + 3 + len(PAPER_ROWS)
     estimate = summarise(evaluation)[0].first_impact_harm
     assert f"{estimate.value:.2f} [{estimate.interval[0]:.2f}, {estimate.interval[1]:.2f}]" in rows[2]

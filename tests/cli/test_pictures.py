@@ -1,0 +1,61 @@
+"""`ethbrake picture ...`."""
+
+from __future__ import annotations
+
+import pytest
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def test_criticality__writes_a_png_and_says_where(ethbrake, tmp_path):
+    out = tmp_path / "map.png"
+    options = ("--scenario", "paper-distance", "--agent", "constant:5", "--cells", "5", "--output", out)
+    answer = ethbrake("picture", "criticality", *options)
+    assert (answer.status, answer.out) == (0, "")
+    assert f"picture: {out}" in answer.err
+    assert out.read_bytes().startswith(PNG)
+
+
+def test_deceleration__writes_a_png_of_that_world(ethbrake, tmp_path):
+    for world in (0, 5):
+        out = tmp_path / f"curve-{world}.png"
+        options = ("--scenario", "paper-random", "--world", str(world), "--output", out)
+        answer = ethbrake("picture", "deceleration", *options)
+        assert (answer.status, answer.out) == (0, "")
+        assert out.read_bytes().startswith(PNG)
+    assert (tmp_path / "curve-0.png").read_bytes() != (tmp_path / "curve-5.png").read_bytes()
+
+
+@pytest.mark.parametrize("picture", ["criticality", "deceleration"])
+@pytest.mark.parametrize("name", ["map.pdf", "map", "map.png.svg"])
+def test_picture__only_png_is_written(ethbrake, tmp_path, picture, name):
+    answer = ethbrake("picture", picture, "--output", tmp_path / name)
+    assert answer.status == 2
+    assert "pictures are written as PNG; give a name that ends in .png" in answer.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("picture", ["criticality", "deceleration"])
+def test_picture__overwrites_only_by_force(ethbrake, tmp_path, picture):
+    out = tmp_path / "map.png"
+    out.write_bytes(b"mine")
+    more = ("--cells", "2") if picture == "criticality" else ()
+    answer = ethbrake("picture", picture, *more, "--output", out)
+    assert (answer.status, out.read_bytes()) == (2, b"mine")
+    assert "--force" in answer.err
+    assert ethbrake("picture", picture, *more, "--output", out, "--force").status == 0
+    assert out.read_bytes().startswith(PNG)
+
+
+def test_criticality__a_scenario_with_random_speeds_is_refused(ethbrake, tmp_path):
+    answer = ethbrake("picture", "criticality", "--scenario", "paper-random", "--output", tmp_path / "map.png")
+    assert answer.status == 2
+    assert "speed_1_mps is random" in answer.err
+
+
+def test_criticality__takes_a_range_of_both_gaps(ethbrake, tmp_path):
+    arguments = ("picture", "criticality", "--agent", "coast", "--cells", "2", "--output", tmp_path / "map.png")
+    assert ethbrake(*arguments, "--gaps", "8", "9").status == 0
+    answer = ethbrake(*arguments, "--gaps", "9", "8", "--force")
+    assert answer.status == 2
+    assert "0 <= low < high" in answer.err

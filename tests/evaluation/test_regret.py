@@ -1,0 +1,204 @@
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.evaluation import (
+    Evaluation,
+    Outcome,
+    evaluate,
+    markdown_table,
+    parameters,
+    summarise,
+    write_per_world_csv,
+)
+from ethbrake_marl.evaluation import regret as regret_module
+from ethbrake_marl.evaluation.regret import assess, distance, known_limits, limits_do_not_apply
+from ethbrake_marl.harm import Ledger
+from ethbrake_marl.scenario import Scenario, load_scenario
+
+# Four worlds by hand: the first is avoidable, the second is in the table, in the third the agent is below the table,
+# the fourth is in no table.
+AVOIDABLE = np.array([True, False, False, False])
+REASON = np.array(["", "front", "rear", "rear"])
+TABLE = {"first": np.array([0.5, 2.0, 4.0, np.nan]), "total": np.array([0.5, 3.0, 5.0, np.nan])}
+FULL = ([10.0, 10.0, 10.0, 10.0], [12.0, 12.0, 12.0, 12.0])
+AGENT = ([1.0, 4.0, 3.0, 6.0], [1.0, 4.0, 5.0, 7.0])
+NULLS = {
+    "unavoidable_rate", "avoidable_collision_rate", "best_known_first_impact_harm", "best_known_total_harm",
+    "mean_regret", "mean_regret_first", "mean_regret_total", "realised_share", "realised_share_first",
+    "realised_share_total", "known_best_share", "below_best_known",
+}  # fmt: skip
+
+
+def outcome(evaluation: Evaluation, harms: tuple[list[float], list[float]]) -> Outcome:
+    """An outcome with these first-impact and total harms, all of the front pair."""
+    first, total = (np.column_stack([harm, np.zeros(len(harm))]) for harm in harms)
+    count = (total > 0.0).astype(np.int64)
+    final = evaluation.worlds.take(np.arange(len(first)))
+    ledger = Ledger(first, total, count, final.vehicles.mass_t)
+    return Outcome(ledger, final, np.ones(len(first), np.bool_), None, None)
+
+
+@pytest.fixture
+def four(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> Evaluation:
+    """An evaluation of full_brake and another agent in the four worlds."""
+    monkeypatch.setattr(
+        regret_module,
+        "avoidability",
+        lambda worlds, vehicle: SimpleNamespace(avoidable=AVOIDABLE[: worlds.n], reason_name=REASON[: worlds.n]),
+    )
+    monkeypatch.setattr(regret_module, "best_known", lambda worlds, scenario, count, vehicles: TABLE[count][: worlds.n])
+    return first_worlds(evaluation, 4)
+
+
+def first_worlds(evaluation: Evaluation, n: int) -> Evaluation:
+    outcomes = {
+        name: outcome(evaluation, (harms[0][:n], harms[1][:n])) for name, harms in (("full_brake", FULL), ("a", AGENT))
+    }
+    rows = np.arange(n)
+    return Evaluation(evaluation.scenario, 1, evaluation.worlds.take(rows), rows, 7, outcomes)
+
+
+def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation) -> None:
+    found = assess(four)
+    assert found is not None
+    assert found.first_impact_harm.tolist() == [0.0, 2.0, 3.0, 6.0]
+    assert found.total_harm.tolist() == [0.0, 3.0, 5.0, 7.0]
+    assert found.source.tolist() == ["witness", "table", "below_table", "agents"]
+    assert found.limits.known.tolist() == [True, True, True, False]
+    assert found.regret(four.outcome("a"), "first").tolist() == [1.0, 2.0, 0.0, 0.0]
+    assert found.regret(four.outcome("full_brake"), "total").tolist() == [12.0, 9.0, 7.0, 5.0]
+    assert found.below(four.outcome("a")).tolist() == [False, False, True, False]
+
+
+def test_best_known__rounding_below_the_table_is_not_below_it(four: Evaluation) -> None:
+    close = outcome(four, ([1.0, 2.0 - 9e-7, 4.0 - 2e-6, 6.0], [1.0, 4.0, 6.0, 7.0]))
+    found = assess(Evaluation(four.scenario, 1, four.worlds, four.index, 7, {"a": close}))
+    assert found is not None
+    assert found.below(close).tolist() == [False, False, True, False]
+    assert found.source.tolist() == ["witness", "table", "below_table", "agents"]
+    assert (found.regret(close, "first") >= 0.0).all()
+
+
+def test_distance__by_hand(four: Evaluation, evaluation: Evaluation) -> None:
+    three = first_worlds(evaluation, 3)
+    found = distance(assess(three), three.outcome("a"), three.outcome("full_brake"))
+    assert found.realised_first is not None and found.realised_total is not None
+    assert found.realised_first.value == pytest.approx((30.0 - 8.0) / (30.0 - 5.0), rel=1e-12)
+    assert found.realised_total.value == pytest.approx((36.0 - 10.0) / (36.0 - 8.0), rel=1e-12)
+    assert found.regret_first is not None and found.regret_first.value == 1.0
+    assert found.regret_total is not None and found.regret_total.value == pytest.approx(2.0 / 3.0, rel=1e-12)
+    assert found.unavoidable_rate is not None and found.unavoidable_rate.value == pytest.approx(2.0 / 3.0)
+    assert found.avoidable_collision_rate is not None
+    assert found.avoidable_collision_rate.value == pytest.approx(1.0 / 3.0)
+    assert (found.known_best_share, found.below_best_known) == (1.0, 1)
+
+
+def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Evaluation) -> None:
+    full, agent = (row.to_json() for row in summarise(four))
+    assert agent["known_best_share"] == full["known_best_share"] == 0.75
+    assert agent["realised_share"] is agent["realised_share_total"] is None
+    assert agent["mean_regret"] == agent["mean_regret_first"] == 0.75
+    assert agent["mean_regret_total"] == 0.5
+    assert full["mean_regret"] == (10.0 + 8.0 + 7.0 + 4.0) / 4.0
+    assert (full["below_best_known"], agent["below_best_known"]) == (0, 1)
+    table = markdown_table(summarise(four))
+    assert "≥ 0.75" in table
+    assert "Found beforehand in 75.0 % of the worlds" in table
+    assert "Below what was known: a in 1 worlds." in table
+
+
+def test_distance__without_full_braking_nothing_is_realised(four: Evaluation, evaluation: Evaluation) -> None:
+    three = first_worlds(evaluation, 3)
+    alone = Evaluation(three.scenario, 1, three.worlds, three.index, 7, {"a": three.outcome("a")})
+    (row,) = (row.to_json() for row in summarise(alone))
+    assert row["realised_share"] is row["realised_share_first"] is row["realised_share_total"] is None
+    assert row["mean_regret"] == 1.0
+
+
+def test_summary__has_the_fields_of_the_limit(evaluation: Evaluation) -> None:
+    for row in summarise(evaluation):
+        found = row.to_json()
+        assert set(found) >= NULLS
+        assert found["mean_regret"] == found["mean_regret_first"] >= 0.0
+        assert found["mean_regret_first"] == pytest.approx(
+            found["first_impact_harm"] - found["best_known_first_impact_harm"], rel=1e-9
+        )
+        assert found["collision_rate"] == pytest.approx(found["unavoidable_rate"] + found["avoidable_collision_rate"])
+        assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert parameters(evaluation)["no_limits_because"] is None
+
+
+@pytest.mark.parametrize(
+    ("roles", "vehicle", "reason"),
+    [
+        (("coast", "learner", "full_brake"), 1, "vehicle_1 follows coast"),
+        (("full_brake", "full_brake", "learner"), 2, "vehicle_3 is driven"),
+        (("full_brake", "learner", "full_brake"), 1, None),
+    ],
+)
+def test_limits__do_not_apply_to_other_scripts_and_vehicles(
+    paper_random: Scenario, roles: tuple[str, ...], vehicle: int, reason: str | None
+) -> None:
+    scenario = paper_random.replace(roles=dict(zip(paper_random.vehicle_names, roles, strict=True)))
+    worlds = scenario.sample(2, 7).worlds
+    found = limits_do_not_apply(worlds, scenario, vehicle)
+    assert found is None if reason is None else found is not None and found.startswith(reason)
+    assert (known_limits(worlds, scenario, vehicle) is None) == (reason is not None)
+
+
+def test_limits__do_not_apply_where_vehicle_1_may_brake_after_vehicle_2(paper_random: Scenario) -> None:
+    late = paper_random.replace(latency_s=[0.6, 0.5, 0.8])
+    result = evaluate(late.sample(2, 7), {"coast": make_agent("coast")}, scenario=late)
+    assert "vehicle_1 may brake later than vehicle_2" in parameters(result)["no_limits_because"]
+    assert assess(result) is None
+
+
+def test_limits__of_another_line_up_are_null_with_the_reason(pair: Scenario, tmp_path: Path) -> None:
+    result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
+    (row,) = (row.to_json() for row in summarise(result))
+    assert {row[name] for name in NULLS} == {None}
+    assert row["mean_regret_interval"] is None
+    assert row["parameters"]["no_limits_because"] == "2 vehicles; avoidability is proven for 3"
+    write_per_world_csv(tmp_path / "out.csv", result)
+    with (tmp_path / "out.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    assert {line["avoidable"] + line["regret_total_harm"] + line["best_known_source"] for line in lines} == {""}
+    assert "proven" not in markdown_table(summarise(result))
+
+
+def test_per_world__shows_the_limit_of_each_world(four: Evaluation, tmp_path: Path) -> None:
+    write_per_world_csv(tmp_path / "out.csv", four)
+    with (tmp_path / "out.csv").open(newline="") as stream:
+        lines = [line for line in csv.DictReader(stream) if line["agent"] == "a"]
+    assert [line["avoidable"] for line in lines] == ["1", "0", "0", "0"]
+    assert [line["unavoidable_reason"] for line in lines] == ["", "front", "rear", "rear"]
+    assert [float(line["best_known_first_impact_harm"]) for line in lines] == [0.0, 2.0, 3.0, 6.0]
+    assert [float(line["best_known_total_harm"]) for line in lines] == [0.0, 3.0, 5.0, 7.0]
+    assert [line["best_known_source"] for line in lines] == ["witness", "table", "below_table", "agents"]
+    assert [float(line["regret_first_impact_harm"]) for line in lines] == [1.0, 2.0, 0.0, 0.0]
+    assert [float(line["regret_total_harm"]) for line in lines] == [1.0, 1.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("name", "unavoidable"), [("paper-random", 309), ("paper-random-early", 272)])
+def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, unavoidable: int) -> None:
+    scenario = load_scenario(name)
+    agents = {spec: make_agent(spec) for spec in ("full_brake", "e_v2x_bm")}
+    result = evaluate(scenario.sample(500, 7), agents, scenario=scenario, seed=7)
+    full, best = (row.to_json() for row in summarise(result))
+    found = assess(result)
+    assert found is not None
+    assert full["unavoidable_rate"] == best["unavoidable_rate"] == unavoidable / 500
+    for spec in agents:
+        driven = result.outcome(spec)
+        assert driven.collided[~found.limits.avoidable].all()  # nobody avoids what is unavoidable
+        assert (found.regret(driven, "first") >= 0.0).all()
+        assert (found.regret(driven, "total") >= 0.0).all()
+    assert best["avoidable_collision_rate"] < 0.02 < full["avoidable_collision_rate"]
