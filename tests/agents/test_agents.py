@@ -175,7 +175,7 @@ def test_make_agent__suggests_the_name_that_was_meant():
 
 
 def test_agent_names__are_those_that_ship():
-    assert agent_names() == ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front")
+    assert agent_names() == ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front", "planner")
 
 
 def test_register_agent__makes_names_and_paths_known(monkeypatch):
