@@ -101,8 +101,8 @@ def speed_table(speeds: Sequence[Speed]) -> Table:
 
 
 def _plain(value: float) -> str:
-    """Three digits, with k for thousands and M for millions."""
-    for size, letter in ((1e6, " M"), (1e3, " k")):
+    """Three digits, with k for thousands, M for millions and G beyond."""
+    for size, letter in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if value >= size:
             return f"{value / size:#.3g}".removesuffix(".") + letter
     return f"{value:.3g}"

@@ -174,7 +174,12 @@ def main() -> None:
         middle = statistics.median(found)
         line = f"{name:19} {what:45} {middle:13,.0f} world-steps/s ({found[0]:,.0f} - {found[-1]:,.0f})"
         if counterpart in ours:
-            line += f"; {counterpart} here is {ours[counterpart] / middle:.3g} times as fast"
+            ratio = ours[counterpart] / middle
+            line += (
+                f"; ours ({counterpart}): {ratio:,.0f} times"
+                if ratio > 20
+                else f"; ours ({counterpart}): {ratio:.2g} times"
+            )
         print(line, flush=True)
 
 

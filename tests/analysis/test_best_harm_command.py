@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ethbrake_marl.analysis.best_harm_table import load_table
+from ethbrake_marl.cli import run_command
+
+SMALL = ["best-harm", "--scenario", "paper-random", "--episodes", "4", "--budget", "60", "--threads", "1"]
+
+
+def test_best_harm_command__prints_figures_and_writes_the_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "t.npz"
+    assert run_command([*SMALL, "--json", "--output", str(file)]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    table = load_table(file)
+    assert figures["best_known_total_harm"] == pytest.approx(table.best["total"].harm.mean())
+    assert figures["harmless_rate"] == (table.best["total"].harm == 0.0).mean()
+    assert table.header["list_seed"] == 7
+    assert [path.name for path in tmp_path.iterdir()] == ["t.npz"]
+
+
+def test_best_harm_command__one_count_from_an_earlier_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, better = tmp_path / "t.npz", tmp_path / "u.npz"
+    assert run_command([*SMALL, "--count", "first", "--output", str(file)]) == 0
+    assert "best_known_first_impact_harm" in capsys.readouterr().out
+    assert run_command([*SMALL, "--count", "first", "--start", str(file), "--output", str(better)]) == 0
+    assert list(load_table(better).best) == ["first"]
+    assert (load_table(better).best["first"].harm <= load_table(file).best["first"].harm + 1e-6).all()
+
+
+@pytest.mark.parametrize(
+    ("more", "fragment"),
+    [
+        (["--budget", "0"], "budget = 0"),
+        (["--vehicles", "vehicle_9"], "vehicle_9"),
+        (["--output", "nowhere/t.npz"], "no folder"),
+        (["--output", "t.txt"], "ends in .npz"),
+        (["--start", "missing.npz"], "no such table"),
+        (["--count", "some"], "some"),
+        (["--episodes", "0"], "n = 0"),
+    ],
+)
+def test_best_harm_command__refuses(
+    more: list[str], fragment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run_command([*SMALL, *more]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("ethbrake: error: ") and fragment in said.err
+    assert list(tmp_path.iterdir()) == []
