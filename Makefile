@@ -1,5 +1,5 @@
 # Everything runs in the project's own environment, .venv, made from Python >= 3.11 and this file alone.
-# TORCH_INDEX: index of CPU builds of torch, e.g. make run TORCH_INDEX=https://download.pytorch.org/whl/cpu
+# TORCH_INDEX: index of CPU builds of torch, e.g. make run TORCH_INDEX=ADDRESS (README: how to find it)
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # ARGS:        passed on by `make run` (to `ethbrake run`) and `make test` (to pytest).
 
@@ -25,7 +25,7 @@ help:
 	@echo "make mutation [ARGS=] mutation testing of physics and harm (ARGS='--sample 100')"
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make clean            remove $(VENV), caches and builds (runs/ stays)"
-	@echo "TORCH_INDEX=URL       take torch from this index (CPU builds: https://download.pytorch.org/whl/cpu)"
+	@echo "TORCH_INDEX=URL       take torch from this index (CPU builds: see README)"
 
 venv: $(STAMP)
 
