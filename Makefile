@@ -1,19 +1,21 @@
 # Everything runs in the project's own environment, .venv, made from Python >= 3.11 and this file alone.
 # TORCH_INDEX: index of CPU builds of torch, e.g. make run TORCH_INDEX=ADDRESS (README: how to find it)
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
+# PEERS:       the environment of `make bench-peers`, apart from the project's own.
 # ARGS:        passed on by `make run` (to `ethbrake run`) and `make test` (to pytest).
 
 SHELL := /bin/sh
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+PEERS := .venv-peers
 TORCH_INDEX ?=
 PYTHON ?=
 ARGS ?=
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics planted-bugs mutation
+.PHONY: help venv run test lint check clean test-physics planted-bugs mutation bench-peers
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -23,8 +25,9 @@ help:
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make planted-bugs     plant 20 bugs in copies of the code; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of physics and harm (ARGS='--sample 100')"
+	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
 	@echo "make venv             the environment alone: $(VENV)"
-	@echo "make clean            remove $(VENV), caches and builds (runs/ stays)"
+	@echo "make clean            remove $(VENV), $(PEERS), caches and builds (runs/ stays)"
 	@echo "TORCH_INDEX=URL       take torch from this index (CPU builds: see README)"
 
 venv: $(STAMP)
@@ -94,6 +97,9 @@ mutation: $(STAMP)
 	@echo "== mutation testing"
 	@$(BIN)/python -m tests.physics.programme.mutation $(ARGS)
 
+bench-peers: $(STAMP)
+	@$(BIN)/python -m tests.benchmarks.peers --environment $(PEERS) --torch-index "$(TORCH_INDEX)" $(ARGS)
+
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist
+	rm -rf $(VENV) $(PEERS) .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist
 	find ethbrake_marl tests train -name __pycache__ -type d -prune -exec rm -rf {} +

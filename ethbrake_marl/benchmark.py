@@ -152,7 +152,7 @@ def stepping(n: int, steps: int = 100) -> Work:
     return work
 
 
-def _sb3(n: int, steps: int = 100) -> Work:
+def vec_env(n: int, steps: int = 100) -> Work:
     environment = eb.make_sb3_vec_env(SCENARIO, n, seed=SEED)  # imports torch, hence only now
     environment.reset()
     actions = np.full((n, 1), -SHARE, np.float32)
@@ -165,7 +165,7 @@ def _sb3(n: int, steps: int = 100) -> Work:
     return work
 
 
-def _pettingzoo(n: int, episodes: int = 20) -> Work:
+def parallel(n: int, episodes: int = 20) -> Work:
     environment = parallel_env(SCENARIO)
     actions = {f"vehicle_{i + 1}": np.array([-SHARE], np.float32) for i in environment.engine.learners}
     environment.reset(seed=SEED)
@@ -269,8 +269,8 @@ BENCHMARKS: tuple[Benchmark, ...] = (
     _advance_of(4096, 1.0),
     _rate_of("engine step", _DRIVING, stepping, 1024, 8e6),
     _rate_of("engine step", _DRIVING, stepping, 4096, 8e6),
-    _rate_of("Stable-Baselines3 VecEnv", _DRIVING, _sb3, 512, 4e6),
-    _rate_of("PettingZoo parallel", "whole episodes, resets included", _pettingzoo, 1, 80e3),
+    _rate_of("Stable-Baselines3 VecEnv", _DRIVING, vec_env, 512, 4e6),
+    _rate_of("PettingZoo parallel", "whole episodes, resets included", parallel, 1, 80e3),
     Benchmark("import and first step", _FRESH, "s", 1, 2.0, _start_seconds),
     _rate_of("sampling", "a list of worlds, refused draws included", _sampling, 10_000, unit="worlds/s"),
     _rate_of("E-V2X-BM pairwise", "one optimum per world", _pairwise, 10_000, unit="worlds/s"),

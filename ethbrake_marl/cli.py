@@ -45,10 +45,10 @@ from ethbrake_marl.scenario import (
     load_scenario,
     new_scenario_text,
     scenario_json_schema,
+    scenario_path,
 )
 from ethbrake_marl.search_commands import best_harm_command
 from ethbrake_marl.terminal import (
-    INTERRUPTED,
     abandon_output,
     interruptible,
     progress_bars,
@@ -57,6 +57,7 @@ from ethbrake_marl.terminal import (
     tolerate_narrow_streams,
     write_json,
 )
+from ethbrake_marl.training_commands import KEPT, end_of_training, resume_command, train_command
 
 BAD_INPUT = 2
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
@@ -75,10 +76,12 @@ scenario_app = typer.Typer(
 )
 app.add_typer(scenario_app, name="scenario")
 app.add_typer(picture_app, name="picture")
+app.command("train", epilog="Example: ethbrake train --scenario paper-random-early --steps 200000 --name early")(
+    train_command
+)
+app.command("resume", epilog="Example: ethbrake resume runs/paper-random-ppo-seed0")(resume_command)
 app.command("best-harm", epilog="Example: ethbrake best-harm --episodes 200 --budget 20000 --json")(best_harm_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
-
-_KEPT = "if the training had begun, the run's folder keeps the last good policy"
 
 
 def main() -> None:
@@ -123,13 +126,13 @@ def run(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train PPO, shield it, compare with the baselines, report.
+    """Train a policy, shield it, compare with the baselines, report.
 
     Writes the run's folder: the policy, results as CSV and JSON, every world, three figures, and report.html.
     Ctrl-C ends the training early, and what it has is evaluated; a second Ctrl-C stops at once.
     """
-    with interruptible(_KEPT):
-        # Here and in `train`: torch takes seconds to load, and no other command needs it.
+    with interruptible(KEPT):
+        # Here and in other commands that learn: torch takes seconds to load, and no other command needs it.
         from ethbrake_marl.experiment import run_experiment, run_folder
 
         chosen, plan = load_driven(scenario, vehicle), load_recipe(recipe)
@@ -148,44 +151,7 @@ def run(
             )
     _show_rows(result.rows, as_json)
     say(f"report: {result.report}")
-    _end(result.status, result.steps, folder)
-
-
-@app.command(epilog="Example: ethbrake train --scenario paper-random-early --steps 200000 --name early")
-def train(
-    scenario: ScenarioOption = "paper-random",
-    recipe: RecipeOption = "ppo",
-    steps: StepsOption = None,
-    seed: TrainingSeedOption = None,
-    name: NameOption = None,
-    output: OutputOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Train a policy into a run's folder.
-
-    Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,hybrid@FOLDER`.
-    Ctrl-C ends the training after the update in progress and keeps the policy.
-    """
-    with interruptible(_KEPT):
-        from ethbrake_marl.experiment import run_folder, train_measured
-
-        chosen, plan = load_runnable(scenario), load_recipe(recipe)
-        folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
-        with progress_bars() as bars:
-            result = train_measured(
-                chosen,
-                folder,
-                recipe=plan,
-                steps=steps,
-                seed=seed,
-                force=force,
-                on_progress=lambda p: bars.show("training", p.steps, p.total_steps, p.metrics),
-            )
-    if as_json:
-        last = result.evaluations[-1] if result.evaluations else None
-        write_json({"directory": str(folder), "status": result.status, "steps": result.steps, "evaluation": last})
-    _end(result.status, result.steps, folder)
+    end_of_training(result.status, result.steps, folder)
 
 
 @app.command("evaluate", epilog="Example: ethbrake evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000")
@@ -211,7 +177,7 @@ def evaluate_command(
 
     Agents: full_brake, coast, constant:A (deceleration in m/s2), copy_leader, gentlest_front, e_v2x_bm,
     e_v2x_bm:pairwise, planner, best_harm; ladder: all of these but constant; and of a run or a policy bundle: ppo@PATH,
-    hybrid@PATH, hybrid:pairwise@PATH.
+    sac@PATH, hybrid@PATH, hybrid:pairwise@PATH. PATH may be shipped.
     """
     if per_world is not None:
         check_target(per_world, force=force)
@@ -250,8 +216,7 @@ def scenario_list(as_json: JsonOption = False) -> None:
 def scenario_show(scenario: Annotated[str, typer.Argument(metavar="NAME|PATH")]) -> None:
     """Print the YAML of a scenario that is in order."""
     load_scenario(scenario)
-    shipped = {entry.name: entry.path for entry in list_scenarios()}
-    typer.echo(shipped.get(scenario, Path(scenario)).read_text("utf-8"), nl=False)
+    typer.echo(scenario_path(scenario).read_text("utf-8"), nl=False)
 
 
 @scenario_app.command("validate", epilog="Example: ethbrake scenario validate my-scenario.yaml")
@@ -314,11 +279,3 @@ def _show_rows(rows: Sequence[SummaryRow], as_json: bool) -> None:
         write_json([row.to_json() for row in rows])
     else:
         result_console().print(rich_table(rows))
-
-
-def _end(status: str, steps: int, folder: Path) -> None:
-    """Say what a training left; an interrupted one ends with that status."""
-    if status == "interrupted":
-        say(f"interrupted after {steps:,} training steps; the policy of that moment is in {folder}")
-        raise typer.Exit(INTERRUPTED)
-    say(f"{status} after {steps:,} training steps: {folder}")

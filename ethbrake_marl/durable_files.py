@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
@@ -37,24 +38,51 @@ def check_writable(folder: Path) -> None:
 
 
 @contextmanager
-def new_folder(path: Path) -> Iterator[Path]:
+def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Give a temporary folder beside ``path`` that takes its name when the block ends well, and vanishes otherwise.
 
-    Raises ``AlreadyExists`` when there is something at ``path``, at the start or at the end.
+    Raises ``AlreadyExists`` when there is something at ``path``, at the start or at the end; with ``replace`` a folder
+    there goes when the block has ended well, and only then.
     """
-    _refuse_existing(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED))
+    if not replace:
+        _refuse_existing(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(errno.ENOTDIR, "Not a directory", str(path.parent)) from None
+    try:
+        partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED))
+    except OSError as error:
+        error.filename = str(path)  # what was asked for, not the passing name
+        raise
     try:
         yield partial
         partial.chmod(0o777 & ~_umask())
         _folder_to_disk(partial)
+        if replace and path.is_dir() and not path.is_symlink():
+            remove_folder(path)
         _refuse_existing(path)
         partial.rename(path)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
     _folder_to_disk(path.parent)
+
+
+def remove_folder(path: Path) -> None:
+    """Take a folder out of the way in one step, then delete it."""
+    aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED))
+    path.rename(aside / path.name)
+    shutil.rmtree(aside)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Delete what writers that were killed left in ``folder``: nobody may be writing in it."""
+    for left in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
+        if left.is_dir() and not left.is_symlink():
+            shutil.rmtree(left)
+        else:
+            left.unlink()
 
 
 def _refuse_existing(path: Path) -> None:

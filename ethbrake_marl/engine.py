@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,61 +30,15 @@ from ethbrake_marl.physics.packed import (
     unpack,
 )
 from ethbrake_marl.physics.segment import DONE
-from ethbrake_marl.rewards import (
-    Reward,
-    RewardParams,
-    StepOutcome,
-    further_terms,
-    potential,
-    reward_params,
-    shared_terms,
-    weighted_sum,
-)
+from ethbrake_marl.rewards import Reward, StepOutcome, further_terms, potential, reward_params, weighted_sum
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.starts import Script, Start, Stream, check_alert, is_state_free, moved, within_capacity
-from ethbrake_marl.stepping import (
-    BAD_ACTION,
-    ENDED,
-    FLAG_ROWS,
-    HARM_ROWS,
-    SAFE_END,
-    START,
-    STEP_FIRST_HARM,
-    STEP_TOTAL_HARM,
-    TERMINATED,
-    TRUNCATED,
-    step_worlds,
-)
+from ethbrake_marl.stepping import BAD_ACTION, ENDED, OUTCOME_ROWS, START, Step, step_worlds
 
 OnBegin = Callable[[Worlds, Ints], None]  # the new worlds at the alert, and the rows where their episodes start
 Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 
 _RUNNING = ("_state", "_params", "_clock", "_wanted", "_potential")
-
-
-class Step(NamedTuple):
-    """What one step brought, for every world of the batch."""
-
-    reward: Floats  # [n, N]
-    terminated: Bools  # [n] everything at rest, no command that would move it
-    truncated: Bools  # [n] the horizon was reached
-    first_impact_harm: Floats  # [n] of the whole line in this step
-    total_harm: Floats  # [n] likewise
-    safe_end: Bools  # [n] the episode ended with this step without any collision
-    command_mps2: Floats  # [n, N] wanted by each vehicle in this step
-    params: RewardParams
-    further: dict[str, Floats]  # terms that the harm does not tell
-
-    @property
-    def ended(self) -> Bools:
-        """Episodes that ended with this step, [n]."""
-        return self.terminated | self.truncated
-
-    @property
-    def terms(self) -> dict[str, Floats]:
-        """Unweighted reward terms, each [n, N]."""
-        harm = self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
-        return shared_terms(self.params, harm, self.safe_end, self.reward.shape) | self.further
 
 
 class Engine:
@@ -136,6 +89,7 @@ class Engine:
         times = scenario.time_step_s, scenario.horizon_s
         self._settings = np.array([*times, self.reward.harm, total, self.reward.terminal])
         self._moves_reward = self.reward.collision + self.reward.risk + self.reward.jerk > 0.0
+        self._more_terms = self._moves_reward or self.reward.shaping > 0.0
         self._stream = Stream(scenario, self.deciders, self.scripts, seed)
         self.reset(worlds=worlds)
 
@@ -240,27 +194,15 @@ class Engine:
             worlds = self.worlds
             for vehicle, script in self._remembering.items():
                 self._wanted[:, vehicle] = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
-        reward = np.empty(self._wanted.shape)
-        harm, flags = np.empty((HARM_ROWS, self.n)), np.empty((FLAG_ROWS, self.n), np.uint8)
+        reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
         world, status = step_worlds(
             self._state, self._params, self._clock, columns, self._learner_index, self._settings, NO_ROWS,
-            self._wanted, reward, harm, flags,
+            self._wanted, reward, outcome,
         )  # fmt: skip
         if status != DONE:
             self._fail(world, status, columns)
-        end = flags.view(np.bool_)
-        step = Step(
-            reward,
-            end[TERMINATED],
-            end[TRUNCATED],
-            harm[STEP_FIRST_HARM],
-            harm[STEP_TOTAL_HARM],
-            end[SAFE_END],
-            self._wanted.copy(),
-            self.reward,
-            {},
-        )
-        if self._moves_reward or self.reward.shaping > 0.0:
+        step = Step(reward, outcome, self.reward, {})
+        if self._more_terms:
             self._add_further_terms(step)
         return step
 

@@ -18,10 +18,10 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, evaluate, parameter_line, summarise
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.learning.bundle import Policy
-from ethbrake_marl.learning.callback import Progress
+from ethbrake_marl.learning.callback import Evaluate, Progress
 from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.learning.run_directory import RunDirectory, RunStatus
-from ethbrake_marl.learning.train import TrainResult, train
+from ethbrake_marl.learning.train import TrainResult, resume, train
 from ethbrake_marl.learning.versions import installed_versions
 from ethbrake_marl.lineup import EPISODES, LIST_SEED, PROGRESS_EVERY, make_lineup
 from ethbrake_marl.results_folder import write_figures, write_page, write_results
@@ -97,14 +97,6 @@ def train_measured(
 
     The list is the first part of that seed's evaluation list: metrics are those of ``evaluate`` on it.
     """
-    plan = recipe.evaluation
-    worlds = scenario.sample(plan.worlds, plan.seed) if len(scenario.learners) == 1 else None
-
-    def measure(policy: Policy) -> dict[str, float]:
-        assert worlds is not None
-        row = summarise(evaluate(worlds, {"ppo": LearnedAgent(policy, "ppo")}, scenario=scenario))[0]
-        return {name: getattr(row, name).value for name in ("first_impact_harm", "total_harm", "collision_rate")}
-
     return train(
         recipe,
         scenario,
@@ -112,9 +104,29 @@ def train_measured(
         steps=steps,
         seed=seed,
         force=force,
-        evaluate=None if worlds is None else measure,
+        evaluate=measure_on_list(recipe, scenario),
         on_progress=on_progress,
     )
+
+
+def resume_measured(
+    directory: Path, *, on_progress: Callable[[Progress], None] | None = None, other_versions: bool = False
+) -> TrainResult:
+    """Go on with a training of ``train_measured`` or ``run_experiment``, as ``learning.train.resume`` does."""
+    return resume(directory, evaluate=measure_on_list, on_progress=on_progress, other_versions=other_versions)
+
+
+def measure_on_list(recipe: TrainingRecipe, scenario: Scenario) -> Evaluate | None:
+    """What measures a policy on the recipe's fixed list; None with several learners, of whom none is *the* vehicle."""
+    if len(scenario.learners) != 1:
+        return None
+    worlds = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
+
+    def measure(policy: Policy) -> dict[str, float]:
+        row = summarise(evaluate(worlds, {"policy": LearnedAgent(policy)}, scenario=scenario))[0]
+        return {name: getattr(row, name).value for name in ("first_impact_harm", "total_harm", "collision_rate")}
+
+    return measure
 
 
 def run_experiment(
@@ -129,7 +141,7 @@ def run_experiment(
     force: bool = False,
     on_stage: OnStage | None = None,
 ) -> ExperimentResult:
-    """Train PPO on ``scenario``, evaluate it, its hybrid and the baselines on a fixed list, write everything.
+    """Train a policy on ``scenario``, evaluate it, its hybrid and the baselines on a fixed list, write everything.
 
     ``seed`` is the training's; the list is ``episodes`` worlds of ``list_seed``. Ctrl-C during the training ends it
     after the update in progress, and the policy so far is evaluated; a second one, or one during the evaluation,
@@ -147,7 +159,7 @@ def run_experiment(
         steps=steps,
         seed=seed,
         force=force,
-        on_progress=lambda p: tell(Stage("training", p.steps, p.total_steps, p.metrics)),
+        on_progress=lambda p: tell(Stage("training", p.steps, p.total_steps, p.metrics, p.note)),
     )
     run = RunDirectory(trained.directory)
     with _status(run, trained.status):
@@ -162,10 +174,11 @@ def run_experiment(
 
 
 def _agents(policy: Policy, scenario: Scenario) -> dict[str, Agent]:
-    """The baselines, the policy alone (``ppo``), and the policy behind its shield (``hybrid``)."""
+    """The baselines, the policy alone (``ppo`` or ``sac``), and the policy behind its shield (``hybrid``)."""
+    name = policy.manifest.algorithm
     learned: dict[str, Agent] = {
-        "ppo": LearnedAgent(policy, "ppo"),
-        "hybrid": HybridAgent(LearnedAgent(policy, "ppo"), scenario),
+        name: LearnedAgent(policy, name),
+        "hybrid": HybridAgent(LearnedAgent(policy, name), scenario),
     }
     return {**make_lineup(BASELINES, scenario), **learned}
 
@@ -221,7 +234,9 @@ def _shown(
         "Reward": _reward(config["recipe"]["reward"]),
         "Whole run": f"{wall_s:.0f} s",
     }
-    summary = f"PPO after {trained.steps:,} steps, alone and behind its shield, against the baselines."
+    manifest = trained.policy.manifest
+    which = f"{manifest.algorithm.upper()} after {manifest.steps:,} steps (least harm on its own list)"
+    summary = f"{which}, alone and behind its shield, against the baselines."
     if trained.status == "interrupted":
         summary += " The training was interrupted; this is the policy it had by then."
     return write_page(run.path, rows, figures, summary=summary, settings=settings, versions=installed_versions())

@@ -53,7 +53,7 @@ NEIGHBOUR_FEATURES = (
     Feature("mass", "t", 10.0, 0.0, 8.0, "its mass"),
     Feature("latency_left", "s", 1.0, 0.0, 4.0, "time until its commands take effect"),
     Feature("hit", "1", 1.0, 0.0, 1.0, "1 if the pair on its side has had an impact"),
-    Feature("stopping_margin", "m", 10.0, -5.0, 5.0, "gap left at rest if both brake fully as soon as they can"),
+    Feature("stopping_margin", "m", 10.0, -15.0, 20.0, "gap left at rest if both brake fully as soon as they can"),
     Feature(
         "fitting_deceleration",
         "m/s2",

@@ -21,7 +21,8 @@ from ethbrake_marl.evaluation.table import BASELINE
 from ethbrake_marl.evaluation.trajectories import trajectories
 
 REFERENCES = ("full_brake", "e_v2x_bm")  # level lines beside the learning curve
-SHOWN = ("full_brake", "e_v2x_bm", "ppo")  # columns of the figure of one episode
+LEARNED = ("ppo", "sac")  # what the trained policy may be called
+SHOWN = ("full_brake", "e_v2x_bm")  # columns of the figure of one episode, and the policy
 
 LEARNING_CURVE = "learning_curve.png"
 HARM_AGAINST_GAP = "harm_against_gap.png"
@@ -73,7 +74,7 @@ def write_figures(
     world = evaluation.worlds.take([shown])
     records = {
         name: record_episode(world, agents[name], scenario=evaluation.scenario, vehicle=evaluation.vehicle)
-        for name in SHOWN
+        for name in (*SHOWN, learned_name(evaluation))
     }
     drawn = {
         LEARNING_CURVE: learning_curve(course, references=references, caption=course_caption),
@@ -106,13 +107,18 @@ FIGURE_TEXTS = {
 }
 
 
+def learned_name(evaluation: Evaluation) -> str:
+    """What the trained policy is called among the agents."""
+    return next(name for name in LEARNED if name in evaluation.outcomes)
+
+
 def telling_world(evaluation: Evaluation) -> int:
     """Row of the world to draw: median saving of the policy among the worlds where full braking harms, else row 0."""
     before = evaluation.outcome(BASELINE).first_impact_harm
     rows = np.flatnonzero(before > 0.0)
     if not len(rows):
         return 0
-    saved = before[rows] - evaluation.outcome("ppo").first_impact_harm[rows]
+    saved = before[rows] - evaluation.outcome(learned_name(evaluation)).first_impact_harm[rows]
     order = np.argsort(saved, kind="stable")
     return int(rows[order[(len(order) - 1) // 2]])
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -30,6 +30,7 @@ from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Worlds, forecast
 
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Value = TypeVar("Value", float, Floats)
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
@@ -110,20 +111,25 @@ class StepOutcome:
     time_step_s: float
 
 
-def shared_terms(params: RewardParams, harm: Floats, safe_end: Bools, shape: tuple[int, ...]) -> dict[str, Floats]:
-    """The terms that are the same for all vehicles and need no more than the step's facts; ``harm`` as counted."""
+def shared_terms(params: RewardParams, harm: Value, safe_end: Value) -> dict[str, Value]:
+    """The terms that all vehicles share and that need no more than the step's facts, of many worlds [n] or of one.
+
+    ``harm`` as counted; ``safe_end`` is 1 or 0.
+    """
     terms = {}
     if params.harm > 0.0:
-        terms["harm"] = _shared(-harm, shape)
+        terms["harm"] = -harm
     if params.terminal > 0.0:
-        terms["terminal"] = _shared(safe_end.astype(np.float64), shape)
+        terms["terminal"] = safe_end
     return terms
 
 
 def reward_terms(params: RewardParams, step: StepOutcome) -> dict[str, Floats]:
     """Unweighted terms of one step, each [n, N]; only those with a weight above 0 (all but shaping)."""
     harm = step.first_impact_harm if params.harm_count == "first" else step.total_harm
-    return shared_terms(params, harm, step.safe_end, step.speeds_mps.shape) | further_terms(params, step)
+    shared = shared_terms(params, harm, step.safe_end.astype(np.float64))
+    spread = {name: _shared(term, step.speeds_mps.shape) for name, term in shared.items()}
+    return spread | further_terms(params, step)
 
 
 def further_terms(params: RewardParams, step: StepOutcome) -> dict[str, Floats]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,11 +13,15 @@ import typer
 
 from ethbrake_marl.analysis.best_harm import BUDGET, search_list
 from ethbrake_marl.analysis.best_harm_table import BestHarmTable, load_table, save_table
+from ethbrake_marl.analysis.lower_bound import lower_bound
 from ethbrake_marl.command_options import ForceOption, JsonOption, ScenarioOption
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
+from ethbrake_marl.evaluation.regret import limits_do_not_apply
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.terminal import interruptible, progress_bars, say, write_json
 
 TABLE_ENDING = ".npz"
@@ -74,12 +81,13 @@ def best_harm_command(
             chunks=parts,
             on_progress=lambda done, total: bars.show("best harm", done, total),
         )
-    table = BestHarmTable(table.identity, table.best, {**table.header, "episodes": episodes, "list_seed": seed})
+    text = _command_text(scenario, episodes, seed, count, names, budget, search_seed, start)
+    table = replace(table, header={**table.header, "episodes": episodes, "list_seed": seed, "command": text})
     if output is not None and parts is not None:
         save_table(output, table)
         shutil.rmtree(parts)
         say(f"every world: {output}")
-    figures = best_harm_figures(table)
+    figures = {**best_harm_figures(table), **_proven(chosen, sample.worlds, controlled or chosen.learners)}
     if as_json:
         write_json(figures)
         return
@@ -95,3 +103,24 @@ def best_harm_figures(table: BestHarmTable) -> dict[str, object]:
         figures[name] = float(best.harm.mean())
         figures["harmless_rate"] = float((best.harm == 0.0).mean())
     return figures
+
+
+def _command_text(
+    scenario: str, episodes: int, seed: int, count: HarmCount | None, vehicles: Sequence[str] | None, budget: int,
+    search_seed: int, start: Path | None,
+) -> str:  # fmt: skip
+    """The command that makes the same table, for its header: every option that changes a result."""
+    words = ["ethbrake", "best-harm", "--scenario", scenario, "--episodes", str(episodes), "--seed", str(seed)]
+    words += [] if count is None else ["--count", count]
+    words += [] if vehicles is None else ["--vehicles", ",".join(vehicles)]
+    words += ["--budget", str(budget), "--search-seed", str(search_seed)]
+    words += [] if start is None else ["--start", start.name]
+    return shlex.join([*words, "--output", "FILE.npz"])
+
+
+def _proven(scenario: Scenario, worlds: Worlds, vehicles: Sequence[int]) -> dict[str, object]:
+    """The mean harm (m2/s2) that no command undercuts, where that is proven: one of three vehicles is controlled."""
+    if len(vehicles) != 1 or limits_do_not_apply(worlds, scenario, vehicles[0]) is not None:
+        return {}
+    proven = lower_bound(worlds, vehicles[0], horizon_s=scenario.horizon_s)
+    return {"proven_harm": float(proven.harm.mean()), "impact_proven_rate": float(proven.impact_proven.mean())}

@@ -1,15 +1,16 @@
-"""The compiled step of the engine: actions to commands, motion, episode ends, and the terms of reward that all share.
+"""The compiled step of the engine: actions to commands, motion, episode ends, the terms of reward that all share.
 
 Worlds are rows of ``physics.packed``; ``clock`` [n, 4] holds what an episode needs beside them.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from numpy.typing import NDArray
 
 from ethbrake_marl.actions import command_of
-from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
 from ethbrake_marl.physics.packed import (
@@ -34,6 +35,7 @@ from ethbrake_marl.physics.segment import (
     TOTAL_HARM,
     advance_table,
 )
+from ethbrake_marl.rewards import RewardParams, shared_terms
 
 # columns of clock
 START = 0  # time of the first decision (s)
@@ -41,27 +43,87 @@ STEP = 1  # steps taken
 LAST_STEP = 2  # the step that ends at the horizon
 ENDED = 3  # 1 once the episode has ended
 CLOCK_WIDTH = 4
-# rows of step_harm: what the step brought to each world
+# rows of outcome: what the step brought to each world
 STEP_FIRST_HARM = 0
 STEP_TOTAL_HARM = 1
-HARM_ROWS = 2
-# rows of flags: how the step ended each episode, if it did
-TERMINATED = 0
-TRUNCATED = 1
-SAFE_END = 2  # without any collision
-FLAG_ROWS = 3
-Flags = NDArray[np.uint8]  # truth values; to hand over an array of booleans takes longer than to step a world
+TERMINATED = 2  # 1 if the step ended the episode in this way, else 0
+TRUNCATED = 3
+SAFE_END = 4  # without any collision
+OUTCOME_ROWS = 5
 # places in settings
 TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT = range(5)
 BAD_ACTION = -1
 
 
+class Step(NamedTuple):
+    """What one step brought, for every world of the batch."""
+
+    reward: Floats  # [n, N]
+    outcome: Floats  # [OUTCOME_ROWS, n] as the kernel tells it; read it through the properties
+    params: RewardParams
+    further: dict[str, Floats]  # unweighted reward terms that differ between vehicles or need the motion, each [n, N]
+
+    @property
+    def terminated(self) -> Bools:
+        """Episodes that ended with this step with everything at rest and no command that would move it, [n]."""
+        return self._is(TERMINATED)
+
+    @property
+    def truncated(self) -> Bools:
+        """Episodes that reached the horizon with this step, [n]."""
+        return self._is(TRUNCATED)
+
+    @property
+    def ended(self) -> Bools:
+        """Episodes that ended with this step, [n]."""
+        return self.terminated | self.truncated
+
+    @property
+    def safe_end(self) -> Bools:
+        """Episodes that ended with this step without any collision, [n]."""
+        return self._is(SAFE_END)
+
+    @property
+    def first_impact_harm(self) -> Floats:
+        """Of the whole line in this step, [n]."""
+        harm: Floats = self.outcome[STEP_FIRST_HARM]
+        return harm
+
+    @property
+    def total_harm(self) -> Floats:
+        """Likewise, every impact counted, [n]."""
+        harm: Floats = self.outcome[STEP_TOTAL_HARM]
+        return harm
+
+    @property
+    def shared(self) -> dict[str, Floats]:
+        """Unweighted reward terms that are the same for all vehicles of a world, each [n]."""
+        return shared_terms(self.params, self.outcome[self._counted], self.outcome[SAFE_END])
+
+    def shared_in(self, world: int) -> dict[str, float]:
+        """The same of one world, as plain numbers."""
+        tell = self.outcome.item
+        return shared_terms(self.params, tell(self._counted, world), tell(SAFE_END, world))
+
+    @property
+    def _counted(self) -> int:
+        return STEP_FIRST_HARM if self.params.harm_count == "first" else STEP_TOTAL_HARM
+
+    def ending(self, world: int) -> tuple[bool, bool]:
+        """Whether this step terminated the episode of one world, and whether it truncated it."""
+        return self.outcome.item(TERMINATED, world) == 1.0, self.outcome.item(TRUNCATED, world) == 1.0
+
+    def _is(self, row: int) -> Bools:
+        truth: Bools = self.outcome[row] == 1.0
+        return truth
+
+
 @compiled
 def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to functions costs more than the work
     state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
-    wanted: Floats, reward: Floats, step_harm: Floats, flags: Flags,
+    wanted: Floats, reward: Floats, outcome: Floats,
 ) -> tuple[int, int]:  # fmt: skip
-    """Advance every running world by one step, in place (state, clock, wanted); fills the last three arrays.
+    """Advance every running world by one step, in place (state, clock, wanted); fills the last two arrays.
 
     ``actions`` [n, L] become the learners' commands in ``wanted`` [n, N]; nothing is moved if one of them is not in
     [-1, 1]. Returns a world and what went wrong there (BAD_ACTION or a status of the kernel), or (-1, DONE).
@@ -79,10 +141,8 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     table = np.zeros((TABLE_ROWS, N))
     for k in range(n):
         if clock[k, ENDED] == 1.0:
-            for f in range(HARM_ROWS):
-                step_harm[f, k] = 0.0
-            for f in range(FLAG_ROWS):
-                flags[f, k] = 0
+            for f in range(OUTCOME_ROWS):
+                outcome[f, k] = 0.0
             for i in range(N):
                 reward[k, i] = 0.0
             continue
@@ -122,14 +182,14 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             first_harm += table[FIRST_HARM, p]
             total_harm += table[TOTAL_HARM, p]
             impacts += state[k, harm + 2 * P + p]
-        step_harm[STEP_FIRST_HARM, k] = first_harm
-        step_harm[STEP_TOTAL_HARM, k] = total_harm
+        outcome[STEP_FIRST_HARM, k] = first_harm
+        outcome[STEP_TOTAL_HARM, k] = total_harm
         over = at_rest or at_horizon
         clock[k, ENDED] = 1.0 if over else 0.0
-        flags[TERMINATED, k] = at_rest
-        flags[TRUNCATED, k] = over and not at_rest
-        flags[SAFE_END, k] = over and impacts == 0.0
-        shared = settings[TERMINAL_WEIGHT] if flags[SAFE_END, k] == 1 else 0.0
+        outcome[TERMINATED, k] = 1.0 if at_rest else 0.0
+        outcome[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
+        outcome[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
+        shared = settings[TERMINAL_WEIGHT] if outcome[SAFE_END, k] == 1.0 else 0.0
         shared -= settings[HARM_WEIGHT] * (total_harm if settings[HARM_IS_TOTAL] == 1.0 else first_harm)
         for i in range(N):
             reward[k, i] = shared

@@ -96,7 +96,8 @@ def test_renew__leaves_what_the_other_rows_wanted():
             return -worlds.time_s
 
     running = engine(third=ByTheClock())
-    wanted = running.step({1: np.zeros(2)}).command_mps2
+    running.step({1: np.zeros(2)})
+    wanted = running.wanted_mps2.copy()
     running.renew(np.array([1]))
     assert running.wanted_mps2[0].tolist() == wanted[0].tolist()
     assert running.wanted_mps2[1, 2] == 0.0

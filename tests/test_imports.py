@@ -24,6 +24,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("scenario", "v2x"),
     ("actions", "observations", "rewards"),
     ("stepping", "starts", "engine"),
+    ("snapshots",),
     ("agents",),
     ("envs",),
     ("ethbrake_v0",),
@@ -34,7 +35,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("experiment",),
     ("__init__",),
     ("doctor", "terminal", "command_options", "machine", "benchmark", "scaling"),
-    ("picture_commands", "search_commands", "bench_commands"),
+    ("picture_commands", "search_commands", "bench_commands", "training_commands"),
     ("cli", "__main__"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
 
 from ethbrake_marl.agents.coupled import optimise_coupled
+from ethbrake_marl.agents.others import fixed_commands
 from ethbrake_marl.agents.pairwise import optimise_pairwise
 from ethbrake_marl.agents.protocol import place, recall
 from ethbrake_marl.errors import InvalidInput
@@ -65,18 +65,13 @@ class EV2XBM:
 
     def _others_mps2(self, worlds: Worlds, vehicle: int) -> Floats:
         """What every vehicle will do, [n, N] m/s2; only the columns of the others are meant."""
-        command = -worlds.vehicles.braking_capacity_mps2
-        for i, script in self.others.items():
-            if i == vehicle:
-                continue
-            if not (is_state_free(script) or (isinstance(script, EV2XBM) and script.decides_before(vehicle))):
-                name = getattr(script, "name", type(script).__name__)
-                raise InvalidInput(
-                    f"agent {self.name!r}: vehicle_{i + 1} is driven by {name!r}, whose command is not fixed at the"
-                    f" alert before vehicle_{vehicle + 1} chooses; take e_v2x_bm:pairwise, which needs nobody's"
-                    " command, for one of the two"
-                )
-            asked = copy.deepcopy(script)  # what it remembers of running episodes is not disturbed
-            asked.begin(worlds, i, np.arange(worlds.n))
-            command[:, i] = asked.act(worlds, i)
-        return command
+
+        def is_fixed(script: Script) -> bool:
+            return is_state_free(script) or (isinstance(script, EV2XBM) and script.decides_before(vehicle))
+
+        advice = (
+            f" before vehicle_{vehicle + 1} chooses; take e_v2x_bm:pairwise, which needs nobody's command, for one of"
+            " the two"
+        )
+        who = f"agent {self.name!r}"
+        return fixed_commands(self.others, worlds, who, vehicle=vehicle, is_fixed=is_fixed, advice=advice)

@@ -51,8 +51,7 @@ class Planner:
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Make the first plan of these rows' episodes."""
-        others = {i: script for i, script in self.others.items() if i != vehicle}
-        command = fixed_commands(others, worlds, f"agent {self.name!r}")
+        command = fixed_commands(self.others, worlds, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._problem(worlds, vehicle, command)
         pairwise = -optimise_pairwise(worlds, vehicle).deceleration_mps2
         found = self._search(problem, constant_profiles(problem, pairwise[:, np.newaxis, np.newaxis]))

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.physics import Floats, Ints
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
 from ethbrake_marl.physics.impact import GAP, SPEED
 from ethbrake_marl.physics.segment import (
     COMMAND,
@@ -127,7 +127,7 @@ def at_rest(table: Floats) -> bool:
     return True
 
 
-@compiled
+@compiled_apart
 def follow_whole(world: Setting, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
     """``follow`` a profile from its first phase on."""
     phase = min(0, ends.shape[0])  # 0, but no literal, for which everything would be compiled a second time

@@ -26,7 +26,7 @@ from ethbrake_marl.agents.profile_moves import (
     split_phases,
 )
 from ethbrake_marl.physics import Floats, Ints
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
 
 MOST_PHASES = 12
 DRAWN_PHASES = 6  # of a random profile
@@ -59,7 +59,7 @@ def search_world(
     """
     K, C = commands.shape
     states = np.zeros((K + 1, start.shape[0]))
-    states[0] = start
+    copy_rows(start.reshape(1, -1), states, 1)
     M, rounds = SMALLEST_FIELD, 3
     while budget >= 2 * M * PER_PROFILE and M < LARGEST_FIELD:
         M *= 2
@@ -77,24 +77,40 @@ def search_world(
         elif stage == rounds + 1:
             select_stepwise(world, seed_ends, seed_commands, states, field)
             each = stepwise
-        # The only place that calls improve, which is the larger part of what is compiled here.
         for m in range(left):
             used = field.phases[m]
             if used > 0 and field.values[0] > 0.0:
                 field.values[m] = improve(world, field.ends[m, :used], field.commands[m, :used], states, each)
         sort(field, left)
     used = field.phases[0]
-    ends[:] = field.ends[0]
-    commands[:] = field.commands[0]
     if used == 0:
         return 0
+    copy_profile(field.ends[0], field.commands[0], ends, commands)
     used = compact(ends[:used], commands[:used], used)
-    ends[used:] = int(world.clock[LAST_STEP])
-    commands[used:] = commands[used - 1]
+    for k in range(used, K):
+        ends[k] = int(world.clock[LAST_STEP])
+        for c in range(C):
+            commands[k, c] = commands[used - 1, c]
     return used
 
 
 @compiled
+def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Floats) -> None:
+    """Copy the phases of one profile over the first ones of another."""
+    for k in range(ends.shape[0]):
+        to_ends[k] = ends[k]
+    copy_rows(commands, to_commands, commands.shape[0])
+
+
+@compiled
+def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
+    """Copy the first ``n`` rows. (An assignment of slices compiles ten times longer, for its message of an error.)"""
+    for k in range(n):
+        for c in range(rows.shape[1]):
+            to_rows[k, c] = rows[k, c]
+
+
+@compiled_apart
 def improve(world: Setting, ends: Ints, commands: Floats, states: Floats, budget: int) -> float:
     """Better and better neighbours of a profile, in place, until ``budget`` candidates have run; its value."""
     new_ends, new_commands, new_states = ends.copy(), commands.copy(), states.copy()
@@ -106,12 +122,11 @@ def improve(world: Setting, ends: Ints, commands: Floats, states: Floats, budget
         if spent >= 0:
             if not again:
                 phase = draw_change(world.random, world.bounds, active, change)
-            new_ends[:] = ends
-            new_commands[:] = commands
+            copy_profile(ends, commands, new_ends, new_commands)
             again = False
             if not apply_change(change, world.bounds, new_ends, new_commands):
                 continue
-            new_states[phase] = states[phase]
+            copy_rows(states[phase:], new_states[phase:], 1)
         spent += 1
         new_value, reached = follow(world, new_ends, new_commands, new_states, phase, value)
         if reached < 0 or not new_value < value:
@@ -119,16 +134,16 @@ def improve(world: Setting, ends: Ints, commands: Floats, states: Floats, budget
                 return math.inf
             continue
         value, active = new_value, reached
-        ends[:] = new_ends
-        commands[:] = new_commands
-        states[phase + 1 : reached + 1] = new_states[phase + 1 : reached + 1]
+        copy_profile(new_ends, new_commands, ends, commands)
+        copy_rows(new_states[phase + 1 :], states[phase + 1 :], reached - phase)
         change[AMOUNT] *= 2.0
         again = spent > 0 and change[KIND] != SET_COMMAND
-    ends[active - 1 :] = int(world.clock[LAST_STEP])  # the episode is over by then
+    for k in range(active - 1, ends.shape[0]):
+        ends[k] = int(world.clock[LAST_STEP])  # the episode is over by then
     return value
 
 
-@compiled
+@compiled_apart
 def gather(world: Setting, seed_ends: Ints, seed_commands: Floats, states: Floats, drawn: int, field: Field) -> None:
     """Fill the field with the best of the given profiles and of ``drawn`` random ones, all of different value."""
     Q, K = seed_ends.shape
@@ -138,35 +153,67 @@ def gather(world: Setting, seed_ends: Ints, seed_commands: Floats, states: Float
     for s in range(Q + drawn):
         used = DRAWN_PHASES
         if s < Q:
-            ends[:] = seed_ends[s]
-            commands[:] = seed_commands[s]
-            used = int(np.argmax(ends == last)) + 1
+            copy_profile(seed_ends[s], seed_commands[s], ends, commands)
+            used = 1
+            while used < K and ends[used - 1] != last:
+                used += 1
         else:
             draw_profile(world.random, world.bounds, ends[:used], commands[:used], last)
         value, reached = follow_whole(world, ends[:used], commands[:used], states, field.values[worst])
-        if reached < 0 or not value < field.values[worst] or np.min(np.abs(field.values - value)) < SAME:
+        if reached < 0 or not value < field.values[worst] or is_among(value, field.values):
             continue
-        field.ends[worst] = ends
-        field.commands[worst] = commands
+        copy_profile(ends, commands, field.ends[worst], field.commands[worst])
         field.phases[worst] = used
         field.values[worst] = value
         if value <= 0.0:
             break
-        worst = int(np.argmax(field.values))
+        worst = largest(field.values)
     sort(field, field.values.shape[0])
 
 
-@compiled
+@compiled_apart
 def sort(field: Field, left: int) -> None:
     """Put the first ``left`` places of the field in order of value."""
-    order = np.argsort(field.values[:left], kind="mergesort")
-    field.values[:left] = field.values[:left][order]
-    field.phases[:left] = field.phases[:left][order]
-    field.ends[:left] = field.ends[:left][order]
-    field.commands[:left] = field.commands[:left][order]
+    for here in range(1, left):
+        m = here
+        while m > 0 and field.values[m] < field.values[m - 1]:
+            swap(field, m)
+            m -= 1
 
 
 @compiled
+def swap(field: Field, m: int) -> None:
+    """Exchange place m of the field with the one before it."""
+    field.values[m], field.values[m - 1] = field.values[m - 1], field.values[m]
+    field.phases[m], field.phases[m - 1] = field.phases[m - 1], field.phases[m]
+    for k in range(field.ends.shape[1]):
+        field.ends[m, k], field.ends[m - 1, k] = field.ends[m - 1, k], field.ends[m, k]
+        for c in range(field.commands.shape[2]):
+            before = field.commands[m - 1, k, c]
+            field.commands[m - 1, k, c] = field.commands[m, k, c]
+            field.commands[m, k, c] = before
+
+
+@compiled
+def is_among(value: float, values: Floats) -> bool:
+    """Whether one of ``values`` belongs to the same profile as this one."""
+    for other in values:  # noqa: SIM110  # any() is not compiled
+        if abs(other - value) < SAME:
+            return True
+    return False
+
+
+@compiled
+def largest(values: Floats) -> int:
+    """Place of the first largest value."""
+    place = 0
+    for k in range(values.shape[0]):
+        if values[k] > values[place]:
+            place = k
+    return place
+
+
+@compiled_apart
 def divide(world: Setting, field: Field) -> None:
     """Give the best of the field as many phases as there may be."""
     used = field.phases[0]
@@ -177,7 +224,7 @@ def divide(world: Setting, field: Field) -> None:
         field.phases[0] = K
 
 
-@compiled
+@compiled_apart
 def select_stepwise(world: Setting, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Field) -> None:
     """From now on advance decision by decision; put the best of the field and the given profiles in the first place.
 
@@ -197,11 +244,9 @@ def select_stepwise(world: Setting, seed_ends: Ints, seed_commands: Floats, stat
         value, reached = follow_whole(world, ends, commands, states, least)
         if reached > 0 and value < least:
             least, size = value, n
-            best_ends[:n] = ends
-            best_commands[:n] = commands
+            copy_profile(ends, commands, best_ends, best_commands)
             if value <= 0.0:
                 break
-    field.ends[0] = best_ends
-    field.commands[0] = best_commands
+    copy_profile(best_ends, best_commands, field.ends[0], field.commands[0])
     field.phases[0] = size
     field.values[0] = least

@@ -15,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.agents.profile_motion import STEPWISE, Setting, Words, follow_whole
 from ethbrake_marl.agents.profile_problem import ProfileProblem, seeded
-from ethbrake_marl.agents.profile_search import MOST_PHASES, search_world
+from ethbrake_marl.agents.profile_search import MOST_PHASES, copy_rows, search_world
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Floats, Ints
@@ -161,9 +161,8 @@ def make_setting(
     """One world's setting, with room to work in."""
     N = mass.shape[0]
     table = np.zeros((TABLE_ROWS, N))
-    table[COMMAND] = command
-    table[MASS] = mass
-    table[LIMIT] = limit
+    for i in range(N):
+        table[COMMAND, i], table[MASS, i], table[LIMIT, i] = command[i], mass[i], limit[i]
     return Setting(table, np.zeros((2, N - 1)), latency, clock.copy(), vehicles, bounds, random)
 
 
@@ -177,7 +176,7 @@ def follow_worlds(
     for k in range(start.shape[0]):
         world = make_setting(clock[k], bounds[k], command[k], latency[k], mass[k], limit[k], vehicles, no_random)
         states = np.zeros((ends.shape[1] + 1, start.shape[1]))
-        states[0] = start[k]
+        copy_rows(start[k : k + 1], states, 1)
         world.clock[STEPWISE] = 1.0
         if follow_whole(world, ends[k], commands[k], states, math.inf)[1] < 0:
             return k

@@ -52,7 +52,7 @@ class BestHarm:
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Look these rows' worlds up, and search those that are not known."""
-        others = fixed_commands(_without(self.others, vehicle), worlds, f"agent {self.name!r}")
+        others = fixed_commands(self.others, worlds, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._problem(worlds, vehicle, others)
         profiles, known = self._recall(problem, self._count)
         unknown = np.flatnonzero(~known)
@@ -87,10 +87,6 @@ class BestHarm:
         whole.ends[unknown] = found.ends
         whole.commands_mps2[unknown] = found.commands_mps2
         return whole
-
-
-def _without(others: Mapping[int, Script], vehicle: int) -> dict[int, Script]:
-    return {i: script for i, script in others.items() if i != vehicle}
 
 
 def _placed(stored: Profiles, rows: Ints, profiles: Profiles, n: int) -> Profiles:

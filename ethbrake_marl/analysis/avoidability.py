@@ -1,4 +1,4 @@
-"""Which collisions nobody could have avoided: exact, world by world, with a witness or the reason.
+"""Which contacts nobody could have avoided: exact, world by world, with a witness or the reason.
 
 One vehicle is controlled, its neighbours brake with their whole capacity from their latencies on. Let z be the
 pointwise largest trajectory behind the vehicle in front: coast to the own latency, drive as long as possible, brake at
@@ -27,7 +27,7 @@ from ethbrake_marl.analysis.avoidability_kernel import (
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 
-REASONS = ("", "early", "front", "rear")  # the name of each code; "" where collisions are avoidable
+REASONS = ("", "early", "front", "rear")  # the name of each code; "" where contact is avoidable
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Avoidability:
 
     @property
     def avoidable(self) -> Bools:
-        """Whether some profile avoids every collision, [n]."""
+        """Whether some profile avoids all contact, hence every impact, [n]."""
         yes: Bools = self.reason == 0
         return yes
 
@@ -63,8 +63,9 @@ class Avoidability:
 
 
 def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str] | None = None) -> Avoidability:
-    """Decide in every world whether ``vehicle`` (index from 0) could have avoided all collisions from now on.
+    """Decide in every world whether ``vehicle`` (index from 0) could have avoided all contact from now on.
 
+    Elsewhere every profile leads to contact, but not always to an impact: see ``LowerBound.impact_proven``.
     Three vehicles with the middle one controlled, or two with either. The others brake with their whole capacity from
     their latencies on. ``scripts`` (index -> name, as ``scenario.scripts``) is only checked to say the same. An overlap
     of the deciding trajectories of up to 1e-12 m counts as a touch, hence as avoided.

@@ -77,7 +77,7 @@ def learner_columns(learners: Sequence[str], actions: Mapping[str, Any]) -> Floa
         action = np.asarray(actions[name])
         if action.shape != (1,) or action.dtype.kind not in "fiu":
             action = checked_action(actions[name], (1,), name)
-        columns[0, c] = action[0]
+        columns[0, c] = action.item()
     return columns
 
 

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_of
-from ethbrake_marl.engine import Engine, Step
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.harm import front_share
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.packed import TIME, command_at, harm_at, params_at
+from ethbrake_marl.stepping import Step
 
 AT_ANY_TIME = (
     "time_s",
@@ -30,25 +31,24 @@ AT_ANY_TIME = (
     "collided",
 )
 AFTER_A_STEP = (*AT_ANY_TIME, "wanted_command_mps2", "applied_action")
-_COLLIDED = AT_ANY_TIME.index("collided")
+_FLOAT32 = np.dtype(np.float32)
 
 
 class Report(NamedTuple):
     """What there is to tell about some worlds."""
 
     values: Floats  # [n, N, len(AFTER_A_STEP)]
-    terms: dict[str, Floats] | None  # reward terms, each [n, N]; None if no step was taken yet
+    step: Step | None  # whose reward terms are told; None: there was none
 
 
 def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
     """The engine's worlds as they are now, before any of them is renewed; only the worlds ``rows`` if given."""
-    packed, wanted = engine.packed, engine.wanted_mps2
-    state, params = packed.state, packed.params
+    (state, params), wanted = engine.packed, engine.wanted_mps2
     if rows is not None:
         state, params, wanted = (array.take(rows, axis=0) for array in (state, params, wanted))
     values = np.empty((*wanted.shape, len(AFTER_A_STEP)))
     _report_rows(state, params, wanted, values)
-    return Report(values, None if step is None else step.terms)
+    return Report(values, step)
 
 
 @compiled
@@ -82,38 +82,47 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 def plain_infos(told: Report, vehicles: Ints | None = None) -> list[dict[str, Any]]:
     """Infos of these vehicles (None: of all), world by world, as plain numbers; ``applied_action`` is an array [1]."""
-    rows: list[list[Any]] = _of(told.values, vehicles).reshape(-1, len(AFTER_A_STEP)).tolist()
-    if told.terms is None:
-        for values in rows:
-            values[_COLLIDED] = values[_COLLIDED] == 1.0
-        return [dict(zip(AT_ANY_TIME, values, strict=False)) for values in rows]
+    worlds: list[list[list[Any]]] = (told.values if vehicles is None else told.values.take(vehicles, axis=1)).tolist()
+    if told.step is None:
+        return [_at_any_time(values) for world in worlds for values in world]
     infos: list[dict[str, Any]] = []
-    for time, applied, first, total, world_first, world_total, collided, wanted, action in rows:
-        applied_action = np.empty(1, np.float32)
-        applied_action[0] = action
-        infos.append(
-            {
-                "time_s": time,
-                "applied_command_mps2": applied,
-                "first_impact_harm": first,
-                "total_harm": total,
-                "world_first_impact_harm": world_first,
-                "world_total_harm": world_total,
-                "collided": collided == 1.0,
-                "wanted_command_mps2": wanted,
-                "applied_action": applied_action,
-                "reward_terms": {},
-            }
-        )
-    for name, term in told.terms.items():
-        for info, value in zip(infos, _of(term, vehicles).ravel().tolist(), strict=True):
+    for k, world in enumerate(worlds):
+        terms = told.step.shared_in(k)
+        for time, applied, first, total, world_first, world_total, collided, wanted, action in world:
+            applied_action = np.empty(1, _FLOAT32)
+            applied_action[0] = action
+            infos.append(
+                {
+                    "time_s": time,
+                    "applied_command_mps2": applied,
+                    "first_impact_harm": first,
+                    "total_harm": total,
+                    "world_first_impact_harm": world_first,
+                    "world_total_harm": world_total,
+                    "collided": collided == 1.0,
+                    "wanted_command_mps2": wanted,
+                    "applied_action": applied_action,
+                    "reward_terms": terms.copy(),
+                }
+            )
+    for name, term in told.step.further.items():
+        told_of = term if vehicles is None else term.take(vehicles, axis=1)
+        for info, value in zip(infos, told_of.ravel().tolist(), strict=True):
             info["reward_terms"][name] = value
     return infos
 
 
-def _of(values: Floats, vehicles: Ints | None) -> Floats:
-    """The columns of these vehicles, [n, len(vehicles), ...]."""
-    return values if vehicles is None else values.take(vehicles, axis=1)
+def _at_any_time(values: list[Any]) -> dict[str, Any]:
+    time, applied, first, total, world_first, world_total, collided, *_ = values
+    return {
+        "time_s": time,
+        "applied_command_mps2": applied,
+        "first_impact_harm": first,
+        "total_harm": total,
+        "world_first_impact_harm": world_first,
+        "world_total_harm": world_total,
+        "collided": collided == 1.0,
+    }
 
 
 def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools | None) -> dict[str, Any]:
@@ -129,9 +138,14 @@ def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools | None) -
         return info
     columns["applied_action"] = columns["applied_action"].astype(np.float32)[:, np.newaxis]
     info |= _masked({name: columns[name] for name in AFTER_A_STEP[len(AT_ANY_TIME) :]}, stepped)
-    info["reward_terms"] = _masked({name: term[:, vehicle] for name, term in (told.terms or {}).items()}, stepped)
+    terms = {} if told.step is None else told.step.shared | _column(told.step.further, vehicle)
+    info["reward_terms"] = _masked(terms, stepped)
     info["_reward_terms"] = stepped.copy()
     return info
+
+
+def _column(terms: dict[str, Floats], vehicle: int) -> dict[str, Floats]:
+    return {name: term[:, vehicle] for name, term in terms.items()}
 
 
 def _masked(columns: dict[str, NDArray[Any]], rows: Bools) -> dict[str, Any]:

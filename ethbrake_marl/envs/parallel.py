@@ -85,13 +85,13 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         step = self.engine.step(learner_columns(self._learners, actions))
         agents = self.possible_agents
         (rewards,) = step.reward.tolist()
-        terminated, truncated = step.terminated.item(), step.truncated.item()
+        terminated, truncated = step.ending(0)
         infos = self._infos(report(self.engine, step))
         if terminated or truncated:
             self.agents = []
         return (
             self._observations(),
-            {agent: rewards[i] for i, agent in enumerate(agents)},
+            dict(zip(agents, rewards, strict=True)),
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, truncated),
             infos,
@@ -116,8 +116,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         return {agent: every[0, i] for i, agent in enumerate(self.possible_agents)}
 
     def _infos(self, told: Report) -> Infos:
-        infos = plain_infos(told)
-        return {agent: infos[i] for i, agent in enumerate(self.possible_agents)}
+        return dict(zip(self.possible_agents, plain_infos(told), strict=True))
 
 
 parallel_env = EthBrakeParallelEnv

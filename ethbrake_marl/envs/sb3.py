@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from ethbrake_marl.engine import Engine, Step
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.build import make_engine
 from ethbrake_marl.envs.infos import Report, plain_infos, report
 from ethbrake_marl.envs.restart import INITIAL_STATE, check_seed, fresh_seed, restart_from, warn_of_unknown
@@ -22,6 +22,8 @@ from ethbrake_marl.observations import Observations, ObservationSpec
 from ethbrake_marl.physics import Bools, Ints, Worlds, concatenate
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario, initial_state_worlds
+from ethbrake_marl.snapshots import Arrays, engine_snapshot, restore_engine
+from ethbrake_marl.stepping import Step
 
 Rewards = NDArray[np.float32]
 
@@ -105,19 +107,33 @@ class EthBrakeVecEnv(VecEnv):
                 f"step: actions of shape {actions.shape}; one for each row, ({self.num_envs}, 1), is needed"
             )
         step = engine.step(actions.reshape(engine.n, len(learners)))
-        reward = step.reward[:, learners].reshape(-1)
+        reward = step.reward.take(learners, axis=1).reshape(-1)
         self._return += reward
         self._steps += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        ended = np.flatnonzero(step.ended)
+        over = step.ended
+        ended = np.flatnonzero(over)
         if len(ended):
             self._close_episodes(ended, step, infos)
             engine.renew(ended)
             self._begun[ended] = report(engine, rows=ended).values
-        return self._observe(), reward.astype(np.float32), self._by_row(step.ended), infos
+        return self._observe(), reward.astype(np.float32), self._by_row(over), infos
 
     def close(self) -> None:
         """Nothing to release."""
+
+    def snapshot(self) -> Arrays:
+        """Copies of everything that changes while it runs, between two steps."""
+        arrays = {f"engine.{name}": array for name, array in engine_snapshot(self.engine).items()}
+        return arrays | {"return": self._return.copy(), "steps": self._steps.copy(), "begun": self._begun.copy()}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from a ``snapshot`` of the same scenario and size, without a reset; raises ``InvalidInput``."""
+        prefix = "engine."
+        restore_engine(self.engine, {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
+        self._return, self._steps = arrays["return"].copy(), arrays["steps"].copy()
+        self._begun = arrays["begun"].copy()
+        self._next_seed, self._started = None, True
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """The batch's attribute, once per row asked for."""
@@ -141,21 +157,19 @@ class EthBrakeVecEnv(VecEnv):
         """Fill in the infos of the rows whose world has ended, before the next episodes start."""
         rows, final = self._rows(ended), self._observe(ended)
         told = plain_infos(report(self.engine, rows=ended), self._learners)
-        truncated = self._by_row(step.truncated)[rows].tolist()
-        for row, info, cut, seen, gained, steps in zip(
-            rows, told, truncated, final, self._return[rows].tolist(), self._steps[rows].tolist(), strict=True
-        ):
+        truncated = self._by_row(step.truncated[ended]).tolist()
+        gained, steps = self._return.take(rows).tolist(), self._steps.take(rows).tolist()
+        for row, info, cut, seen, gain, count in zip(rows.tolist(), told, truncated, final, gained, steps, strict=True):
             info["TimeLimit.truncated"] = cut
             info["terminal_observation"] = seen.copy()
-            info["episode"] = {"r": gained, "l": steps, "t": 0.0}
+            info["episode"] = {"r": gain, "l": count, "t": 0.0}
             infos[row] = info
         self._return[rows], self._steps[rows] = 0.0, 0
 
-    def _rows(self, worlds: Ints) -> list[int]:
+    def _rows(self, worlds: Ints) -> Ints:
         """Rows of all learners of these worlds, in order."""
         width = len(self.engine.learners)
-        rows: list[int] = (worlds[:, np.newaxis] * width + np.arange(width)).ravel().tolist()
-        return rows
+        return (worlds[:, np.newaxis] * width + np.arange(width)).reshape(-1)
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:

@@ -11,7 +11,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ethbrake_marl.engine import Step
 from ethbrake_marl.envs.build import check_render_mode, make_engine, only_learner
 from ethbrake_marl.envs.infos import batch_info, report
 from ethbrake_marl.envs.restart import check_seed, restart
@@ -21,6 +20,7 @@ from ethbrake_marl.observations import Observations, ObservationSpec
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.stepping import Step
 
 _MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 

@@ -12,14 +12,14 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
 
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.analysis.avoidability import avoidability
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.figure_style import COLOURS, GREY, add_caption, new_figure
 from ethbrake_marl.evaluation.parameters import parameter_line, parameters
-from ethbrake_marl.evaluation.regret import known_limits, limits_do_not_apply
+from ethbrake_marl.evaluation.regret import limits_do_not_apply
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome, controlled_vehicle, evaluate
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.scenario import Scenario, worlds_from_table
-from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.quantities import QUANTITIES
 
 CELLS = 81  # along each gap
@@ -82,8 +82,8 @@ def criticality_map(
     evaluation = evaluate(
         worlds, agents, scenario=scenario, chunk=CHUNK, on_progress=lambda agent, done: tell(agent, done, worlds.n)
     )
-    limits = known_limits(worlds, scenario, evaluation.vehicle)
-    avoidable = None if limits is None else limits.avoidable.reshape(cells, cells)
+    proven = limits_do_not_apply(worlds, scenario, evaluation.vehicle) is None
+    avoidable = avoidability(worlds, evaluation.vehicle).avoidable.reshape(cells, cells) if proven else None
     boundary = avoidability_boundary(scenario, *ranges)
     return CriticalityMap(first, second, evaluation, avoidable, *(boundary or (None, None)))
 
@@ -91,7 +91,7 @@ def criticality_map(
 def avoidability_boundary(scenario: Scenario, range_1_m: Range, range_2_m: Range) -> tuple[Floats, Floats] | None:
     """Smallest second gap at which worlds are avoidable, for first gaps over a range: (gap 1 [B], gap 2 [B]).
 
-    A larger gap to Vehicle 3 never makes a collision unavoidable, so the boundary is found by halving. NaN where it is
+    A larger gap to Vehicle 3 never makes contact unavoidable, so the boundary is found by halving. NaN where it is
     outside the range. None where ``limits_do_not_apply``.
     """
     vehicle = controlled_vehicle(scenario, None)
@@ -99,9 +99,7 @@ def avoidability_boundary(scenario: Scenario, range_1_m: Range, range_2_m: Range
         return None
 
     def avoidable(gap_1_m: Floats, gap_2_m: Floats) -> Bools:
-        limits = known_limits(_worlds_at(scenario, gap_1_m, gap_2_m), scenario, vehicle)
-        assert limits is not None
-        return limits.avoidable
+        return avoidability(_worlds_at(scenario, gap_1_m, gap_2_m), vehicle).avoidable
 
     return _halve(avoidable, np.linspace(*range_1_m, COLUMNS), range_2_m)
 
@@ -138,7 +136,7 @@ def criticality_figure(found: CriticalityMap) -> Figure:
     panels[0].set_ylabel("Gap 2, Vehicle 2 to Vehicle 3 (m)", fontsize=9)
     bar = figure.colorbar(mesh, ax=panels, label="Harm (m²/s²)", pad=0.015)
     bar.ax.tick_params(labelsize=9)
-    line = "Line: above it some command of Vehicle 2 avoids every collision, below it none does (proven)."
+    line = "Line: above it some command of Vehicle 2 avoids all contact, below it none does (proven)."
     if found.boundary_gap_1_m is None:
         line = "Nothing is proven about avoidability for this line-up."
     add_caption(figure, f"{line} White: no harm. {parameter_line(parameters(found.evaluation))}.")
@@ -175,7 +173,7 @@ def _draw_boundary(axes: Axes, found: CriticalityMap) -> None:
 
 def _range_of(scenario: Scenario, pair: int) -> Range:
     """Over which a gap is drawn: what the scenario draws from, or around its fixed number."""
-    low, high = support(scenario.quantities("gaps_m")[pair])
+    low, high = scenario.bounds("gaps_m")[pair]
     return (low, high) if low < high else (FIXED_GAP[0] * low, FIXED_GAP[1] * high)
 
 
@@ -184,7 +182,7 @@ def _worlds_at(scenario: Scenario, gap_1_m: Floats, gap_2_m: Floats) -> Worlds:
     columns = {"gap_1_m": gap_1_m, "gap_2_m": gap_2_m}
     for field, pairs in (("gaps_m", range(2, scenario.vehicles - 1)), ("speeds_mps", range(scenario.vehicles))):
         for i in pairs:
-            low, high = support(scenario.quantities(field)[i])
+            low, high = scenario.bounds(field)[i]
             name = QUANTITIES[field].column_of(i)
             if low != high:
                 raise InvalidInput(

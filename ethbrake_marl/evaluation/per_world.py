@@ -23,6 +23,8 @@ REGRET_COLUMNS = (
     "best_known_first_impact_harm",
     "best_known_total_harm",
     "best_known_source",
+    "impact_proven",
+    "proven_harm",
     "regret_first_impact_harm",
     "regret_total_harm",
 )
@@ -71,6 +73,8 @@ def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
         regrets.first_impact_harm,
         regrets.total_harm,
         regrets.source,
+        regrets.limits.impact_proven.astype(int),
+        regrets.limits.proven_harm,
         regrets.regret(outcome, "first"),
         regrets.regret(outcome, "total"),
     )

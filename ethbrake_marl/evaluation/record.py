@@ -65,7 +65,7 @@ def record_episode(
     while not engine.ended.all():
         before = engine.worlds
         step = engine.step({})
-        segments.append((before, step.command_mps2, float(engine.worlds.time_s[0])))
+        segments.append((before, engine.wanted_mps2.copy(), float(engine.worlds.time_s[0])))
         at_rest = bool(step.terminated[0])
     samples = list(_samples(segments, sample_s))
     time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))

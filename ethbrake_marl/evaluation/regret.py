@@ -1,8 +1,9 @@
 """How far each agent stays from the best that is known: which collisions nobody avoids, and regret world by world.
 
 Three vehicles, Vehicle 2 driven, the others braking fully: for these it is proven world by world whether some command
-avoids every collision (``analysis.avoidability``), and the least harm known is that proof's witness (harm 0), or the
-result of a search (``analysis.best_harm``), or what an agent of the same evaluation achieved, whichever is least.
+avoids all contact (``analysis.avoidability``) and which harm no command undercuts (``analysis.lower_bound``). The least
+harm known is the first proof's witness (harm 0), or the result of a search (``analysis.best_harm``), or what an agent
+of the same evaluation achieved, whichever is least.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.analysis.avoidability import avoidability
 from ethbrake_marl.analysis.best_harm_shipped import best_known
+from ethbrake_marl.analysis.lower_bound import lower_bound
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate, relative_decrease
 from ethbrake_marl.harm import COUNTS, HarmCount
@@ -31,10 +33,16 @@ _VEHICLES, _DRIVEN = 3, 1
 class Limits:
     """What is known of each world before anybody drives: [n] each."""
 
-    avoidable: Bools  # some admissible command of Vehicle 2 avoids every collision
+    avoidable: Bools  # some admissible command of Vehicle 2 avoids all contact
     reason: NDArray[np.str_]  # why not: "early", "front" or "rear"; "" where avoidable
     first_impact_harm: Floats  # least known (m2/s2): 0 where avoidable, else a table's; NaN in no table
     total_harm: Floats
+    proven_harm: Floats  # no command does less harm than this (m2/s2), under either count
+
+    @property
+    def impact_proven(self) -> Bools:
+        """Worlds in which every command leads to an impact, not only to contact."""
+        return self.proven_harm > 0.0
 
     @property
     def known(self) -> Bools:
@@ -69,10 +77,14 @@ class Regrets:
 class Distance:
     """One agent's summary: what was avoidable, and how far it stayed from the best known; all None if unknown."""
 
-    unavoidable_rate: Estimate | None = None  # of the worlds, whoever drives
+    unavoidable_rate: Estimate | None = None  # worlds without any command that avoids contact, whoever drives
+    impact_proven_rate: Estimate | None = None  # worlds without any command that avoids an impact
     avoidable_collision_rate: Estimate | None = None  # worlds that collided and need not have
     best_known_first: Estimate | None = None  # mean best known harm (m2/s2)
     best_known_total: Estimate | None = None
+    proven_harm: Estimate | None = None  # mean harm that no command undercuts (m2/s2)
+    gap_first: Estimate | None = None  # mean best known harm above the proven one (m2/s2)
+    gap_total: Estimate | None = None
     regret_first: Estimate | None = None  # mean harm above the best known (m2/s2)
     regret_total: Estimate | None = None
     realised_first: Estimate | None = None  # (full_brake - agent) / (full_brake - best known)
@@ -84,9 +96,13 @@ class Distance:
         """The estimates by their names in JSON; ``mean_regret`` and ``realised_share`` are of first-impact harm."""
         return {
             "unavoidable_rate": self.unavoidable_rate,
+            "impact_proven_rate": self.impact_proven_rate,
             "avoidable_collision_rate": self.avoidable_collision_rate,
             "best_known_first_impact_harm": self.best_known_first,
             "best_known_total_harm": self.best_known_total,
+            "proven_harm": self.proven_harm,
+            "best_known_minus_proven_first": self.gap_first,
+            "best_known_minus_proven_total": self.gap_total,
             "mean_regret": self.regret_first,
             "mean_regret_first": self.regret_first,
             "mean_regret_total": self.regret_total,
@@ -119,8 +135,9 @@ def known_limits(worlds: Worlds, scenario: Scenario, vehicle: int) -> Limits | N
         return None
     proof = avoidability(worlds, vehicle)
     first, total = (best_known(worlds, scenario, count, vehicles=(vehicle,)) for count in COUNTS)
-    avoidable = proof.avoidable
-    return Limits(avoidable, proof.reason_name, np.where(avoidable, 0.0, first), np.where(avoidable, 0.0, total))
+    proven = lower_bound(worlds, vehicle, count="first", horizon_s=scenario.horizon_s).harm
+    free = proof.avoidable
+    return Limits(free, proof.reason_name, np.where(free, 0.0, first), np.where(free, 0.0, total), proven)
 
 
 def assess(evaluation: Evaluation) -> Regrets | None:
@@ -145,14 +162,18 @@ def distance(regrets: Regrets | None, outcome: Outcome, full_brake: Outcome | No
     """
     if regrets is None:
         return Distance()
-    avoidable, known = regrets.limits.avoidable, regrets.limits.known
+    avoidable, known, proven = regrets.limits.avoidable, regrets.limits.known, regrets.limits.proven_harm
     first, total = regrets.regret(outcome, "first"), regrets.regret(outcome, "total")
     reference = full_brake if bool(known.all()) else None
     return Distance(
         unavoidable_rate=rate(int((~avoidable).sum()), len(avoidable)),
+        impact_proven_rate=rate(int(regrets.limits.impact_proven.sum()), len(avoidable)),
         avoidable_collision_rate=rate(int((outcome.collided & avoidable).sum()), len(avoidable)),
         best_known_first=mean(regrets.first_impact_harm),
         best_known_total=mean(regrets.total_harm),
+        proven_harm=mean(proven),
+        gap_first=mean(regrets.first_impact_harm - proven),
+        gap_total=mean(regrets.total_harm - proven),
         regret_first=mean(first),
         regret_total=mean(total),
         realised_first=relative_decrease(first, regrets.regret(reference, "first")) if reference else None,

@@ -73,7 +73,7 @@ MEANINGS = {
     "Decrease": "1 − harm / harm of full braking in the same worlds; interval by the delta method, paired by world.",
     "Predicted harm": "What the agent itself expected at the alert, under the count that it minimises.",
     "Regret": "First-impact harm minus the best known first-impact harm of the same world; mean per world. The best"
-    " known is 0 where a collision is proven avoidable, else the result of a search over whole profiles of Vehicle 2,"
+    " known is 0 where contact is proven avoidable, else the result of a search over whole profiles of Vehicle 2,"
     " or of an agent in this table that did better. With ≥: the best of some world is known from these agents alone.",
     "Realised share": "(Full braking − agent) / (full braking − best known), first-impact harm: how much of the"
     " reduction of harm that is known to be possible the agent brings.",
@@ -154,8 +154,12 @@ def markdown_table(rows: Sequence[SummaryRow]) -> str:
     return "\n".join([*lines, "", _conditions(rows), ""])
 
 
+def _bracketed(cell: Cell) -> str:
+    return f"{cell.value} [{cell.interval}]" if cell.interval else cell.value
+
+
 def _markdown_line(line: Line) -> str:
-    cells = (f"{c.value} [{c.interval}]" if c.interval else c.value for c in line.cells)
+    cells = map(_bracketed, line.cells)
     return "| " + " | ".join([line.agent.replace("|", "\\|"), *cells]) + " |"
 
 
@@ -175,13 +179,15 @@ def _conditions(rows: Sequence[SummaryRow]) -> str:
 def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
     """What nobody could avoid in these worlds and the best known harm, as sentences; none where nothing is proven."""
     found = rows[0].distance if rows else None
-    if found is None or not (found.unavoidable_rate and found.best_known_first and found.best_known_total):
+    if found is None or not (found.best_known_first and found.best_known_total and found.proven_harm):
         return []
-    low, high = (f"{100 * end:.1f}" for end in found.unavoidable_rate.interval or (0.0, 1.0))
+    contact, impact = (_bracketed(_percent(one, 1)) for one in (found.unavoidable_rate, found.impact_proven_rate))
+    first, total, proven = found.best_known_first.value, found.best_known_total.value, found.proven_harm.value
     text = (
-        f"In {100 * found.unavoidable_rate.value:.1f} % [{low}, {high}] of these worlds no command of Vehicle 2 avoids"
-        f" a collision (proven). Best known harm: {found.best_known_first.value:.2f} first-impact,"
-        f" {found.best_known_total.value:.2f} total."
+        f"In {contact} of these worlds no command of Vehicle 2 avoids contact, in {impact} none avoids an impact (both"
+        f" proven; in those between, vehicles may get away with leaning on each other). Best known harm: {first:.2f}"
+        f" first-impact, {total:.2f} total; proven: no less than {proven:.2f}; gap: {first - proven:.2f} and"
+        f" {total - proven:.2f}."
     )
     if found.known_best_share is not None and found.known_best_share < 1.0:
         text += (

@@ -72,9 +72,12 @@ def make_policy(tensors: Mapping[str, Float32s], **manifest: Any) -> Policy:
         raise InvalidInput(f"policy: {error}") from None
 
 
-def save_policy(policy: Policy, folder: Path) -> None:
-    """Write ``policy`` as the new folder ``folder``, completely or not at all; raises ``AlreadyExists``."""
-    with new_folder(folder) as partial:
+def save_policy(policy: Policy, folder: Path, *, replace: bool = False) -> None:
+    """Write ``policy`` as the new folder ``folder``, completely or not at all; raises ``AlreadyExists``.
+
+    With ``replace`` a folder that is there goes once the new one is written.
+    """
+    with new_folder(folder, replace=replace) as partial:
         write_file(partial / WEIGHTS, _serialise(policy.tensors))
         write_file(partial / MANIFEST, policy.manifest.model_dump_json(indent=2).encode() + b"\n")
 

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
-from ethbrake_marl.learning.bundle import Policy, save_policy
-from ethbrake_marl.learning.divergence import check_rollout, check_update
+from ethbrake_marl.learning.bundle import Policy
+from ethbrake_marl.learning.course import RETURN, Course
+from ethbrake_marl.learning.divergence import check_losses, check_rollout, check_step, check_weights
+from ethbrake_marl.learning.model_state import Model
 from ethbrake_marl.learning.recipe import TrainingRecipe
-from ethbrake_marl.learning.run_directory import RunDirectory
 
-# Column of the log -> info of an episode's end; means over the episodes of one rollout, exploration included.
+# Column of the log -> info of an episode's end; means over the episodes since the last row, exploration included.
 EPISODE_COLUMNS = {
     "rollout/first_impact_harm": "world_first_impact_harm",
     "rollout/total_harm": "world_total_harm",
@@ -39,23 +39,14 @@ class Progress:
     updates: int
     wall_s: float
     metrics: Mapping[str, float]  # of the last evaluation, and the mean return of recent episodes
+    note: str = ""  # to be told once
 
 
-@dataclass
-class Course:
-    """What a training has reached: the last good policy and the evaluations on the way."""
+class Save(Protocol):
+    """Writes a checkpoint of the training at rest."""
 
-    policy: Policy | None = None  # none until the first weights were checked
-    steps: int = 0
-    updates: int = 0
-    evaluations: list[dict[str, float]] = field(default_factory=list)  # steps, updates and what ``evaluate`` gave
-    checkpoints: list[str] = field(default_factory=list)
-    started: float = field(default_factory=time.monotonic)
-
-    @property
-    def wall_s(self) -> float:
-        """Seconds since the start."""
-        return time.monotonic() - self.started
+    def __call__(self, between: BetweenUpdates) -> None:
+        """Write one."""
 
 
 class BetweenUpdates(BaseCallback):
@@ -64,84 +55,129 @@ class BetweenUpdates(BaseCallback):
     ``stop`` is asked before every rollout; ``StopRequested`` is raised when it says yes, with everything saved.
     """
 
-    model: PPO
+    model: Model
 
     def __init__(
         self,
         recipe: TrainingRecipe,
-        run: RunDirectory,
-        policy_now: Callable[[PPO], Policy],
+        policy_now: Callable[[Model], Policy],
         *,
+        save: Save,
         stop: Callable[[], bool],
         evaluate: Evaluate | None,
         on_progress: Callable[[Progress], None] | None,
     ) -> None:
         super().__init__()
-        self._recipe, self._run, self._policy_now = recipe, run, policy_now
+        self.recipe, self._policy_now, self._save = recipe, policy_now, save
         self._stop, self._evaluate, self._on_progress = stop, evaluate, on_progress
-        self._rollouts = 0
-        self._ended: list[dict[str, Any]] = []  # infos of the episodes that ended in this rollout
-        self.course = Course()
+        self.updates = 0
+        self.course = Course(recipe.reward.harm_count)
+        self.notes: list[str] = []  # to be told when the training begins
+        self._ended: dict[str, list[float]] = {column: [] for column in EPISODE_COLUMNS}
+        self._resumed = False  # what is due at this rest was done before the checkpoint was written
 
-    @property
-    def total_steps(self) -> int:
-        """Decisions that are wanted; the training ends after the first update at or beyond them."""
-        return self._recipe.total_steps
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint must hold of this object."""
+        return {"updates": self.updates, "ended": self._ended, "course": self.course.to_json()}
+
+    def restore(self, content: Mapping[str, Any], steps: int, policy: Policy, best: Policy | None) -> None:
+        """Go on from a checkpoint."""
+        self.updates = self.course.updates = int(content["updates"])
+        self._ended = {column: list(content["ended"][column]) for column in EPISODE_COLUMNS}
+        self.course.restore(content["course"])
+        self.course.steps, self.course.policy, self.course.best = steps, policy, best
+        self._resumed = True
 
     @property
     def planned_steps(self) -> int:
-        """Decisions at that end: whole rollouts."""
-        rollout = self.model.n_envs * self.model.n_steps
-        return -(-self.total_steps // rollout) * rollout
+        """Decisions at the end: whole rollouts."""
+        rollout = self.model.n_envs * self.recipe.rounds
+        return -(-self.recipe.total_steps // rollout) * rollout
+
+    def tell(self, note: str = "") -> None:
+        """Report how far the training is."""
+        if self._on_progress is None:
+            return
+        course = self.course
+        metrics = dict(course.evaluations[-1]) if course.evaluations else {}
+        recent = self._recent_return()
+        if recent is not None:
+            metrics[RETURN] = recent
+        self._on_progress(Progress(course.steps, self.planned_steps, course.updates, course.wall_s, metrics, note))
 
     def _on_rollout_start(self) -> None:
-        self._after_update()
+        while self.notes:
+            self.tell(self.notes.pop(0))
+        if not self._resumed:
+            self._after_update()
+        self._resumed = False
         if self._stop():
+            self._rest()
+            self._save(self)
             raise StopRequested
 
     def _on_step(self) -> bool:
         infos = self.locals["infos"]
-        self._ended += [infos[row] for row in np.flatnonzero(self.locals["dones"])]
+        if not isinstance(self.model, PPO):
+            check_step(self.model, self.locals["rewards"], self.locals["new_obs"])
+        for row in np.flatnonzero(self.locals["dones"]):
+            for column, name in EPISODE_COLUMNS.items():
+                self._ended[column].append(float(infos[row][name]))
         return True
 
     def _on_rollout_end(self) -> None:
-        check_rollout(self.model)
-        self._rollouts += 1
-        if self._ended:
-            for column, name in EPISODE_COLUMNS.items():
-                self.logger.record(column, float(np.mean([info[name] for info in self._ended])))
-        self._ended = []
+        if isinstance(self.model, PPO):
+            check_rollout(self.model)
+        self.updates += 1
 
     def _on_training_end(self) -> None:
         self._after_update(last=True)
 
     def _after_update(self, *, last: bool = False) -> None:
-        course = self.course
-        check_update(self.model)
-        course.policy = self._policy_now(self.model)
-        course.steps, course.updates = self.model.num_timesteps, self._rollouts
-        if self._evaluate is not None and (last or course.updates % self._recipe.evaluation.every_updates == 0):
-            self._measure(course.policy, self._evaluate)
-        if course.updates and course.updates % self._recipe.checkpoint_every_updates == 0:
-            folder = self._run.checkpoint(course.steps)
-            save_policy(course.policy, folder)
-            course.checkpoints.append(folder.name)
-        self._log(course)
+        """Do what is due at this rest, the checkpoint after all the rest of it."""
+        check_losses(self.model)
+        updates, recipe = self.updates, self.recipe
+        measure = self._evaluate is not None and (last or updates % recipe.evaluation.every_updates == 0)
+        if last or measure or updates % recipe.logged_updates == 0:
+            self._rest()
+            if measure:
+                self._measure()
+            self._log()
+        if not last and updates and updates % recipe.checkpoint_every_updates == 0:
+            self._rest()
+            self._save(self)
 
-    def _measure(self, policy: Policy, evaluate: Evaluate) -> None:
-        metrics = {name: float(value) for name, value in evaluate(policy).items()}
-        self.course.evaluations.append({"steps": self.course.steps, "updates": self.course.updates, **metrics})
+    def _rest(self) -> None:
+        """Bring the course to this moment."""
+        course = self.course
+        if course.policy is None or (course.steps, course.updates) != (self.model.num_timesteps, self.updates):
+            check_weights(self.model)
+            course.policy = self._policy_now(self.model)
+            course.steps, course.updates = self.model.num_timesteps, self.updates
+
+    def _measure(self) -> None:
+        assert self.course.policy is not None and self._evaluate is not None
+        metrics = {name: float(value) for name, value in self._evaluate(self.course.policy).items()}
+        alarm = self.course.measured(self.course.policy, metrics, self._recent_return())
         for name, value in metrics.items():
             self.logger.record(f"eval/{name}", value)
+        self.logger.record("eval/alarm", int(alarm is not None))
+        if alarm is not None:
+            self.tell(f"alarm: {alarm}")
 
-    def _log(self, course: Course) -> None:
-        if course.updates:
-            self.model.dump_logs(course.updates)
-        elif course.evaluations:
+    def _recent_return(self) -> float | None:
+        episodes = self.model.ep_info_buffer or ()
+        return sum(float(e["r"]) for e in episodes) / len(episodes) if episodes else None
+
+    def _log(self) -> None:
+        if any(self._ended.values()):
+            for column, values in self._ended.items():
+                self.logger.record(column, float(np.mean(values)))
+        self._ended = {column: [] for column in EPISODE_COLUMNS}
+        if self.updates and isinstance(self.model, PPO):
+            self.model.dump_logs(self.updates)
+        elif self.updates:
+            self.model.dump_logs()
+        elif self.course.evaluations:
             self.logger.dump(step=0)
-        if self._on_progress is not None:
-            metrics = dict(course.evaluations[-1]) if course.evaluations else {}
-            episodes = self.model.ep_info_buffer or ()
-            if episodes:
-                metrics["episode_return"] = sum(float(e["r"]) for e in episodes) / len(episodes)
-            self._on_progress(Progress(course.steps, self.planned_steps, course.updates, course.wall_s, metrics))
+        self.tell()

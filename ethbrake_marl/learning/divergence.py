@@ -9,40 +9,64 @@ import torch
 from stable_baselines3 import PPO
 
 from ethbrake_marl.errors import EthBrakeError
+from ethbrake_marl.learning.model_state import Model, optimizers_of
 
-_LOSSES = ("train/loss", "train/value_loss", "train/policy_gradient_loss")
+_LOSSES = (
+    "train/loss",
+    "train/value_loss",
+    "train/policy_gradient_loss",
+    "train/actor_loss",
+    "train/critic_loss",
+    "train/ent_coef_loss",
+)
 
 
 class TrainingDiverged(EthBrakeError, ArithmeticError):
     """A reward, a loss or a weight is no longer a finite number; the last good policy was kept."""
 
 
-def watch_gradients(model: PPO) -> None:
+def watch_gradients(model: Model) -> None:
     """Refuse every optimiser step whose gradients are not finite, so that the weights stay as they were."""
+    hint = "learning_rate or max_grad_norm" if isinstance(model, PPO) else "learning_rate"
 
     def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         sums = [p.grad.sum() for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
         if not torch.isfinite(torch.stack(sums)).all():
             raise TrainingDiverged(
-                f"training: the gradient of the loss is not finite at step {model.num_timesteps};"
-                " try a smaller learning_rate or max_grad_norm"
+                f"training: the gradient of the loss is not finite at step {model.num_timesteps}; try a smaller {hint}"
             )
 
-    model.policy.optimizer.register_step_pre_hook(check)
+    for optimizer in optimizers_of(model).values():
+        optimizer.register_step_pre_hook(check)
 
 
-def check_update(model: PPO) -> None:
-    """Refuse an update whose losses or weights are not finite; an infinite loss may well leave finite weights."""
+def check_losses(model: Model) -> None:
+    """Refuse an update whose losses are not finite; an infinite loss may well leave finite weights."""
     logged = model.logger.name_to_value
-    losses = {name: float(logged[name]) for name in _LOSSES if name in logged}
-    for name, value in losses.items():
-        if not np.isfinite(value):
+    for name in _LOSSES:
+        if name in logged and not np.isfinite(float(logged[name])):
             raise TrainingDiverged(
-                f"training: {name} = {value} after step {model.num_timesteps}: must be finite;"
+                f"training: {name} = {float(logged[name])} after step {model.num_timesteps}: must be finite;"
                 " try a smaller learning_rate, or smaller weights of the reward"
             )
+
+
+def check_weights(model: Model) -> None:
+    """Refuse weights that are not finite."""
     if not weights_are_finite(model):
         raise TrainingDiverged(f"training: a weight is not finite after step {model.num_timesteps}")
+
+
+def check_step(model: Model, rewards: Any, observations: Any) -> None:
+    """Refuse a step with a reward or observation that is not finite; names which."""
+    for name, entries in (("observations", observations), ("rewards", rewards)):
+        good = np.isfinite(entries)
+        if not good.all():
+            row = np.argwhere(~good)[0][0]
+            raise TrainingDiverged(
+                f"training: {name}[row {row}] = {entries[~good][0]} at step {model.num_timesteps}: must be finite;"
+                " the environment or its reward is at fault"
+            )
 
 
 def check_rollout(model: PPO) -> None:
@@ -58,8 +82,13 @@ def check_rollout(model: PPO) -> None:
             )
 
 
-def weights_are_finite(model: PPO) -> bool:
+def weights_are_finite(model: Model) -> bool:
     """Whether every weight is finite, and the exploration noise a usable one."""
-    finite = all(bool(torch.isfinite(p).all()) for p in model.policy.parameters())
-    spread = torch.exp(model.policy.log_std.detach())
-    return finite and bool(torch.isfinite(spread).all()) and bool((spread > 0.0).all())
+    numbers = [*model.policy.parameters()]
+    spread = None
+    if isinstance(model, PPO):
+        spread = torch.exp(model.policy.log_std.detach())
+    elif model.log_ent_coef is not None:
+        spread = torch.exp(model.log_ent_coef.detach())
+    finite = all(bool(torch.isfinite(p).all()) for p in numbers)
+    return finite and (spread is None or bool((torch.isfinite(spread) & (spread > 0.0)).all()))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.networks import NetworkSpec
+from ethbrake_marl.learning.squash import squash
 from ethbrake_marl.physics.compiled import compiled
 
 Float32s = NDArray[np.float32]
@@ -47,9 +48,17 @@ class Actor:
         for k, (weight, bias) in enumerate(self._layers):
             y = np.empty((weight.shape[0], x.shape[1]), dtype=np.float32)
             dense(weight, bias, x, y)
-            if k < len(self._layers) - 1:
-                x = np.maximum(y, np.float32(0.0)) if self.spec.activation == "relu" else np.tanh(y)
-        return np.clip(y, np.float32(-1.0), np.float32(1.0)) if self.spec.output == "clip" else np.tanh(y)
+            if k == len(self._layers) - 1:
+                break
+            if self.spec.activation == "relu":
+                x = np.maximum(y, np.float32(0.0))
+            else:
+                squash(y)
+                x = y
+        if self.spec.output == "clip":
+            return np.clip(y, np.float32(-1.0), np.float32(1.0))
+        squash(y)
+        return y
 
     def _checked(self, observation: Float32s) -> Float32s:
         wanted = (observation.shape[0] if observation.ndim else 0, self.spec.observation_size)

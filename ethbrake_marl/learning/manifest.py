@@ -42,7 +42,7 @@ class Manifest(_Strict):
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
     format_version: Literal[2] = 2
-    algorithm: Literal["ppo"]
+    algorithm: Literal["ppo", "sac"]
     network: NetworkSpec
     observation: ObservationSchema
     action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"

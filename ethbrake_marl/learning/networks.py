@@ -15,13 +15,15 @@ Activation = Literal["relu", "tanh"]
 Output = Literal["clip", "tanh"]
 Width = Annotated[int, Field(ge=1, le=4096)]
 Hidden = Annotated[tuple[Width, ...], Field(min_length=1, max_length=8)]
+PerhapsHidden = Annotated[tuple[Width, ...], Field(max_length=8)]
 
 
 class NetworkSpec(BaseModel):
-    """An actor and a critic, both multilayer perceptrons on the same observation.
+    """An actor, and perhaps a critic, both multilayer perceptrons on the same observation.
 
     The action is ``output(actor(observation))`` in [-1, 1]: ``clip`` cuts the actor's mean at the bounds (PPO's
-    Gaussian), ``tanh`` squashes it.
+    Gaussian, whose noise is one number per action), ``tanh`` squashes it (SAC's Gaussian, whose noise is a second
+    head of the actor). Without ``value_hidden`` there is no critic: a policy needs none to act.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -29,14 +31,14 @@ class NetworkSpec(BaseModel):
     observation_size: Annotated[int, Field(ge=1, le=4096)]
     action_size: Annotated[int, Field(ge=1, le=64)]
     policy_hidden: Hidden
-    value_hidden: Hidden
+    value_hidden: PerhapsHidden
     activation: Activation
     output: Output
 
 
 @dataclass(frozen=True, slots=True)
 class TensorRow:
-    """One tensor: its name in a bundle, its shape, and its name in Stable-Baselines3's ``ActorCriticPolicy``."""
+    """One tensor: its name in a bundle, its shape, and its name in Stable-Baselines3's policy (PPO's or SAC's)."""
 
     name: str
     shape: tuple[int, ...]
@@ -45,13 +47,22 @@ class TensorRow:
 
 def tensor_table(spec: NetworkSpec) -> tuple[TensorRow, ...]:
     """List every tensor of ``spec``, all float32; weights are [outputs, inputs] as in ``y = W x + b``."""
-    rows = [
-        *_layers("policy", "mlp_extractor.policy_net", spec.observation_size, spec.policy_hidden),
-        *_layer("policy.output", "action_net", spec.policy_hidden[-1], spec.action_size),
-        TensorRow("policy.log_std", (spec.action_size,), "log_std"),
-        *_layers("value", "mlp_extractor.value_net", spec.observation_size, spec.value_hidden),
-        *_layer("value.output", "value_net", spec.value_hidden[-1], 1),
-    ]
+    last = spec.policy_hidden[-1]
+    if spec.output == "clip":
+        rows = [
+            *_layers("policy", "mlp_extractor.policy_net", spec.observation_size, spec.policy_hidden),
+            *_layer("policy.output", "action_net", last, spec.action_size),
+            TensorRow("policy.log_std", (spec.action_size,), "log_std"),
+        ]
+    else:
+        rows = [
+            *_layers("policy", "actor.latent_pi", spec.observation_size, spec.policy_hidden),
+            *_layer("policy.output", "actor.mu", last, spec.action_size),
+            *_layer("policy.log_std", "actor.log_std", last, spec.action_size),
+        ]
+    if spec.value_hidden:
+        rows += _layers("value", "mlp_extractor.value_net", spec.observation_size, spec.value_hidden)
+        rows += _layer("value.output", "value_net", spec.value_hidden[-1], 1)
     return tuple(rows)
 
 

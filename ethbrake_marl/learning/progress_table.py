@@ -34,6 +34,18 @@ class ProgressTable(KVWriter):
         heading = _lines([dict(zip(self._columns, self._columns, strict=True))], self._columns)
         write_file(self._path, (heading + _lines(self._rows, self._columns)).encode())
 
+    def content(self) -> bytes:
+        """The file as it is; empty before the first row."""
+        return self._path.read_bytes() if self._rows else b""
+
+    def restore(self, content: bytes) -> None:
+        """Go back to an earlier ``content``, in the file too."""
+        text = content.decode("utf-8")
+        reader = csv.DictReader(io.StringIO(text))
+        self._columns = list(reader.fieldnames or ())
+        self._rows = [{name: value for name, value in row.items() if value != ""} for row in reader]
+        write_file(self._path, content)
+
     def close(self) -> None:
         """Nothing is held open between rows."""
 

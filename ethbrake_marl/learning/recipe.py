@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -12,12 +13,14 @@ from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.learning.networks import Activation, NetworkSpec, Width
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario.consistency import refuse
+from ethbrake_marl.scenario.flow_text import flow_text
 from ethbrake_marl.scenario.shipped_files import shipped_folder
 from ethbrake_marl.scenario.validation_messages import explain
 from ethbrake_marl.scenario.yaml_loading import Document, YamlPath, read_yaml
 
 ROLLOUT_LIMIT = 2**24  # decisions held in memory between two updates
 
+Algorithm = Literal["ppo", "sac"]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -62,6 +65,25 @@ class NetworkShape(_Part):
         )
 
 
+class SquashedShape(_Part):
+    """Hidden layers of the actor and of each of the two critics; the actor's noise depends on what it sees."""
+
+    policy: Layers
+    value: Layers
+    activation: Activation = "relu"
+
+    def spec(self, observation_size: int) -> NetworkSpec:
+        """What a bundle holds: the actor, whose squashed mean is the action. Critics stay in the checkpoints."""
+        return NetworkSpec(
+            observation_size=observation_size,
+            action_size=1,
+            policy_hidden=self.policy,
+            value_hidden=(),
+            activation=self.activation,
+            output="tanh",
+        )
+
+
 class EvaluationPlan(_Part):
     """The fixed list on which the policy is measured while it learns."""
 
@@ -71,27 +93,21 @@ class EvaluationPlan(_Part):
 
 
 class TrainingRecipe(_Part):
-    """How to train: algorithm, its parameters, network, reward, seed, and what is saved and measured on the way."""
+    """How to train, whatever the algorithm: its name, reward, seed, and what is saved and measured on the way.
+
+    An update is one round of collecting and learning.
+    """
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")
     title: str = ""
     description: str = ""
     source: str = ""
-    algorithm: Literal["ppo"]
+    algorithm: Algorithm
     total_steps: Annotated[int, Field(ge=1)]
     n_envs: Annotated[int, Field(ge=1)]
-    n_steps: Annotated[int, Field(ge=2)]
     batch_size: Annotated[int, Field(ge=2)]
-    n_epochs: Annotated[int, Field(ge=1, le=1000)]
     learning_rate: LearningRate
     gamma: Fraction
-    gae_lambda: Fraction
-    clip_range: Rate
-    ent_coef: NonNegative
-    vf_coef: NonNegative
-    max_grad_norm: Positive
-    target_kl: Positive | None = None
-    network: NetworkShape
     reward: RewardParams
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     evaluation: EvaluationPlan
@@ -104,8 +120,44 @@ class TrainingRecipe(_Part):
             raise ValueError("every weight is 0; nothing could be learned")
         return value
 
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """The network of the policy's bundle."""
+        raise NotImplementedError
+
+    @property
+    def rounds(self) -> int:
+        """Decisions of each learner between two updates."""
+        raise NotImplementedError
+
+    @property
+    def logged_updates(self) -> int:
+        """Updates between two rows of the progress table."""
+        return 1
+
+    def replace(self, **changes: Any) -> Self:
+        """The same recipe with other values in some fields, checked again; raises ``InvalidInput``."""
+        content = {**self.model_dump(mode="json"), **changes}
+        changed = _checked(Document(f"recipe {self.name!r}", content, {}))
+        assert isinstance(changed, type(self)) or "algorithm" in changes
+        return changed  # type: ignore[return-value]  # of another class only if another algorithm was asked for
+
+
+class PpoRecipe(TrainingRecipe):
+    """PPO: collect ``n_steps`` decisions of every learner, then go through them ``n_epochs`` times."""
+
+    algorithm: Literal["ppo"]
+    n_steps: Annotated[int, Field(ge=2)]
+    n_epochs: Annotated[int, Field(ge=1, le=1000)]
+    gae_lambda: Fraction
+    clip_range: Rate
+    ent_coef: NonNegative
+    vf_coef: NonNegative
+    max_grad_norm: Positive
+    target_kl: Positive | None = None
+    network: NetworkShape
+
     @model_validator(mode="after")
-    def _whole_batches(self) -> TrainingRecipe:
+    def _whole_batches(self) -> PpoRecipe:
         rollout = self.n_envs * self.n_steps
         if not rollout <= ROLLOUT_LIMIT:
             right = f"n_envs x n_steps = {rollout} decisions per update; at most {ROLLOUT_LIMIT}"
@@ -114,10 +166,68 @@ class TrainingRecipe(_Part):
             refuse(("batch_size",), self.batch_size, f"must divide n_envs x n_steps = {rollout}")
         return self
 
-    def replace(self, **changes: Any) -> TrainingRecipe:
-        """The same recipe with other values in some fields, checked again; raises ``InvalidInput``."""
-        content = {**self.model_dump(mode="json"), **changes}
-        return _checked(Document(f"recipe {self.name!r}", content, {}))
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """Actor and critic."""
+        return self.network.spec(observation_size)
+
+    @property
+    def rounds(self) -> int:
+        """Decisions of each learner between two updates."""
+        return self.n_steps
+
+
+class SacRecipe(TrainingRecipe):
+    """SAC: collect ``steps_per_update`` decisions of every learner, then ``gradient_steps`` steps from the memory."""
+
+    algorithm: Literal["sac"]
+    steps_per_update: Annotated[int, Field(ge=1, le=10_000)] = 1
+    gradient_steps: Annotated[int, Field(ge=1, le=100_000)] = 1
+    buffer_size: Annotated[int, Field(ge=1, le=10_000_000)]
+    learning_starts: Annotated[int, Field(ge=0)]
+    tau: Rate
+    ent_coef: float | str = "auto"
+    initial_ent_coef: Positive = 1.0  # where an automatic one starts
+    target_entropy: Annotated[float, Field(allow_inf_nan=False)] | None = None  # None: -1 per action
+    target_update_interval: Annotated[int, Field(ge=1)] = 1
+    network: SquashedShape
+    log_every_updates: Annotated[int, Field(ge=1)]
+
+    @field_validator("ent_coef", mode="plain")
+    @classmethod
+    def _automatic_or_fixed(cls, value: Any) -> float | str:
+        if value == "auto":
+            return "auto"
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
+            raise ValueError("must be auto or a number of at least 0")
+        return float(value)
+
+    @model_validator(mode="after")
+    def _room_for_everybody(self) -> SacRecipe:
+        if not self.buffer_size >= self.n_envs:
+            refuse(("buffer_size",), self.buffer_size, f"must be at least n_envs = {self.n_envs}")
+        return self
+
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """The actor alone."""
+        return self.network.spec(observation_size)
+
+    @property
+    def rounds(self) -> int:
+        """Decisions of each learner between two updates."""
+        return self.steps_per_update
+
+    @property
+    def logged_updates(self) -> int:
+        """Updates between two rows of the progress table."""
+        return self.log_every_updates
+
+    @property
+    def update_ratio(self) -> float:
+        """Gradient steps per decision of one learner in each world."""
+        return self.gradient_steps / (self.n_envs * self.steps_per_update)
+
+
+RECIPES: dict[str, type[PpoRecipe] | type[SacRecipe]] = {"ppo": PpoRecipe, "sac": SacRecipe}
 
 
 def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
@@ -139,21 +249,36 @@ def shipped_recipes() -> dict[str, Path]:
     return {file.stem: file for file in sorted(shipped_folder("train", "recipes").glob("*.yaml"))}
 
 
+def recipe_of(content: str) -> TrainingRecipe:
+    """The recipe that ``model_dump(mode="json")`` wrote, from its JSON text; raises ``InvalidInput``."""
+    return _checked(Document("recipe", json.loads(content), {}))
+
+
 def _checked(document: Document) -> TrainingRecipe:
-    if not isinstance(document.content, dict):
+    content = document.content
+    if not isinstance(content, dict):
         raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance algorithm: ppo")
+    name = content.get("algorithm", "ppo")
+    if not isinstance(name, str) or name not in RECIPES:
+        line = document.line_of(("algorithm",))
+        where = document.file if line is None else f"{document.file}, line {line}"
+        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {' or '.join(RECIPES)}")
+    model = RECIPES[name]
     try:
-        return TrainingRecipe.model_validate(document.content)
+        return model.model_validate(content)
     except ValidationError as error:
-        raise explain(error, document, RecipeWording()) from None
+        raise explain(error, document, RecipeWording(model)) from None
 
 
 class RecipeWording:
-    """The ``Wording`` of messages about a recipe."""
+    """The ``Wording`` of messages about a recipe of one algorithm."""
+
+    def __init__(self, model: type[TrainingRecipe] = PpoRecipe) -> None:
+        self._model = model
 
     def known(self, path: YamlPath) -> list[str]:
         """The keys of the part in which ``path`` ends."""
-        model: type[BaseModel] = TrainingRecipe
+        model: type[BaseModel] = self._model
         for part in path[:-1]:
             inner = model.model_fields[str(part)].annotation
             if isinstance(inner, type) and issubclass(inner, BaseModel):
@@ -162,7 +287,8 @@ class RecipeWording:
 
     def needed(self, path: YamlPath) -> str:
         """Where an example stands."""
-        return "it is needed; every key is in the shipped recipe ppo"
+        name = next(name for name, model in RECIPES.items() if model is self._model)
+        return f"it is needed; every key is in the shipped recipe {name}"
 
     def owner(self, path: YamlPath) -> str:
         """Nobody's: a recipe knows no vehicles."""

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
-import shutil
-import tempfile
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from ethbrake_marl.durable_files import write_file
-from ethbrake_marl.errors import AlreadyExists
+from ethbrake_marl.durable_files import new_folder, write_file
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.learning.strict_json import parse_strict_json
 
 RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
@@ -46,12 +46,22 @@ class RunDirectory:
 
     @property
     def policy(self) -> Path:
-        """The bundle at the end of the run."""
+        """The bundle to use: the policy of least harm on the fixed list, or the last where no harm is measured."""
         return self.path / "policy"
 
+    @property
+    def last_policy(self) -> Path:
+        """The bundle at the end of the run."""
+        return self.path / "policy-last"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Where the training can go on; empty once it has finished."""
+        return self.path / "checkpoints"
+
     def checkpoint(self, steps: int) -> Path:
-        """The bundle after ``steps`` decisions."""
-        return self.path / "checkpoints" / f"step_{steps:09d}"
+        """The checkpoint after ``steps`` decisions."""
+        return self.checkpoints / f"step_{steps:012d}"
 
     def write_json(self, file: Path, content: Mapping[str, Any]) -> None:
         """Replace ``file`` in one step."""
@@ -63,49 +73,84 @@ class RunRecord:
 
     def __init__(self, run: RunDirectory) -> None:
         self._run = run
-        self._started, self._clock = _now(), time.monotonic()
-        self._write("running", {})
+        self._started = _read_status(run).get("started_utc") or _now()
+        write_status(run, "running", {"started_utc": self._started})
 
-    def end(
-        self, status: RunStatus, reason: str | None, *, steps: int, updates: int, checkpoints: Sequence[str]
-    ) -> None:
+    def end(self, status: RunStatus, reason: str | None, left: Mapping[str, Any]) -> None:
         """Say how the run ended, why if it failed, and what it leaves."""
         policy = self._run.policy.name if self._run.policy.is_dir() else None
-        wall_s = round(time.monotonic() - self._clock, 3)
-        left = {"steps": steps, "updates": updates, "policy": policy, "checkpoints": list(checkpoints)}
-        self._write(status, {"ended_utc": _now(), "wall_s": wall_s, "reason": reason, **left})
+        left_over = () if status == "finished" else self._run.checkpoints.glob("step_*")
+        checkpoints = sorted(path.name for path in left_over)
+        more = {"ended_utc": _now(), "reason": reason, **left, "policy": policy, "checkpoints": checkpoints}
+        write_status(self._run, status, {"started_utc": self._started, **more})
 
-    def _write(self, status: RunStatus, more: Mapping[str, Any]) -> None:
-        head = {"format": "ethbrake-run", "format_version": 1, "status": status, "started_utc": self._started}
-        self._run.write_json(self._run.status, {**head, **more})
+
+def write_status(run: RunDirectory, status: RunStatus, more: Mapping[str, Any]) -> None:
+    """Replace ``run.json``."""
+    run.write_json(run.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **more})
+
+
+def _read_status(run: RunDirectory) -> dict[str, Any]:
+    try:
+        content = parse_strict_json(run.status.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def create_run(path: Path, *, force: bool = False) -> RunDirectory:
-    """Make the new, empty folder of a run.
+def create_run(path: Path, config: Mapping[str, Any], *, force: bool = False) -> RunDirectory:
+    """Make the folder of a run with its ``config.json`` and ``run.json``, in one step: it can be resumed from then on.
 
     Raises ``AlreadyExists`` when there is something; with ``force`` an earlier run (a folder with a ``run.json``) or an
     empty folder is replaced, and anything else is still refused.
     """
     run = RunDirectory(path)
-    if force and path.is_dir() and not path.is_symlink():
-        _remove_run(run)
-    try:
-        path.mkdir(parents=True)
-    except FileExistsError:
+    replace = force and path.is_dir() and not path.is_symlink() and (run.status.is_file() or not any(path.iterdir()))
+    if not replace and (path.exists() or path.is_symlink()):
         if not run.status.is_file():
-            raise AlreadyExists(f"{path}: is there already, and is no run; give another name") from None
-        replace = "replace it with force (--force; make run ARGS=--force)"
-        raise AlreadyExists(f"{path}: is there already; give another name (--name), or {replace}") from None
+            raise AlreadyExists(f"{path}: is there already, and is no run; give another name")
+        raise AlreadyExists(
+            f"{path}: is there already; give another name (--name), go on with it (ethbrake resume), or replace it with"
+            " force (--force; make run ARGS=--force)"
+        )
+    with new_folder(path, replace=replace) as partial:
+        new = RunDirectory(partial)
+        new.write_json(new.config, config)
+        write_status(new, "running", {"started_utc": _now()})
     return run
 
 
-def _remove_run(run: RunDirectory) -> None:
-    """Take the folder out of the way in one step, then delete it."""
-    if run.status.is_file() or not any(run.path.iterdir()):
-        aside = Path(tempfile.mkdtemp(dir=run.path.parent, prefix=f".{run.path.name}.", suffix=".old"))
-        run.path.rename(aside / run.path.name)
-        shutil.rmtree(aside)
+def open_run(path: Path) -> tuple[RunDirectory, dict[str, Any]]:
+    """The run in ``path`` and its configuration; raises ``InvalidInput`` when there is none, or it has finished."""
+    run = RunDirectory(path)
+    status = _read_status(run)
+    if status.get("format") != "ethbrake-run" or not run.config.is_file():
+        raise InvalidInput(f"{path}: holds no training; give the folder of a run, for instance runs/my-run")
+    resumable = any(run.checkpoints.glob("step_*"))
+    if status.get("status") == "finished" or (status.get("stage") is not None and not resumable):
+        raise InvalidInput(
+            f"{path}: this training has finished; measure its policy with: ethbrake evaluate --agents hybrid@{path}"
+        )
+    try:
+        config: dict[str, Any] = parse_strict_json(run.config.read_bytes())
+    except ValueError as error:
+        raise InvalidInput(f"{run.config}: {error}") from None
+    return run, config
+
+
+@contextmanager
+def only_process(run: RunDirectory) -> Iterator[None]:
+    """Hold the run's lock, which ends with the process however it ends.
+
+    Raises ``InvalidInput`` when another process trains in this folder.
+    """
+    with (run.path / "run.lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InvalidInput(f"{run.path}: another process is training here") from None
+        yield

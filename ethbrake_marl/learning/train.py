@@ -1,30 +1,31 @@
-"""Train one policy: recipe and scenario in, a run's folder with a policy bundle out."""
+"""Train one policy: recipe and scenario in, a run's folder with a policy out; or go on with one that stopped."""
 
 from __future__ import annotations
 
-import random
+import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-import torch
-from stable_baselines3 import PPO
-from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from pydantic import ValidationError
 from stable_baselines3.common.vec_env import VecEnv
 
+from ethbrake_marl.durable_files import remove_unfinished
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.bundle import Policy, make_policy, save_policy
-from ethbrake_marl.learning.callback import BetweenUpdates, Course, Evaluate, Progress, StopRequested
-from ethbrake_marl.learning.divergence import TrainingDiverged, watch_gradients, weights_are_finite
+from ethbrake_marl.learning.bundle import Policy, make_policy
+from ethbrake_marl.learning.callback import BetweenUpdates, Evaluate, Progress
+from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
 from ethbrake_marl.learning.manifest import observation_schema
-from ethbrake_marl.learning.progress_table import ProgressTable
-from ethbrake_marl.learning.recipe import TrainingRecipe
-from ethbrake_marl.learning.run_directory import RunDirectory, RunRecord, RunStatus, create_run
-from ethbrake_marl.learning.sb3_policy import policy_arguments, tensors_of
+from ethbrake_marl.learning.model_state import Model
+from ethbrake_marl.learning.models import make_model
+from ethbrake_marl.learning.random_state import own_random_state
+from ethbrake_marl.learning.recipe import SacRecipe, TrainingRecipe, recipe_of
+from ethbrake_marl.learning.run_directory import RunDirectory, create_run, only_process, open_run
+from ethbrake_marl.learning.sb3_policy import tensors_of
+from ethbrake_marl.learning.session import Session
 from ethbrake_marl.learning.stop_signal import stop_on_signal
 from ethbrake_marl.learning.versions import installed_versions
 from ethbrake_marl.observations import ObservationSpec
@@ -38,12 +39,14 @@ class TrainResult:
     """What a training left behind."""
 
     directory: Path
-    policy: Policy  # also saved as directory/policy
+    policy: Policy  # of least harm on the fixed list, the last where none was measured; also saved as directory/policy
+    last_policy: Policy  # also saved as directory/policy-last
     status: Literal["finished", "interrupted"]
-    steps: int  # decisions of learners, a multiple of rows x n_steps
+    steps: int  # decisions of learners, a multiple of rows x rounds
     updates: int
     wall_s: float
     evaluations: tuple[Mapping[str, float], ...]
+    alarms: tuple[str, ...]  # return up, harm not down
 
 
 def train(
@@ -64,95 +67,108 @@ def train(
     scenario, seed and machine give the same policy, bit for bit; global random states are left as they were.
 
     Ctrl-C stops after the update in progress (status ``interrupted``); a second one raises ``KeyboardInterrupt``.
-    Whatever ends it, ``policy/`` holds the last good policy. Raises ``AlreadyExists`` for an existing directory without
-    ``force``, ``InvalidInput`` for a scenario without learners, ``TrainingDiverged`` for numbers that are not finite.
+    Whatever ends it but a kill, ``policy/`` holds the best policy so far and ``policy-last/`` the last good one;
+    ``resume`` goes on. Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` for a
+    scenario without learners, ``TrainingDiverged`` for numbers that are not finite.
     """
     changes = {"seed": seed, "total_steps": steps}
     recipe = recipe.replace(**{name: value for name, value in changes.items() if value is not None})
     if not scenario.learners:
         raise InvalidInput(f"scenario {scenario.name!r}: no vehicle learns; give at least one the role learner")
-    with _own_random_state(), stop_on_signal() as stop, _environment(recipe, scenario) as environment:
-        model = _model(recipe, environment)
-        run = create_run(Path(directory), force=force)
-        record = RunRecord(run)
-        run.write_json(run.config, _config(recipe, scenario))
-        policy_now = _policy_maker(recipe, scenario)
-        between = BetweenUpdates(recipe, run, policy_now, stop=stop, evaluate=evaluate, on_progress=on_progress)
-        return _learn(model, between, run, record)
+    with _environment(recipe, scenario):  # whatever is wrong with it is said before anything is made
+        run = create_run(Path(directory), _config(recipe, scenario), force=force)
+    return _run(run, recipe, scenario, evaluate, on_progress, None)
 
 
-def _learn(model: PPO, between: BetweenUpdates, run: RunDirectory, record: RunRecord) -> TrainResult:
-    """Train to the end, and leave the folder complete whatever that end is."""
-    course = between.course
-    logger = Logger(str(run.path), [ProgressTable(run.progress), TensorBoardOutputFormat(str(run.tensorboard))])
-    model.set_logger(logger)
-    status: Literal["finished", "interrupted"] = "finished"
+def resume(
+    directory: str | Path,
+    *,
+    evaluate: Callable[[TrainingRecipe, Scenario], Evaluate | None] | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    other_versions: bool = False,
+) -> TrainResult:
+    """Go on with a training that was stopped or killed, to the policy that it would have come to: the same bits.
+
+    It goes on from the newest checkpoint that is whole, or from the beginning when there is none; rows and events
+    after that checkpoint are dropped, so that nothing stands twice. ``evaluate(recipe, scenario)`` gives the function
+    that measures, which must be the one of ``train``. Raises ``InvalidInput`` for a folder without a training, one
+    that has finished, one in which another process trains, and a checkpoint written by other versions, whose numbers
+    may differ, unless ``other_versions``.
+    """
+    run, config = open_run(Path(directory))
     try:
-        model.learn(between.total_steps, callback=between, log_interval=None)  # type: ignore[arg-type]
-    except StopRequested:
-        status = "interrupted"
-    except BaseException as error:
-        cause = _diverged(model, error)
-        _close(record, run, course, "interrupted" if isinstance(error, KeyboardInterrupt) else "failed", cause)
-        if cause is error:
-            raise
-        raise cause from error
-    finally:
-        logger.close()
-    _close(record, run, course, status)
-    assert course.policy is not None  # set before the first rollout
-    evaluations = tuple(course.evaluations)
-    return TrainResult(run.path, course.policy, status, course.steps, course.updates, course.wall_s, evaluations)
+        recipe = recipe_of(json.dumps(config["recipe"]))
+        scenario = Scenario.model_validate_json(json.dumps(config["scenario"]))
+    except (KeyError, ValidationError) as error:
+        raise InvalidInput(f"{run.config}: is not the configuration of a training ({error})") from None
+    measure = None if evaluate is None else evaluate(recipe, scenario)
+    return _run(run, recipe, scenario, measure, on_progress, lambda: _newest(run, other_versions))
 
 
-def _close(
-    record: RunRecord, run: RunDirectory, course: Course, status: RunStatus, cause: BaseException | None = None
-) -> None:
-    """Save the last good policy, then say how the run ended."""
-    if course.policy is not None:
-        save_policy(course.policy, run.policy)
-    reason = None if cause is None else f"{type(cause).__name__}: {cause}"
-    record.end(status, reason, steps=course.steps, updates=course.updates, checkpoints=course.checkpoints)
-
-
-def _diverged(model: PPO, error: BaseException) -> BaseException:
-    """The error to report: torch's own when a distribution gets a NaN says little about a training."""
-    if isinstance(error, ValueError) and not weights_are_finite(model):
-        return TrainingDiverged(
-            f"training: a weight or the exploration noise is not finite at step {model.num_timesteps};"
-            " try a smaller learning_rate"
+def _run(
+    run: RunDirectory,
+    recipe: TrainingRecipe,
+    scenario: Scenario,
+    evaluate: Evaluate | None,
+    on_progress: Callable[[Progress], None] | None,
+    find: Callable[[], tuple[TrainingState | None, list[str]]] | None,
+) -> TrainResult:
+    """Train in the run's folder, from the state that ``find`` gives."""
+    with only_process(run), own_random_state(), stop_on_signal() as stop, _environment(recipe, scenario) as environment:
+        state, damaged = (None, []) if find is None else find()
+        session = Session(run, make_model(recipe, environment), recipe)
+        between = BetweenUpdates(
+            recipe,
+            _policy_maker(recipe, scenario),
+            save=session.save,
+            stop=stop,
+            evaluate=evaluate,
+            on_progress=on_progress,
         )
-    return error
-
-
-def _model(recipe: TrainingRecipe, environment: VecEnv) -> PPO:
-    network = recipe.network.spec(OBSERVATION.size)
-    model = PPO(
-        "MlpPolicy",
-        environment,
-        learning_rate=recipe.learning_rate.at,
-        n_steps=recipe.n_steps,
-        batch_size=recipe.batch_size,
-        n_epochs=recipe.n_epochs,
-        gamma=recipe.gamma,
-        gae_lambda=recipe.gae_lambda,
-        clip_range=recipe.clip_range,
-        ent_coef=recipe.ent_coef,
-        vf_coef=recipe.vf_coef,
-        max_grad_norm=recipe.max_grad_norm,
-        target_kl=recipe.target_kl,
-        stats_window_size=max(100, environment.num_envs),
-        policy_kwargs=policy_arguments(network, recipe.network.initial_log_std),
-        seed=recipe.seed,
-        device="cpu",
+        if find is not None:
+            session.restore(between, state)
+            between.notes += [f"a damaged checkpoint was left aside: {reason}" for reason in damaged]
+        status = session.learn(between)
+    course = between.course
+    assert course.policy is not None and course.kept is not None  # set before the first rollout
+    return TrainResult(
+        run.path,
+        course.kept,
+        course.policy,
+        status,
+        course.steps,
+        course.updates,
+        course.wall_s,
+        tuple(course.evaluations),
+        tuple(course.alarms),
     )
-    watch_gradients(model)
-    return model
 
 
-def _policy_maker(recipe: TrainingRecipe, scenario: Scenario) -> Callable[[PPO], Policy]:
+def _newest(run: RunDirectory, other_versions: bool) -> tuple[TrainingState | None, list[str]]:
+    """The newest whole checkpoint, if there is one, and what was wrong with newer ones."""
+    remove_unfinished(run.path)
+    if not run.checkpoints.is_dir():
+        return None, []
+    remove_unfinished(run.checkpoints)
+    state, damaged = newest_usable(run.checkpoints)
+    if state is not None and not other_versions:
+        _check_versions(run, state.versions)
+    return state, damaged
+
+
+def _check_versions(run: RunDirectory, then: Mapping[str, str]) -> None:
+    now = installed_versions()
+    for name in sorted(now.keys() | then.keys()):
+        if now.get(name) != then.get(name):
+            raise InvalidInput(
+                f"{run.path}: was trained with {name} {then.get(name)}, here is {now.get(name)}: the numbers would"
+                " differ; install that version, or go on all the same with --other-versions"
+            )
+
+
+def _policy_maker(recipe: TrainingRecipe, scenario: Scenario) -> Callable[[Model], Policy]:
     """How to make a policy of the model's present weights."""
-    network = recipe.network.spec(OBSERVATION.size)
+    network = recipe.network_spec(OBSERVATION.size)
     fixed = {
         "algorithm": recipe.algorithm,
         "network": network,
@@ -167,11 +183,13 @@ def _policy_maker(recipe: TrainingRecipe, scenario: Scenario) -> Callable[[PPO],
 
 
 def _config(recipe: TrainingRecipe, scenario: Scenario) -> dict[str, Any]:
+    stated = {"update_ratio": recipe.update_ratio} if isinstance(recipe, SacRecipe) else {}
     return {
         "recipe": recipe.model_dump(mode="json"),
-        "scenario": scenario.model_dump(mode="json"),
+        "scenario": scenario.model_dump(mode="json", exclude_unset=True),  # what its file says: defaults may clash
         "seeds": {"training": recipe.seed, "evaluation": recipe.evaluation.seed},
         "versions": installed_versions(),
+        **stated,
     }
 
 
@@ -182,20 +200,3 @@ def _environment(recipe: TrainingRecipe, scenario: Scenario) -> Iterator[VecEnv]
         yield environment
     finally:
         environment.close()
-
-
-@contextmanager
-def _own_random_state() -> Iterator[None]:
-    """Stable-Baselines3 seeds and uses the global generators: give them back as they were. One torch thread.
-
-    A second thread makes a network this small 3 to 15 times slower as soon as another process wants a core.
-    """
-    states = random.getstate(), np.random.get_state(), torch.get_rng_state(), torch.get_num_threads()  # noqa: NPY002
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        torch.set_rng_state(states[2])
-        torch.set_num_threads(states[3])

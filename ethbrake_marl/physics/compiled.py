@@ -50,11 +50,23 @@ def compiled(function: Function) -> Function:
     What a kernel calls becomes part of it (``forceinline``): a call would count references to its arrays, atomically,
     which cost more than half of the physics.
     """
+    return _compile(function, inline=True)
+
+
+def compiled_apart(function: Function) -> Function:
+    """Compile as ``compiled`` does, but leave calls of it calls: for what is large, shared, and seldom called.
+
+    Made part of every caller, such functions would be compiled once for each of them: minutes instead of seconds.
+    """
+    return _compile(function, inline=False)
+
+
+def _compile(function: Function, *, inline: bool) -> Function:
     config: Any = numba_config  # its settings are made at run time
     before = config.CACHE_DIR
     config.CACHE_DIR = str(cache_folder())
     try:
-        compiler: Any = numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy", forceinline=True)
+        compiler: Any = numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy", forceinline=inline)
         return cast(Function, compiler(function))
     finally:
         config.CACHE_DIR = before

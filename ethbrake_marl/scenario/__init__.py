@@ -1,6 +1,12 @@
 """Scenarios: strict YAML files that describe families of worlds, and the reproducible lists drawn from them."""
 
-from ethbrake_marl.scenario.catalogue import CatalogueEntry, list_scenarios, load_scenario, scenario_folder
+from ethbrake_marl.scenario.catalogue import (
+    CatalogueEntry,
+    list_scenarios,
+    load_scenario,
+    scenario_folder,
+    scenario_path,
+)
 from ethbrake_marl.scenario.distributions import Choice, Normal, Uniform
 from ethbrake_marl.scenario.initial_states import (
     initial_state_worlds,
@@ -35,6 +41,7 @@ __all__ = [
     "read_yaml",
     "scenario_folder",
     "scenario_json_schema",
+    "scenario_path",
     "table_columns",
     "worlds_from_table",
 ]

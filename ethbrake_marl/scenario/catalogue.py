@@ -31,18 +31,33 @@ def scenario_folder() -> Path:
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:
-    """Load a shipped scenario by name, or a file by path (anything with a separator, ``.yaml`` or ``.yml``).
+    """Load a shipped scenario by name, or a file by path; see ``scenario_path``.
 
     Raises ``UnknownName`` with a suggestion for an unknown name, and ``InvalidInput`` with file, line, path inside
     it and value for a file that does not describe a scenario, or whose name differs from the file's.
     """
+    return _load(scenario_path(name_or_path))
+
+
+def scenario_path(name_or_path: str | Path) -> Path:
+    """The file of a scenario; it need not exist when a path is given.
+
+    A path is anything with a separator, ``.yaml`` or ``.yml``. A shipped scenario has its name, ``stress-wide``; where
+    that begins with its folder's, ``stress/wide`` means the same unless there is such a file.
+    Raises ``UnknownName`` with a suggestion for an unknown name.
+    """
     text = str(name_or_path)
-    if Path(text).suffix in _SUFFIXES or "/" in text or "\\" in text:
-        return _load(Path(text))
+    path = Path(text)
+    if path.suffix in _SUFFIXES or "\\" in text or ("/" in text and path.exists()):
+        return path
     paths = _shipped_paths()
+    if "/" in text:
+        return {f"{p.parent.name}/{p.stem.removeprefix(p.parent.name + '-')}": p for p in paths.values()}.get(
+            text, path
+        )
     if text not in paths:
         raise unknown_name("scenario", text, paths)
-    return _load(paths[text])
+    return paths[text]
 
 
 def list_scenarios() -> list[CatalogueEntry]:

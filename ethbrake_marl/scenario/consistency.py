@@ -15,7 +15,7 @@ from pydantic_core import PydanticCustomError
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.flow_text import flow_text
-from ethbrake_marl.scenario.quantities import QuantityRule
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, QUANTITIES, QuantityRule
 from ethbrake_marl.scenario.scripts import (
     LEARNER,
     STATE_FREE,
@@ -43,8 +43,9 @@ def check_entries(rule: QuantityRule, value: Any, vehicles: int | None) -> None:
         right = f"has {len(value)} entries; {vehicles} vehicles need {rule.count(vehicles)} ({per}), or one for all"
         raise PydanticCustomError("scenario", "{right}", {"right": right, "value": "", "at": ()})
     for index, entry in enumerate(value if listed else (value,)):
-        if not rule.allows(*support(entry)):
-            overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" else ""
+        low, high = support(entry)
+        if not rule.allows(low, high):
+            overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
             refuse((index,) if listed else (), entry, f"must be {rule.interval}{overlap}")
 
 
@@ -85,22 +86,54 @@ def check_roles(roles: Mapping[str, str], vehicles: int) -> None:
             refuse((name,), role, f"{LEARNER} takes no argument")
 
 
+def check_alternatives(scenario: Scenario) -> None:
+    """Gaps are declared in exactly one of two ways, and so are speeds; deviations go with the speed of the line."""
+    if "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None:
+        right = "needs line_speed_mps, the speed that it is added to"
+        refuse(("speed_deviations_mps",), _plain(scenario.speed_deviations_mps), right)
+    for usual, other in ALTERNATIVES.items():
+        given = [key for key in (usual, other) if getattr(scenario, key) is not None]
+        if not given:
+            raise PydanticCustomError("missing", "missing", {"at": (usual,)})
+        if len(given) == 2:
+            refuse((other,), _plain(getattr(scenario, other)), f"give either {usual} or {other}, not both")
+
+
 def check_whole(scenario: Scenario) -> None:
-    """Fields that limit each other: time step, horizon, latency, speeds, constant scripts, rejection."""
+    """Fields that limit each other: time step, horizon, latency, speeds, gaps, constant scripts, rejection."""
     if not scenario.time_step_s <= scenario.horizon_s:
         refuse(("time_step_s",), scenario.time_step_s, f"must not be above horizon_s ({scenario.horizon_s:g} s)")
     for i, latency in enumerate(scenario.quantities("latency_s")):
         if not support(latency)[1] < scenario.horizon_s:
             right = f"must be below horizon_s ({scenario.horizon_s:g} s), or the vehicle can never act"
             refuse(_path(scenario, "latency_s", i), latency, right)
-    limits = scenario.quantities("speed_limit_mps")
-    for i, speed in enumerate(scenario.quantities("speeds_mps")):
-        if not support(speed)[1] <= support(limits[i])[0]:
-            right = f"must not be above speed_limit_mps of vehicle_{i + 1}, {flow_text(_plain(limits[i]))} m/s"
-            refuse(_path(scenario, "speeds_mps", i), speed, right)
+    _check_speeds(scenario)
+    if scenario.time_gaps_s is not None:
+        _check_time_gaps(scenario)
     _check_constant_scripts(scenario)
     if scenario.early_impacts == "reject" and scenario.learners:
         _check_rejection(scenario)
+
+
+def _check_speeds(scenario: Scenario) -> None:
+    limits = scenario.quantities("speed_limit_mps")
+    for i, (low, high) in enumerate(scenario.bounds("speeds_mps")):
+        if low >= 0.0 and high <= support(limits[i])[0]:
+            continue
+        limit = f"speed_limit_mps of vehicle_{i + 1}, {flow_text(_plain(limits[i]))} m/s"
+        if scenario.line_speed_mps is None:
+            speed = scenario.quantities("speeds_mps")[i]
+            refuse(_path(scenario, "speeds_mps", i), speed, f"must not be above {limit}")
+        right = f"with speed_deviations_mps vehicle_{i + 1} drives {low:g} to {high:g} m/s; must be 0 to {limit}"
+        refuse(("line_speed_mps",), scenario.line_speed_mps, right)
+
+
+def _check_time_gaps(scenario: Scenario) -> None:
+    largest = QUANTITIES["gaps_m"].high
+    for pair, (_, high) in enumerate(scenario.bounds("gaps_m")):
+        if not high <= largest:
+            right = f"is up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"
+            refuse(_path(scenario, "time_gaps_s", pair), scenario.quantities("time_gaps_s")[pair], right)
 
 
 def _check_constant_scripts(scenario: Scenario) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds, make_worlds
+from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.numerals import parse_numeral
 from ethbrake_marl.scenario.quantities import QUANTITIES, suggestion
 from ethbrake_marl.scenario.schema import Scenario
@@ -125,22 +126,30 @@ def _worlds(given: Mapping[Entry, Floats], scenario: Scenario, naming: _Naming) 
     """Check the given columns, each [n], fill in the scenario's fixed numbers, and build the worlds."""
     n = len(next(iter(given.values()))) if given else 1
     full: dict[str, Floats] = {}
-    for field, rule in QUANTITIES.items():
+    for field, rule in sorted(QUANTITIES.items(), key=lambda item: item[0] == "gaps_m"):  # gaps may need the speeds
         full[field] = np.empty((n, rule.count(scenario.vehicles)))
-        for index, quantity in enumerate(scenario.quantities(field)):
+        for index in range(rule.count(scenario.vehicles)):
             column = given.get((field, index))
-            if column is not None:
-                good = (column > 0.0 if rule.positive else column >= 0.0) & (column <= rule.high)
-                _require(good, naming, (field, index), column, f"must be {rule.interval}")
-                full[field][:, index] = column
-            elif isinstance(quantity, float):
-                full[field][:, index] = quantity
-            else:
+            if column is None:
+                column = _fixed(scenario, field, index, full)
+            if column is None:
                 missing = naming.entry((field, index))
                 raise InvalidInput(f"{naming.where}: {missing} is missing, and random in scenario {scenario.name!r}")
+            good = (column > 0.0 if rule.positive else column >= 0.0) & (column <= rule.high)
+            _require(good, naming, (field, index), column, f"must be {rule.interval}")
+            full[field][:, index] = column
     _check_together(full, scenario, naming)
     restitution = full.pop("restitution")[:, 0]
     return make_worlds(full.pop("gaps_m"), full.pop("speeds_mps"), restitution=restitution, **full)
+
+
+def _fixed(scenario: Scenario, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:
+    """What the scenario fixes for this entry, [n] or [1]: a time gap at the speeds in ``full``; None if random."""
+    by_time = field == "gaps_m" and scenario.time_gaps_s is not None
+    low, high = support(scenario.quantities("time_gaps_s")[index]) if by_time else scenario.bounds(field)[index]
+    if low != high:
+        return None
+    return low * full["speeds_mps"][:, index + 1] if by_time else np.array([low])
 
 
 def _check_together(full: Mapping[str, Floats], scenario: Scenario, naming: _Naming) -> None:

@@ -1,6 +1,7 @@
 """The quantities that describe a world: meaning, unit, allowed range, and the place of each in the random numbers.
 
-One table serves the schema, its messages, the tables of initial states and the sampling.
+Speeds and gaps may be declared in another way (``OTHERWISE``). One table serves the schema, its messages, the
+tables of initial states and the sampling.
 """
 
 from __future__ import annotations
@@ -36,20 +37,26 @@ class QuantityRule:
     column: str  # name in a table of initial states
     meaning: str
     example: str
+    low: float = 0.0  # smallest allowed value
+    block: int = 0  # vehicle (from 0) in whose block of uniform numbers entry 0 stands
 
     @property
     def interval(self) -> str:
         """The allowed range, with its unit, as messages write it."""
         unit = f" {SYMBOLS.get(self.unit, self.unit)} ({UNITS[self.unit]})" if self.unit else ""
-        return f"finite and in {'(' if self.positive else '['}0, {self.high:g}]{unit}"
+        return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
 
     def allows(self, low: float, high: float) -> bool:
         """Whether every value from ``low`` to ``high`` is in range; false for NaN."""
-        return (low > 0.0 if self.positive else low >= 0.0) and high <= self.high
+        return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
 
     def count(self, vehicles: int) -> int:
         """How many values a world of ``vehicles`` vehicles has."""
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
+
+    def place(self, index: int) -> int:
+        """Which of a world's uniform numbers belongs to entry ``index`` (from 0)."""
+        return BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
         """Name of the column that holds entry ``index`` (from 0) in a table of initial states."""
@@ -100,6 +107,28 @@ QUANTITIES = {
         ),
     )
 }  # fmt: skip
+
+# Other ways to declare speeds and gaps. What replaces a quantity takes over its uniform numbers; the speed of the line
+# has the one number of vehicle_2 that restitution, one per world, leaves free.
+OTHERWISE = {
+    rule.name: rule
+    for rule in (
+        QuantityRule(
+            "time_gaps_s", "s", "pair", 60.0, True, 0, "",
+            "gap of each pair divided by the speed of its rear vehicle, front to rear", "[1, 1]",
+        ),
+        QuantityRule(
+            "line_speed_mps", "mps", "world", 200.0, False, 7, "",
+            "speed that all vehicles share at the alert", "20", block=1,
+        ),
+        QuantityRule(
+            "speed_deviations_mps", "mps", "vehicle", 200.0, False, 1, "",
+            "what each vehicle adds to line_speed_mps", "[0, -2, 0]", low=-200.0,
+        ),
+    )
+}  # fmt: skip
+DECLARED = {**QUANTITIES, **OTHERWISE}  # every key that declares a quantity
+ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps"}  # a scenario has exactly one of each two
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:

@@ -16,8 +16,8 @@ import numpy as np
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, concatenate, make_worlds
-from ethbrake_marl.scenario.distributions import values
-from ethbrake_marl.scenario.quantities import BLOCK, QUANTITIES
+from ethbrake_marl.scenario.derivation import drawn_quantities
+from ethbrake_marl.scenario.quantities import BLOCK
 from ethbrake_marl.scenario.scripts import constant_command
 
 if TYPE_CHECKING:
@@ -120,9 +120,10 @@ def _redraw_one(scenario: Scenario, seed: int, channel: Channel, index: Ints) ->
 
 def _unusable(scenario: Scenario, world: int) -> InvalidInput:
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners)
+    gaps = "time_gaps_s" if scenario.gaps_m is None else "gaps_m"
     return InvalidInput(
         f"scenario {scenario.name!r}: early_impacts: reject, but {MOST_ATTEMPTS} draws of world {world} all have an"
-        f" impact before {learners} may act; give larger gaps_m, a smaller latency_s, or early_impacts: keep"
+        f" impact before {learners} may act; give larger {gaps}, a smaller latency_s, or early_impacts: keep"
     )
 
 
@@ -132,12 +133,7 @@ def _draw(scenario: Scenario, seed: int, channel: Channel, attempt: int, index: 
     u = uniform_numbers(seed, channel, attempt, first, last - first + 1, BLOCK * scenario.vehicles)
     if len(u) != len(index):
         u = u[index - first]
-    drawn = {}
-    for field, rule in QUANTITIES.items():
-        entries = scenario.quantities(field)
-        drawn[field] = np.empty((len(index), len(entries)))
-        for i, entry in enumerate(entries):
-            drawn[field][:, i] = values(entry, u[:, BLOCK * i + rule.slot])
+    drawn = drawn_quantities(scenario, u)
     restitution = drawn.pop("restitution")[:, 0]
     return make_worlds(drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, **drawn)
 

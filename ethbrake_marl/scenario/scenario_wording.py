@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from ethbrake_marl.scenario.distributions import DISTRIBUTIONS, Choice, NormalShape
-from ethbrake_marl.scenario.quantities import QUANTITIES
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
 from ethbrake_marl.scenario.yaml_loading import YamlPath
 
 _INSIDE = {
@@ -34,14 +34,15 @@ class ScenarioWording:
         key = path[-1]
         if isinstance(key, int):
             return "two numbers [low, high] are needed"
-        rule = QUANTITIES.get(key)
+        rule = DECLARED.get(key)
         if rule is None and len(path) > 1:
             return "a number is needed, as in {normal: {mean: 20, sd: 1, low: 18, high: 22}}"
         if rule is None:
             return f"it is needed, for instance {key}: my-scenario"
-        return f"the {rule.meaning} is needed, for instance {key}: {rule.example}"
+        other = f", or {ALTERNATIVES[key]}: {DECLARED[ALTERNATIVES[key]].example}" if key in ALTERNATIVES else ""
+        return f"the {rule.meaning} is needed, for instance {key}: {rule.example}{other}"
 
     def owner(self, path: YamlPath) -> str:
         """Whose value stands at ``path``: a vehicle or a pair; empty for anything else."""
-        rule = QUANTITIES.get(str(path[0])) if len(path) > 1 else None
+        rule = DECLARED.get(str(path[0])) if len(path) > 1 else None
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""

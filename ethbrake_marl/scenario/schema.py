@@ -7,12 +7,21 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, field_validator, model_validator
-from pydantic_core.core_schema import ValidationInfo
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core.core_schema import NullableSchema, ValidationInfo, WithDefaultSchema
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.scenario.consistency import check_entries, check_roles, check_whole, complete_roles
+from ethbrake_marl.scenario.consistency import (
+    check_alternatives,
+    check_entries,
+    check_roles,
+    check_whole,
+    complete_roles,
+    refuse,
+)
+from ethbrake_marl.scenario.derivation import quantity_bounds
 from ethbrake_marl.scenario.distributions import Choice, Normal, Quantity, Uniform
-from ethbrake_marl.scenario.quantities import QUANTITIES
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
 from ethbrake_marl.scenario.sampling import Channel, Sample, draw_list
 from ethbrake_marl.scenario.scenario_wording import ScenarioWording
 from ethbrake_marl.scenario.scripts import LEARNER
@@ -54,14 +63,17 @@ class Scenario(BaseModel):
     horizon_s: float = Field(
         default=8.0, gt=0.0, le=3600.0, allow_inf_nan=False, description="time after which an episode is cut off"
     )
-    gaps_m: PerVehicle = Field(description=QUANTITIES["gaps_m"].meaning)
-    speeds_mps: PerVehicle = Field(description=QUANTITIES["speeds_mps"].meaning)
-    braking_capacity_mps2: PerVehicle = Field(description=QUANTITIES["braking_capacity_mps2"].meaning)
-    driving_capacity_mps2: PerVehicle = Field(description=QUANTITIES["driving_capacity_mps2"].meaning)
-    mass_t: PerVehicle = Field(description=QUANTITIES["mass_t"].meaning)
-    latency_s: PerVehicle = Field(description=QUANTITIES["latency_s"].meaning)
-    speed_limit_mps: PerVehicle = Field(default=40.0, description=QUANTITIES["speed_limit_mps"].meaning)
-    restitution: Quantity = Field(default=0.1, description=QUANTITIES["restitution"].meaning)
+    gaps_m: PerVehicle | None = Field(default=None, description=DECLARED["gaps_m"].meaning)
+    time_gaps_s: PerVehicle | None = Field(default=None, description=DECLARED["time_gaps_s"].meaning)
+    speeds_mps: PerVehicle | None = Field(default=None, description=DECLARED["speeds_mps"].meaning)
+    line_speed_mps: Quantity | None = Field(default=None, description=DECLARED["line_speed_mps"].meaning)
+    speed_deviations_mps: PerVehicle = Field(default=0.0, description=DECLARED["speed_deviations_mps"].meaning)
+    braking_capacity_mps2: PerVehicle = Field(description=DECLARED["braking_capacity_mps2"].meaning)
+    driving_capacity_mps2: PerVehicle = Field(description=DECLARED["driving_capacity_mps2"].meaning)
+    mass_t: PerVehicle = Field(description=DECLARED["mass_t"].meaning)
+    latency_s: PerVehicle = Field(description=DECLARED["latency_s"].meaning)
+    speed_limit_mps: PerVehicle = Field(default=40.0, description=DECLARED["speed_limit_mps"].meaning)
+    restitution: Quantity = Field(default=0.1, description=DECLARED["restitution"].meaning)
     roles: dict[str, str] = Field(
         default_factory=lambda data: complete_roles(None, data.get("vehicles", 3)),
         description="learner or a script for each vehicle; vehicles left out of a given mapping brake fully",
@@ -82,10 +94,18 @@ class Scenario(BaseModel):
         _build(scenario, document)
         return scenario
 
-    @field_validator(*QUANTITIES)
+    @field_validator(*ALTERNATIVES, *ALTERNATIVES.values(), mode="before")
+    @classmethod
+    def _given(cls, value: Any) -> Any:
+        """``null`` is no value: a key that is not used is left out."""
+        if value is None:
+            refuse((), value, "must be a number or a distribution; a key that is not used is left out")
+        return value
+
+    @field_validator(*DECLARED)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        check_entries(QUANTITIES[str(info.field_name)], value, info.data.get("vehicles"))
+        check_entries(DECLARED[str(info.field_name)], value, info.data.get("vehicles"))
         return value
 
     @field_validator("roles")
@@ -99,6 +119,7 @@ class Scenario(BaseModel):
 
     @model_validator(mode="after")
     def _whole(self) -> Scenario:
+        check_alternatives(self)
         check_whole(self)
         return self
 
@@ -119,11 +140,20 @@ class Scenario(BaseModel):
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
     def quantities(self, field: str) -> tuple[AnyQuantity, ...]:
-        """The entries of a quantity, one per vehicle (gaps: per pair; restitution: one)."""
-        declared = getattr(self, QUANTITIES[field].name)
+        """What is declared under a key, one entry per vehicle (gaps: per pair; restitution, line speed: one).
+
+        Raises ``InvalidInput`` for a key that this scenario does not use, ``gaps_m`` beside ``time_gaps_s``.
+        """
+        declared: AnyQuantity | tuple[AnyQuantity, ...] | None = getattr(self, DECLARED[field].name)
+        if declared is None:
+            raise InvalidInput(f"scenario {self.name!r}: {field} is not given; it is derived, see Scenario.bounds")
         if isinstance(declared, tuple):
             return declared
-        return (declared,) * QUANTITIES[field].count(self.vehicles)
+        return (declared,) * DECLARED[field].count(self.vehicles)
+
+    def bounds(self, field: str) -> tuple[tuple[float, float], ...]:
+        """Smallest and largest value of each entry of ``gaps_m``, ``speeds_mps``, ..., however it is declared."""
+        return tuple((float(low), float(high)) for low, high in quantity_bounds(self)[field].T)
 
     def declared(self) -> dict[str, Any]:
         """What was given, as plain data: ``Scenario(**scenario.declared())`` is the same scenario."""
@@ -139,8 +169,15 @@ class Scenario(BaseModel):
         return draw_list(self, n, seed, first=first, channel=channel)
 
     def replace(self, **changes: Any) -> Scenario:
-        """The same scenario with other values in some fields, checked again."""
-        return Scenario(**{**self.declared(), **changes})
+        """The same scenario with other values in some fields, checked again.
+
+        A new way to declare gaps or speeds takes the place of the old one.
+        """
+        old = {key for pair in ALTERNATIVES.items() for key in pair if changes.keys() & set(pair)}
+        if "speeds_mps" in changes:
+            old.add("speed_deviations_mps")
+        kept = {key: value for key, value in self.declared().items() if key not in old}
+        return Scenario(**{**kept, **changes})
 
     def with_learners(self, learners: Sequence[str | int]) -> Scenario:
         """The same scenario with exactly these learners, by name (``vehicle_2``) or index (from 0).
@@ -171,7 +208,26 @@ class Scenario(BaseModel):
 
 def scenario_json_schema() -> dict[str, Any]:
     """JSON Schema of a scenario file, for editors that complete and check YAML."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Scenario.model_json_schema()}
+    one_of_two = [{"oneOf": [{"required": [key]} for key in pair]} for pair in ALTERNATIVES.items()]
+    needed = {"speed_deviations_mps": ["line_speed_mps"]}
+    schema = Scenario.model_json_schema(schema_generator=_FileSchema)
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **schema, "allOf": one_of_two, "dependentRequired": needed,
+    }  # fmt: skip
+
+
+class _FileSchema(GenerateJsonSchema):
+    """In a file a key that is not used is left out; it is never ``null``."""
+
+    def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
+        """The schema of the value where there is one."""
+        return self.generate_inner(schema["schema"])
+
+    def default_schema(self, schema: WithDefaultSchema) -> JsonSchemaValue:
+        """As always, but without ``"default": null``."""
+        described = super().default_schema(schema)
+        return {key: value for key, value in described.items() if key != "default" or value is not None}
 
 
 def _build(scenario: Scenario, document: Document) -> None:

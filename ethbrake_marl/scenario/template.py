@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.flow_text import flow_text
-from ethbrake_marl.scenario.quantities import QUANTITIES
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
 from ethbrake_marl.scenario.schema import NAME_PATTERN, Scenario
 
 _HEAD = """\
@@ -23,6 +24,7 @@ _HEAD = """\
 def new_scenario_text(name: str, based_on: str = "paper-random") -> str:
     """Text of a commented YAML file for a new scenario ``name`` with the values of ``based_on``, all keys written out.
 
+    A key that stands for another way to declare gaps or speeds is there as a comment with an example.
     Save it as ``<name>.yaml``. Raises ``InvalidInput`` for a name that cannot be one, or an unknown ``based_on``.
     """
     if re.fullmatch(NAME_PATTERN, name) is None:
@@ -38,15 +40,25 @@ def new_scenario_text(name: str, based_on: str = "paper-random") -> str:
         "description": "What this scenario is for.",
         "source": f"Values of {base.name}, to be changed.",
     }
-    keys = [f"\n# {_comment(key)}\n{key}:{_value(values[key])}\n" for key in Scenario.model_fields]
+    if base.line_speed_mps is None:
+        del values["speed_deviations_mps"]
+    keys = [f"\n# {_comment(key)}\n{_line(key, values)}\n" for key in Scenario.model_fields]
     return _HEAD.format(name=name, based_on=base.name) + "".join(keys)
 
 
+def _line(key: str, values: Mapping[str, object]) -> str:
+    """``key: value``; a key that goes only with the other way to declare the same stands in a comment."""
+    return f"{key}:{_value(values[key])}" if key in values else f"# {key}: {DECLARED[key].example}"
+
+
 def _comment(key: str) -> str:
-    rule = QUANTITIES.get(key)
+    rule = DECLARED.get(key)
     if rule is None:
         return str(Scenario.model_fields[key].description)
-    return f"{rule.meaning}; {rule.interval}{', below horizon_s' if key == 'latency_s' else ''}"
+    other = {**ALTERNATIVES, **{new: usual for usual, new in ALTERNATIVES.items()}}.get(key)
+    besides = f"; either this or {other}" if other else ""
+    besides = "; only beside line_speed_mps" if key == "speed_deviations_mps" else besides
+    return f"{rule.meaning}; {rule.interval}{', below horizon_s' if key == 'latency_s' else ''}{besides}"
 
 
 def _value(value: object) -> str:

@@ -54,7 +54,7 @@ def explain(error: ValidationError, document: Document, wording: Wording) -> Inv
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
     unknown = [d for d in details if d["type"] == "extra_forbidden"]
     meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(_path(d))) for d in unknown)
-    rest = [d for d in details if d not in unknown and not (d["type"] == "missing" and f" {d['loc'][-1]}" in meant)]
+    rest = [d for d in details if d not in unknown and not (d["type"] == "missing" and f" {_path(d)[-1]}" in meant)]
     shown = (unknown + rest)[0]
     more = len(unknown) + len(rest) - 1
     path = _path(shown)

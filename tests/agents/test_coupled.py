@@ -11,7 +11,8 @@ from ethbrake_marl.agents import coupled
 from ethbrake_marl.agents.coupled import Samples, cell_bounds, choose, lowest_minima, optimise_coupled
 from ethbrake_marl.agents.pairwise import optimise_pairwise
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, make_worlds
+from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, forecast, make_worlds
+from ethbrake_marl.scenario import load_scenario
 
 
 def random_worlds(n: int, seed: int, *, vehicles: int = 3, gap: tuple[float, float] = (5, 10)) -> Worlds:
@@ -52,12 +53,15 @@ def test_coupled__is_not_worse_than_a_grid_of_401(vehicles, vehicle, n):
     assert np.all(optimise_coupled(worlds, vehicle, count="total").harm <= total + 1e-9)
 
 
-@pytest.mark.long
-def test_coupled__is_not_worse_than_a_grid_of_2001_in_2000_worlds():
-    worlds = random_worlds(2000, seed=22)
-    for count, grid in zip(("first", "total"), least_on_grid(worlds, 1, 2001), strict=True):
-        excess = optimise_coupled(worlds, 1, count=count).harm - grid
-        assert excess.max() <= 1e-9
+@pytest.mark.parametrize("n", [120, pytest.param(10_000, marks=pytest.mark.long)])
+def test_coupled__is_not_worse_than_a_grid_of_2001_on_the_papers_list(n):
+    worlds = load_scenario("paper-random").sample(n, seed=7).worlds
+    others = -worlds.vehicles.braking_capacity_mps2
+    grid = np.full((n, 1), -7.0) * np.linspace(0.0, 1.0, 2001)
+    for count, harms in zip(("first", "total"), forecast(worlds, others, 1, grid, 8.0), strict=True):
+        excess = optimise_coupled(worlds, 1, count=count).harm - harms.min(axis=1)
+        print(f"{count}: largest excess {excess.max():.1e}, mean {excess.mean():.5f} m2/s2")
+        assert excess.max() <= 1e-6
         assert np.mean(excess) < 0.0  # narrowing finds more than the grid
 
 
@@ -141,7 +145,8 @@ def test_coupled__refuses_an_unknown_count():
 
 def samples(at, harm, other=None) -> Samples:
     one = np.array([harm], dtype=float)
-    return Samples(np.array([at], dtype=float), one, one if other is None else np.array([other], dtype=float))
+    rest = one if other is None else np.array([other], dtype=float)
+    return Samples(np.array([at], dtype=float), one, rest, np.zeros_like(one))
 
 
 @pytest.mark.parametrize(
@@ -166,7 +171,9 @@ def test_lowest_minima__brackets_in_order_of_depth_whatever_the_order_of_samples
 
 def test_cell_bounds__let_a_falling_side_run_on():
     # Middle cell: falling by 2 on its left, rising by 3 on its right, each up to twice as fast inside: 3 - 4, 1 - 6.
-    assert cell_bounds(np.array([[5.0, 3.0, 1.0, 4.0]])).tolist() == [[3.0, -5.0, -3.0]]
+    assert cell_bounds(np.arange(4.0)[None], np.array([[5.0, 3.0, 1.0, 4.0]])).tolist() == [[3.0, -5.0, -3.0]]
+    # With uneven samples the slope counts: falling by 2 over 1, then a cell twice as wide: 3 - 2 * 2 * 2.
+    assert cell_bounds(np.array([[0.0, 1.0, 3.0]]), np.array([[5.0, 3.0, 4.0]]))[0, 1] == -5.0
 
 
 def test_coupled__finds_a_kink_to_nine_digits():
@@ -199,6 +206,15 @@ def test_coupled__looks_into_more_than_the_most_promising_cell():
         restitution=rng.uniform(0, 1, 250),
     )
     assert optimise_coupled(worlds.take([191]), 2, count="total").harm[0] < 1048.2
+
+
+@pytest.mark.parametrize(
+    ("world", "count", "least"), [(609, "first", 12.2943), (3545, "first", 18.3988), (3290, "total", 55.3322)]
+)
+def test_coupled__finds_what_falls_toward_a_jump_between_two_samples(world, count, least):
+    # Just before one more impact the harm is least: a sawtooth that an even look from outside does not show.
+    one = load_scenario("paper-random").sample(1, seed=7, first=world).worlds
+    assert optimise_coupled(one, 1, count=count).harm[0] < least
 
 
 def test_coupled__is_steady_around_its_optimum():

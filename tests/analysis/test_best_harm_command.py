@@ -21,6 +21,15 @@ def test_best_harm_command__prints_figures_and_writes_the_table(
     assert figures["best_known_total_harm"] == pytest.approx(table.best["total"].harm.mean())
     assert figures["harmless_rate"] == (table.best["total"].harm == 0.0).mean()
     assert table.header["list_seed"] == 7
+    assert (
+        table.header["command"]
+        == figures["command"]
+        == (
+            "ethbrake best-harm --scenario paper-random --episodes 4 --seed 7 --budget 60 --search-seed 0 --output FILE.npz"
+        )
+    )
+    assert 0.0 < figures["proven_harm"] <= figures["best_known_first_impact_harm"]
+    assert figures["impact_proven_rate"] in (0.5, 0.75, 1.0)
     assert [path.name for path in tmp_path.iterdir()] == ["t.npz"]
 
 
@@ -30,6 +39,8 @@ def test_best_harm_command__one_count_from_an_earlier_table(tmp_path: Path, caps
     assert "best_known_first_impact_harm" in capsys.readouterr().out
     assert run_command([*SMALL, "--count", "first", "--start", str(file), "--output", str(better)]) == 0
     assert list(load_table(better).best) == ["first"]
+    assert "--count first" in load_table(better).header["command"]
+    assert "--start t.npz" in load_table(better).header["command"]
     assert (load_table(better).best["first"].harm <= load_table(file).best["first"].harm + 1e-6).all()
 
 

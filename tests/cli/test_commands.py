@@ -14,6 +14,7 @@ COMMANDS = [
     "",
     "run",
     "train",
+    "resume",
     "evaluate",
     "doctor",
     "bench",

@@ -21,7 +21,9 @@ from ethbrake_marl.scenario import load_scenario
 )
 def test_telling_world__is_the_median_saving_among_harmful_worlds(before, after, row):
     harms = {"full_brake": before, "ppo": after}
-    evaluation = SimpleNamespace(outcome=lambda name: SimpleNamespace(first_impact_harm=np.array(harms[name])))
+    evaluation = SimpleNamespace(
+        outcome=lambda name: SimpleNamespace(first_impact_harm=np.array(harms[name])), outcomes=harms
+    )
     assert telling_world(evaluation) == row
 
 

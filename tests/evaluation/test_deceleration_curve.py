@@ -100,13 +100,15 @@ def test_curve__needs_one_world_and_two_points(paper_random: Scenario) -> None:
 
 def test_figure__marks_what_e_v2x_bm_takes_and_the_best_known(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = load_scenario("paper-distance")
-    known = Limits(np.array([False]), np.array(["rear"]), np.array([1.25]), np.array([2.5]))
+    known = Limits(np.array([False]), np.array(["rear"]), np.array([1.25]), np.array([2.5]), np.array([0.5]))
     monkeypatch.setattr(module, "known_limits", lambda worlds, scenario, vehicle: known)
     figure = deceleration_figure(scenario, seven_seven(scenario), 1, title="a title")
     axes, strips = figure.axes
     assert "a* = 5.170 m/s², closed form: predicts 4.03" in texts(figure)
     assert "coupled, least first-impact harm: 10.55" in texts(figure)  # 10.546 in docs/cli.md
-    assert "best known profile: 1.25 first-impact, 2.50 total" in [text.get_text() for text in axes.texts]
+    assert "best known profile: 1.25 first-impact, 2.50 total; proven: no less than 0.50" in [
+        text.get_text() for text in axes.texts
+    ]
     assert {(1.25, 1.25), (2.5, 2.5)} <= {tuple(line.get_ydata()) for line in axes.lines}
     assert axes.get_title(loc="left") == "a title"
     assert [label.get_text() for label in strips.get_yticklabels()] == ["front pair", "rear pair"]

@@ -27,11 +27,13 @@ from ethbrake_marl.scenario import Scenario, load_scenario
 # the fourth is in no table.
 AVOIDABLE = np.array([True, False, False, False])
 REASON = np.array(["", "front", "rear", "rear"])
+PROVEN = np.array([0.0, 1.5, 0.0, 5.0])  # in the third world, contact is unavoidable and no impact proven
 TABLE = {"first": np.array([0.5, 2.0, 4.0, np.nan]), "total": np.array([0.5, 3.0, 5.0, np.nan])}
 FULL = ([10.0, 10.0, 10.0, 10.0], [12.0, 12.0, 12.0, 12.0])
 AGENT = ([1.0, 4.0, 3.0, 6.0], [1.0, 4.0, 5.0, 7.0])
 NULLS = {
-    "unavoidable_rate", "avoidable_collision_rate", "best_known_first_impact_harm", "best_known_total_harm",
+    "unavoidable_rate", "impact_proven_rate", "avoidable_collision_rate", "best_known_first_impact_harm",
+    "best_known_total_harm", "proven_harm", "best_known_minus_proven_first", "best_known_minus_proven_total",
     "mean_regret", "mean_regret_first", "mean_regret_total", "realised_share", "realised_share_first",
     "realised_share_total", "known_best_share", "below_best_known",
 }  # fmt: skip
@@ -53,6 +55,9 @@ def four(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> Evaluation:
         regret_module,
         "avoidability",
         lambda worlds, vehicle: SimpleNamespace(avoidable=AVOIDABLE[: worlds.n], reason_name=REASON[: worlds.n]),
+    )
+    monkeypatch.setattr(
+        regret_module, "lower_bound", lambda worlds, vehicle, **settings: SimpleNamespace(harm=PROVEN[: worlds.n])
     )
     monkeypatch.setattr(regret_module, "best_known", lambda worlds, scenario, count, vehicles: TABLE[count][: worlds.n])
     return first_worlds(evaluation, 4)
@@ -98,6 +103,10 @@ def test_distance__by_hand(four: Evaluation, evaluation: Evaluation) -> None:
     assert found.unavoidable_rate is not None and found.unavoidable_rate.value == pytest.approx(2.0 / 3.0)
     assert found.avoidable_collision_rate is not None
     assert found.avoidable_collision_rate.value == pytest.approx(1.0 / 3.0)
+    assert found.impact_proven_rate is not None and found.impact_proven_rate.value == pytest.approx(1.0 / 3.0)
+    assert found.proven_harm is not None and found.proven_harm.value == pytest.approx(0.5)
+    assert found.gap_first is not None and found.gap_first.value == pytest.approx((0.0 + 0.5 + 3.0) / 3.0)
+    assert found.gap_total is not None and found.gap_total.value == pytest.approx((0.0 + 1.5 + 5.0) / 3.0)
     assert (found.known_best_share, found.below_best_known) == (1.0, 1)
 
 
@@ -131,7 +140,12 @@ def test_summary__has_the_fields_of_the_limit(evaluation: Evaluation) -> None:
         assert found["mean_regret_first"] == pytest.approx(
             found["first_impact_harm"] - found["best_known_first_impact_harm"], rel=1e-9
         )
-        assert found["collision_rate"] == pytest.approx(found["unavoidable_rate"] + found["avoidable_collision_rate"])
+        proven, avoidable = (found["impact_proven_rate"], found["avoidable_collision_rate"])
+        assert proven + avoidable - 1e-12 <= found["collision_rate"] <= found["unavoidable_rate"] + avoidable + 1e-12
+        for count in ("first", "total"):
+            name = "first_impact_harm" if count == "first" else "total_harm"
+            gap = found[f"best_known_{name}"] - found["proven_harm"]
+            assert 0.0 <= found[f"best_known_minus_proven_{count}"] == pytest.approx(gap, rel=1e-9)
         assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert parameters(evaluation)["no_limits_because"] is None
 
@@ -182,6 +196,8 @@ def test_per_world__shows_the_limit_of_each_world(four: Evaluation, tmp_path: Pa
     assert [line["unavoidable_reason"] for line in lines] == ["", "front", "rear", "rear"]
     assert [float(line["best_known_first_impact_harm"]) for line in lines] == [0.0, 2.0, 3.0, 6.0]
     assert [float(line["best_known_total_harm"]) for line in lines] == [0.0, 3.0, 5.0, 7.0]
+    assert [line["impact_proven"] for line in lines] == ["0", "1", "0", "1"]
+    assert [float(line["proven_harm"]) for line in lines] == [0.0, 1.5, 0.0, 5.0]
     assert [line["best_known_source"] for line in lines] == ["witness", "table", "below_table", "agents"]
     assert [float(line["regret_first_impact_harm"]) for line in lines] == [1.0, 2.0, 0.0, 0.0]
     assert [float(line["regret_total_harm"]) for line in lines] == [1.0, 1.0, 0.0, 0.0]
@@ -198,7 +214,21 @@ def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, un
     assert full["unavoidable_rate"] == best["unavoidable_rate"] == unavoidable / 500
     for spec in agents:
         driven = result.outcome(spec)
-        assert driven.collided[~found.limits.avoidable].all()  # nobody avoids what is unavoidable
+        assert driven.collided[found.limits.impact_proven].all()  # nobody avoids what is proven
+        assert (driven.first_impact_harm >= found.limits.proven_harm - 1e-9).all()
         assert (found.regret(driven, "first") >= 0.0).all()
         assert (found.regret(driven, "total") >= 0.0).all()
+    assert not (found.limits.avoidable & found.limits.impact_proven).any()
+    assert (found.first_impact_harm >= found.limits.proven_harm - 1e-9).all()
     assert best["avoidable_collision_rate"] < 0.02 < full["avoidable_collision_rate"]
+
+
+def test_leaning__is_contact_without_an_impact_and_no_collision(tmp_path: Path) -> None:
+    """Gap 2 is 0: Vehicle 3 leans on the braking Vehicle 2 and is braked by it; coasting, it could not stop in time."""
+    scenario = load_scenario("paper-delay-low").replace(gaps_m=[12.0, 0.0], speeds_mps=20.0, latency_s=[0.0, 0.1, 0.8])
+    result = evaluate(scenario.sample(1, 7), {"full_brake": make_agent("full_brake")}, scenario=scenario)
+    (row,) = (row.to_json() for row in summarise(result))
+    assert (row["unavoidable_rate"], row["impact_proven_rate"], row["collision_rate"]) == (1.0, 0.0, 0.0)
+    assert row["best_known_first_impact_harm"] == row["proven_harm"] == 0.0
+    text = markdown_table(summarise(result))
+    assert "In 100.0 %" in text and "avoids contact" in text and "in 0.0 %" in text and "avoids an impact" in text

@@ -11,6 +11,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.forward import Actor, dense
 from ethbrake_marl.learning.networks import NetworkSpec, tensor_table
 from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.squash import squash
 
 Tensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 
@@ -122,3 +123,27 @@ def test_actor__refuses_what_it_cannot_mean(observation: np.ndarray, message: st
     spec = _papers_network(4)
     with pytest.raises(InvalidInput, match=message):
         Actor(spec, random_tensors(spec))(observation)
+
+
+def test_squash__is_the_rounded_hyperbolic_tangent() -> None:
+    x = np.concatenate([np.linspace(-12.0, 12.0, 200_001), np.logspace(-30, 0, 2000), [0.0, -0.0, 1e30, -1e30]])
+    single = x.astype(np.float32)[np.newaxis]
+    actual = single.copy()
+    squash(actual)
+    exact = np.tanh(single.astype(np.float64))
+    spacing = np.spacing(np.abs(exact).astype(np.float32)).astype(np.float64)
+    assert (np.abs(actual - exact) <= 0.5001 * spacing).all()
+    assert actual[0, -2:].tolist() == [1.0, -1.0]
+
+
+@pytest.mark.parametrize("output", ["clip", "tanh"])
+def test_actor__a_squashed_action_is_bitwise_independent_of_the_batch(output: str, random_tensors: Tensors) -> None:
+    spec = NetworkSpec(
+        observation_size=27, action_size=1, policy_hidden=(64,), value_hidden=(), activation="tanh", output=output
+    )
+    actor, seen = Actor(spec, random_tensors(spec)), _observations(200, 27)
+    together = actor(seen)
+    alone = np.concatenate([actor(seen[k : k + 1]) for k in range(200)])
+    assert np.unique(together).size > 80
+    assert np.array_equal(alone, together)
+    assert np.array_equal(actor(seen[37:104]), together[37:104])

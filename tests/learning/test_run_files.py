@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
@@ -46,25 +47,25 @@ def test_new_folder__does_not_take_a_name_that_was_taken_meanwhile(tmp_path: Pat
 
 
 def test_create_run__refuses_what_exists(tmp_path: Path) -> None:
-    run = create_run(tmp_path / "runs" / "first")
-    run.write_json(run.status, {"status": "finished"})
+    run = create_run(tmp_path / "runs" / "first", {"seeds": {"training": 3}})
+    assert json.loads(run.config.read_text()) == {"seeds": {"training": 3}}
+    assert json.loads(run.status.read_text())["status"] == "running"
     with pytest.raises(
         AlreadyExists, match=r"first: is there already; give another name .*--force; make run ARGS=--force"
     ):
-        create_run(run.path)
+        create_run(run.path, {})
     assert run.status.is_file()
 
 
 def test_create_run__force_replaces_a_run_and_nothing_else(tmp_path: Path) -> None:
-    run = create_run(tmp_path / "first")
-    run.write_json(run.status, {})
+    run = create_run(tmp_path / "first", {})
     (run.path / "old").touch()
-    assert list(create_run(run.path, force=True).path.iterdir()) == []
+    assert sorted(p.name for p in create_run(run.path, {}, force=True).path.iterdir()) == ["config.json", "run.json"]
     precious = tmp_path / "thesis"
     precious.mkdir()
     (precious / "chapter-1").touch()
     with pytest.raises(AlreadyExists, match="thesis: is there already, and is no run; give another name"):
-        create_run(precious, force=True)
+        create_run(precious, {}, force=True)
     assert (precious / "chapter-1").is_file()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["first", "thesis"]
 

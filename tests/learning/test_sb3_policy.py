@@ -9,7 +9,9 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from ethbrake_marl.learning.forward import Actor
 from ethbrake_marl.learning.networks import NetworkSpec
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.sb3_policy import policy_arguments, tensors_of
+from ethbrake_marl.learning.sb3_policy import ppo_arguments, tensors_of
+
+SHAPE = load_recipe("ppo-paper").network
 
 
 def _papers_network(observation_size: int) -> NetworkSpec:
@@ -19,7 +21,12 @@ def _papers_network(observation_size: int) -> NetworkSpec:
 def _policy(spec: NetworkSpec, seed: int) -> ActorCriticPolicy:
     torch.manual_seed(seed)
     seen = Box(-10.0, 10.0, (spec.observation_size,), np.float32)
-    policy = ActorCriticPolicy(seen, Box(-1.0, 1.0, (1,), np.float32), lambda _: 1e-3, **policy_arguments(spec, -0.5))
+    policy = ActorCriticPolicy(
+        seen,
+        Box(-1.0, 1.0, (1,), np.float32),
+        lambda _: 1e-3,
+        **ppo_arguments(SHAPE.model_copy(update={"activation": spec.activation, "initial_log_std": -0.5})),
+    )
     with torch.no_grad():
         policy.action_net.weight *= 100.0  # fresh weights are tiny: fill [-1, 1] and go beyond it
     return policy

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
 
 from ethbrake_marl.physics import Bools, Floats, Impacts, Worlds, advance
@@ -22,8 +25,26 @@ def state_bytes(worlds: Worlds, impacts: Impacts) -> tuple[bytes, ...]:
     return tuple(c.tobytes() for c in (*columns, impacts.first_impact_harm, impacts.total_harm, impacts.count))
 
 
-def split_errors(N: int, n: int, cuts: int, key: int) -> tuple[Floats, Bools]:
-    """Relative changes of worlds cut at random times, and which of them have few impacts; [worlds of equal counts]."""
+def relative_changes(mine: Worlds, theirs: Worlds, total_harm: Floats, other_harm: Floats) -> Floats:
+    """Largest change of a world's gaps, speeds and harm, relative to at least 100 m, 30 m/s, 900 m2/s2, [n]."""
+    worst = np.zeros(mine.n)
+    parts = ((mine.gaps_m, theirs.gaps_m, 100.0), (mine.speeds_mps, theirs.speeds_mps, 30.0))
+    for one, other, size in (*parts, (total_harm, other_harm, 900.0)):
+        scale = np.maximum(np.abs(other).max(axis=1), size)
+        worst = np.maximum(worst, np.abs(one - other).max(axis=1) / scale)
+    return worst
+
+
+class Split(NamedTuple):
+    """What cutting a run at random times changed; arrays [n]."""
+
+    error: Floats  # relative_changes
+    few: Bools  # at most FEW_IMPACTS impacts
+    other: Bools  # some pair has another number of impacts
+
+
+def split_errors(N: int, n: int, cuts: int, key: int) -> Split:
+    """Whole runs against the same runs cut at random times."""
     batch = driving_lines(key, n, N)
     whole, impacts = once(batch)
     edges = np.sort(np.random.default_rng(cuts).uniform(0.0, HORIZON_S, (cuts, n)), axis=0)
@@ -31,10 +52,21 @@ def split_errors(N: int, n: int, cuts: int, key: int) -> tuple[Floats, Bools]:
     for edge in edges:
         world, part = advance(world, batch.command, until_s=edge)
         total, count = total + part.total_harm, count + part.count
-    same = (count == impacts.count).all(axis=1)
-    worst = np.zeros(n)
-    parts = ((world.gaps_m, whole.gaps_m, 100.0), (world.speeds_mps, whole.speeds_mps, 30.0))
-    for mine, theirs, size in (*parts, (total, impacts.total_harm, 900.0)):
-        scale = np.maximum(np.abs(theirs).max(axis=1), size)
-        worst = np.maximum(worst, np.abs(mine - theirs).max(axis=1) / scale)
-    return worst[same], count.sum(axis=1)[same] <= FEW_IMPACTS
+    error = relative_changes(world, whole, total, impacts.total_harm)
+    return Split(error, _few(impacts), (count != impacts.count).any(axis=1))
+
+
+def last_digit_errors(N: int, n: int, key: int) -> Split:
+    """The same runs, uncut, against those whose initial gaps have another last digit: what doubles can know at all."""
+    batch = driving_lines(key, n, N)
+    whole, impacts = once(batch)
+    gaps = batch.worlds.gaps_m
+    moved = replace(batch.worlds, gaps_m=np.where(gaps > 0.0, np.nextafter(gaps, np.inf), gaps))
+    other, changed = once(Batch(moved, batch.command))
+    error = relative_changes(other, whole, changed.total_harm, impacts.total_harm)
+    return Split(error, _few(impacts), (changed.count != impacts.count).any(axis=1))
+
+
+def _few(impacts: Impacts) -> Bools:
+    few: Bools = impacts.count.sum(axis=1) <= FEW_IMPACTS
+    return few

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
+import numba
 import numpy as np
 import pytest
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics import Worlds, advance, make_worlds
 
 
@@ -186,3 +190,24 @@ def test_split__two_half_segments_equal_one():
 def test_bad_input__is_refused_with_its_place_and_range(call, message):
     with pytest.raises(InvalidInput, match=message):
         call(line([5.0], [1.0, 1.0]))
+
+
+@pytest.mark.parametrize(("command", "message"), [([10.0, -11.0], "0, 1] = -11"), ([-10.0, 10.5], "0, 1] = 10.5")])
+def test_bad_command__is_named_also_behind_one_that_is_just_allowed(command, message):
+    with pytest.raises(InvalidInput, match=re.escape(message)):
+        advance(line([5.0], [1.0, 1.0]), command, 1.0)
+
+
+def test_overlap__that_no_advance_could_have_left_is_reported():
+    # pair 0 meets, so the world goes event by event; pair 1 overlaps by 1 m (a state of the sampled map) and separates
+    worlds = replace(line([1.0, 1.0], [0.0, 8.0, 4.0]), gaps_m=np.array([[1.0, -1.0]]))
+    with pytest.raises(PhysicsError, match=r"world 0: a contact was missed between 0 s and 2 s"):
+        advance(worlds, [0.0, 0.0, 0.0], 2.0)
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="100,000 events take long without compilation")
+def test_bounces__more_than_any_segment_holds_are_reported():
+    # e = 1 and a push of 10 m/s2 against a heavy wall: a bounce of 0.2 m/s every 0.04 s for 10,000 s
+    wall = line([0.0], [0.0, 0.2], mass=[2.0**60, 1.0], e=1.0)
+    with pytest.raises(PhysicsError, match="world 0: more than 100000 events between 0 s and 10000 s"):
+        advance(wall, [-10.0, 10.0], 10_000.0)

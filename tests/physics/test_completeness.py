@@ -9,7 +9,7 @@ import pytest
 
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.physics.events import contact
-from ethbrake_marl.physics.tolerances import CONTACT_TIME_EPS, EPS
+from ethbrake_marl.physics.tolerances import BORDERLINE_SHARE, CONTACT_TIME_EPS, EPS
 from tests.physics.exact_simulator import square_root
 from tests.physics.segments import Scan, Segments, meetings, random_segments, scan
 
@@ -20,7 +20,7 @@ def clean(found: Scan) -> None:
     """Nothing missed, invented or misplaced; and the scan said something."""
     assert (found.missed.tolist(), found.phantom.tolist(), found.wrong.tolist()) == ([], [], [])
     assert found.contacts > 0.1 * found.pairs / 4 and found.in_doubt > 0
-    assert found.borderline <= 1e-4 * found.pairs
+    assert found.borderline <= BORDERLINE_SHARE * found.pairs
 
 
 @pytest.mark.parametrize(("N", "n"), [(2, 200_000), (3, 20_000), (5, 10_000)])

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ethbrake_marl.physics import Worlds, advance, make_worlds
-from ethbrake_marl.physics.tolerances import ENERGY_EPS, EPS, GAP_M, MOMENTUM_EPS, RESTITUTION_EPS
+from ethbrake_marl.physics.tolerances import ENERGY_EPS, EPS, GAP_M, MOMENTUM_EPS, RESTITUTION_EPS, SMALLEST
 from tests.physics.measures import energy_rise_eps, momentum_eps, restitution_eps, rounds
 from tests.physics.random_worlds import driving_lines, touching_lines
 from tests.physics.watched import Watched
 
-SPEED = st.floats(0.0, 40.0)
+SPEED = st.just(0.0) | st.floats(SMALLEST, 40.0)
 MASS = st.floats(1e-2, 1e4)
 
 
@@ -97,6 +97,14 @@ def test_impact__the_common_speed_of_a_block_is_refined(speeds, mass, e):
     )  # fmt: skip
     after, _ = advance(before, np.zeros(len(speeds)), 0.0)
     assert momentum_eps(before, after)[0] <= MOMENTUM_EPS
+
+
+def test_impact__of_speeds_below_the_range_of_doubles_moves_by_less_than_their_spacing():
+    # 5e-324 m/s has no half: relative tolerances end at SMALLEST, nothing else happens
+    least = 5e-324
+    after, impacts = advance(pair((0.0, least), (1.0, 1.0), 0.5), [0.0, 0.0], 0.0)
+    assert impacts.count.tolist() == [[0]] and after.gaps_m.tolist() == [[0.0]]
+    assert after.speeds_mps[0, 0] == after.speeds_mps[0, 1] and 0.0 <= after.speeds_mps[0, 0] <= least
 
 
 def test_impact__a_pair_that_separates_is_left_alone_to_the_last_bit():

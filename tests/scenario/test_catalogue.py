@@ -36,6 +36,13 @@ PAPER = {
 }
 
 
+def not_used(scenario: Scenario) -> set[str]:
+    """The keys of the ways to declare gaps and speeds that the scenario does not use."""
+    gaps = "gaps_m" if scenario.gaps_m is None else "time_gaps_s"
+    speeds = {"speeds_mps"} if scenario.speeds_mps is None else {"line_speed_mps", "speed_deviations_mps"}
+    return {gaps, *speeds}
+
+
 def test_list__is_sorted_and_has_the_papers_scenarios():
     entries = list_scenarios()
     names = [entry.name for entry in entries]
@@ -90,6 +97,23 @@ def test_path__is_what_looks_like_one(path):
         load_scenario(path)
 
 
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_path__of_a_shipped_one_may_be_folder_and_short_name(path: Path):
+    folder = path.parent.name
+    assert path.stem.startswith(f"{folder}-")
+    assert load_scenario(f"{folder}/{path.stem.removeprefix(f'{folder}-')}") == load_scenario(path.stem)
+    with pytest.raises(InvalidInput, match="no such file"):
+        load_scenario(f"{folder}/{path.stem}")
+
+
+def test_path__a_file_that_exists_goes_before_the_shipped_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "stress").mkdir()
+    (tmp_path / "stress" / "wide").write_text(new_scenario_text("wide"))
+    assert load_scenario("stress/wide").name == "wide"
+    assert load_scenario("stress-wide").name == "stress-wide"
+
+
 @pytest.mark.parametrize("suffix", [".yaml", ".yml"])
 def test_path__the_users_own_file(tmp_path: Path, suffix: str):
     path = tmp_path / f"mine{suffix}"
@@ -112,7 +136,8 @@ def test_new__has_every_key_and_the_values_it_is_based_on(path):
     new, base = Scenario.from_document(parse_yaml(text)), load_scenario(path.stem)
     assert new.model_dump(exclude=own) == base.model_dump(exclude=own)
     assert new.name == "mine"
-    assert all(re.search(rf"^# .*\n{key}:", text, re.MULTILINE) for key in Scenario.model_fields)
+    assert all(re.search(rf"^# .*\n(# )?{key}:", text, re.MULTILINE) for key in Scenario.model_fields)
+    assert {key for key in Scenario.model_fields if f"\n# {key}:" in text} == not_used(base)
     assert not re.search(r"[ \t]$", text, re.MULTILINE)
 
 
@@ -126,8 +151,17 @@ def test_json_schema__names_every_field_and_serialises():
     schema = json.loads(json.dumps(scenario_json_schema()))
     assert set(schema["properties"]) == set(Scenario.model_fields)
     assert schema["additionalProperties"] is False
-    assert {"name", "gaps_m", "latency_s"} <= set(schema["required"])
-    assert "vehicles" not in schema["required"]
+    assert {"name", "mass_t", "latency_s"} <= set(schema["required"])
+    assert not {"vehicles", "gaps_m", "time_gaps_s"} & set(schema["required"])
+
+
+def test_json_schema__asks_for_one_of_two_ways_and_knows_no_null():
+    schema = scenario_json_schema()
+    pairs = [[way["required"] for way in pair["oneOf"]] for pair in schema["allOf"]]
+    assert pairs == [[["gaps_m"], ["time_gaps_s"]], [["speeds_mps"], ["line_speed_mps"]]]
+    assert schema["dependentRequired"] == {"speed_deviations_mps": ["line_speed_mps"]}
+    assert "null" not in json.dumps(schema)
+    assert schema["properties"]["time_step_s"]["default"] == 0.1
 
 
 def test_docs__the_table_of_keys_has_every_field_with_its_default():
@@ -138,6 +172,10 @@ def test_docs__the_table_of_keys_has_every_field_with_its_default():
         cells = [cell.strip() for cell in rows[key].split("|")]
         if field.is_required():
             assert cells[0] == "required", key
+        elif field.default is None:
+            other = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps"}
+            other |= {new: usual for usual, new in other.items()}
+            assert cells[0] == f"this or `{other[key]}`"
         elif field.default_factory is None:
             assert cells[0] == (f"`{flow_text(field.default)}`" if field.default != "" else "empty"), key
 

@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Vehicles, Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario, sampling
-from ethbrake_marl.scenario.quantities import BLOCK, QUANTITIES
+from ethbrake_marl.scenario.quantities import BLOCK, OTHERWISE, QUANTITIES
 from ethbrake_marl.scenario.sampling import uniform_numbers
 
 # As printed by: python -c "import ethbrake_marl as eb; print(eb.load_scenario('paper-random').sample(3, 7).worlds)"
@@ -103,12 +103,11 @@ def test_columns__changing_one_quantity_leaves_all_others_alone(changed):
 
 
 def test_columns__every_entry_of_a_world_has_its_own():
-    places = [
-        BLOCK * index + rule.slot
-        for rule in QUANTITIES.values()
-        for index in range(rule.count(64))
-    ]  # fmt: skip
+    rules = [*QUANTITIES.values(), OTHERWISE["line_speed_mps"]]
+    places = [rule.place(index) for rule in rules for index in range(rule.count(64))]
     assert len(set(places)) == len(places)
+    assert [QUANTITIES["mass_t"].place(i) for i in range(3)] == [5, 13, 21]
+    assert OTHERWISE["line_speed_mps"].place(0) == 15  # slot 7 of vehicle_2
     assert max(places) < BLOCK * 64
     assert BLOCK % 4 == 0
 

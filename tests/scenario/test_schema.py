@@ -69,7 +69,7 @@ def test_roles__survive_copies():
 
 
 def test_python__arguments_raise_the_same_errors():
-    with pytest.raises(InvalidInput, match=r"scenario 'bad': gaps_km: .* gaps_m \(metres\)\? \(and 5 more\)$"):
+    with pytest.raises(InvalidInput, match=r"scenario 'bad': gaps_km: .* gaps_m \(metres\)\? \(and 4 more\)$"):
         Scenario(name="bad", gaps_km=7)
     with pytest.raises(InvalidInput, match=r"^scenario 'given': mass_t\[0\] \(vehicle_1\) = -1: "):
         build(mass_t=[-1, 2, 3])

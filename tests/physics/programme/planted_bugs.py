@@ -1,9 +1,10 @@
 """Twenty bugs that such a simulator could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make planted-bugs`` (or ``python -m tests.physics.programme.planted_bugs [--jobs J] [--only WORD]``). A bug is a
-textual patch of the kernel or the ledger. It is applied to a temporary copy, never to the working tree; there the fast
-suite runs (``tests/physics``, ``tests/golden``, ``tests/test_harm.py``) until its first failure. A patch that does not
-fit the code any more is an error.
+textual patch of the kernel or the ledger. It is applied to a temporary copy, never to the working tree. There some test
+files run with compilation switched off (2 s), and where these stay green the whole suite of the physics, compiled;
+until the first failure. The first suite is tried without any bug before: it must be green. (The second one is what
+``make test`` runs.) A patch that does not fit the code is an error.
 """
 
 from __future__ import annotations
@@ -21,7 +22,11 @@ from typing import NamedTuple
 
 from tests.physics.programme.mutation import ROOT, copy_repository
 
-SUITE = ("tests/physics", "tests/golden", "tests/test_harm.py")
+QUICK = tuple(
+    f"tests/{name}.py"
+    for name in ("physics/test_advance", "physics/test_ties", "physics/test_against_exact", "test_harm")
+)
+WHOLE = ("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py")
 LIMIT_S = 900.0
 
 EVENTS, IMPACT, SEGMENT, ADVANCE = (
@@ -140,10 +145,11 @@ def plant(folder: Path, patches: tuple[Patch, ...]) -> None:
         file.write_text(text.replace(patch.old, patch.new), "utf-8")
 
 
-def first_red(folder: Path) -> str:
-    """The first test that fails in ``folder``, or an empty string."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "numba"), "NUMBA_DISABLE_JIT": "0"}
-    command = [sys.executable, "-B", "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--rootdir=.", *SUITE]
+def first_red(folder: Path, suite: tuple[str, ...], *, compiled: bool) -> str:
+    """The first test of a suite that fails in ``folder``, or an empty string."""
+    switch = "0" if compiled else "1"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "numba"), "NUMBA_DISABLE_JIT": switch}
+    command = [sys.executable, "-B", "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--rootdir=.", *suite]
     try:
         done = subprocess.run(
             command, cwd=folder, env=environment, capture_output=True, text=True, timeout=LIMIT_S, check=False
@@ -160,11 +166,16 @@ def first_red(folder: Path) -> str:
 
 def try_bug(name: str) -> str:
     """The test that finds one planted bug, or an empty string."""
+    return red_with(BUGS[name], QUICK, compiled=False) or red_with(BUGS[name], WHOLE, compiled=True)
+
+
+def red_with(patches: tuple[Patch, ...], suite: tuple[str, ...], *, compiled: bool) -> str:
+    """The first test of a suite that fails in a copy with these patches, or an empty string."""
     folder = Path(tempfile.mkdtemp(prefix="planted-"))
     try:
         copy_repository(folder)
-        plant(folder, BUGS[name])
-        return first_red(folder)
+        plant(folder, patches)
+        return first_red(folder, suite, compiled=compiled)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -190,12 +201,15 @@ def main() -> int:
         print(f"ERROR  {wrong}")
     if misfits:
         return 1
+    if red := red_with((), QUICK, compiled=False):
+        print(f"ERROR  red without any bug: {red}")
+        return 1
     names = [name for name in BUGS if given.only in name]
     found = 0
     with ThreadPoolExecutor(given.jobs) as pool:
         for name, red in zip(names, pool.map(try_bug, names), strict=True):
             found += bool(red)
-            print(f"{'found ' if red else 'MISSED'}  {name:52s} {red}", flush=True)
+            print(f"{'found ' if red else 'MISSED'}  {name:52s} {red.removeprefix('tests/')}", flush=True)
     print(f"planted bugs: {found}/{len(names)} found: {'PASS' if found == len(names) else 'FAIL'}")
     return 0 if found == len(names) else 1
 

@@ -1,0 +1,134 @@
+"""Everything about a model in training as plain arrays and JSON, and back: it goes on to the same bits."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO, SAC
+
+from ethbrake_marl.learning.random_state import capture_random, restore_random
+from ethbrake_marl.snapshots import Arrays
+
+Model = PPO | SAC
+
+REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "_total_timesteps")
+
+
+def capture_model(model: Model) -> tuple[Arrays, dict[str, Any]]:
+    """Weights, optimisers, environment, random generators and counters between two updates, replay memory aside."""
+    arrays: Arrays = {f"policy.{name}": _copied(tensor) for name, tensor in model.policy.state_dict().items()}
+    if isinstance(model, SAC) and model.log_ent_coef is not None:
+        arrays["log_ent_coef"] = _copied(model.log_ent_coef.detach())
+    rates: dict[str, float] = {}
+    for name, optimizer in optimizers_of(model).items():
+        content = optimizer.state_dict()
+        rates[name] = float(content["param_groups"][0]["lr"])
+        for index, entries in content["state"].items():
+            arrays |= {f"optimizer.{name}.{index}.{key}": _copied(value) for key, value in entries.items()}
+    environment: Any = model.env
+    arrays |= {f"environment.{name}": array for name, array in environment.snapshot().items()}
+    generators, random_plain = capture_random(model.action_space)
+    observations: Any = model._last_obs
+    episodes = list(model.ep_info_buffer or ())
+    arrays |= generators | {
+        "last.observations": observations.copy(),
+        "last.episode_starts": np.array(model._last_episode_starts, np.bool_),
+        "episodes.return": np.array([episode["r"] for episode in episodes], np.float64),
+        "episodes.steps": np.array([episode["l"] for episode in episodes], np.int64),
+    }
+    counters = {name: getattr(model, name) for name in _COUNTERS}
+    return arrays, {"counters": counters, "learning_rates": rates, "random": random_plain, "log": _pending_log(model)}
+
+
+def restore_model(model: Model, arrays: Mapping[str, NDArray[Any]], plain: Mapping[str, Any]) -> None:
+    """Bring a freshly built model of the same recipe to the state of ``capture_model``."""
+    model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in _group(arrays, "policy.").items()})
+    if isinstance(model, SAC) and model.log_ent_coef is not None:
+        model.log_ent_coef.data.copy_(torch.from_numpy(arrays["log_ent_coef"]))
+    for name, optimizer in optimizers_of(model).items():
+        _restore_optimizer(optimizer, _group(arrays, f"optimizer.{name}."), plain["learning_rates"][name])
+    environment: Any = model.env
+    environment.restore(_group(arrays, "environment."))
+    for name in _COUNTERS:
+        setattr(model, name, plain["counters"][name])
+    model._last_obs = arrays["last.observations"].copy()
+    model._last_episode_starts = arrays["last.episode_starts"].copy()
+    model.ep_info_buffer, model.ep_success_buffer = _deques(model)
+    for gained, steps in zip(arrays["episodes.return"].tolist(), arrays["episodes.steps"].tolist(), strict=True):
+        model.ep_info_buffer.append({"r": gained, "l": steps, "t": 0.0})
+    restore_random(model.action_space, arrays, plain["random"])
+
+
+def restore_log(model: Model, plain: Mapping[str, Any]) -> None:
+    """Give the model's logger what was recorded and not yet written."""
+    for name, (value, count, excluded) in plain["log"].items():
+        model.logger.name_to_value[name] = value
+        model.logger.name_to_count[name] = count
+        model.logger.name_to_excluded[name] = tuple(excluded)
+
+
+def replay_arrays(model: Model) -> tuple[Arrays, dict[str, Any]]:
+    """The filled part of the replay memory, as views, and where it goes on; nothing without one (PPO)."""
+    memory: Any = getattr(model, "replay_buffer", None)
+    if memory is None:
+        return {}, {}
+    return {name: getattr(memory, name)[: memory.size()] for name in REPLAY}, {"pos": memory.pos, "full": memory.full}
+
+
+def restore_replay(model: Model, arrays: Mapping[str, NDArray[Any]], plain: Mapping[str, Any]) -> None:
+    """Fill the replay memory of a fresh model."""
+    memory: Any = getattr(model, "replay_buffer", None)
+    if memory is None:
+        return
+    for name in REPLAY:
+        getattr(memory, name)[: len(arrays[name])] = arrays[name]
+    memory.pos, memory.full = plain["pos"], plain["full"]
+
+
+def optimizers_of(model: Model) -> dict[str, torch.optim.Optimizer]:
+    """The model's optimisers by name."""
+    if isinstance(model, PPO):
+        return {"policy": model.policy.optimizer}
+    found: dict[str, Any] = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
+    if model.ent_coef_optimizer is not None:
+        found["ent_coef"] = model.ent_coef_optimizer
+    return found
+
+
+def _restore_optimizer(optimizer: torch.optim.Optimizer, arrays: Arrays, rate: float) -> None:
+    content = optimizer.state_dict()
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, array in arrays.items():
+        index, key = name.split(".")
+        state.setdefault(int(index), {})[key] = torch.from_numpy(array.copy())
+    for group in content["param_groups"]:
+        group["lr"] = rate
+    optimizer.load_state_dict({"state": state, "param_groups": content["param_groups"]})
+
+
+def _pending_log(model: Model) -> dict[str, Any]:
+    log = model.logger
+    pending = {}
+    for name, value in log.name_to_value.items():
+        number = value.item() if isinstance(value, np.generic | torch.Tensor) else value
+        pending[name] = [number, log.name_to_count[name], list(log.name_to_excluded[name] or ())]
+    return pending
+
+
+def _deques(model: Model) -> tuple[Any, Any]:
+    size = model._stats_window_size
+    return deque(maxlen=size), deque(maxlen=size)
+
+
+def _group(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
+def _copied(tensor: Any) -> NDArray[Any]:
+    return np.array(torch.as_tensor(tensor).detach().cpu().numpy())

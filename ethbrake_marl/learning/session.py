@@ -1,0 +1,135 @@
+"""One stretch of a training in one process: from a fresh model or a checkpoint, to the end or the next stop."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+
+from ethbrake_marl.durable_files import remove_folder
+from ethbrake_marl.learning.bundle import Policy, save_policy
+from ethbrake_marl.learning.callback import BetweenUpdates, StopRequested
+from ethbrake_marl.learning.checkpoint import TrainingState, prune, write_checkpoint
+from ethbrake_marl.learning.divergence import TrainingDiverged, weights_are_finite
+from ethbrake_marl.learning.event_files import cut_back, event_sizes
+from ethbrake_marl.learning.model_state import (
+    Model,
+    capture_model,
+    replay_arrays,
+    restore_log,
+    restore_model,
+    restore_replay,
+)
+from ethbrake_marl.learning.progress_table import ProgressTable
+from ethbrake_marl.learning.recipe import TrainingRecipe
+from ethbrake_marl.learning.run_directory import RunDirectory, RunRecord, RunStatus
+from ethbrake_marl.learning.versions import installed_versions
+
+Ended = Literal["finished", "interrupted"]
+
+
+class Session:
+    """Keeps the run's folder complete while a model learns in it."""
+
+    def __init__(self, run: RunDirectory, model: Model, recipe: TrainingRecipe) -> None:
+        self._run, self._model, self._recipe = run, model, recipe
+        self._record = RunRecord(run)
+        self._table = ProgressTable(run.progress)
+        self._restored: TrainingState | None = None
+        self._events: TensorBoardOutputFormat | None = None
+
+    def save(self, between: BetweenUpdates) -> None:
+        """Write a checkpoint of this moment, unless there is one, and delete those that are old."""
+        course, folder = between.course, self._run.checkpoint(between.course.steps)
+        if folder.exists():
+            return
+        assert course.policy is not None and self._events is not None
+        self._events.writer.flush()
+        arrays, numbers = capture_model(self._model)
+        replay, replay_numbers = replay_arrays(self._model)
+        numbers |= {
+            "between": between.state(),
+            "replay": replay_numbers,
+            "events": event_sizes(self._run.tensorboard),
+        }
+        state = TrainingState(
+            course.steps,
+            course.updates,
+            numbers,
+            arrays,
+            replay,
+            course.policy,
+            course.best,
+            self._table.content(),
+            installed_versions(),
+        )
+        write_checkpoint(folder, state)
+        prune(self._run.checkpoints)
+
+    def restore(self, between: BetweenUpdates, state: TrainingState | None) -> None:
+        """Bring model, callback, table and events back to ``state``; None: to the beginning."""
+        if state is None:
+            self._run.progress.unlink(missing_ok=True)
+            cut_back(self._run.tensorboard, {})
+            return
+        restore_model(self._model, state.arrays, state.numbers)
+        restore_replay(self._model, state.replay, state.numbers["replay"])
+        between.restore(state.numbers["between"], state.steps, state.policy, state.best)
+        self._table.restore(state.table)
+        cut_back(self._run.tensorboard, state.numbers["events"])
+        self._restored = state
+
+    def learn(self, between: BetweenUpdates) -> Ended:
+        """Train to the end, and leave the folder complete whatever that end is."""
+        model, state = self._model, self._restored
+        self._events = TensorBoardOutputFormat(str(self._run.tensorboard))
+        logger = Logger(str(self._run.path), [self._table, self._events])
+        model.set_logger(logger)
+        if state is not None:
+            restore_log(model, state.numbers)
+        status: Ended = "finished"
+        try:
+            steps = self._recipe.total_steps - model.num_timesteps
+            model.learn(steps, callback=between, log_interval=None, reset_num_timesteps=state is None)  # type: ignore[arg-type]
+        except StopRequested:
+            status = "interrupted"
+        except BaseException as error:
+            cause = self._diverged(error)
+            self._close(between, "interrupted" if isinstance(error, KeyboardInterrupt) else "failed", cause)
+            if cause is error:
+                raise
+            raise cause from error
+        finally:
+            logger.close()
+        self._close(between, status)
+        return status
+
+    def _close(self, between: BetweenUpdates, status: RunStatus, cause: BaseException | None = None) -> None:
+        """Save the best and the last good policy, say how the run ended; a finished one needs no checkpoint."""
+        course = between.course
+        self._save_policy(course.kept, "policy")
+        self._save_policy(course.policy, "policy-last")
+        reason = None if cause is None else f"{type(cause).__name__}: {cause}"
+        left: dict[str, Any] = {
+            "wall_s": round(course.wall_s, 3),
+            "steps": course.steps,
+            "updates": course.updates,
+            "policy_steps": None if course.kept is None else course.kept.manifest.steps,
+            "alarms": course.alarms,
+        }
+        self._record.end(status, reason, left)
+        if status == "finished" and self._run.checkpoints.is_dir():
+            remove_folder(self._run.checkpoints)
+
+    def _save_policy(self, policy: Policy | None, name: str) -> None:
+        if policy is not None:
+            save_policy(policy, self._run.path / name, replace=True)
+
+    def _diverged(self, error: BaseException) -> BaseException:
+        """The error to report: torch's own when a distribution gets a NaN says little about a training."""
+        if isinstance(error, ValueError) and not weights_are_finite(self._model):
+            return TrainingDiverged(
+                f"training: a weight or the exploration noise is not finite at step {self._model.num_timesteps};"
+                " try a smaller learning_rate"
+            )
+        return error

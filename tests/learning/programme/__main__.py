@@ -1,0 +1,162 @@
+"""The long programme on resuming: processes that train are killed (-9) at random moments, and must lose nothing.
+
+    python -m tests.learning.programme [--kills 20] [--torn 40] [--seed 0]
+
+Prints one line per gate and exits with status 1 when one fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import multiprocessing
+import random
+import shutil
+import sys
+import tempfile
+import time
+from multiprocessing.context import ForkProcess
+from pathlib import Path
+
+from ethbrake_marl.experiment import resume_measured, train_measured
+from ethbrake_marl.learning.checkpoint import newest_usable
+from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.scenario import load_scenario
+
+SOON_S = 300.0
+
+PPO = load_recipe("ppo").replace(
+    total_steps=60 * 512,
+    n_envs=32,
+    n_steps=16,
+    batch_size=128,
+    network={"policy": [64, 64], "value": [64, 64]},
+    evaluation={"every_updates": 10, "worlds": 50, "seed": 1007},
+    checkpoint_every_updates=4,
+)
+SAC = load_recipe("sac").replace(
+    total_steps=500 * 16,
+    n_envs=16,
+    batch_size=64,
+    buffer_size=5000,
+    learning_starts=500,
+    network={"policy": [64, 64], "value": [64, 64]},
+    evaluation={"every_updates": 100, "worlds": 50, "seed": 1007},
+    checkpoint_every_updates=25,
+    log_every_updates=20,
+)
+WRITING = SAC.replace(checkpoint_every_updates=5, total_steps=4000 * 16, evaluation=PPO.evaluation.model_dump())
+RECIPES: dict[str, TrainingRecipe] = {"ppo": PPO, "sac": SAC, "writing": WRITING}
+
+FORK = multiprocessing.get_context("fork")  # a fresh interpreter needs seconds; test_resume.py kills some of those
+
+
+def work(what: str, run: Path) -> None:
+    """Train from the beginning (``what`` names the recipe), or resume what is there."""
+    if run.exists():
+        resume_measured(run)
+    else:
+        train_measured(load_scenario("paper-random"), run, recipe=RECIPES[what])
+
+
+def start(what: str, run: Path) -> ForkProcess:
+    """A process that does ``work``."""
+    process = FORK.Process(target=work, args=(what, run))
+    process.start()
+    return process
+
+
+def digest(run: Path) -> str:
+    """What a finished run says and holds: the weights of both policies."""
+    both = [(run / name / "weights.safetensors").read_bytes() for name in ("policy", "policy-last")]
+    return hashlib.sha256(b"".join(both)).hexdigest()
+
+
+def finish(what: str, run: Path) -> str:
+    """Train or resume to the end, undisturbed."""
+    process = start(what, run)
+    process.join()
+    if process.exitcode != 0:
+        raise SystemExit(f"{run}: the process failed")
+    return digest(run)
+
+
+def random_kills(what: str, kills: int, folder: Path, rng: random.Random) -> int:
+    """How many of ``kills`` trainings, each killed at a random moment and resumed, end with the same weights."""
+    before = time.monotonic()
+    expected = finish(what, folder / "whole")
+    whole_s = time.monotonic() - before
+    same = 0
+    for k in range(kills):
+        run = folder / f"{what}-{k}"
+        moments = [rng.uniform(0.0, whole_s)] + ([rng.uniform(0.0, whole_s)] if k % 4 == 3 else [])
+        at = []
+        for moment in moments:
+            process = start(what, run)
+            time.sleep(moment)
+            process.kill()
+            process.join()
+            at.append(newest(run))
+            if (run / "policy-last").is_dir():
+                break  # it had finished
+        finished = (run / "run.json").is_file() and '"finished"' in (run / "run.json").read_text()
+        good = (digest(run) if finished else finish(what, run)) == expected
+        same += good
+        note = "same" if good else "OTHER WEIGHTS"
+        print(f"  {what} {k}: killed after {', '.join(f'{m:.1f} s' for m in moments)} at {at}: {note}", flush=True)
+        shutil.rmtree(run)
+    return same
+
+
+def newest(run: Path) -> str:
+    """The newest checkpoint of a run by name."""
+    return max((path.name for path in run.glob("checkpoints/step_*")), default="the beginning")
+
+
+def torn_writes(kills: int, folder: Path, rng: random.Random) -> int:
+    """How many of ``kills`` that hit the writing of a checkpoint leave one that can be used."""
+    run, usable, hit = folder / "torn", 0, 0
+    while hit < kills:
+        process = start("writing", run)
+        first, deadline = newest(run), time.monotonic() + SOON_S
+        while newest(run) == first or not list(run.glob("checkpoints/.ethbrake-*.partial")):
+            if not process.is_alive() or time.monotonic() > deadline:
+                raise SystemExit(f"{run}: the training ended before it was killed {kills} times")
+            time.sleep(rng.uniform(0.0, 0.002))
+        time.sleep(rng.uniform(0.0, 0.02))
+        process.kill()
+        process.join()
+        if not list(run.glob("checkpoints/.ethbrake-*.partial")):
+            continue  # the write was over
+        hit += 1
+        state, damaged = newest_usable(run / "checkpoints")
+        usable += state is not None
+        where = "none" if state is None else state.steps
+        print(f"  kill {hit} while writing: usable checkpoint at step {where}, {len(damaged)} damaged", flush=True)
+    return usable
+
+
+def main() -> int:
+    """Run the gates."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--torn", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    rng = random.Random(options.seed)
+    good = True
+    with tempfile.TemporaryDirectory() as scratch:
+        for what in ("ppo", "sac"):
+            folder = Path(scratch) / what
+            folder.mkdir()
+            same = random_kills(what, options.kills, folder, rng)
+            good &= same == options.kills
+            print(f"resume, {what}: {same}/{options.kills} random kills end with the same weights", flush=True)
+        usable = torn_writes(options.torn, Path(scratch), rng)
+        good &= usable == options.torn
+        print(f"checkpoints: {usable}/{options.torn} kills while writing leave a usable one", flush=True)
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
