@@ -15,7 +15,7 @@ ARGS ?=
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics planted-bugs mutation bench-peers
+.PHONY: help venv run test lint check clean test-physics test-resume planted-bugs mutation bench-peers
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -23,6 +23,7 @@ help:
 	@echo "make lint             ruff, ruff format --check, mypy --strict"
 	@echo "make check            lint and test"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
+	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make planted-bugs     plant 20 bugs in copies of the code; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of physics and harm (ARGS='--sample 100')"
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
@@ -88,6 +89,10 @@ check: lint
 test-physics: $(STAMP)
 	@echo "== long programme on the physics"
 	@$(BIN)/python -m tests.physics.programme $(ARGS)
+
+test-resume: $(STAMP)
+	@echo "== long programme on resuming: trainings are killed at random moments"
+	@$(BIN)/python -m tests.learning.programme $(ARGS)
 
 planted-bugs: $(STAMP)
 	@echo "== planted bugs"

@@ -55,7 +55,7 @@ _HOME = {
     "list_scenarios": "scenario",
     "load_policy": "learning.bundle",
     "load_scenario": "scenario",
-    "make_agent": "agents.registry",
+    "make_agent": "lineup",  # above the registry: best_harm and trained policies are registered there
     "make_sb3_vec_env": "envs.sb3",
     "make_worlds": "physics",
     "parallel_env": "envs.parallel",

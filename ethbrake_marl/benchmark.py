@@ -153,6 +153,7 @@ def stepping(n: int, steps: int = 100) -> Work:
 
 
 def vec_env(n: int, steps: int = 100) -> Work:
+    """The Stable-Baselines3 ``VecEnv``: the engine's step, infos, and new episodes as old ones end."""
     environment = eb.make_sb3_vec_env(SCENARIO, n, seed=SEED)  # imports torch, hence only now
     environment.reset()
     actions = np.full((n, 1), -SHARE, np.float32)
@@ -166,6 +167,7 @@ def vec_env(n: int, steps: int = 100) -> Work:
 
 
 def parallel(n: int, episodes: int = 20) -> Work:
+    """Whole episodes of one world (``n`` is 1) through PettingZoo's parallel API, resets included."""
     environment = parallel_env(SCENARIO)
     actions = {f"vehicle_{i + 1}": np.array([-SHARE], np.float32) for i in environment.engine.learners}
     environment.reset(seed=SEED)

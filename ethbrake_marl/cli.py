@@ -40,6 +40,7 @@ from ethbrake_marl.lineup import (
     make_lineup,
 )
 from ethbrake_marl.picture_commands import picture_app
+from ethbrake_marl.policy_commands import export_command, import_legacy_command
 from ethbrake_marl.scenario import (
     list_scenarios,
     load_scenario,
@@ -57,7 +58,13 @@ from ethbrake_marl.terminal import (
     tolerate_narrow_streams,
     write_json,
 )
-from ethbrake_marl.training_commands import KEPT, end_of_training, resume_command, train_command
+from ethbrake_marl.training_commands import (
+    KEPT,
+    end_of_training,
+    learning_curves_command,
+    resume_command,
+    train_command,
+)
 
 BAD_INPUT = 2
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
@@ -80,6 +87,13 @@ app.command("train", epilog="Example: ethbrake train --scenario paper-random-ear
     train_command
 )
 app.command("resume", epilog="Example: ethbrake resume runs/paper-random-ppo-seed0")(resume_command)
+app.command(
+    "learning-curves", epilog="Example: ethbrake learning-curves --scenario paper-delay-low --output runs/low-delay"
+)(learning_curves_command)
+app.command("export", epilog="Example: ethbrake export runs/early --onnx early.onnx")(export_command)
+app.command(
+    "import-legacy", epilog="Example: ethbrake import-legacy old.zip --output old --algorithm sac --i-trust-this-file"
+)(import_legacy_command)
 app.command("best-harm", epilog="Example: ethbrake best-harm --episodes 200 --budget 20000 --json")(best_harm_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
 

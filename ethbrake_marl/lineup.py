@@ -11,11 +11,11 @@ import numpy as np
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.registry import agent_names, make_agent, register_agent
+from ethbrake_marl.agents.registry import Factory, agent_names, make_agent, register_agent
 from ethbrake_marl.analysis.best_harm_shipped import make_best_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.bundle import load_policy
+from ethbrake_marl.learning.shipped import SHIPPED, PolicyKind, load_named_policy
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
 from ethbrake_marl.shield.episode import HybridAgent
@@ -37,7 +37,8 @@ LADDER = (  # from no decision at all up to the best that is known
 
 register_agent("best_harm", make_best_harm)
 
-_OF_A_POLICY = ("ppo", "hybrid")
+POLICY_KINDS: tuple[PolicyKind, ...] = ("ppo", "sac", "universal")
+_OF_A_POLICY = (*POLICY_KINDS, "hybrid")
 _LADDER_SPEC = "ladder"
 
 
@@ -88,11 +89,12 @@ def check_agents(agents: Mapping[str, Agent], worlds: Worlds, scenario: Scenario
 def make_lineup(specs: Sequence[str], scenario: Scenario, *, count: HarmCount = "first") -> dict[str, Agent]:
     """One fresh agent per spec, by its spec, to drive a vehicle of ``scenario``.
 
-    Every spec of ``make_agent``, and ``ppo@PATH`` (the policy of a run, or a bundle), ``hybrid@PATH`` (Algorithm 1:
-    that policy or coupled E-V2X-BM, whichever harms less) and ``hybrid:pairwise@PATH`` (with the paper's closed form
-    instead). ``ladder`` stands for every agent of ``LADDER`` that there is. ``count`` is the harm that optimising and
-    choosing agents minimise. Raises ``InvalidInput`` for a spec given twice, ``UnknownName`` with a suggestion, and
-    whatever loading a policy raises.
+    Every spec of ``make_agent``, and ``ppo@PATH`` or ``sac@PATH`` (the policy of a run, or a bundle), ``hybrid@PATH``
+    (Algorithm 1: that policy or coupled E-V2X-BM, whichever harms less) and ``hybrid:pairwise@PATH`` (with the paper's
+    closed form instead). PATH may be ``shipped``, the policy that comes with the package for this scenario and count
+    (PPO's for a hybrid), or ``shipped/NAME``; ``universal@shipped`` is for all scenarios. ``ladder`` stands for every
+    agent of ``LADDER`` that there is. ``count`` is the harm that optimising and choosing agents minimise. Raises
+    ``InvalidInput`` for a spec given twice, ``UnknownName`` with a suggestion, and whatever loading a policy raises.
     """
     specs = [each for spec in specs for each in (_ladder() if spec == _LADDER_SPEC else [spec])]
     for k, spec in enumerate(specs):
@@ -147,14 +149,36 @@ def _agent(spec: str, scenario: Scenario, count: HarmCount) -> Agent:
     return make_agent(spec, count=count, horizon_s=scenario.horizon_s)
 
 
-def _agent_of_a_policy(spec: str, scenario: Scenario, count: HarmCount) -> Agent:
+def _agent_of_a_policy(spec: str, scenario: Scenario | None, count: HarmCount) -> Agent:
+    """A policy alone, or behind its shield, which needs the scenario."""
     kind, _, path = spec.partition("@")
-    if not path or kind not in ("ppo", "hybrid", "hybrid:pairwise"):
+    if not path or kind not in (*_OF_A_POLICY, "hybrid:pairwise"):
         raise InvalidInput(
-            f"agent {spec!r}: must be ppo@PATH, hybrid@PATH or hybrid:pairwise@PATH, where PATH is a run or a policy"
-            " bundle, for instance ppo@runs/my-run"
+            f"agent {spec!r}: must be ppo@PATH, sac@PATH, universal@shipped, hybrid@PATH or hybrid:pairwise@PATH, where"
+            " PATH is a run or a policy bundle, for instance ppo@runs/my-run, or shipped"
         )
-    policy = LearnedAgent(load_policy(path), name=f"ppo@{path}")
-    if kind == "ppo":
+    wanted: PolicyKind = "sac" if kind == "sac" else "universal" if kind == "universal" else "ppo"
+    if kind == "universal" and path != SHIPPED:
+        raise InvalidInput(f"agent {spec!r}: must be universal@{SHIPPED}; for another policy: ppo@PATH or sac@PATH")
+    loaded = load_named_policy(path, wanted, scenario, count)
+    trained_by = loaded.manifest.algorithm
+    if kind in ("ppo", "sac") and kind != trained_by:
+        raise InvalidInput(f"agent {spec!r}: that policy was trained by {trained_by.upper()}: {trained_by}@{path}")
+    policy = LearnedAgent(loaded, name=spec if kind in POLICY_KINDS else f"{trained_by}@{path}")
+    if kind in POLICY_KINDS:
         return policy
+    assert scenario is not None
     return HybridAgent(policy, scenario, bound="pairwise" if kind == "hybrid:pairwise" else "coupled", count=count)
+
+
+def _register_policies() -> None:
+    """Make ``ppo@PATH``, ``sac@PATH`` and ``universal@shipped`` known to ``make_agent``."""
+
+    def factory_of(kind: str) -> Factory:
+        return lambda argument, settings: _agent_of_a_policy(f"{kind}@{argument or ''}", None, settings.count)
+
+    for kind in POLICY_KINDS:
+        register_agent(kind, factory_of(kind))
+
+
+_register_policies()

@@ -17,6 +17,7 @@ from ethbrake_marl.command_options import (
     StepsOption,
     TrainingSeedOption,
 )
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.lineup import load_runnable
 from ethbrake_marl.terminal import INTERRUPTED, Bars, interruptible, progress_bars, say, write_json
@@ -81,6 +82,46 @@ def resume_command(
                 folder, on_progress=lambda p: show_progress(bars, p), other_versions=other_versions
             )
     _show_result(result, as_json)
+
+
+def learning_curves_command(
+    output: Annotated[
+        Path, typer.Option("--output", metavar="FOLDER", help="Folder of all trainings, of the figure and the table.")
+    ],
+    scenario: ScenarioOption = "paper-random",
+    recipes: Annotated[
+        str, typer.Option(metavar="RECIPE:SEEDS,...", help="Recipes, each with its number of seeds (0, 1, ...).")
+    ] = "ppo:5,sac:3",
+    steps: StepsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Train several seeds of several recipes, and draw their learning curves in one figure.
+
+    The same command goes on after an interruption: finished trainings are kept, begun ones go on.
+    """
+    with interruptible(KEPT):
+        from ethbrake_marl.learning_curves import FIGURE, parse_trainings, train_all, write_curves
+
+        chosen, plan = load_runnable(scenario), parse_trainings(recipes)
+        if len(chosen.learners) != 1:
+            raise InvalidInput(
+                f"scenario {chosen.name!r}: has {len(chosen.learners)} learners; curves need exactly one"
+            )
+        with progress_bars() as bars:
+            finished = train_all(
+                chosen,
+                plan,
+                output,
+                steps=steps,
+                tell=lambda name, p: bars.show(name, p.steps, p.total_steps, p.metrics, p.note),
+            )
+        if not finished:
+            say(f"interrupted; the same command goes on with what is in {output}")
+            raise typer.Exit(INTERRUPTED)
+        summary = write_curves(chosen, plan, output)
+    if as_json:
+        write_json(summary)
+    say(f"figure: {output / FIGURE}")
 
 
 def show_progress(bars: Bars, progress: Progress) -> None:

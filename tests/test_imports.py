@@ -33,9 +33,10 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("viewer",),
     ("lineup", "results_folder"),
     ("experiment",),
+    ("learning_curves",),
     ("__init__",),
     ("doctor", "terminal", "command_options", "machine", "benchmark", "scaling"),
-    ("picture_commands", "search_commands", "bench_commands", "training_commands"),
+    ("picture_commands", "search_commands", "bench_commands", "training_commands", "policy_commands"),
     ("cli", "__main__"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}

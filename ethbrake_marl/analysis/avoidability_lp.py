@@ -40,7 +40,7 @@ class LinearVerdict(NamedTuple):
 def avoidable_by_lp(
     world: Worlds, controlled: Sequence[int], step_s: float, *, horizon_s: float | None = None
 ) -> LinearVerdict:
-    """Whether ``controlled`` vehicles (indices from 0) of one world can together avoid all collisions, approximately.
+    """Whether ``controlled`` vehicles (indices from 0) of one world can together avoid all contact, approximately.
 
     The margin is off by at most ``step_s^2 max(a + a_u)`` as long as the best profile changes its command no more than
     six times; a verdict within that tolerance is not ``certain``. ``horizon_s`` counts from the world's time; the

@@ -111,8 +111,11 @@ def search_list(
     """``best_harm`` of a long list, ``CHUNK`` worlds at a time, resumable.
 
     With ``chunks``, a folder, each finished chunk is kept there as a file, and a later call with the same question
-    takes it from there. A file that answers another question is computed anew and replaced.
+    takes it from there. A file that answers another question is computed anew and replaced. Raises ``InvalidInput``, as
+    ``best_harm`` does, and if ``known`` holds no world of the list.
     """
+    if known is not None:
+        known.check_holds_any(world_identity(scenario, sample.worlds, vehicles))
     parts = []
     n = sample.worlds.n
     for first in range(0, n, CHUNK):

@@ -22,6 +22,7 @@ from ethbrake_marl.physics import Bools, Floats, Ints
 
 TABLE_FORMAT = 1
 TOLERANCE = 1e-6  # an agent must be this much (m2/s2) below the table to replace its value
+_ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # of the header, in an error
 _COUNTS: tuple[HarmCount, ...] = ("first", "total")
 
 
@@ -46,6 +47,15 @@ class BestHarmTable:
         place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
         rows = order[place]
         return np.where(self.identity[rows] == identity, rows, -1)
+
+    def check_holds_any(self, identity: Words) -> None:
+        """Raise ``InvalidInput`` if none of these worlds is in the table: it is of another list."""
+        if not (self.rows(identity) >= 0).any():
+            made = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
+            raise InvalidInput(
+                f"table of best known harm ({made}): holds none of these {len(identity)} worlds; give the scenario,"
+                " seed and vehicles that it was made for"
+            )
 
     def harm(self, identity: Words, count: HarmCount) -> Floats:
         """Best known harm of each world (m2/s2), NaN where it is not in the table."""

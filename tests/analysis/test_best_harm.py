@@ -108,8 +108,23 @@ def test_best_harm__two_vehicles_together_are_not_worse_than_one_of_them(
     alone = best_harm(scenario, few, counts=["first"], budget=200, threads=1).best["first"].harm
     joint = best_harm(scenario, few, counts=["first"], vehicles=(0, 1), budget=200, threads=1)
     assert (joint.best["first"].harm <= alone + 1e-6).all()
+    assert joint.best["first"].harm.sum() < 0.9 * alone.sum()
     assert joint.best["first"].profiles.commands_mps2.shape[2] == 2
     assert np.array_equal(realised_harm(scenario, few, joint.best["first"], (0, 1))[0], joint.best["first"].harm)
+
+
+def test_best_harm__joint_optimum_of_two_cars_by_hand() -> None:
+    """Vehicle 2 alone cannot do better than 400 - 2 * 5 * 20; vehicle 1 drives away with 4: 400 - 2 * (5 + 4) * 20."""
+    scenario = Scenario(
+        name="two", vehicles=2, gaps_m=20.0, speeds_mps=[0.0, 20.0], braking_capacity_mps2=5.0,
+        driving_capacity_mps2=[4.0, 5.0], mass_t=1.0, latency_s=0.0, restitution=0.0,
+        roles={"vehicle_2": "learner"},
+    )  # fmt: skip
+    worlds = scenario.sample(1, seed=1).worlds
+    for vehicles, harm in (((1,), 200.0), ((0,), 40.0), ((0, 1), 40.0)):
+        found = best_harm(scenario, worlds, vehicles=vehicles, budget=1000, threads=1)
+        for count in COUNTS:
+            assert found.best[count].harm == pytest.approx([harm], abs=1e-2), (vehicles, count)
 
 
 def test_stored_profile__driven_in_the_engine_does_the_stored_harm_bit_for_bit(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from ethbrake_marl.analysis.best_harm_shipped import TABLES
 from ethbrake_marl.analysis.best_harm_table import load_table
 from ethbrake_marl.cli import run_command
 
@@ -21,13 +22,8 @@ def test_best_harm_command__prints_figures_and_writes_the_table(
     assert figures["best_known_total_harm"] == pytest.approx(table.best["total"].harm.mean())
     assert figures["harmless_rate"] == (table.best["total"].harm == 0.0).mean()
     assert table.header["list_seed"] == 7
-    assert (
-        table.header["command"]
-        == figures["command"]
-        == (
-            "ethbrake best-harm --scenario paper-random --episodes 4 --seed 7 --budget 60 --search-seed 0 --output FILE.npz"
-        )
-    )
+    command = "ethbrake best-harm --scenario paper-random --episodes 4 --seed 7 --budget 60 --search-seed 0 --output"
+    assert table.header["command"] == figures["command"] == f"{command} FILE.npz"
     assert 0.0 < figures["proven_harm"] <= figures["best_known_first_impact_harm"]
     assert figures["impact_proven_rate"] in (0.5, 0.75, 1.0)
     assert [path.name for path in tmp_path.iterdir()] == ["t.npz"]
@@ -52,6 +48,11 @@ def test_best_harm_command__one_count_from_an_earlier_table(tmp_path: Path, caps
         (["--output", "nowhere/t.npz"], "no folder"),
         (["--output", "t.txt"], "ends in .npz"),
         (["--start", "missing.npz"], "no such table"),
+        (["--start", str(TABLES / "paper-delay-low.npz")], "scenario paper-delay-low, list_seed 7"),
+        (["--start", str(TABLES / "paper-random.npz"), "--seed", "8"], "holds none of these 4 worlds"),
+        (["--start", str(TABLES / "paper-random.npz"), "--vehicles", "vehicle_3"], "holds none of these 4 worlds"),
+        (["--vehicles", ""], "unknown vehicle ''"),
+        (["--vehicles", "vehicle_2,vehicle_2"], "listed twice"),
         (["--count", "some"], "some"),
         (["--episodes", "0"], "n = 0"),
     ],

@@ -15,6 +15,9 @@ COMMANDS = [
     "run",
     "train",
     "resume",
+    "learning-curves",
+    "export",
+    "import-legacy",
     "evaluate",
     "doctor",
     "bench",
@@ -158,4 +161,10 @@ def test_scenario_validate__counts_the_refused_draws(ethbrake, scenario_file):
 def test_scenario_schema__is_a_json_schema(ethbrake):
     schema = json.loads(ethbrake("scenario", "schema").out)
     assert schema["$schema"].startswith("https://json-schema.org/")
-    assert "gaps_m" in schema["required"]
+    assert "mass_t" in schema["required"]
+    assert {"oneOf": [{"required": ["gaps_m"]}, {"required": ["time_gaps_s"]}]} in schema["allOf"]
+
+
+def test_scenario__folder_and_short_name_of_a_shipped_one(ethbrake):
+    assert ethbrake("scenario", "show", "stress/wide").out == ethbrake("scenario", "show", "stress-wide").out
+    assert ethbrake("scenario", "validate", "stress/wide").out.startswith("OK  stress-wide: 3 vehicles")

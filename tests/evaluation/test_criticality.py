@@ -38,6 +38,14 @@ def test_map__a_fixed_gap_is_drawn_around_it_and_a_range_can_be_given() -> None:
     assert found.gap_1_m.tolist() == found.gap_2_m.tolist() == [6.0, 7.0]
 
 
+def test_map__time_gaps_give_its_range_at_the_speed_of_the_rear_vehicle() -> None:
+    scenario = DISTANCE.replace(
+        time_gaps_s={"uniform": [0.25, 0.5]}, line_speed_mps=20, speed_deviations_mps=[0, -2, 0]
+    )
+    found = criticality_map(scenario, FULL, cells=2)
+    assert (found.gap_1_m.tolist(), found.gap_2_m.tolist()) == ([4.5, 9.0], [5.0, 10.0])
+
+
 def test_boundary__lies_between_avoidable_and_unavoidable_worlds() -> None:
     found = avoidability_boundary(DISTANCE, (5.0, 10.0), (5.0, 10.0))
     assert found is not None

@@ -4,6 +4,8 @@ import hashlib
 import json
 import os
 import pickle
+import socket
+import stat
 import subprocess
 import sys
 from collections.abc import Callable
@@ -99,6 +101,44 @@ def _folder_instead(folder: Path) -> None:
     (folder / "weights.safetensors").mkdir()
 
 
+def _socket(folder: Path) -> None:
+    (folder / "weights.safetensors").unlink()
+    here = os.getcwd()
+    os.chdir(folder)  # the name of a socket has a short longest length
+    try:
+        with socket.socket(socket.AF_UNIX) as listening:
+            listening.bind("weights.safetensors")
+    finally:
+        os.chdir(here)
+
+
+def _endless_device(folder: Path) -> None:
+    """A file that never ends: a device where that may be made, else a huge file without blocks."""
+    path = folder / "weights.safetensors"
+    path.unlink()
+    try:
+        os.mknod(path, 0o600 | stat.S_IFCHR, os.makedev(1, 5))
+    except PermissionError:
+        path.touch()
+        os.truncate(path, 1 << 40)
+
+
+def _sparse_giant(folder: Path) -> None:
+    os.truncate(folder / "weights.safetensors", 1 << 40)
+
+
+def _first_tensor(**changes: Any) -> Spoil:
+    return _header(lambda h: h["policy.0.bias"].update(changes))
+
+
+def _renamed(name: str) -> Spoil:
+    return _header(lambda h: h.update({name: h.pop("policy.0.bias")}))
+
+
+def _raw_header(text: bytes) -> Spoil:
+    return _weights(lambda data: len(text).to_bytes(8, "little") + text + data[-400:])
+
+
 def _with(tensors: dict[str, np.ndarray], name: str, value: np.ndarray) -> dict[str, np.ndarray]:
     return {**tensors, name: value}
 
@@ -130,7 +170,10 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "two_values": (_manifest(lambda data: data + data), r"manifest.json: Extra data"),
     "large": (_manifest(lambda data: data + b" " * (1 << 20)), r"manifest.json: larger than 1048576 bytes"),
     "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: Extra inputs"),
-    "dotted_algorithm": (_edit(algorithm="subprocess.Popen"), r"manifest.json: algorithm: Input should be 'ppo'"),
+    "dotted_algorithm": (
+        _edit(algorithm="subprocess.Popen"),
+        r"manifest.json: algorithm: Input should be 'ppo' or 'sac'",
+    ),
     "dotted_activation": (_edit(network__activation="torch.nn.ReLU"), r"manifest.json: network.activation"),
     "future_version": (_edit(format_version=3), r"manifest.json: format_version: Input should be 2"),
     "wrong_type": (_edit(steps="many"), r"manifest.json: steps: Input should be a valid integer"),
@@ -162,6 +205,39 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
         lambda f: _replace(f / "weights.safetensors", lambda d: d[:-3] + bytes([d[-3] ^ 1]) + d[-2:]),
         r"weights.safetensors: SHA-256 is [0-9a-f]{64}, the manifest says",
     ),
+    "socket": (_socket, r"weights.safetensors: (is not a plain file|cannot be read)"),
+    "endless_device": (_endless_device, r"weights.safetensors: (is not a plain file|larger than)"),
+    "sparse_giant": (_sparse_giant, r"weights.safetensors: larger than"),
+    "other_case": (lambda f: (f / "manifest.json").rename(f / "Manifest.json"), r"manifest.json: is missing"),
+    "hidden_file": (lambda f: (f / ".weights.py").write_text("raise SystemExit"), r".weights.py: does not belong"),
+    "extra_folder": (lambda f: (f / "__pycache__").mkdir(), r"__pycache__: does not belong"),
+    "byte_order_mark": (_manifest(lambda data: b"\xef\xbb\xbf" + data), r"manifest.json: "),
+    "utf16": (_manifest(lambda data: data.decode().encode("utf-16")), r"manifest.json: "),
+    "null_byte": (_manifest(lambda data: data + b"\0"), r"manifest.json: Extra data"),
+    "path_to_weights": (_edit(weights="../../other/weights.safetensors"), r"manifest.json: weights: Extra inputs"),
+    "path_as_learner": (_edit(learners=["../../vehicle_2"]), r"manifest.json: learners: '../../vehicle_2' is no"),
+    "unknown_activation": (_edit(network__activation="gelu"), r"manifest.json: network.activation: Input should be"),
+    "unknown_output": (_edit(network__output="eval"), r"manifest.json: network.output: Input should be"),
+    "negative_layer": (_edit(network__policy_hidden=[-13, 9]), r"manifest.json: network.policy_hidden.0"),
+    "layer_not_whole": (_edit(network__policy_hidden=[13.5, 9]), r"manifest.json: network.policy_hidden.0"),
+    "true_for_a_number": (_edit(network__action_size=True), r"manifest.json: network.action_size"),
+    "deep_scenario": (
+        _manifest(lambda data: data.replace(b'"paper-random"', b"[" * 100_000 + b"]" * 100_000)),
+        r"manifest.json: (nested too deeply|.*recursion)",
+    ),
+    "tensor_path": (_renamed("../../policy.0.bias"), r"tensor 'policy.0.bias' is missing"),
+    "tensor_dunder": (_renamed("__class__.__init__"), r"tensor 'policy.0.bias' is missing"),
+    "unknown_dtype": (_first_tensor(dtype="F99"), r"tensor 'policy.0.bias' is F99"),
+    "object_dtype": (_first_tensor(dtype="O"), r"tensor 'policy.0.bias' is O"),
+    "negative_shape": (_first_tensor(shape=[-13]), r"tensor 'policy.0.bias' is F32 \[-13\]"),
+    "overflowing_shape": (_first_tensor(shape=[2**63, 2]), r"tensor 'policy.0.bias' is F32 \[9223372036854775808, 2\]"),
+    "offsets_beyond": (_first_tensor(data_offsets=[0, 2**40]), r"weights.safetensors: not a safetensors file"),
+    "offsets_backwards": (_first_tensor(data_offsets=[52, 0]), r"weights.safetensors: not a safetensors file"),
+    "offsets_negative": (_first_tensor(data_offsets=[-52, 0]), r"weights.safetensors: not a safetensors file"),
+    "deep_header": (_raw_header(b"[" * 200_000), r"weights.safetensors: nested too deeply"),
+    "key_twice_in_header": (_raw_header(b'{"a": {}, "a": {}}'), r"weights.safetensors: key 'a' stands twice"),
+    "empty_header": (_raw_header(b"{}"), r"tensor 'policy.0.bias' is missing"),
+    "minus_infinite_weight": (_tensors(lambda t: _not_finite(t, -np.inf)), r"tensor 'value.0.bias' holds a number"),
     "empty_weights": (_weights(lambda _: b""), r"weights.safetensors: not a safetensors file"),
     "pickle": (_weights(lambda _: pickle.dumps(_Payload())), r"weights.safetensors: not a safetensors file"),
     "zip": (_weights(lambda _: b"PK\x03\x04" + b"\0" * 4000), r"weights.safetensors: not a safetensors file"),
@@ -294,6 +370,17 @@ def test_load_policy__runs_nothing_and_opens_nothing_else(policy: Policy, tmp_pa
     assert seen["refused"] == list(SPOILED)
     assert seen["events"] == []
     assert seen["torch"] is False
+
+
+def test_load_policy__a_hard_link_is_the_file_itself(policy: Policy, tmp_path: Path) -> None:
+    """Installers link packages hard, so this is no sign of anything; what is in the file is checked all the same."""
+    save_policy(policy, tmp_path / "policy")
+    os.link(tmp_path / "policy" / "weights.safetensors", tmp_path / "elsewhere")
+    assert load_policy(tmp_path / "policy").manifest == policy.manifest
+
+
+def test_damaged_bundles__are_many() -> None:
+    assert len(SPOILED) >= 80
 
 
 def test_save_policy__does_not_replace(policy: Policy, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.learning.networks import NetworkSpec
-from ethbrake_marl.learning.recipe import LearningRate, load_recipe, shipped_recipes
+from ethbrake_marl.learning.recipe import LearningRate, SacRecipe, load_recipe, recipe_of, shipped_recipes
 
 GOOD = """\
 name: mine
@@ -64,6 +64,37 @@ def test_load_recipe__the_papers_table() -> None:
     assert (r.gae_lambda, r.vf_coef, r.ent_coef, r.target_kl, r.max_grad_norm) == (0.95, 0.5, 0.005, 0.15, 0.3)
 
 
+def test_load_recipe__the_papers_table_of_sac() -> None:
+    r = load_recipe("sac-paper")
+    assert isinstance(r, SacRecipe)
+    assert (r.batch_size, r.buffer_size, r.learning_starts, r.tau, r.gamma) == (256, 10**6, 10**4, 0.02, 0.99)
+    assert (r.steps_per_update, r.gradient_steps, r.ent_coef, r.target_update_interval) == (1, 1, "auto", 1)
+    assert (r.network.policy, r.network.value, r.network.activation) == ((256, 256), (256, 256), "relu")
+    assert (r.n_envs, r.update_ratio) == (1, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"ent_coef": "automatic"}, r"ent_coef = automatic: must be auto or a number of at least 0"),
+        ({"ent_coef": -1}, r"ent_coef = -1: must be auto or a number of at least 0"),
+        ({"buffer_size": 63}, r"buffer_size = 63: must be at least n_envs = 64"),
+        ({"n_steps": 3}, r"n_steps: unknown key"),
+        ({"tau": 0.0}, r"tau = 0.*: must be greater than 0"),
+        ({"algorithm": "td3"}, r"algorithm = td3: must be ppo or sac"),
+    ],
+)
+def test_sac_recipe__refuses_bad_input(change: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidInput, match=f"recipe 'sac': {message}"):
+        load_recipe("sac").replace(**change)
+
+
+def test_recipe__comes_back_from_its_json() -> None:
+    for name in shipped_recipes():
+        recipe = load_recipe(name)
+        assert recipe_of(recipe.model_dump_json()) == recipe
+
+
 def test_shipped_recipes__are_found_by_name() -> None:
     assert {"ppo", "ppo-paper"} <= shipped_recipes().keys()
     with pytest.raises(UnknownName, match="unknown recipe 'ppo-papre'; did you mean 'ppo-paper'"):
@@ -93,7 +124,7 @@ def test_replace__is_checked_again() -> None:
         ("gamma: 0.99\n", "", r"mine.yaml: gamma: missing; it is needed"),
         ("gamma: 0.99", "gamma: .nan", r"line 9: gamma = .nan: must be"),
         ("gamma: 0.99", "gamma: 1.5", r"line 9: gamma = 1.5: must be less than or equal to 1"),
-        ("algorithm: ppo", "algorithm: trpo", r"line 2: algorithm = trpo: must be ppo"),
+        ("algorithm: ppo", "algorithm: trpo", r"line 2: algorithm = trpo: must be ppo or sac"),
         ("total_steps: 4096", "total_steps: many", r"line 3: total_steps = many: must be a whole number"),
         (
             "total_steps: 4096",

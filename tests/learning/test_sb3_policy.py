@@ -5,11 +5,12 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.sac.policies import SACPolicy
 
 from ethbrake_marl.learning.forward import Actor
 from ethbrake_marl.learning.networks import NetworkSpec
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.sb3_policy import ppo_arguments, tensors_of
+from ethbrake_marl.learning.sb3_policy import ppo_arguments, sac_arguments, tensors_of
 
 SHAPE = load_recipe("ppo-paper").network
 
@@ -58,3 +59,19 @@ def test_tensors_of__is_a_copy() -> None:
     with torch.no_grad():
         policy.mlp_extractor.policy_net[0].weight += 1.0
     assert np.array_equal(before["policy.0.weight"], kept)
+
+
+def test_tensors_of__of_sac_gives_its_deterministic_action() -> None:
+    shape = load_recipe("sac-paper").network
+    spec = shape.spec(27)
+    torch.manual_seed(3)
+    seen = Box(-10.0, 10.0, (27,), np.float32)
+    policy = SACPolicy(seen, Box(-1.0, 1.0, (1,), np.float32), lambda _: 1e-3, **sac_arguments(shape))
+    with torch.no_grad():
+        policy.actor.mu.weight *= 10.0
+    observations = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 27)).astype(np.float32)
+    expected, _ = policy.predict(observations, deterministic=True)
+    tensors = tensors_of(policy, spec)
+    assert sum(t.size for t in tensors.values()) == sum(p.numel() for p in policy.actor.parameters())
+    assert np.ptp(expected) > 0.5
+    np.testing.assert_allclose(Actor(spec, tensors)(observations), expected, rtol=0.0, atol=5e-6)

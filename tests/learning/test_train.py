@@ -200,6 +200,27 @@ def test_train__numbers_that_are_not_finite_stop_it_and_keep_the_last_good_polic
     assert np.isfinite(kept.tensors["policy.0.weight"]).all()
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda reward: reward * np.nan, r"rewards\[row 0\] = nan at step 640: must be finite"),
+        (lambda reward: reward * 0.0 + np.float32(3e38), r"(the gradient of the loss is not finite|critic_loss = inf)"),
+    ],
+)
+def test_train__sac_stops_on_numbers_that_are_not_finite_too(
+    spoil: Callable[[Any], Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = {"n_envs": 16, "total_steps": 1280, "learning_starts": 100, "batch_size": 64, "buffer_size": 64}
+    recipe = load_recipe("sac").replace(
+        **small, network={"policy": [8], "value": [8]}, log_every_updates=5, checkpoint_every_updates=1000
+    )
+    _spoiled_steps(monkeypatch, lambda step, a: (a[0], spoil(a[1]) if step == 40 else a[1], *a[2:]))
+    with pytest.raises(TrainingDiverged, match=message):
+        train(recipe, SCENARIO, tmp_path / "run")
+    assert load_policy(tmp_path / "run").manifest.steps in (35 * 16, 40 * 16)
+
+
 def test_train__an_error_of_the_callers_function_is_passed_on(recipe: TrainingRecipe, tmp_path: Path) -> None:
     def broken(policy: Policy) -> dict[str, float]:
         raise RuntimeError("no worlds")

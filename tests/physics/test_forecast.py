@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics import advance, forecast, make_worlds
 
 
@@ -54,3 +54,15 @@ def test_forecast__a_world_at_the_horizon_has_no_harm_left():
 def test_bad_input__is_refused(call):
     with pytest.raises(InvalidInput, match="forecast"):
         call(worlds(5))
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_overlap__that_no_advance_could_have_left_is_reported_with_its_world(k):
+    # pair 0 meets, so the world goes event by event; pair 1 overlaps by 1 m and separates
+    start = make_worlds(
+        [[1.0, 1.0], [1.0, 1.0]], [0.0, 8.0, 4.0], braking_capacity_mps2=9, driving_capacity_mps2=9, latency_s=0,
+        mass_t=1, restitution=0,
+    )  # fmt: skip
+    start.gaps_m[k, 1] = -1.0
+    with pytest.raises(PhysicsError, match=f"forecast: world {k} could not be advanced to 2 s"):
+        forecast(start, np.zeros((2, 3)), 1, np.zeros((2, 1)), 2.0)

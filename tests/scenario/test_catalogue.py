@@ -195,6 +195,8 @@ def test_docs__the_example_is_a_valid_scenario():
         ("gaps_m: {uniform: [5, 10]}", "gaps_km: 0.007"),
         ("mass_t: [4.5, 5.5, 5.9]", "mass_t: [4.5, -5.5, 5.9]"),
         ("speeds_mps: {uniform: [18, 22]}", "speeds_mps: {uniform: [18, 45]}"),
+        ("\n# Every gap and every speed is drawn on its own.", "time_gaps_s: 1"),
+        ("speeds_mps: {uniform: [18, 22]}", "line_speed_mps: 39\nspeed_deviations_mps: {uniform: [-2, 2]}"),
     ],
 )
 def test_docs__the_mistakes_are_answered_as_printed(old, new):

@@ -129,9 +129,7 @@ BAD = [
 def test_bad_input__one_error(given, place, right):
     with pytest.raises(InvalidInput) as caught:
         build(**given)
-    assert str(caught.value).startswith(
-        f"scenario 'given': {place}: " if ": " not in place else f"scenario 'given': {place}"
-    )
+    assert str(caught.value).startswith(f"scenario 'given': {place}")
     assert right in str(caught.value)
     assert "more)" not in str(caught.value)
 

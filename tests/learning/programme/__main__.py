@@ -82,30 +82,37 @@ def finish(what: str, run: Path) -> str:
 
 
 def random_kills(what: str, kills: int, folder: Path, rng: random.Random) -> int:
-    """How many of ``kills`` trainings, each killed at a random moment and resumed, end with the same weights."""
-    before = time.monotonic()
+    """How many of ``kills`` trainings, each killed at a random moment and resumed, end with the same weights.
+
+    Moments are even in the progress of the training, and a fraction of a second after it; every fourth is killed twice.
+    """
     expected = finish(what, folder / "whole")
-    whole_s = time.monotonic() - before
+    rows = table_rows(folder / "whole")
     same = 0
     for k in range(kills):
-        run = folder / f"{what}-{k}"
-        moments = [rng.uniform(0.0, whole_s)] + ([rng.uniform(0.0, whole_s)] if k % 4 == 3 else [])
-        at = []
-        for moment in moments:
+        run, at = folder / f"{what}-{k}", []
+        for row in sorted(rng.randrange(rows) for _ in range(2 if k % 4 == 3 else 1)):
             process = start(what, run)
-            time.sleep(moment)
+            while process.is_alive() and table_rows(run) < row:
+                time.sleep(0.005)
+            time.sleep(rng.uniform(0.0, 0.3))
             process.kill()
             process.join()
-            at.append(newest(run))
-            if (run / "policy-last").is_dir():
-                break  # it had finished
-        finished = (run / "run.json").is_file() and '"finished"' in (run / "run.json").read_text()
+            at.append(f"row {table_rows(run)} ({newest(run)})")
+            if not run.exists() or '"finished"' in (run / "run.json").read_text():
+                break
+        finished = run.exists() and '"finished"' in (run / "run.json").read_text()
         good = (digest(run) if finished else finish(what, run)) == expected
         same += good
-        note = "same" if good else "OTHER WEIGHTS"
-        print(f"  {what} {k}: killed after {', '.join(f'{m:.1f} s' for m in moments)} at {at}: {note}", flush=True)
+        print(f"  {what} {k}: killed at {', '.join(at)}: {'same' if good else 'OTHER WEIGHTS'}", flush=True)
         shutil.rmtree(run)
     return same
+
+
+def table_rows(run: Path) -> int:
+    """Rows of the progress table."""
+    table = run / "progress.csv"
+    return table.read_text().count("\n") - 1 if table.is_file() else 0
 
 
 def newest(run: Path) -> str:

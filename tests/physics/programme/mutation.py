@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import random
 import resource
@@ -35,12 +36,12 @@ from tests.physics.programme.mutants import ROOT, Mutant, mutants
 
 PHYSICS = "ethbrake_marl/physics"
 NOT_MUTATED = {"__init__.py", "tolerances.py"}
-PATIENCE = 1.5  # times the processor time of the quick suite without a mutant, and
-SHORTEST_LIMIT_S = 5.0
+PATIENCE = 3.0  # times the processor time of a test file without a mutant, and
+SHORTEST_LIMIT_S = 2.0
 WALL_PER_CPU = 20  # a process that waits instead of computing ends after this many times its processor time
 COMPILED_LIMIT_S = 600
 MOST_MEMORY_BYTES = 8 * 2**30
-SECONDS_PER_MUTANT = 1.5  # one process, for the estimate
+SECONDS_PER_MUTANT = 1.2  # one process, for the estimate
 THRESHOLD = 0.95
 
 KERNEL = (
@@ -53,7 +54,7 @@ QUICK = {
     "compiled.py": ("tests/physics/test_compiled.py",),
     "packed.py": ("tests/physics/test_packed.py", "tests/test_engine.py"),
     "parallel.py": ("tests/physics/test_parallel.py",),
-    "sampled.py": ("tests/physics/test_sampled.py",),
+    "sampled.py": ("tests/physics/test_sampled.py", "tests/physics/test_sampled_input.py"),
     "forecast.py": ("tests/physics/test_forecast.py",),
     "harm.py": ("tests/test_harm.py", "tests/physics/test_ledger.py"),
     "advance.py": (
@@ -86,15 +87,17 @@ def quick_files(file: str) -> tuple[str, ...]:
     return QUICK.get(Path(file).name, KERNEL)
 
 
-def quick_run(folder: Path, files: tuple[str, ...], limit_s: int) -> tuple[str, float]:
-    """Run tests in a forked process: "passed", "failed" or "timeout", and the processor time it took."""
+def quick_run(folder: Path, limit_s: dict[str, float]) -> tuple[str, float]:
+    """Run test files, each within its processor time, in a forked process until the first failure.
+
+    Returns "passed", "failed" or "timeout", and the processor time of all.
+    """
     child = os.fork()
     if child == 0:
-        resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s))
         resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY_BYTES, MOST_MEMORY_BYTES))
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(WALL_PER_CPU * limit_s)
-        _run_pytest(folder, files)
+        signal.alarm(round(WALL_PER_CPU * sum(limit_s.values())))
+        _run_pytest(folder, limit_s)
     _, status, used = os.wait4(child, 0)
     code = os.waitstatus_to_exitcode(status)
     limits = (-signal.SIGXCPU, -signal.SIGKILL, -signal.SIGALRM)
@@ -102,7 +105,7 @@ def quick_run(folder: Path, files: tuple[str, ...], limit_s: int) -> tuple[str, 
     return verdict, used.ru_utime + used.ru_stime
 
 
-def _run_pytest(folder: Path, files: tuple[str, ...]) -> None:
+def _run_pytest(folder: Path, limit_s: dict[str, float]) -> None:
     """In the child: the tests, silently; never returns."""
     import pytest
 
@@ -116,7 +119,9 @@ def _run_pytest(folder: Path, files: tuple[str, ...]) -> None:
     options = [*PYTEST, *LEFT_TO_COMPILED, "-W", "ignore::pytest.PytestAssertRewriteWarning"]
     code = 3
     try:
-        for file in files:  # one after another: most mutants die in the first, before the others are even imported
+        for file, limit in limit_s.items():  # most mutants die in the first, before the others are even imported
+            seconds = math.ceil(time.process_time() + limit)
+            resource.setrlimit(resource.RLIMIT_CPU, (seconds, resource.RLIM_INFINITY))
             code = int(pytest.main([*options, file]))
             if code != 0:
                 break
@@ -146,7 +151,7 @@ class Worker:
     def __init__(self, folder: Path, journal: Path | None) -> None:
         self.folder = copy_repository(folder)
         self.journal = journal
-        self.limit_s: dict[tuple[str, ...], int] = {}
+        self.limit_s: dict[str, float] = {}
 
     def try_mutant(self, mutant: Mutant, *, compiled: bool) -> str:
         """The verdict of one suite on one mutant; the copy is whole again afterwards."""
@@ -158,8 +163,8 @@ class Worker:
             if compiled:
                 verdict = compiled_run(self.folder)
             else:
-                files = quick_files(mutant.file)
-                verdict, seconds = quick_run(self.folder, files, self.limit_s[files])
+                limits = {file: self.limit_s[file] for file in quick_files(mutant.file)}
+                verdict, seconds = quick_run(self.folder, limits)
         finally:
             file.write_text(original, "utf-8")
         if self.journal is not None:
@@ -172,11 +177,11 @@ class Worker:
 
     def check_whole(self, share: list[Mutant]) -> None:
         """The suites must pass without a mutant, or nothing would mean anything; how long they take sets the limit."""
-        for files in sorted({quick_files(mutant.file) for mutant in share}):
-            verdict, seconds = quick_run(self.folder, files, COMPILED_LIMIT_S)
+        for file in sorted({file for mutant in share for file in quick_files(mutant.file)}):
+            verdict, seconds = quick_run(self.folder, {file: COMPILED_LIMIT_S})
             if verdict != "passed":
-                raise RuntimeError(f"the quick suite fails without any mutant: {' '.join(files)}")
-            self.limit_s[files] = round(PATIENCE * seconds + SHORTEST_LIMIT_S)
+                raise RuntimeError(f"fails without any mutant: {file}")
+            self.limit_s[file] = PATIENCE * seconds + SHORTEST_LIMIT_S
 
     def check_whole_compiled(self) -> None:
         """As ``check_whole``, for the second suite."""

@@ -1,0 +1,132 @@
+"""`ethbrake resume`, `learning-curves`, `export` and `import-legacy`, with trainings of a few small updates."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from stable_baselines3 import PPO
+
+from ethbrake_marl.envs.sb3 import make_sb3_vec_env
+from ethbrake_marl.learning.bundle import load_policy
+from tests.cli.conftest import TINY_RECIPE
+from tests.cli.test_bad_input import refused
+from tests.cli.test_run import ctrl_c_when, run_json
+
+TINY_SAC = {
+    "name": "tiny-sac",
+    "algorithm": "sac",
+    "total_steps": 320,
+    "n_envs": 16,
+    "batch_size": 16,
+    "buffer_size": 200,
+    "learning_starts": 64,
+    "learning_rate": {"start": 1e-3, "end": 1e-4},
+    "gamma": 0.99,
+    "tau": 0.02,
+    "network": {"policy": [8], "value": [8]},
+    "reward": {"harm": 1.0},
+    "evaluation": {"every_updates": 10, "worlds": 10, "seed": 7},
+    "checkpoint_every_updates": 100,
+    "log_every_updates": 5,
+}
+
+
+@pytest.fixture(scope="session")
+def tiny_sac(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recipe") / "tiny-sac.yaml"
+    path.write_text(yaml.safe_dump(TINY_SAC))
+    return path
+
+
+def test_resume__goes_on_and_ends_as_if_nothing_had_happened(ethbrake, tiny_recipe, tmp_path, monkeypatch):
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    assert ethbrake("train", "--recipe", tiny_recipe, "--output", whole).status == 0
+    with monkeypatch.context() as patch:
+        ctrl_c_when(patch, lambda shown: shown["done"] == 128)
+        answer = ethbrake("train", "--recipe", tiny_recipe, "--output", stopped)
+    assert answer.status == 130
+    assert f"go on with: ethbrake resume {stopped}" in answer.err.splitlines()[-1]
+    answer = ethbrake("resume", stopped, "--json")
+    assert answer.status == 0
+    assert (json.loads(answer.out)["status"], json.loads(answer.out)["steps"]) == ("finished", 256)
+    for name in ("policy", "policy-last"):
+        expected = load_policy(whole / name).manifest.weights_sha256
+        assert load_policy(stopped / name).manifest.weights_sha256 == expected
+    refused(ethbrake("resume", stopped), "has finished", "ethbrake evaluate --agents hybrid@")
+    refused(ethbrake("resume", tmp_path), "holds no training")
+
+
+def test_resume__an_interrupted_run_goes_on_as_a_training(ethbrake, tiny_recipe, tmp_path, monkeypatch):
+    folder = tmp_path / "stopped"
+    with monkeypatch.context() as patch:
+        ctrl_c_when(patch, lambda shown: shown["done"] == 128)
+        assert ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", folder).status == 130
+    assert run_json(folder)["stage"] == "report"
+    assert ethbrake("resume", folder).status == 0
+    assert (run_json(folder)["status"], run_json(folder)["steps"]) == ("finished", 256)
+
+
+def test_run__with_sac_calls_its_policy_so(ethbrake, tiny_sac, tmp_path):
+    answer = ethbrake("run", "--recipe", tiny_sac, "--episodes", "20", "--output", tmp_path / "new", "--json")
+    assert answer.status == 0
+    assert [row["agent"] for row in json.loads(answer.out)][-2:] == ["sac", "hybrid"]
+    assert json.loads((tmp_path / "new" / "config.json").read_text())["update_ratio"] == 1 / 16
+    answer = ethbrake("evaluate", "--episodes", "20", "--agents", f"sac@{tmp_path / 'new'}", "--json")
+    assert answer.status == 0
+    refused(ethbrake("evaluate", "--agents", f"ppo@{tmp_path / 'new'}"), "was trained by SAC")
+
+
+def test_learning_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_recipe, tiny_sac, tmp_path, monkeypatch):
+    folder = tmp_path / "curves"
+    arguments = ("learning-curves", "--recipes", f"{tiny_recipe}:2,{tiny_sac}:2", "--output", folder, "--json")
+    with monkeypatch.context() as patch:
+        ctrl_c_when(patch, lambda shown: shown["name"] == "tiny-seed1" and shown["done"] == 128)
+        answer = ethbrake(*arguments)
+    assert answer.status == 130 and "the same command goes on" in answer.err
+    kept = (folder / "tiny-seed0" / "policy" / "manifest.json").stat().st_mtime_ns
+    answer = ethbrake(*arguments)
+    assert answer.status == 0
+    assert (folder / "tiny-seed0" / "policy" / "manifest.json").stat().st_mtime_ns == kept
+    assert (folder / "learning_curves.png").read_bytes().startswith(b"\x89PNG")
+    rows = list(csv.DictReader((folder / "learning_curves.csv").read_text().splitlines()))
+    harms = {(r["recipe"], r["seed"], int(r["steps"])): float(r["value"]) for r in rows if r["figure"] != "return"}
+    assert {key[2] for key in harms if key[0] == "tiny"} == {0, 128, 256}
+    assert {key[2] for key in harms if key[0] == "tiny-sac"} == {0, 160, 320}
+    summary = json.loads(answer.out)
+    last = [harms["tiny", seed, 256] for seed in "01"]
+    assert summary["recipes"]["tiny"]["last"]["each"] == last
+    assert summary["recipes"]["tiny"]["last"]["interquartile_mean"] == pytest.approx(sum(last) / 2)
+    low, high = summary["recipes"]["tiny"]["last"]["interval"]
+    assert min(last) <= low <= high <= max(last)
+    other = tiny_recipe.parent / "other.yaml"
+    other.write_text(yaml.safe_dump({**TINY_RECIPE, "gamma": 0.9}))
+    refused(ethbrake("learning-curves", "--recipes", f"{other}:1", "--output", folder), "another recipe or scenario")
+
+
+@pytest.mark.parametrize("recipes", ["ppo", "ppo:0", "ppo:2,ppo:3", "pppo:2", ""])
+def test_learning_curves__refuses_a_plan_that_is_none(ethbrake, recipes, tmp_path):
+    refused(ethbrake("learning-curves", "--recipes", recipes, "--output", tmp_path / "new"), "recipe")
+    assert not (tmp_path / "new").exists()
+
+
+def test_export__writes_onnx(ethbrake, finished_run, tmp_path):
+    onnx = pytest.importorskip("onnx")
+    assert ethbrake("export", finished_run, "--onnx", tmp_path / "policy.onnx").status == 0
+    model = onnx.load(str(tmp_path / "policy.onnx"))
+    assert [output.name for output in model.graph.output] == ["action", "acceleration_mps2"]
+    refused(ethbrake("export", finished_run, "--onnx", tmp_path / "policy.onnx"), "is there already")
+
+
+def test_import_legacy__needs_trust_and_makes_a_bundle(ethbrake, tmp_path):
+    environment = make_sb3_vec_env("paper-random", 4)
+    PPO("MlpPolicy", environment, n_steps=8, batch_size=8, device="cpu").save(tmp_path / "old.zip")
+    arguments = ("import-legacy", tmp_path / "old.zip", "--output", tmp_path / "new")
+    refused(ethbrake(*arguments), "runs the code inside it", "--i-trust-this-file")
+    assert not (tmp_path / "new").exists()
+    assert ethbrake(*arguments, "--i-trust-this-file").status == 0
+    assert ethbrake("evaluate", "--episodes", "5", "--agents", f"ppo@{tmp_path / 'new'}", "--json").status == 0
+    refused(ethbrake(*arguments, "--i-trust-this-file"), "is there already")

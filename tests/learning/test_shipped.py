@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.learning import shipped
+from ethbrake_marl.learning.bundle import Policy, save_policy
+from ethbrake_marl.learning.shipped import card, load_named_policy, shipped_name, shipped_policies
+from ethbrake_marl.lineup import make_lineup
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield import HybridAgent
+
+SCENARIO = load_scenario("paper-random")
+
+
+@pytest.fixture
+def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package in which four policies ship."""
+    for name in ("ppo-paper-random", "ppo-paper-random-total", "ppo-paper-distance", "universal"):
+        save_policy(policy, tmp_path / name / "policy")
+        (tmp_path / name / "card.md").write_text(f"# {name}\n")
+    monkeypatch.setattr(shipped, "_FOLDER", tmp_path)
+    return tmp_path
+
+
+def test_shipped_name__is_by_kind_scenario_and_count(folder: Path) -> None:
+    assert shipped_name("ppo", "paper-random", "first") == "ppo-paper-random"
+    assert shipped_name("ppo", "paper-random", "total") == "ppo-paper-random-total"
+    assert shipped_name("ppo", "paper-distance", "total") == "ppo-paper-distance"  # better than none
+    assert shipped_name("universal", "paper-delay-low", "first") == "universal"
+    assert shipped_name("ppo", None, "total") == "ppo-paper-random-total"
+    assert card("universal") == "# universal\n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "scenario"), [("sac", "paper-random"), ("ppo", "paper-delay-low"), ("ppo", None), ("sac", None)]
+)
+def test_shipped_name__lists_what_ships_when_there_is_none(kind: str, scenario: str | None, folder: Path) -> None:
+    listed = "ppo-paper-distance, ppo-paper-random, ppo-paper-random-total, universal"
+    with pytest.raises(InvalidInput, match=f"shipped policy {kind}.*: there is not exactly one; shipped are: {listed}"):
+        shipped_name(kind, scenario, "first")
+
+
+def test_load_named_policy__by_its_own_name(folder: Path) -> None:
+    assert load_named_policy("shipped/universal").manifest.steps == 1024
+    with pytest.raises(UnknownName, match="unknown shipped policy 'universel'; did you mean 'universal'"):
+        load_named_policy("shipped/universel")
+
+
+def test_lineup__takes_what_ships(folder: Path, policy: Policy) -> None:
+    worlds = SCENARIO.sample(5, 1).worlds
+    specs = ["ppo@shipped", "universal@shipped", "hybrid@shipped", "ppo@shipped/ppo-paper-distance"]
+    lineup = make_lineup(specs, SCENARIO)
+    assert list(lineup) == specs
+    assert isinstance(lineup["hybrid@shipped"], HybridAgent)
+    assert lineup["universal@shipped"].name == "universal@shipped"
+    alone = lineup["ppo@shipped"].act(worlds, 1)
+    assert np.array_equal(alone, eb.make_agent("universal@shipped").act(worlds, 1))
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("universal@runs/x", "must be universal@shipped"),
+        ("sac@shipped/universal", "that policy was trained by PPO: ppo@shipped/universal"),
+        ("ppo@", "a path is needed|must be ppo@PATH"),
+        ("sac", "must be ppo@PATH, sac@PATH"),
+    ],
+)
+def test_lineup__says_what_a_policy_is_called(spec: str, message: str, folder: Path) -> None:
+    with pytest.raises(InvalidInput, match=message):
+        make_lineup([spec], SCENARIO)
+
+
+def test_shipped_policies__each_that_ships_is_small_and_has_a_card() -> None:
+    for name, path in shipped_policies().items():
+        assert load_named_policy(f"shipped/{name}").manifest.steps > 0
+        assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 1_000_000
+        assert card(name).startswith("# ")
