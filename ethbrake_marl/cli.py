@@ -191,7 +191,7 @@ def evaluate_command(
 
     Agents: full_brake, coast, constant:A (deceleration in m/s2), copy_leader, gentlest_front, e_v2x_bm,
     e_v2x_bm:pairwise, planner, best_harm; ladder: all of these but constant; and of a run or a policy bundle: ppo@PATH,
-    sac@PATH, hybrid@PATH, hybrid:pairwise@PATH. PATH may be shipped.
+    sac@PATH, rehearsed@PATH, hybrid@PATH, hybrid:pairwise@PATH, hybrid:rehearsed@PATH. PATH may be shipped.
     """
     if per_world is not None:
         check_target(per_world, force=force)

@@ -12,6 +12,7 @@ import numpy as np
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import Factory, agent_names, make_agent, register_agent
+from ethbrake_marl.agents.rehearsed import Rehearsed
 from ethbrake_marl.analysis.best_harm_shipped import make_best_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
@@ -38,7 +39,8 @@ LADDER = (  # from no decision at all up to the best that is known
 register_agent("best_harm", make_best_harm)
 
 POLICY_KINDS: tuple[PolicyKind, ...] = ("ppo", "sac", "universal")
-_OF_A_POLICY = (*POLICY_KINDS, "hybrid")
+_WITH_SCENARIO = ("rehearsed", "hybrid", "hybrid:pairwise", "hybrid:rehearsed")  # of a policy, for one scenario
+_OF_A_POLICY = (*POLICY_KINDS, "rehearsed", "hybrid")
 _LADDER_SPEC = "ladder"
 
 
@@ -90,11 +92,12 @@ def make_lineup(specs: Sequence[str], scenario: Scenario, *, count: HarmCount = 
     """One fresh agent per spec, by its spec, to drive a vehicle of ``scenario``.
 
     Every spec of ``make_agent``, and ``ppo@PATH`` or ``sac@PATH`` (the policy of a run, or a bundle), ``hybrid@PATH``
-    (Algorithm 1: that policy or coupled E-V2X-BM, whichever harms less) and ``hybrid:pairwise@PATH`` (with the paper's
-    closed form instead). PATH may be ``shipped``, the policy that comes with the package for this scenario and count
-    (PPO's for a hybrid), or ``shipped/NAME``; ``universal@shipped`` is for all scenarios. ``ladder`` stands for every
-    agent of ``LADDER`` that there is. ``count`` is the harm that optimising and choosing agents minimise. Raises
-    ``InvalidInput`` for a spec given twice, ``UnknownName`` with a suggestion, and whatever loading a policy raises.
+    (Algorithm 1: that policy or coupled E-V2X-BM, whichever harms less), ``hybrid:pairwise@PATH`` (with the paper's
+    closed form instead), ``rehearsed@PATH`` (``agents.rehearsed``) and ``hybrid:rehearsed@PATH``. PATH may be
+    ``shipped``, the policy that comes with the package for this scenario and count (PPO's for the last four), or
+    ``shipped/NAME``; ``universal@shipped`` is for all scenarios. ``ladder`` stands for every agent of ``LADDER`` that
+    there is. ``count`` is the harm that optimising and choosing agents minimise. Raises ``InvalidInput`` for a spec
+    given twice, ``UnknownName`` with a suggestion, and whatever loading a policy raises.
     """
     specs = [each for spec in specs for each in (_ladder() if spec == _LADDER_SPEC else [spec])]
     for k, spec in enumerate(specs):
@@ -152,10 +155,11 @@ def _agent(spec: str, scenario: Scenario, count: HarmCount) -> Agent:
 def _agent_of_a_policy(spec: str, scenario: Scenario | None, count: HarmCount) -> Agent:
     """A policy alone, or behind its shield, which needs the scenario."""
     kind, _, path = spec.partition("@")
-    if not path or kind not in (*_OF_A_POLICY, "hybrid:pairwise"):
+    if not path or kind not in (*POLICY_KINDS, *_WITH_SCENARIO):
+        kinds = ", ".join(f"{each}@PATH" for each in ("ppo", "sac", *_WITH_SCENARIO))
         raise InvalidInput(
-            f"agent {spec!r}: must be ppo@PATH, sac@PATH, universal@shipped, hybrid@PATH or hybrid:pairwise@PATH, where"
-            " PATH is a run or a policy bundle, for instance ppo@runs/my-run, or shipped"
+            f"agent {spec!r}: must be universal@shipped or one of {kinds}, where PATH is a run or a policy bundle, for"
+            " instance ppo@runs/my-run, or shipped"
         )
     wanted: PolicyKind = "sac" if kind == "sac" else "universal" if kind == "universal" else "ppo"
     if kind == "universal" and path != SHIPPED:
@@ -168,7 +172,10 @@ def _agent_of_a_policy(spec: str, scenario: Scenario | None, count: HarmCount) -
     if kind in POLICY_KINDS:
         return policy
     assert scenario is not None
-    return HybridAgent(policy, scenario, bound="pairwise" if kind == "hybrid:pairwise" else "coupled", count=count)
+    driver = Rehearsed(policy, scenario, count=count) if kind.endswith("rehearsed") else policy
+    if kind == "rehearsed":
+        return driver
+    return HybridAgent(driver, scenario, bound="pairwise" if kind == "hybrid:pairwise" else "coupled", count=count)
 
 
 def _register_policies() -> None:

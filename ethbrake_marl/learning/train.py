@@ -75,9 +75,11 @@ def train(
     recipe = recipe.replace(**{name: value for name, value in changes.items() if value is not None})
     if not scenario.learners:
         raise InvalidInput(f"scenario {scenario.name!r}: no vehicle learns; give at least one the role learner")
-    with _environment(recipe, scenario):  # whatever is wrong with it is said before anything is made
-        run = create_run(Path(directory), _config(recipe, scenario), force=force)
-    return _run(run, recipe, scenario, evaluate, on_progress, None)
+
+    def begin() -> tuple[RunDirectory, None]:
+        return create_run(Path(directory), _config(recipe, scenario), force=force), None
+
+    return _run(begin, recipe, scenario, evaluate, on_progress)
 
 
 def resume(
@@ -102,33 +104,38 @@ def resume(
     except (KeyError, ValidationError) as error:
         raise InvalidInput(f"{run.config}: is not the configuration of a training ({error})") from None
     measure = None if evaluate is None else evaluate(recipe, scenario)
-    return _run(run, recipe, scenario, measure, on_progress, lambda: _newest(run, other_versions))
+    return _run(lambda: (run, other_versions), recipe, scenario, measure, on_progress)
 
 
 def _run(
-    run: RunDirectory,
+    begin: Callable[[], tuple[RunDirectory, bool | None]],
     recipe: TrainingRecipe,
     scenario: Scenario,
     evaluate: Evaluate | None,
     on_progress: Callable[[Progress], None] | None,
-    find: Callable[[], tuple[TrainingState | None, list[str]]] | None,
 ) -> TrainResult:
-    """Train in the run's folder, from the state that ``find`` gives."""
-    with only_process(run), own_random_state(), stop_on_signal() as stop, _environment(recipe, scenario) as environment:
-        state, damaged = (None, []) if find is None else find()
-        session = Session(run, make_model(recipe, environment), recipe)
-        between = BetweenUpdates(
-            recipe,
-            _policy_maker(recipe, scenario),
-            save=session.save,
-            stop=stop,
-            evaluate=evaluate,
-            on_progress=on_progress,
-        )
-        if find is not None:
-            session.restore(between, state)
-            between.notes += [f"a damaged checkpoint was left aside: {reason}" for reason in damaged]
-        status = session.learn(between)
+    """Train in the folder that ``begin`` makes or finds, once nothing can be wrong with environment and model.
+
+    What else it gives is None for a new training, else whether other versions may go on with it.
+    """
+    with own_random_state(), stop_on_signal() as stop, _environment(recipe, scenario) as environment:
+        model = make_model(recipe, environment)
+        run, other_versions = begin()
+        with only_process(run):
+            found = None if other_versions is None else _newest(run, other_versions)
+            session = Session(run, model, recipe)
+            between = BetweenUpdates(
+                recipe,
+                _policy_maker(recipe, scenario),
+                save=session.save,
+                stop=stop,
+                evaluate=evaluate,
+                on_progress=on_progress,
+            )
+            if found is not None:
+                session.restore(between, found[0])
+                between.notes += [f"a damaged checkpoint was left aside: {reason}" for reason in found[1]]
+            status = session.learn(between)
     course = between.course
     assert course.policy is not None and course.kept is not None  # set before the first rollout
     return TrainResult(

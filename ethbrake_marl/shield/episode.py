@@ -16,6 +16,7 @@ import numpy as np
 from ethbrake_marl.agents.driving import drive, introduce, scripted
 from ethbrake_marl.agents.e_v2x_bm import EV2XBM
 from ethbrake_marl.agents.protocol import Agent, place
+from ethbrake_marl.agents.rehearsed import Rehearsed
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
@@ -60,11 +61,14 @@ class HybridAgent:
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Choose for these rows; ``worlds`` holds those rows only, at the alert."""
-        policy_harm = self._harm(worlds, self._rehearsal, vehicle)
         scripts = scripted(self.scenario, but=vehicle)
         for agent in (self.policy, self.backup):
             introduce(agent, vehicle, scripts)
             agent.begin(worlds, vehicle, rows)
+        if isinstance(self.policy, Rehearsed):  # was rolled out just now
+            policy_harm = self.policy.predicted_harm[rows]
+        else:
+            policy_harm = self._harm(worlds, self._rehearsal, vehicle)
         bound = self.backup.predicted_harm[rows]
         if self.bound == "coupled":
             bound = self._harm(worlds, FixedCommand(-self.backup.deceleration_mps2[rows]), vehicle)

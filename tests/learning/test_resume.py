@@ -273,6 +273,7 @@ def test_resume__refuses_what_it_cannot_go_on_with(
     monkeypatch.setattr(train_module, "installed_versions", lambda: {"torch": "99.0"})
     with pytest.raises(InvalidInput, match=r"was trained with ethbrake-marl .*: the numbers would differ"):
         resume(tmp_path / "run")
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"
     assert resume(tmp_path / "run", other_versions=True).status == "finished"
 
 

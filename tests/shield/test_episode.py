@@ -8,6 +8,7 @@ from pettingzoo.test import parallel_api_test
 
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rehearsed import Rehearsed
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.scenario import load_scenario
@@ -42,6 +43,14 @@ def test_coupled__is_never_worse_than_either_part(count):
     assert realised.tolist() == hybrid.predicted_harm.tolist()
     assert hybrid.chosen_policy.tolist() == (alone <= baseline).tolist()
     assert 0 < hybrid.chosen_policy.sum() < WORLDS.n
+
+
+def test_rehearsed__policy_is_taken_at_its_word():
+    hybrid = HybridAgent(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=6), SCENARIO)
+    realised = harm(hybrid)
+    plain = harm(HybridAgent(make_agent("constant:5"), SCENARIO))
+    assert realised.tolist() == hybrid.predicted_harm.tolist()
+    assert (realised <= plain).all() and (realised < plain).any()
 
 
 def test_pairwise__bound_is_exceeded_in_the_same_physics():
