@@ -99,7 +99,8 @@ def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) ->
         summary["recipes"][name] = {"seeds": trainings.seeds, "kept": _estimate(kept), "last": _estimate(last)}
     curves = {metric: lines for metric, lines in curves.items() if lines}
     caption = f"{scenario.name}: mean over seeds, bands: one standard deviation. {_conditions(plan)}"
-    figure = seed_curves({_LABELS[metric]: lines for metric, lines in curves.items()}, caption=caption)
+    panels = {_LABELS[metric]: lines for metric, lines in curves.items()}
+    figure = seed_curves(panels, logarithmic=[_LABELS[metric] for metric in metrics], caption=caption)
     write_output(folder / FIGURE, png_bytes(figure), force=True)
     write_output(folder / TABLE, _csv(curves).encode(), force=True)
     write_output(folder / SUMMARY, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode(), force=True)

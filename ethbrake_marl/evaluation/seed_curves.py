@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.figure_style import add_caption, new_figure, series_style, style_axes
@@ -22,10 +22,13 @@ class SeedCurve:
     values: Floats  # [seeds, k]
 
 
-def seed_curves(panels: Mapping[str, Mapping[str, SeedCurve]], *, caption: str = "") -> Figure:
+def seed_curves(
+    panels: Mapping[str, Mapping[str, SeedCurve]], *, logarithmic: Collection[str] = (), caption: str = ""
+) -> Figure:
     """One panel per label, one line per recipe: the mean over seeds, bands one standard deviation to either side.
 
-    Raises ``InvalidInput`` without panels or lines.
+    Panels in ``logarithmic`` have a logarithmic axis if their means allow it: harm falls to a tenth, and the last
+    tenth is what matters. Raises ``InvalidInput`` without panels or lines.
     """
     if not panels or not all(panels.values()):
         raise InvalidInput("seed_curves: nothing to draw; at least one training with one evaluation is needed")
@@ -41,6 +44,11 @@ def seed_curves(panels: Mapping[str, Mapping[str, SeedCurve]], *, caption: str =
             axes.fill_between(
                 curve.steps, mean - spread, mean + spread, color=str(style["color"]), alpha=0.18, linewidth=0.0
             )
+        if label in logarithmic and all((curve.values > 0.0).all() for curve in curves.values()):
+            axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
         axes.set_title(label, loc="left", fontsize=10)
         axes.set_xlabel("Training steps", fontsize=9)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))

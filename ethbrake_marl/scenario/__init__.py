@@ -7,7 +7,7 @@ from ethbrake_marl.scenario.catalogue import (
     scenario_folder,
     scenario_path,
 )
-from ethbrake_marl.scenario.distributions import Choice, Normal, Uniform
+from ethbrake_marl.scenario.distributions import Choice, LogUniform, Normal, Uniform
 from ethbrake_marl.scenario.initial_states import (
     initial_state_worlds,
     read_initial_states,
@@ -25,6 +25,7 @@ __all__ = [
     "Channel",
     "Choice",
     "Document",
+    "LogUniform",
     "Normal",
     "Sample",
     "Scenario",

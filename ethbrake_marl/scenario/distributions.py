@@ -52,6 +52,29 @@ class Uniform(_Distribution):
         return low + (high - low) * u
 
 
+class LogUniform(_Distribution):
+    """``{loguniform: [low, high]}``: every ratio is equally likely, as between 1 and 2 so between 2 and 4."""
+
+    loguniform: Pair = Field(description="[low, high], both above 0")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> LogUniform:
+        low, high = self.loguniform
+        _require(low > 0.0, "loguniform", self.loguniform, "low must be above 0")
+        _require(low <= high, "loguniform", self.loguniform, "low must not be above high")
+        return self
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that can be drawn."""
+        return self.loguniform
+
+    def value(self, u: Floats) -> Floats:
+        """``low (high / low)^u``, in the shape of ``u`` in [0, 1)."""
+        low, high = self.loguniform
+        return np.clip(low * (high / low) ** u, low, high)
+
+
 class NormalShape(_Distribution):
     """Mean and standard deviation of the untruncated bell, and the bounds that cut it."""
 
@@ -137,23 +160,24 @@ def _kind(value: object) -> str | None:
     return None if isinstance(value, list | tuple) else "#number"
 
 
-DISTRIBUTIONS = ("uniform", "normal", "choice")
+DISTRIBUTIONS = ("uniform", "loguniform", "normal", "choice")
 
 # Tags begin with # so that they can be told from keys in the location of an error.
 Quantity = Annotated[
     Annotated[Number, Tag("#number")]
     | Annotated[Uniform, Tag("#uniform")]
+    | Annotated[LogUniform, Tag("#loguniform")]
     | Annotated[Normal, Tag("#normal")]
     | Annotated[Choice, Tag("#choice")],
     Discriminator(_kind, custom_error_type="quantity", custom_error_message="no such quantity"),
 ]
 
 
-def support(quantity: float | Uniform | Normal | Choice) -> tuple[float, float]:
+def support(quantity: float | Uniform | LogUniform | Normal | Choice) -> tuple[float, float]:
     """Smallest and largest value that the quantity can take."""
     return (quantity, quantity) if isinstance(quantity, float) else quantity.support
 
 
-def values(quantity: float | Uniform | Normal | Choice, u: Floats) -> Floats:
+def values(quantity: float | Uniform | LogUniform | Normal | Choice, u: Floats) -> Floats:
     """The quantity's values for uniform numbers ``u`` in [0, 1), in the shape of ``u``."""
     return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)

@@ -11,6 +11,7 @@ from ethbrake_marl.scenario.yaml_loading import YamlPath
 
 _INSIDE = {
     "uniform": ("uniform",),
+    "loguniform": ("loguniform",),
     "normal": tuple(NormalShape.model_fields),
     "choice": tuple(Choice.model_fields),
 }

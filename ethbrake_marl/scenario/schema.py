@@ -20,7 +20,7 @@ from ethbrake_marl.scenario.consistency import (
     refuse,
 )
 from ethbrake_marl.scenario.derivation import quantity_bounds
-from ethbrake_marl.scenario.distributions import Choice, Normal, Quantity, Uniform
+from ethbrake_marl.scenario.distributions import Choice, LogUniform, Normal, Quantity, Uniform
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
 from ethbrake_marl.scenario.sampling import Channel, Sample, draw_list
 from ethbrake_marl.scenario.scenario_wording import ScenarioWording
@@ -28,7 +28,7 @@ from ethbrake_marl.scenario.scripts import LEARNER
 from ethbrake_marl.scenario.validation_messages import explain
 from ethbrake_marl.scenario.yaml_loading import Document
 
-AnyQuantity = float | Uniform | Normal | Choice
+AnyQuantity = float | Uniform | LogUniform | Normal | Choice
 
 NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
@@ -46,10 +46,10 @@ PerVehicle = Annotated[
 class Scenario(BaseModel):
     """A line of vehicles, how each quantity is drawn, and who learns.
 
-    A quantity is a number, ``{uniform: [low, high]}``, ``{normal: {mean, sd, low, high}}`` or ``{choice: [...]}``.
-    One entry stands for every vehicle (each draws its own value); a list has one entry per vehicle, gaps one per
-    pair. Every way to build one (``Scenario(...)``, ``load_scenario``, ``replace``) raises ``InvalidInput`` with
-    one message: where, value, what would be right.
+    A quantity is a number, ``{uniform: [low, high]}``, ``{loguniform: [low, high]}``,
+    ``{normal: {mean, sd, low, high}}`` or ``{choice: [...]}``. One entry stands for every vehicle (each draws its own
+    value); a list has one entry per vehicle, gaps one per pair. Every way to build one (``Scenario(...)``,
+    ``load_scenario``, ``replace``) raises ``InvalidInput`` with one message: where, value, what would be right.
     """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")

@@ -14,7 +14,7 @@ from ethbrake_marl.scenario.schema import NAME_PATTERN, Scenario
 _HEAD = """\
 # Scenario {name}, started from {based_on}.
 # A quantity is a number, or is drawn for every world:
-#   {{uniform: [low, high]}}
+#   {{uniform: [low, high]}}, {{loguniform: [low, high]}}
 #   {{normal: {{mean: 20, sd: 1, low: 18, high: 22}}}}    truncated to [low, high]
 #   {{choice: [6, 7, 8]}}    optionally with weights: [1, 2, 1]
 # One entry stands for every vehicle (each draws its own value); a list has one entry per vehicle, front to rear.

@@ -14,7 +14,10 @@ from ethbrake_marl.scenario.numerals import parse_numeral
 from ethbrake_marl.scenario.quantities import suggestion
 from ethbrake_marl.scenario.yaml_loading import Document, YamlPath
 
-_QUANTITY = "must be a number, {uniform: [low, high]}, {normal: {mean, sd, low, high}} or {choice: [a, b, ...]}"
+_QUANTITY = (
+    "must be a number, {uniform: [low, high]}, {loguniform: [low, high]}, {normal: {mean, sd, low, high}}"
+    " or {choice: [a, b, ...]}"
+)
 _RIGHT = {
     "finite_number": "must be a finite number",
     "int_type": "must be a whole number, written without a decimal point",

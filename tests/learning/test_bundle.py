@@ -18,7 +18,7 @@ import safetensors.numpy
 
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
 from ethbrake_marl.learning import bundle
-from ethbrake_marl.learning.bundle import Policy, load_policy, make_policy, save_policy
+from ethbrake_marl.learning.bundle import Policy, actor_only, load_policy, make_policy, save_policy
 from ethbrake_marl.learning.manifest import content_sha256
 
 Spoil = Callable[[Path], None]
@@ -370,6 +370,15 @@ def test_load_policy__runs_nothing_and_opens_nothing_else(policy: Policy, tmp_pa
     assert seen["refused"] == list(SPOILED)
     assert seen["events"] == []
     assert seen["torch"] is False
+
+
+def test_actor_only__acts_the_same_without_the_critic(policy: Policy, tmp_path: Path) -> None:
+    save_policy(actor_only(policy), tmp_path / "policy")
+    loaded = load_policy(tmp_path / "policy")
+    assert not any(name.startswith("value") for name in loaded.tensors)
+    assert loaded.manifest.scenario == policy.manifest.scenario
+    seen = np.random.default_rng(0).normal(size=(50, policy.observation.size)).astype(np.float32)
+    assert np.array_equal(loaded(seen), policy(seen))
 
 
 def test_load_policy__a_hard_link_is_the_file_itself(policy: Policy, tmp_path: Path) -> None:

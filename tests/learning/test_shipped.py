@@ -67,8 +67,8 @@ def test_lineup__takes_what_ships(folder: Path, policy: Policy) -> None:
     [
         ("universal@runs/x", "must be universal@shipped"),
         ("sac@shipped/universal", "that policy was trained by PPO: ppo@shipped/universal"),
-        ("ppo@", "a path is needed|must be ppo@PATH"),
-        ("sac", "must be ppo@PATH, sac@PATH"),
+        ("ppo@", "a path is needed|must be universal@shipped or one of ppo@PATH"),
+        ("sac", "must be universal@shipped or one of ppo@PATH, sac@PATH"),
     ],
 )
 def test_lineup__says_what_a_policy_is_called(spec: str, message: str, folder: Path) -> None:

@@ -24,7 +24,9 @@ LINES = {
     "early_impacts": "early_impacts: reject",
 }
 LINE_NUMBER = {key: number for number, key in enumerate(LINES, start=1)}
-QUANTITY_KINDS = "{uniform: [low, high]}, {normal: {mean, sd, low, high}} or {choice: [a, b, ...]}"
+QUANTITY_KINDS = (
+    "{uniform: [low, high]}, {loguniform: [low, high]}, {normal: {mean, sd, low, high}} or {choice: [a, b, ...]}"
+)
 
 
 def build(**changed: str | None) -> Scenario:

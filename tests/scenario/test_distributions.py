@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from scipy.stats import truncnorm
 
-from ethbrake_marl.scenario.distributions import Choice, Normal, Uniform, support, values
+from ethbrake_marl.scenario.distributions import Choice, LogUniform, Normal, Uniform, support, values
 
 GRID = (np.arange(200_000) + 0.5) / 200_000
 ALMOST_ONE = np.array([1.0 - 2.0**-53])
@@ -50,6 +51,18 @@ def test_choice__the_largest_u_takes_the_last_entry(weights):
     assert choice.value(ALMOST_ONE)[0] == len(weights) - 1
 
 
+def test_loguniform__by_hand():
+    drawn = LogUniform(loguniform=(1.0, 16.0)).value(np.array([0.0, 0.25, 0.5, 0.75]))
+    assert np.allclose(drawn, [1.0, 2.0, 4.0, 8.0], rtol=1e-15)
+    assert (LogUniform(loguniform=(0.2, 2.0)).value(ALMOST_ONE) <= 2.0).all()
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 1.0), (-1.0, 1.0), (2.0, 1.0)])
+def test_loguniform__needs_bounds_above_0_in_order(bounds):
+    with pytest.raises(ValidationError, match="low must"):
+        LogUniform(loguniform=bounds)
+
+
 def test_normal__its_middle_is_the_mean_when_the_bounds_are_symmetric():
     assert normal(20.0, 1.0, 18.0, 22.0).value(np.array([0.5])).tolist() == [20.0]
 
@@ -71,6 +84,7 @@ def test_normal__stays_in_its_bounds_far_out_in_the_tail():
     "quantity",
     [
         Uniform(uniform=(5.0, 10.0)),
+        LogUniform(loguniform=(0.2, 2.0)),
         Choice(choice=(1.0, 2.0, 5.0), weights=(0.2, 0.3, 0.5)),
         normal(20.0, 1.0, 18.0, 22.0),
     ],
