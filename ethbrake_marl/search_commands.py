@@ -57,10 +57,7 @@ def best_harm_command(
     The other vehicles follow their scripts. With --output, finished parts are kept beside the file, and the same
     command goes on where it was interrupted.
     """
-    if output is not None:
-        check_target(output, force=force)
-        if output.suffix != TABLE_ENDING:
-            raise InvalidInput(f"{output}: a table ends in {TABLE_ENDING}")
+    _check_output(output, force=force)
     chosen = load_runnable(scenario)
     names = None if vehicles is None else [name.strip() for name in vehicles.split(",")]
     controlled = None if names is None else chosen.with_learners(names).learners
@@ -87,7 +84,20 @@ def best_harm_command(
         save_table(output, table)
         shutil.rmtree(parts)
         say(f"every world: {output}")
-    figures = {**best_harm_figures(table), **_proven(chosen, sample.worlds, controlled or chosen.learners)}
+    _show(
+        {**best_harm_figures(table), **_proven(chosen, sample.worlds, controlled or chosen.learners)}, as_json=as_json
+    )
+
+
+def _check_output(output: Path | None, *, force: bool) -> None:
+    """Refuse a table's file before any work."""
+    if output is not None:
+        check_target(output, force=force)
+        if output.suffix != TABLE_ENDING:
+            raise InvalidInput(f"{output}: a table ends in {TABLE_ENDING}")
+
+
+def _show(figures: dict[str, object], *, as_json: bool) -> None:
     if as_json:
         write_json(figures)
         return

@@ -13,9 +13,9 @@ from ethbrake_marl.harm import HarmCount, check_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 
-REHEARSALS = 16  # deviations tried beside the policy as it is
+REHEARSALS = 32  # deviations tried beside the policy as it is
 SEGMENT_S = 0.8  # a deviation is constant this long
-SIZES = (0.035, 0.085, 0.17)  # largest deviations, as shares of the braking capacity, in turn
+SIZES = (0.05, 0.15, 0.4)  # largest deviations, as shares of the braking capacity, in turn
 _SEGMENTS = 64  # of different deviation; the last one goes on
 
 

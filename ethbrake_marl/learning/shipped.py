@@ -30,24 +30,23 @@ def shipped_policies() -> dict[str, Path]:
 def shipped_name(kind: PolicyKind, scenario: str | None, count: HarmCount) -> str:
     """Name of the policy of this kind for ``scenario``, of those trained for ``count`` if there is one.
 
-    Names are ``universal``, ``ppo-SCENARIO`` and ``sac-SCENARIO``, with ``-total`` behind where a policy was trained
-    for total harm. Without a scenario the only one of its kind is meant. Raises ``InvalidInput`` listing what ships.
+    ``universal`` is for all scenarios, ``ppo`` and ``sac`` are for the one that they were trained on, ``ppo-SCENARIO``
+    and ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. Raises
+    ``InvalidInput`` listing what ships.
     """
     names = shipped_policies()
-    if kind == "universal" or scenario is not None:
-        plain = kind if kind == "universal" else f"{kind}-{scenario}"
-        for name in (f"{plain}-total", plain) if count == "total" else (plain,):
-            if name in names:
+    plain = [kind] if kind == "universal" or scenario is None else [f"{kind}-{scenario}", kind]
+    for stem in plain:
+        for name in (f"{stem}-total", stem) if count == "total" else (stem,):
+            if name in names and (stem != kind or scenario is None or _is_for(kind, names[name], scenario)):
                 return name
-    else:
-        suited = [
-            name for name in names if name.startswith(f"{kind}-") and name.endswith("-total") == (count == "total")
-        ]
-        if len(suited) == 1:
-            return suited[0]
     wanted = kind if scenario is None or kind == "universal" else f"{kind} for scenario {scenario!r}"
     every = ", ".join(names) or "none"
-    raise InvalidInput(f"shipped policy {wanted}: there is not exactly one; shipped are: {every} (as {SHIPPED}/NAME)")
+    raise InvalidInput(f"shipped policy {wanted}: there is none; shipped are: {every} (each as {SHIPPED}/NAME)")
+
+
+def _is_for(kind: PolicyKind, folder: Path, scenario: str) -> bool:
+    return kind == "universal" or load_policy(folder / BUNDLE).manifest.scenario.get("name") == scenario
 
 
 def load_shipped(name: str) -> Policy:

@@ -18,6 +18,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.bundle import Policy, make_policy
 from ethbrake_marl.learning.callback import BetweenUpdates, Evaluate, Progress
 from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
+from ethbrake_marl.learning.course import Course
 from ethbrake_marl.learning.manifest import observation_schema
 from ethbrake_marl.learning.model_state import Model
 from ethbrake_marl.learning.models import make_model
@@ -136,7 +137,10 @@ def _run(
                 session.restore(between, found[0])
                 between.notes += [f"a damaged checkpoint was left aside: {reason}" for reason in found[1]]
             status = session.learn(between)
-    course = between.course
+    return _result(run, between.course, status)
+
+
+def _result(run: RunDirectory, course: Course, status: Literal["finished", "interrupted"]) -> TrainResult:
     assert course.policy is not None and course.kept is not None  # set before the first rollout
     return TrainResult(
         run.path,

@@ -176,7 +176,9 @@ def test_make_agent__suggests_the_name_that_was_meant():
 
 def test_agent_names__are_those_that_ship():
     own = ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front", "planner")
-    assert tuple(name for name in agent_names() if name != "best_harm") == own  # which the room of analysis registers
+    # Rooms above register more, where another test of this process loaded them.
+    here = [name for name in agent_names() if registry._FACTORIES[name].__module__ == registry.__name__]
+    assert tuple(here) == own
 
 
 def test_register_agent__makes_names_and_paths_known(monkeypatch):
@@ -187,13 +189,13 @@ def test_register_agent__makes_names_and_paths_known(monkeypatch):
         seen.append((argument, settings.count))
         return make_agent("coast")
 
-    register_agent("ppo", factory)
-    register_agent("ppo", factory)
-    for spec in ("ppo", "ppo:my-run", "ppo@my-run", "ppo@C:/runs/my run@2"):
+    register_agent("mine", factory)
+    register_agent("mine", factory)
+    for spec in ("mine", "mine:my-run", "mine@my-run", "mine@C:/runs/my run@2"):
         make_agent(spec, count="total")
     assert seen == [(None, "total"), ("my-run", "total"), ("my-run", "total"), ("C:/runs/my run@2", "total")]
-    assert "ppo" in agent_names()
+    assert "mine" in agent_names()
     with pytest.raises(AlreadyExists):
-        register_agent("ppo", lambda argument, settings: make_agent("coast"))
+        register_agent("mine", lambda argument, settings: make_agent("coast"))
     with pytest.raises(InvalidInput):
-        register_agent("ppo:x", factory)
+        register_agent("mine:x", factory)

@@ -19,8 +19,8 @@ SCENARIO = load_scenario("paper-random")
 
 @pytest.fixture
 def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package in which four policies ship."""
-    for name in ("ppo-paper-random", "ppo-paper-random-total", "ppo-paper-distance", "universal"):
+    """A package in which four policies ship; they were trained on paper-random."""
+    for name in ("ppo", "ppo-total", "ppo-paper-distance", "universal"):
         save_policy(policy, tmp_path / name / "policy")
         (tmp_path / name / "card.md").write_text(f"# {name}\n")
     monkeypatch.setattr(shipped, "_FOLDER", tmp_path)
@@ -28,20 +28,18 @@ def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
 
 
 def test_shipped_name__is_by_kind_scenario_and_count(folder: Path) -> None:
-    assert shipped_name("ppo", "paper-random", "first") == "ppo-paper-random"
-    assert shipped_name("ppo", "paper-random", "total") == "ppo-paper-random-total"
+    assert shipped_name("ppo", "paper-random", "first") == "ppo"
+    assert shipped_name("ppo", "paper-random", "total") == "ppo-total"
     assert shipped_name("ppo", "paper-distance", "total") == "ppo-paper-distance"  # better than none
     assert shipped_name("universal", "paper-delay-low", "first") == "universal"
-    assert shipped_name("ppo", None, "total") == "ppo-paper-random-total"
+    assert shipped_name("ppo", None, "total") == "ppo-total"
     assert card("universal") == "# universal\n"
 
 
-@pytest.mark.parametrize(
-    ("kind", "scenario"), [("sac", "paper-random"), ("ppo", "paper-delay-low"), ("ppo", None), ("sac", None)]
-)
+@pytest.mark.parametrize(("kind", "scenario"), [("sac", "paper-random"), ("ppo", "paper-delay-low"), ("sac", None)])
 def test_shipped_name__lists_what_ships_when_there_is_none(kind: str, scenario: str | None, folder: Path) -> None:
-    listed = "ppo-paper-distance, ppo-paper-random, ppo-paper-random-total, universal"
-    with pytest.raises(InvalidInput, match=f"shipped policy {kind}.*: there is not exactly one; shipped are: {listed}"):
+    listed = "ppo, ppo-paper-distance, ppo-total, universal"
+    with pytest.raises(InvalidInput, match=f"shipped policy {kind}.*: there is none; shipped are: {listed}"):
         shipped_name(kind, scenario, "first")
 
 

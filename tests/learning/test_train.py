@@ -19,7 +19,7 @@ from ethbrake_marl.learning import train as train_module
 from ethbrake_marl.learning.bundle import Policy, load_policy
 from ethbrake_marl.learning.callback import Progress
 from ethbrake_marl.learning.divergence import TrainingDiverged
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of
+from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of, shipped_recipes
 from ethbrake_marl.learning.train import train
 from ethbrake_marl.scenario import load_scenario
 
@@ -230,3 +230,15 @@ def test_train__an_error_of_the_callers_function_is_passed_on(recipe: TrainingRe
     status = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (status["status"], status["reason"]) == ("failed", "RuntimeError: no worlds")
     assert load_policy(tmp_path / "run").manifest.steps == 0
+
+
+@pytest.mark.parametrize("name", sorted(shipped_recipes()))
+def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> None:
+    recipe = load_recipe(name)
+    fewest = next(
+        n for n in (1, 8, recipe.n_envs) if recipe.algorithm == "sac" or n * recipe.rounds % recipe.batch_size == 0
+    )
+    recipe = recipe.replace(n_envs=fewest)
+    result = train(recipe, SCENARIO, tmp_path / "run", steps=1)
+    assert (result.status, result.updates, result.steps) == ("finished", 1, recipe.n_envs * recipe.rounds)
+    assert load_policy(tmp_path / "run").manifest.algorithm == recipe.algorithm

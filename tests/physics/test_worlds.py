@@ -93,6 +93,7 @@ def test_make_worlds__accepts_the_ends_of_every_range():
             {"speeds": [[1.0, 2.0, 3.0], [1.0, 2.0, 31.0]]},
             "speeds_mps[1, 2] = 31: above this vehicle's speed_limit_mps 30",
         ),
+        ({"speeds": [30.0, 31.0, 1.0]}, "speeds_mps[0, 1] = 31: above this vehicle's speed_limit_mps 30"),
         ({"braking_capacity_mps2": 0.0}, "braking_capacity_mps2[0, 0] = 0: must be finite and in (0, inf]"),
         ({"driving_capacity_mps2": -1.0}, "driving_capacity_mps2[0, 0] = -1: must be finite and in [0, inf]"),
         ({"latency_s": [0.0, 0.0, -0.1]}, "latency_s[0, 2] = -0.1: must be finite and in [0, inf]"),
