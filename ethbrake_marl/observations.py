@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.packed import RESTITUTION, TIME, command_at, gap_at, pack, params_at, speed_at
-from ethbrake_marl.v2x import knows
+from ethbrake_marl.physics.packed import RESTITUTION, TIME, command_at, gap_at, pack, params_at, speed_at, vehicles_in
 
 Observations = NDArray[np.float32]
 
@@ -142,10 +141,12 @@ def _observe_rows(
 
     One long loop on purpose: handing these arrays on to functions made it four times as slow.
     """
-    N = (params.shape[1] - 1) // 5
+    N = vehicles_in(state)
     speed, command, gap_column = speed_at(N), command_at(N), gap_at(N)
     hit = gap_column + N - 1
     braking, driving, latency, mass = params_at(0, N), params_at(1, N), params_at(2, N), params_at(3, N)
+    news = params_at(5, N)
+    by_link = params.shape[1] > news
     value = np.zeros(out.shape[2])
     for k in range(out.shape[0]):
         time = state[k, TIME]
@@ -163,7 +164,7 @@ def _observe_rows(
             c = _OWN
             for offset in offsets:
                 j = i + offset
-                if not (0 <= j < N and knows(time, params[k, latency + i])):
+                if not (0 <= j < N and time >= params[k, news + i * N + j if by_link else latency + i]):
                     for absent in range(c, c + _NEIGHBOUR):
                         value[absent] = 0.0
                     c += _NEIGHBOUR

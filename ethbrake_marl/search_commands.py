@@ -13,13 +13,14 @@ import typer
 
 from ethbrake_marl.analysis.best_harm import BUDGET, search_list
 from ethbrake_marl.analysis.best_harm_table import BestHarmTable, load_table, save_table
+from ethbrake_marl.analysis.driven_profiles import fold_agent
 from ethbrake_marl.analysis.lower_bound import lower_bound
 from ethbrake_marl.command_options import ForceOption, JsonOption, ScenarioOption
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.regret import limits_do_not_apply
 from ethbrake_marl.harm import COUNTS, HarmCount
-from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable
+from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable, make_lineup
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.terminal import interruptible, progress_bars, say, write_json
@@ -46,6 +47,10 @@ def best_harm_command(
     start: Annotated[
         Path | None, typer.Option(metavar="FILE.npz", help="A table to start from; no world gets worse than there.")
     ] = None,
+    agents: Annotated[
+        str | None,
+        typer.Option(metavar="A,B,...", help="Who drives afterwards; where one does less harm, its episode counts."),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option(metavar="FILE.npz", help="Also write the table of every world to this file.")
     ] = None,
@@ -63,13 +68,16 @@ def best_harm_command(
     controlled = None if names is None else chosen.with_learners(names).learners
     known = None if start is None else load_table(start)
     sample = chosen.sample(episodes, seed)
+    counts: Sequence[HarmCount] = COUNTS if count is None else (count,)
+    specs = _agent_specs(agents, chosen, controlled)
+    drivers = {spec: {each: make_lineup([spec], chosen, count=each)[spec] for each in counts} for spec in specs}
     parts = None if output is None else output.with_name(f".{output.name}.parts")
     kept = "nothing was written" if parts is None else f"{parts} keeps what was found; the same command goes on"
     with interruptible(kept), progress_bars() as bars:
         table = search_list(
             chosen,
             sample,
-            counts=COUNTS if count is None else (count,),
+            counts=counts,
             vehicles=controlled,
             budget=budget,
             seed=search_seed,
@@ -78,7 +86,10 @@ def best_harm_command(
             chunks=parts,
             on_progress=lambda done, total: bars.show("best harm", done, total),
         )
-    text = _command_text(scenario, episodes, seed, count, names, budget, search_seed, start)
+        for k, (spec, by_count) in enumerate(drivers.items()):
+            bars.show("agents", k, len(drivers))
+            table = fold_agent(table, chosen, sample.worlds, spec, by_count)
+    text = _command_text(scenario, episodes, seed, count, names, budget, search_seed, start, specs)
     table = replace(table, header={**table.header, "episodes": episodes, "list_seed": seed, "command": text})
     if output is not None and parts is not None:
         save_table(output, table)
@@ -87,6 +98,15 @@ def best_harm_command(
     _show(
         {**best_harm_figures(table), **_proven(chosen, sample.worlds, controlled or chosen.learners)}, as_json=as_json
     )
+
+
+def _agent_specs(agents: str | None, scenario: Scenario, controlled: Sequence[int] | None) -> list[str]:
+    """Who drives after the search; ``InvalidInput`` if it is not the scenario's only learner that is searched."""
+    if agents is None:
+        return []
+    if len(scenario.learners) != 1 or (controlled is not None and tuple(controlled) != scenario.learners):
+        raise InvalidInput("--agents: drive the scenario's only learner; leave out --vehicles")
+    return [spec.strip() for spec in agents.split(",")]
 
 
 def _check_output(output: Path | None, *, force: bool) -> None:
@@ -117,7 +137,7 @@ def best_harm_figures(table: BestHarmTable) -> dict[str, object]:
 
 def _command_text(
     scenario: str, episodes: int, seed: int, count: HarmCount | None, vehicles: Sequence[str] | None, budget: int,
-    search_seed: int, start: Path | None,
+    search_seed: int, start: Path | None, agents: Sequence[str],
 ) -> str:  # fmt: skip
     """The command that makes the same table, for its header: every option that changes a result."""
     words = ["ethbrake", "best-harm", "--scenario", scenario, "--episodes", str(episodes), "--seed", str(seed)]
@@ -125,6 +145,7 @@ def _command_text(
     words += [] if vehicles is None else ["--vehicles", ",".join(vehicles)]
     words += ["--budget", str(budget), "--search-seed", str(search_seed)]
     words += [] if start is None else ["--start", start.name]
+    words += ["--agents", ",".join(agents)] if agents else []
     return shlex.join([*words, "--output", "FILE.npz"])
 
 

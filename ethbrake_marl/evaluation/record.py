@@ -122,6 +122,7 @@ def _with_post(world: Worlds, distance: float) -> Worlds:
         _ahead(1.0, vehicles.mass_t),
         _ahead(1.0, vehicles.speed_limit_mps),
         vehicles.restitution,
+        np.empty((world.n, 0)),
     )
     no_hit = np.zeros((world.n, 1), np.bool_)
     return Worlds(

@@ -7,7 +7,8 @@ Columns, for N vehicles and P = N - 1 pairs; the ``_at`` functions give the firs
 
 state   time, speeds N, commands in force N, commands in force before N, gaps P, hit flags P; and since the
         episode began: first-impact harm P, total harm P, impacts P
-params  restitution, braking N, driving N, latency N, mass N, speed limit N
+params  restitution, braking N, driving N, latency N, mass N, speed limit N; and, where it is told, when vehicle i has
+        the news of vehicle j, N * N columns (``Vehicles.known_from_s``)
 """
 
 from __future__ import annotations
@@ -62,15 +63,21 @@ def state_width(vehicles: int) -> int:
 
 @compiled
 def params_at(group: int, vehicles: int) -> int:
-    """First column of a group of parameters: 0 braking, 1 driving, 2 latency, 3 mass, 4 speed limit."""
+    """First column of a group of parameters: 0 braking, 1 driving, 2 latency, 3 mass, 4 speed limit, 5 news."""
     return 1 + group * vehicles
+
+
+@compiled
+def vehicles_in(state: Floats) -> int:
+    """Number of vehicles N of these rows of state."""
+    return (state.shape[1] + 4) // 8
 
 
 class Packed(NamedTuple):
     """Worlds by rows."""
 
     state: Floats  # [n, S]
-    params: Floats  # [n, 1 + 5 N]
+    params: Floats  # [n, 1 + 5 N] or [n, 1 + 5 N + N * N]
 
 
 def pack(worlds: Worlds) -> Packed:
@@ -91,6 +98,7 @@ def pack(worlds: Worlds) -> Packed:
             v.latency_s,
             v.mass_t,
             v.speed_limit_mps,
+            v.known_from_s,
         ],
         axis=1,
     )
@@ -100,11 +108,11 @@ def pack(worlds: Worlds) -> Packed:
 def unpack(packed: Packed) -> Worlds:
     """The worlds of these rows, in their own memory."""
     state, params = packed
-    N = (params.shape[1] - 1) // 5
+    N = vehicles_in(state)
     braking, driving, latency, mass, limit = (params[:, params_at(g, N) : params_at(g + 1, N)].copy() for g in range(5))
-    gaps = gap_at(N)
+    gaps, news = gap_at(N), params[:, params_at(5, N) :].copy()
     return Worlds(
-        Vehicles(braking, driving, latency, mass, limit, params[:, RESTITUTION].copy()),
+        Vehicles(braking, driving, latency, mass, limit, params[:, RESTITUTION].copy(), news),
         state[:, gaps : gaps + N - 1].copy(),
         state[:, speed_at(N) : command_at(N)].copy(),
         state[:, TIME].copy(),

@@ -39,6 +39,7 @@ class Vehicles:
     mass_t: Floats  # [n, N] > 0
     speed_limit_mps: Floats  # [n, N] driving stops here, > 0
     restitution: Floats  # [n] in [0, 1]
+    known_from_s: Floats  # [n, 0], or [n, N * N] when vehicle i has the news of vehicle j, in column i * N + j; ``v2x``
 
     def take(self, rows: ArrayLike) -> Vehicles:
         """Select worlds by index or mask (always a copy)."""
@@ -127,6 +128,7 @@ def make_worlds(
         _full("mass_t", mass_t, (n, N), 0.0, np.inf, open_low=True),
         _full("speed_limit_mps", speed_limit_mps, (n, N), 0.0, np.inf, open_low=True),
         restitution_,
+        np.empty((n, 0)),
     )
     speeds = _full("speeds_mps", speeds, (n, N), 0.0, np.inf)
     if not np.all(speeds <= vehicles.speed_limit_mps):

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from ethbrake_marl.analysis.best_harm import realised_harm
 from ethbrake_marl.analysis.best_harm_shipped import TABLES
 from ethbrake_marl.analysis.best_harm_table import load_table
 from ethbrake_marl.cli import run_command
+from ethbrake_marl.scenario import load_scenario
 
 SMALL = ["best-harm", "--scenario", "paper-random", "--episodes", "4", "--budget", "60", "--threads", "1"]
 
@@ -40,6 +42,24 @@ def test_best_harm_command__one_count_from_an_earlier_table(tmp_path: Path, caps
     assert (load_table(better).best["first"].harm <= load_table(file).best["first"].harm + 1e-6).all()
 
 
+def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    alone, folded = tmp_path / "t.npz", tmp_path / "u.npz"
+    small = ["best-harm", "--episodes", "30", "--budget", "60", "--threads", "1"]
+    assert run_command([*small, "--output", str(alone)]) == 0
+    assert run_command([*small, "--agents", "planner:60,full_brake", "--output", str(folded)]) == 0
+    before, after = load_table(alone), load_table(folded)
+    assert list(after.header["lowered_by"]) == ["planner:60", "full_brake"]
+    assert "--agents planner:60,full_brake" in after.header["command"]
+    scenario = load_scenario("paper-random")
+    for k, count in enumerate(("first", "total")):
+        changed = after.best[count].harm != before.best[count].harm
+        assert (after.best[count].harm <= before.best[count].harm).all()
+        lowered = after.header["lowered_by"]["planner:60"][count]
+        assert lowered >= changed.sum() > 5  # in some worlds by the agents of both counts
+        again = realised_harm(scenario, scenario.sample(30, 7).worlds, after.best[count], [1])[k]
+        assert again.tolist() == after.best[count].harm.tolist()
+
+
 @pytest.mark.parametrize(
     ("more", "fragment"),
     [
@@ -54,6 +74,8 @@ def test_best_harm_command__one_count_from_an_earlier_table(tmp_path: Path, caps
         (["--vehicles", ""], "unknown vehicle ''"),
         (["--vehicles", "vehicle_2,vehicle_2"], "listed twice"),
         (["--count", "some"], "some"),
+        (["--agents", "plannr"], "unknown agent 'plannr'"),
+        (["--agents", "planner", "--vehicles", "vehicle_3"], "leave out --vehicles"),
         (["--episodes", "0"], "n = 0"),
     ],
 )

@@ -1,0 +1,144 @@
+"""Step mode of the shield: a guaranteed harm that holds at every step, whoever proposes the actions.
+
+**Claim.** Let ``B`` be the bound at the first decision: the harm of the backup plan, executed in the engine. If in each
+step what ``certify`` says is applied, the harm realised at the end of the episode is at most ``B``, whatever is
+proposed; and the bound never rises on the way.
+
+**Induction.** Between two decisions the shield holds a *plan* (an action for every decision up to the horizon) and its
+harm ``c``: the harm of the whole episode, past harm and which pairs were hit before included, if that plan is executed
+from the present state. Both come out of one function, ``follow_plan``, which advances decision by decision with the
+operations of the engine's step in their order, and adds harm in its order. So:
+
+1. *Start.* ``c = B``.
+2. *The proposal is applied* only with a plan from the next state whose harm, computed by ``follow_plan`` from that very
+   state, is at most the budget; that plan is held from now on, and ``c`` is its harm. (If the proposal is what the plan
+   says, the rest of the plan is that plan, with the same ``c``: the same operations on the same numbers.)
+3. *The plan's action is applied* otherwise. The rest of the plan is executed from a state that ``follow_plan`` passed
+   through when it found ``c``: the harm remains ``c`` to the last bit. A plan that harms less may replace it.
+4. *End.* When the episode ends nothing is left to execute, and ``c`` is the harm realised.
+
+The budget is ``c`` (or anything between ``c`` and ``B``), so ``c <= B`` always. ∎ No tolerance enters: where the engine
+does what it is said to do, realised harm and the last bound are the same double.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.profile_motion import START, TIME_STEP
+from ethbrake_marl.agents.profile_problem import ProfileProblem
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.shield.certify_kernel import NO_CERTIFICATE, NOT_A_NUMBER, certify_worlds, harm_of_plans
+
+REASONS = (
+    "same as plan",  # the proposal is the plan's action
+    "plan remains",  # the rest of the plan still keeps the budget after the proposal
+    "constant",  # a constant action after the proposal keeps it
+    "no certificate",  # neither does: the plan's action was applied
+    "not a number",  # nothing usable was proposed: the plan's action was applied
+    "ended",  # the episode is over
+    "assumption broken",  # the world did not do what was predicted: the fallback was applied
+)
+CONSTANTS = tuple(-k / 10 for k in range(11))  # actions that are tried as constants: coasting to full braking
+
+
+class Running(NamedTuple):
+    """Running episodes at a decision, as the shield knows them."""
+
+    problem: ProfileProblem  # parameters, commands of the others, grid of decisions; one vehicle
+    states: Floats  # [n, S] of agents.profile_motion: speeds, gaps, hit flags, both harms so far
+    steps: Ints  # [n] number of the decision
+    ended: Bools  # [n]
+
+    @property
+    def time_s(self) -> Floats:
+        """Time of the decision, [n] s."""
+        clock = self.problem.clock
+        time: Floats = clock[:, START] + self.steps * clock[:, TIME_STEP]
+        return time
+
+
+class Backup(NamedTuple):
+    """What is executed if nothing else is certified."""
+
+    plan: Floats  # [n, L] actions, column j for decision j
+    harm: Floats  # [n] of the episode if it is executed from now on (m2/s2)
+    constants: Floats = np.array(CONSTANTS)  # [K] actions that may replace the rest of a plan
+
+
+class Decision(NamedTuple):
+    """What is applied, why, and what holds from now on."""
+
+    applied: Floats  # [n] actions in [-1, 1]
+    intervened: Bools  # [n] what is applied is not what was proposed (clipped)
+    reason: NDArray[np.int64]  # [n] places in REASONS
+    bound: Floats  # [n] harm of the episode is at most this from now on (m2/s2)
+    margin: Floats  # [n] budget minus the least harm found after the proposal; negative: why it was rejected
+    after: Running  # as it will be at the next decision
+    backup: Backup  # the plan that goes with the bound
+
+
+def begin_running(problem: ProfileProblem) -> Running:
+    """The episodes of a problem at their first decision."""
+    if len(problem.vehicles) != 1:
+        raise InvalidInput(f"shield: {len(problem.vehicles)} controlled vehicles; exactly one is needed")
+    return Running(problem, problem.start, np.zeros(problem.n, np.int64), np.zeros(problem.n, np.bool_))
+
+
+def plan_harm(running: Running, plan: Floats) -> Floats:
+    """Harm of the episodes if the plans [n, L] are executed from here, [n] m2/s2, to the engine's bits."""
+    problem, value = running.problem, np.empty(running.problem.n)
+    _check_plan(running, plan)
+    harm_of_plans(
+        running.states, running.steps, problem.clock, _bounds(problem), problem.command, problem.latency, problem.mass,
+        problem.limit, int(problem.vehicles[0]), np.ascontiguousarray(plan, np.float64), value,
+    )  # fmt: skip
+    if not np.isfinite(value).all():
+        raise PhysicsError(f"shield: world {int(np.argmin(np.isfinite(value)))} could not be advanced")
+    return value
+
+
+def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
+    """Decide in every world whether the proposed action [n] is applied, or the backup's; see the module's claim.
+
+    ``budget`` [n] is the harm that is guaranteed, at least the backup's. A proposal beyond [-1, 1] is clipped first; one
+    that is no number is replaced. Nothing given is changed. Raises ``InvalidInput`` for shapes that do not fit or a
+    budget below the backup's harm, ``PhysicsError`` if a world cannot be advanced.
+    """
+    n, problem = running.problem.n, running.problem
+    _check_plan(running, backup.plan)
+    given = np.ascontiguousarray(proposed, np.float64)
+    if not given.shape == backup.harm.shape == budget.shape == (n,):
+        raise InvalidInput(
+            f"certify: proposed {given.shape}, backup's harm {backup.harm.shape}, budget {budget.shape}; ({n},) needed"
+        )
+    if not (budget >= backup.harm).all():
+        raise InvalidInput("certify: a budget is below the backup's harm; nothing could be guaranteed")
+    plans, after, out = backup.plan.copy(), np.empty_like(running.states), np.empty((n, 4))
+    over = np.zeros(n, np.bool_)
+    failed = certify_worlds(
+        running.states, running.steps, running.ended, problem.clock, _bounds(problem), problem.command,
+        problem.latency, problem.mass, problem.limit, int(problem.vehicles[0]), given, budget, backup.harm,
+        backup.constants, plans, after, out, over,
+    )  # fmt: skip
+    if failed >= 0:
+        raise PhysicsError(f"shield: world {failed} could not be advanced")
+    applied, bound, margin = out[:, 0].copy(), out[:, 2].copy(), out[:, 3].copy()
+    reason = out[:, 1].astype(np.int64)
+    intervened = (reason == NO_CERTIFICATE) | (reason == NOT_A_NUMBER)
+    later = running._replace(states=after, steps=running.steps + ~running.ended, ended=over)
+    return Decision(applied, intervened, reason, bound, margin, later, backup._replace(plan=plans, harm=bound))
+
+
+def _bounds(problem: ProfileProblem) -> Floats:
+    return problem.bounds[:, 0]
+
+
+def _check_plan(running: Running, plan: Floats) -> None:
+    most = int(running.problem.last_step.max(initial=0))
+    if plan.ndim != 2 or plan.shape[0] != running.problem.n or plan.shape[1] < most:
+        raise InvalidInput(f"shield: plan {plan.shape}; ({running.problem.n}, at least {most}) is needed")
