@@ -34,6 +34,7 @@ from ethbrake_marl.rewards import Reward, StepOutcome, further_terms, potential,
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.starts import Script, Start, Stream, check_alert, is_state_free, moved, within_capacity
 from ethbrake_marl.stepping import BAD_ACTION, ENDED, OUTCOME_ROWS, START, Step, step_worlds
+from ethbrake_marl.v2x import known_from, told_by_link
 
 OnBegin = Callable[[Worlds, Ints], None]  # the new worlds at the alert, and the rows where their episodes start
 Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
@@ -122,6 +123,11 @@ class Engine:
         return Ledger(first, total, count, mass)
 
     @property
+    def known_from_s(self) -> Floats:
+        """When vehicle i has (had, or will have) the news of vehicle j, [n, N, N]; see ``v2x.known_from``."""
+        return known_from(self.worlds.vehicles)
+
+    @property
     def ended(self) -> Bools:
         """Episodes that have ended, [n]."""
         ended: Bools = self._clock[:, ENDED] == 1.0
@@ -134,6 +140,7 @@ class Engine:
         """
         if worlds is not None:
             check_alert(worlds, self.n, self.scenario.vehicles)
+            worlds = told_by_link(worlds) if self.scenario.v2x.by_link else worlds
         stream = copy.copy(self._stream)
         if seed is not None:
             stream.restart(seed)
@@ -166,7 +173,10 @@ class Engine:
 
     def _renew(self, rows: Ints) -> None:
         start = self._stream.take(len(rows))
-        self._state[rows], self._params[rows] = start.packed
+        state, params = start.packed
+        if params.shape[1] < self._params.shape[1]:  # worlds that were given have news by link, those of the stream not
+            params = pack(told_by_link(unpack(start.packed))).params
+        self._state[rows], self._params[rows] = state, params
         self._clock[rows], self._wanted[rows] = start.clock, start.wanted
         self._begin(rows, start)
 

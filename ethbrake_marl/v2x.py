@@ -1,16 +1,226 @@
-"""Who knows what, and when.
+"""Who hears of whom, and when: V2X messages per link, lost information, on-board sensing as the fall-back.
 
-A message carries its sender's state, capacities and latency. Vehicle i has the messages of its whole line from the
-moment its own latency has elapsed (the paper: the latency covers transmission, processing and actuation); before it,
-it knows only itself.
+A message carries its sender's state, capacities and latency. On the link from vehicle j to vehicle i it is of use from
+
+    tau_ij = U(0, T) + k T + L_radio + t_proc + t_act        (T the message period)
+
+on, where ``U(0, T)`` is the wait for the next message, ``k`` the periods lost to a burst (Gilbert-Elliott channel:
+``P(k >= m) = p / (p + r) (1 - r)^(m - 1)``), and with the share ``lost`` of links no message ever arrives. Sensors see
+the direct neighbours: they add a hop of ``sensing_s``. Vehicle i reacts from
+
+    latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
+
+on (nobody reacts to an emergency before its news: Vehicle 1's own message, or the sight of the vehicle ahead that
+brakes), and knows of vehicle j from ``max(latency_i, tau_ij)``, or ``max(latency_i, hop_ij)`` for a direct neighbour
+in sight if that is sooner. The rule of the paper, preset ``paper``: everything, from the own latency on.
 """
 
 from __future__ import annotations
 
-from ethbrake_marl.physics.compiled import compiled
+from dataclasses import replace
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.worlds import Floats, Ints, Vehicles, Worlds
+
+PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
+PER_LINK = 4  # uniform numbers of one link: wait, burst, loss, hop; one Philox counter
+
+Preset = Literal["paper", "clear", "nominal", "congested", "blocked", "sensors-only"]
+Hears = Literal["all", "front", "none"]
+Senses = Literal["both", "front", "none"]
+Seconds = Annotated[float, Field(ge=0.0, le=60.0, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
-@compiled
-def knows(time_s: float, own_latency_s: float) -> bool:
-    """Whether a vehicle with this latency has the news of the other vehicles at this time."""
-    return time_s >= own_latency_s
+class Channel(NamedTuple):
+    """Everything that decides who knows what, and when."""
+
+    timing: Literal["latency", "fixed", "messages"]  # tau: the receiver's own latency, a number, or generated
+    hears: Hears = "all"  # whose messages a vehicle gets: all vehicles', only those from ahead, nobody's
+    senses: Senses = "both"  # direct neighbours in sight
+    link_latency_s: float = 0.0  # tau of timing "fixed"
+    loss_begins: float = 0.0  # p, per message period
+    loss_ends: float = 1.0  # r, per message period; mean burst 1 / r
+    lost: float = 0.0  # share of links on which nothing ever arrives
+    message_period_s: float = 0.1  # T
+    radio_s: float = 0.02  # L_radio
+    processing_s: float = 0.1  # t_proc
+    actuation_s: float = 0.2  # t_act
+    sensing_s: tuple[float, float] = (0.8, 1.1)  # a hop is drawn evenly from it
+
+
+CHANNELS = {
+    "paper": Channel("latency", senses="none"),
+    "clear": Channel("messages", loss_begins=0.01, loss_ends=0.5),
+    "nominal": Channel("messages", loss_begins=0.05, loss_ends=0.5),
+    "congested": Channel("messages", loss_begins=0.10, loss_ends=0.30, lost=0.05),
+    "blocked": Channel("messages", loss_begins=0.20, loss_ends=0.20, lost=0.20),
+    "sensors-only": Channel("messages", hears="none"),
+}
+_OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
+
+
+class V2X(BaseModel):
+    """A preset, and what differs from it; see ``docs/cooperation.md``. Written as its name alone, or as a mapping."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+    preset: Preset = "paper"
+    hears: Hears | None = None
+    senses: Senses | None = None
+    link_latency_s: Seconds | None = None
+    lost: Share | None = None
+    message_period_s: Annotated[float, Field(gt=0.0, le=60.0, allow_inf_nan=False)] | None = None
+    loss_begins: Share | None = None
+    loss_ends: Annotated[float, Field(ge=0.01, le=1.0, allow_inf_nan=False)] | None = None
+    radio_s: Seconds | None = None
+    processing_s: Seconds | None = None
+    actuation_s: Seconds | None = None
+    sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name(cls, value: Any) -> Any:
+        return {"preset": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _possible(self) -> V2X:
+        channel, fixed = self.channel, self.link_latency_s is not None
+        if fixed or channel.timing == "latency" or channel.hears == "none":
+            for name in _OF_MESSAGES:
+                why = "a fixed link_latency_s" if fixed else f"preset {self.preset}"
+                _require(getattr(self, name) is None, name, self, f"{why} has no generated messages; leave it out")
+        low, high = channel.sensing_s
+        _require(low <= high, "sensing_s", self, "low must not be above high")
+        silent = channel.timing == "messages" or channel.hears == "none" or channel.lost > 0.0
+        needs_sight = silent and (channel.timing != "latency")
+        right = "without sight of the vehicle ahead, one that hears nothing would never react; use both or front"
+        _require(channel.senses != "none" or not needs_sight, "senses", self, right)
+        return self
+
+    @property
+    def channel(self) -> Channel:
+        """The preset with everything that was given in its place."""
+        given = {name: getattr(self, name) for name in Channel._fields[1:] if getattr(self, name) is not None}
+        base = CHANNELS[self.preset]
+        return base._replace(timing="fixed" if self.link_latency_s is not None else base.timing, **given)
+
+    @property
+    def by_link(self) -> bool:
+        """Whether anything differs from the paper's rule: all news, from the own latency on."""
+        return self.channel != CHANNELS["paper"]
+
+    @property
+    def drawn(self) -> bool:
+        """Whether chance decides: what is known when differs from world to world."""
+        channel = self.channel
+        low, high = channel.sensing_s
+        by_messages = channel.timing == "messages" and channel.hears != "none"
+        lossy = channel.hears != "none" and 0.0 < channel.lost < 1.0
+        return self.by_link and (by_messages or lossy or (channel.senses != "none" and low != high))
+
+    def latest_reaction_s(self, own_latency_s: Floats) -> Floats:
+        """Upper bound of each vehicle's latency, [N], from that of its own part [N]."""
+        channel, latest = self.channel, own_latency_s.copy()
+        if channel.timing == "latency":
+            return latest
+        sure = channel.timing == "fixed" and channel.hears != "none" and channel.lost == 0.0
+        for i in range(1, len(latest)):
+            seen = latest[i - 1] + channel.sensing_s[1] if channel.senses != "none" else np.inf
+            latest[i] = max(latest[i], min(seen, channel.link_latency_s if sure else np.inf))
+        return latest
+
+
+def _require(holds: bool, name: str, v2x: V2X, right: str) -> None:
+    """Refuse the value of ``name`` unless ``holds``; ``right`` says what would do."""
+    if not holds:
+        value = getattr(v2x, name)
+        shown = v2x.channel._asdict()[name] if value is None else value
+        raise PydanticCustomError("scenario", "{right}", {"right": right, "value": str(shown), "at": (name,)})
+
+
+def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
+    """Message periods k lost to a burst, in the shape of the uniform numbers ``u`` in [0, 1).
+
+    ``k >= m`` exactly where ``u < p / (p + r) (1 - r)^(m - 1)``: the inverse distribution function of the
+    Gilbert-Elliott channel in its long-run state, by multiplication alone, so every machine gets the same k.
+    """
+    bound = loss_begins / (loss_begins + loss_ends)
+    bounds = []
+    while bound > 2.0**-53:
+        bounds.append(bound)
+        bound *= 1.0 - loss_ends
+    rising = np.array(bounds[::-1])
+    periods: Ints = len(rising) - np.searchsorted(rising, u, side="right")
+    return periods
+
+
+def link_delays(channel: Channel, u: Floats) -> Floats:
+    """The delay tau (s) of each link from its uniform numbers ``u`` [..., PER_LINK]; infinite where nothing arrives."""
+    delay = np.full(u.shape[:-1], channel.link_latency_s)
+    if channel.timing == "messages":
+        after_sending = channel.radio_s + channel.processing_s + channel.actuation_s
+        periods = burst_periods(u[..., 1], channel.loss_begins, channel.loss_ends)
+        delay = (u[..., 0] + periods) * channel.message_period_s + after_sending
+    delay[u[..., 2] < channel.lost] = np.inf
+    return delay
+
+
+def with_news(v2x: V2X, vehicles: Vehicles, u: Floats) -> Vehicles:
+    """These vehicles with the latencies and the news of the channel drawn by ``u`` [n, N * N * PER_LINK] in [0, 1)."""
+    n, N = vehicles.latency_s.shape
+    channel, links = v2x.channel, u.reshape(n, N, N, PER_LINK)
+    low, high = channel.sensing_s
+    hop = low + (high - low) * links[..., 3]
+    heard = np.full((n, N, N), -np.inf) if channel.timing == "latency" else link_delays(channel, links)
+    if channel.timing == "latency":
+        heard[links[..., 2] < channel.lost] = np.inf
+    receiver, sender = np.indices((N, N))
+    heard[:, (sender >= receiver) if channel.hears == "front" else np.full((N, N), channel.hears == "none")] = np.inf
+    ahead = sender == receiver - 1
+    in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": np.zeros((N, N), np.bool_)}
+    seen = np.where(in_sight[channel.senses], hop, np.inf)
+    latency = vehicles.latency_s.copy()
+    if channel.timing != "latency":
+        for i in range(1, N):
+            told = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
+            latency[:, i] = np.maximum(latency[:, i], told)
+    known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
+    known[:, np.arange(N), np.arange(N)] = 0.0
+    return replace(vehicles, latency_s=latency, known_from_s=known.reshape(n, N * N))
+
+
+def known_from(vehicles: Vehicles) -> Floats:
+    """When vehicle i has the news of vehicle j (s since the alert), [n, N, N]; infinite: never; of itself: 0."""
+    n, N = vehicles.latency_s.shape
+    if vehicles.known_from_s.shape[1]:
+        return vehicles.known_from_s.reshape(n, N, N).copy()
+    known = vehicles.latency_s.repeat(N, axis=1).reshape(n, N, N)
+    known[:, np.arange(N), np.arange(N)] = 0.0
+    return known
+
+
+def told_by_link(worlds: Worlds) -> Worlds:
+    """The same worlds with their news written out link by link."""
+    if worlds.vehicles.known_from_s.shape[1]:
+        return worlds
+    known = known_from(worlds.vehicles).reshape(worlds.n, worlds.N * worlds.N)
+    return replace(worlds, vehicles=replace(worlds.vehicles, known_from_s=known))
+
+
+def fixed_news(v2x: V2X, vehicles: Vehicles, where: str) -> Vehicles:
+    """The same for worlds that somebody gives, where nothing is left to chance; ``InvalidInput`` where it is."""
+    if not v2x.by_link:
+        return vehicles
+    if v2x.drawn:
+        raise InvalidInput(
+            f"{where}: the scenario draws what each vehicle knows when (v2x: {v2x.preset}); take one whose channel is"
+            " fixed, for instance scenario.replace(v2x='paper')"
+        )
+    n, N = vehicles.latency_s.shape
+    return with_news(v2x, vehicles, np.zeros((n, N * N * PER_LINK)))

@@ -3,7 +3,8 @@
 After a reset: ``time_s``, ``applied_command_mps2`` (in force now; 0 until the latency has elapsed), the vehicle's share
 of the harm so far under both counts, the same for the whole world, and whether anything has collided. After a step
 also ``wanted_command_mps2``, ``applied_action`` (the vehicle's command as an action, whoever chose it), and the reward
-terms before their weights.
+terms before their weights. Where the scenario has a ``v2x`` channel, always also ``known_from_s`` [N]: since when this
+vehicle has the news of each other one (infinite: never; its own: 0).
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ class Report(NamedTuple):
 
     values: Floats  # [n, N, len(AFTER_A_STEP)]
     step: Step | None  # whose reward terms are told; None: there was none
+    known_from_s: Floats | None = None  # [n, N, N] where the news comes link by link
 
 
 def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
@@ -48,7 +50,9 @@ def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -
         state, params, wanted = (array.take(rows, axis=0) for array in (state, params, wanted))
     values = np.empty((*wanted.shape, len(AFTER_A_STEP)))
     _report_rows(state, params, wanted, values)
-    return Report(values, step)
+    n, N = wanted.shape
+    news = params[:, params_at(5, N) :]
+    return Report(values, step, news.reshape(n, N, N).copy() if news.shape[1] else None)
 
 
 @compiled
@@ -82,6 +86,15 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 def plain_infos(told: Report, vehicles: Ints | None = None) -> list[dict[str, Any]]:
     """Infos of these vehicles (None: of all), world by world, as plain numbers; ``applied_action`` is an array [1]."""
+    infos = _without_news(told, vehicles)
+    if told.known_from_s is not None:
+        news = told.known_from_s if vehicles is None else told.known_from_s.take(vehicles, axis=1)
+        for info, known in zip(infos, news.reshape(-1, news.shape[2]), strict=True):
+            info["known_from_s"] = known.copy()
+    return infos
+
+
+def _without_news(told: Report, vehicles: Ints | None) -> list[dict[str, Any]]:
     worlds: list[list[list[Any]]] = (told.values if vehicles is None else told.values.take(vehicles, axis=1)).tolist()
     if told.step is None:
         return [_at_any_time(values) for world in worlds for values in world]
@@ -133,7 +146,10 @@ def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools | None) -
     """
     columns: dict[str, NDArray[Any]] = {name: told.values[:, vehicle, c] for c, name in enumerate(AFTER_A_STEP)}
     columns["collided"] = columns["collided"] == 1.0
-    info = _masked({name: columns[name] for name in AT_ANY_TIME}, rows)
+    always = {name: columns[name] for name in AT_ANY_TIME}
+    if told.known_from_s is not None:
+        always["known_from_s"] = told.known_from_s[:, vehicle]
+    info = _masked(always, rows)
     if stepped is None:
         return info
     columns["applied_action"] = columns["applied_action"].astype(np.float32)[:, np.newaxis]

@@ -70,7 +70,7 @@ def params_at(group: int, vehicles: int) -> int:
 @compiled
 def vehicles_in(state: Floats) -> int:
     """Number of vehicles N of these rows of state."""
-    return (state.shape[1] + 4) // 8
+    return int((state.shape[1] + 4) // 8)
 
 
 class Packed(NamedTuple):

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, NoReturn
 
+import numpy as np
 from pydantic import BaseModel
 from pydantic_core import PydanticCustomError
 
@@ -107,12 +108,26 @@ def check_whole(scenario: Scenario) -> None:
         if not support(latency)[1] < scenario.horizon_s:
             right = f"must be below horizon_s ({scenario.horizon_s:g} s), or the vehicle can never act"
             refuse(_path(scenario, "latency_s", i), latency, right)
+    _check_reactions(scenario)
     _check_speeds(scenario)
     if scenario.time_gaps_s is not None:
         _check_time_gaps(scenario)
     _check_constant_scripts(scenario)
     if scenario.early_impacts == "reject" and scenario.learners:
         _check_rejection(scenario)
+
+
+def _check_reactions(scenario: Scenario) -> None:
+    """However late the news is, every vehicle may act before the horizon."""
+    own = np.array([support(latency)[1] for latency in scenario.quantities("latency_s")])
+    latest = scenario.v2x.latest_reaction_s(own)
+    if not (latest < scenario.horizon_s).all():
+        i = int(np.argmin(latest < scenario.horizon_s))
+        right = (
+            f"vehicle_{i + 1} may have no news until {latest[i]:g} s; it must be below horizon_s"
+            f" ({scenario.horizon_s:g} s)"
+        )
+        refuse(("v2x",), scenario.v2x, right)
 
 
 def _check_speeds(scenario: Scenario) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.numerals import parse_numeral
 from ethbrake_marl.scenario.quantities import QUANTITIES, suggestion
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.v2x import fixed_news
 
 Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
 
@@ -140,7 +141,8 @@ def _worlds(given: Mapping[Entry, Floats], scenario: Scenario, naming: _Naming) 
             full[field][:, index] = column
     _check_together(full, scenario, naming)
     restitution = full.pop("restitution")[:, 0]
-    return make_worlds(full.pop("gaps_m"), full.pop("speeds_mps"), restitution=restitution, **full)
+    worlds = make_worlds(full.pop("gaps_m"), full.pop("speeds_mps"), restitution=restitution, **full)
+    return replace(worlds, vehicles=fixed_news(scenario.v2x, worlds.vehicles, naming.where))
 
 
 def _fixed(scenario: Scenario, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:

@@ -8,7 +8,7 @@ stable.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, concatenat
 from ethbrake_marl.scenario.derivation import drawn_quantities
 from ethbrake_marl.scenario.quantities import BLOCK
 from ethbrake_marl.scenario.scripts import constant_command
+from ethbrake_marl.v2x import PER_LINK, with_news
 
 if TYPE_CHECKING:
     from ethbrake_marl.scenario.schema import Scenario
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 Channel = Literal["list", "training"]
 
 CHANNELS: dict[str, int] = {"list": 0, "training": 1}
+V2X_NEWS = (1,)  # the stream of the links' delays and losses
 MOST_ATTEMPTS = 1000  # draws of one world before its scenario is declared unusable
 _PATIENCE = 10  # attempts of a whole list before one world is tried to its end
 
@@ -44,12 +46,15 @@ class Sample:
     rejected: int  # draws refused because of an early impact
 
 
-def uniform_numbers(seed: int, channel: Channel, attempt: int, first: int, n: int, width: int) -> Floats:
+def uniform_numbers(
+    seed: int, channel: Channel, attempt: int, first: int, n: int, width: int, *, of: tuple[int, ...] = ()
+) -> Floats:
     """Uniform numbers in [0, 1) of worlds ``first`` to ``first + n - 1``: [n, width], width a multiple of 4.
 
-    Row k depends on (seed, channel, attempt, first + k, width) only. u is the upper 53 bits of a Philox integer.
+    Row k depends on (seed, channel, attempt, of, first + k, width) only; ``of`` names a stream of its own, such as
+    ``V2X_NEWS``. u is the upper 53 bits of a Philox integer.
     """
-    sequence = np.random.SeedSequence([seed], spawn_key=(CHANNELS[channel], attempt))
+    sequence = np.random.SeedSequence([seed], spawn_key=(CHANNELS[channel], attempt, *of))
     key = sequence.generate_state(2, np.uint64)
     stream = np.random.Philox(key=key, counter=first * (width // _NUMBERS_PER_COUNTER))
     integers = np.asarray(stream.random_raw(n * width)).reshape(n, width)
@@ -135,7 +140,12 @@ def _draw(scenario: Scenario, seed: int, channel: Channel, attempt: int, index: 
         u = u[index - first]
     drawn = drawn_quantities(scenario, u)
     restitution = drawn.pop("restitution")[:, 0]
-    return make_worlds(drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, **drawn)
+    worlds = make_worlds(drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, **drawn)
+    if not scenario.v2x.by_link:
+        return worlds
+    width = PER_LINK * scenario.vehicles * scenario.vehicles
+    u = uniform_numbers(seed, channel, attempt, first, last - first + 1, width, of=V2X_NEWS)[index - first]
+    return replace(worlds, vehicles=with_news(scenario.v2x, worlds.vehicles, u))
 
 
 def _check_request(n: int, seed: int, first: int, channel: str) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from ethbrake_marl.scenario.distributions import DISTRIBUTIONS, Choice, NormalShape
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
 from ethbrake_marl.scenario.yaml_loading import YamlPath
+from ethbrake_marl.v2x import V2X
 
 _INSIDE = {
     "uniform": ("uniform",),
@@ -24,10 +25,12 @@ class ScenarioWording:
     keys: Iterable[str]
 
     def known(self, path: YamlPath) -> list[str]:
-        """The keys that may stand where ``path`` ends: at the top, in a distribution, or in its parameters."""
+        """The keys that may stand where ``path`` ends: at the top, in a distribution, in its parameters, in v2x."""
         if len(path) == 1:
             return list(self.keys)
         outer = str(path[-2])
+        if outer == "v2x":
+            return list(V2X.model_fields)
         return list(_INSIDE[outer]) if outer == "normal" else sorted({*DISTRIBUTIONS, "weights"})
 
     def needed(self, path: YamlPath) -> str:

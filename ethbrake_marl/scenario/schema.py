@@ -27,6 +27,7 @@ from ethbrake_marl.scenario.scenario_wording import ScenarioWording
 from ethbrake_marl.scenario.scripts import LEARNER
 from ethbrake_marl.scenario.validation_messages import explain
 from ethbrake_marl.scenario.yaml_loading import Document
+from ethbrake_marl.v2x import V2X
 
 AnyQuantity = float | Uniform | LogUniform | Normal | Choice
 
@@ -81,6 +82,8 @@ class Scenario(BaseModel):
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="what happens to worlds with an impact before the first learner may act"
     )
+
+    v2x: V2X = Field(default=V2X(), description="what each vehicle knows when: a preset, or what differs from one")
 
     def __init__(self, /, **data: Any) -> None:
         name = data.get("name")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -41,6 +41,7 @@ def numbered(n: int, first: int = 0) -> Worlds:
         latency_s=wide + 0.125, mass_t=wide + 1.5, speed_limit_mps=wide + 99.0, restitution=number / 1000.0,
     )  # fmt: skip
     hit = np.stack([number % 2 == 0, number % 3 == 0], axis=1)
+    worlds = replace(worlds, vehicles=replace(worlds.vehicles, known_from_s=wide + np.arange(9.0)))
     return Worlds(worlds.vehicles, worlds.gaps_m, worlds.speeds_mps, number + 0.75, hit, wide - [1.0, 2.0, 3.0])
 
 
@@ -58,7 +59,8 @@ def test_make_worlds__broadcasts_every_parameter_to_its_shape():
     wide = {name for name, shape in shapes.items() if shape == (4, 3)}
     assert shapes["gaps_m"] == shapes["pair_hit"] == (4, 2)
     assert shapes["time_s"] == shapes["restitution"] == (4,)
-    assert wide == set(shapes) - {"gaps_m", "pair_hit", "time_s", "restitution"}
+    assert wide == set(shapes) - {"gaps_m", "pair_hit", "time_s", "restitution", "known_from_s"}
+    assert shapes["known_from_s"] == (4, 0)
     assert worlds.vehicles.mass_t[3].tolist() == [1.0, 2.0, 3.0]
     assert all(column.flags.c_contiguous and column.flags.owndata for column in columns(worlds).values())
 

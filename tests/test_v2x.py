@@ -1,0 +1,243 @@
+"""Who hears of whom, and when: distributions against their formulas, the news by hand, and nothing that leaks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.observations import ObservationSpec, observe
+from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
+from ethbrake_marl.snapshots import engine_snapshot, restore_engine
+from ethbrake_marl.v2x import CHANNELS, PER_LINK, PRESETS, V2X, burst_periods, known_from, link_delays, with_news
+
+PAPER = load_scenario("paper-random")
+MESSAGES = [name for name in PRESETS if CHANNELS[name].timing == "messages"]
+RADIO = [name for name in MESSAGES if CHANNELS[name].hears == "all"]
+
+
+def channel_of(name: str, **changes: object) -> Scenario:
+    return PAPER.replace(v2x={"preset": name, **changes}, latency_s=0, early_impacts="keep")
+
+
+def vehicles(latency_s, n=1):
+    given = {"braking_capacity_mps2": 6, "driving_capacity_mps2": 6, "mass_t": 5, "restitution": 0.1}
+    return make_worlds(5.0, np.full((n, len(latency_s)), 20.0), latency_s=latency_s, **given).vehicles
+
+
+@pytest.mark.parametrize("name", RADIO)
+def test_burst_periods__have_the_share_of_their_formula(name):
+    p, r = CHANNELS[name].loss_begins, CHANNELS[name].loss_ends
+    periods = burst_periods(np.random.default_rng(3).random(1_000_000), p, r)
+    for k in range(1, 12):
+        assert (periods >= k).mean() == pytest.approx(p / (p + r) * (1 - r) ** (k - 1), abs=0.01)
+    assert periods.min() == 0 and periods.max() >= 5
+
+
+def test_burst_periods__at_the_bounds_by_hand():
+    # p = r = 0.5: P(k >= 1) = 1/2, P(k >= 2) = 1/4, P(k >= 3) = 1/8; all exact in binary.
+    u = np.array([0.5, 0.4999, 0.25, 0.2499, 0.125, 0.1249, 0.99])
+    assert burst_periods(u, 0.5, 0.5).tolist() == [0, 1, 1, 2, 2, 3, 0]
+    assert burst_periods(u, 0.0, 0.5).tolist() == [0] * 7
+    assert burst_periods(np.array([0.0]), 0.5, 1.0).tolist() == [1]
+
+
+@pytest.mark.parametrize("name", RADIO)
+def test_link_delays__of_10_to_the_6_links_follow_the_model(name):
+    channel = CHANNELS[name]
+    delay = link_delays(channel, np.random.default_rng(4).random((1_000_000, PER_LINK)))
+    assert np.isinf(delay).mean() == pytest.approx(channel.lost, abs=0.01)
+    periods = (delay[np.isfinite(delay)] - 0.02 - 0.1 - 0.2) / 0.1  # U(0, 1) + k
+    assert periods.min() >= -1e-9
+    p, r = channel.loss_begins, channel.loss_ends
+    for k in range(1, 8):
+        assert (periods >= k).mean() == pytest.approx(p / (p + r) * (1 - r) ** (k - 1), abs=0.01)
+    wait = periods % 1.0
+    assert np.histogram(wait, 10, (0, 1))[0] / wait.size == pytest.approx(np.full(10, 0.1), abs=0.01)
+
+
+def test_link_delays__by_hand():
+    # wait 0.25 periods, one period lost, 20 + 100 + 200 ms; then a link that is lost, and a fixed one.
+    u = np.array([[0.25, 0.1, 0.9, 0.0], [0.25, 0.1, 0.05, 0.0]])
+    channel = CHANNELS["congested"]._replace(loss_begins=0.5, loss_ends=0.5)
+    channel = channel._replace(lost=0.1)
+    assert link_delays(channel, u)[0] == pytest.approx((0.25 + 3) * 0.1 + 0.32)  # 0.1 < 1/8: k = 3
+    assert link_delays(channel, u)[1] == np.inf
+    assert link_delays(channel._replace(timing="fixed", link_latency_s=0.3), u).tolist() == [0.3, np.inf]
+
+
+def test_with_news__sight_goes_hop_by_hop():
+    # hops drawn at the middle: 0.95 s each; nobody hears anything.
+    u = np.full((1, 9 * PER_LINK), 0.5)
+    told = with_news(V2X.model_validate("sensors-only"), vehicles([0.0, 0.1, 2.5]), u)
+    assert told.latency_s.tolist() == [[0.0, pytest.approx(0.95), 2.5]]  # 0.95 + 0.95 < 2.5, its own part
+    known = known_from(told)[0]
+    assert known[0].tolist() == [0.0, pytest.approx(0.95), np.inf]
+    assert known[1].tolist() == [pytest.approx(0.95), 0.0, pytest.approx(0.95)]
+    assert known[2].tolist() == [np.inf, 2.5, 0.0]
+
+
+def test_with_news__news_of_the_emergency_comes_by_radio_or_by_sight():
+    v2x = V2X.model_validate({"preset": "nominal", "link_latency_s": 0.4, "loss_begins": None})
+    u = np.full((1, 9 * PER_LINK), 0.5)
+    told = with_news(v2x, vehicles([0.0, 0.1, 0.6]), u)
+    assert told.latency_s.tolist() == [[0.0, 0.4, 0.6]]
+    assert known_from(told)[0].tolist() == [[0.0, 0.4, 0.4], [0.4, 0.0, 0.4], [0.6, 0.6, 0.0]]
+    links = u.reshape(9, PER_LINK).copy()
+    links[2 * 3 + 0, 2] = 0.0  # the link from vehicle_1 to vehicle_3 is lost
+    lossy = V2X.model_validate({"preset": "nominal", "link_latency_s": 0.4, "lost": 0.1})
+    told = with_news(lossy, vehicles([0.0, 0.1, 0.6]), links.reshape(1, -1))
+    assert told.latency_s.tolist() == [[0.0, 0.4, pytest.approx(0.4 + 0.95)]]
+    assert known_from(told)[0, 2].tolist() == [np.inf, pytest.approx(1.35), 0.0]
+
+
+def test_with_news__front_news_only_at_the_papers_times():
+    told = with_news(V2X.model_validate({"hears": "front"}), vehicles([0.0, 0.5, 0.8]), np.zeros((1, 36)))
+    assert told.latency_s.tolist() == [[0.0, 0.5, 0.8]]
+    assert known_from(told)[0].tolist() == [[0.0, np.inf, np.inf], [0.5, 0.0, np.inf], [0.8, 0.8, 0.0]]
+
+
+def test_paper__is_the_rule_of_the_own_latency():
+    plain, named = PAPER.sample(50, 7).worlds, PAPER.replace(v2x="paper").sample(50, 7).worlds
+    assert named.vehicles.known_from_s.shape == (50, 0)
+    assert known_from(plain.vehicles)[0].tolist() == [[0.0, 0.0, 0.0], [0.5, 0.0, 0.5], [0.8, 0.8, 0.0]]
+    assert named.gaps_m.tobytes() == plain.gaps_m.tobytes()
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_sample__a_world_alone_has_the_same_news_and_the_line_of_the_paper(name):
+    scenario = channel_of(name)
+    many, alone = scenario.sample(30, 7).worlds, scenario.sample(1, 7, first=17).worlds
+    assert many.vehicles.known_from_s[17].tobytes() == alone.vehicles.known_from_s[0].tobytes()
+    assert many.vehicles.latency_s[17].tobytes() == alone.vehicles.latency_s[0].tobytes()
+    same = PAPER.replace(early_impacts="keep").sample(30, 7).worlds
+    assert many.gaps_m.tobytes() == same.gaps_m.tobytes() and many.speeds_mps.tobytes() == same.speeds_mps.tobytes()
+    other = scenario.sample(30, 7, channel="training").worlds
+    assert (many.vehicles.known_from_s[:, 1] != other.vehicles.known_from_s[:, 1]).all()
+
+
+def shuffled(worlds, vehicle):
+    """The worlds with everything exchanged between them that ``vehicle`` does not know yet."""
+    unknown = known_from(worlds.vehicles)[:, vehicle] > worlds.time_s[:, np.newaxis]
+    lines = np.random.default_rng(1).permutation(worlds.n)
+    changed = {}
+    for name in ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps"):
+        column = getattr(worlds.vehicles, name)
+        changed[name] = np.where(unknown, column[lines] * 1.5, column)
+    gaps = np.where(unknown[:, [0, 2]], worlds.gaps_m[lines] + 3.0, worlds.gaps_m)
+    return replace(
+        worlds,
+        vehicles=replace(worlds.vehicles, **changed),
+        gaps_m=gaps,
+        speeds_mps=np.where(unknown, worlds.speeds_mps[lines] * 0.5, worlds.speeds_mps),
+        command_mps2=np.where(unknown, -1.0, worlds.command_mps2),
+        pair_hit=np.where(unknown[:, [0, 2]], True, worlds.pair_hit),
+    )
+
+
+@pytest.mark.parametrize("name", ["blocked", "congested", "sensors-only"])
+def test_observe__what_is_not_known_changes_no_bit(name):
+    start = channel_of(name).sample(400, 5).worlds
+    spec = ObservationSpec()
+    seen = 0
+    for time in (0.0, 0.5, 0.8, 1.0, 1.5):
+        worlds, _ = advance(start, -3.0, until_s=time)
+        other = shuffled(worlds, 1)
+        unknown = known_from(worlds.vehicles)[:, 1][:, [0, 2]] > time
+        assert observe(worlds, 1, spec).tobytes() == observe(other, 1, spec).tobytes()
+        flags = observe(worlds, 1, spec)[:, [7, 17]]
+        assert (flags == ~unknown).all()
+        seen += int(unknown.sum())
+    assert seen > 400
+
+
+def engine(scenario, n=20, **settings):
+    scripts = {i: make_agent(script) for i, script in scenario.scripts.items()}
+    return Engine(scenario, n, learners=scenario.learners, scripts=scripts, **settings)
+
+
+def test_engine__tells_what_is_known_when_and_starts_when_a_learner_may_act():
+    running = engine(channel_of("blocked"), seed=3)
+    vehicles = running.worlds.vehicles
+    assert running.known_from_s.tolist() == known_from(vehicles).tolist()
+    assert running.worlds.time_s.tolist() == vehicles.latency_s[:, 1].tolist()
+    assert np.ptp(running.worlds.time_s) > 0.2
+    before = running.known_from_s.copy()
+    running.renew(np.array([4]))
+    after = running.known_from_s
+    assert (np.delete(after, 4, 0) == np.delete(before, 4, 0)).all() and (after[4] != before[4]).any()
+
+
+def test_engine__takes_worlds_with_and_without_news_by_link():
+    plain = PAPER.sample(20, 7).worlds
+    running = engine(channel_of("nominal"))
+    running.reset(worlds=plain)
+    assert running.known_from_s.tolist() == known_from(plain.vehicles).tolist()
+    running.renew(np.array([0]))
+    running.step(np.zeros((20, 1)))
+    of_paper = engine(PAPER)
+    of_paper.reset(worlds=channel_of("nominal").sample(20, 7).worlds)
+    of_paper.renew(np.array([0]))
+    assert of_paper.known_from_s[0].tolist() == known_from(plain.vehicles)[0].tolist()
+
+
+def test_engine__snapshot_keeps_the_news():
+    running, other = engine(channel_of("blocked"), seed=3), engine(channel_of("blocked"), seed=4)
+    restore_engine(other, engine_snapshot(running))
+    assert other.known_from_s.tobytes() == running.known_from_s.tobytes()
+    assert other.observe(1).tobytes() == running.observe(1).tobytes()
+
+
+def test_infos__tell_the_news_only_where_there_is_a_channel():
+    env = parallel_env(channel_of("congested"))
+    _, infos = env.reset(seed=5)
+    known = env.engine.known_from_s[0]
+    assert all(infos[f"vehicle_{i + 1}"]["known_from_s"].tolist() == known[i].tolist() for i in range(3))
+    _, _, _, _, infos = env.step({"vehicle_2": np.zeros(1, np.float32)})
+    assert infos["vehicle_2"]["known_from_s"].tolist() == known[1].tolist()
+    assert "known_from_s" not in parallel_env(PAPER).reset(seed=5)[1]["vehicle_2"]
+
+
+def test_initial_state__needs_a_channel_without_chance():
+    given = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
+    with pytest.raises(InvalidInput, match="the scenario draws what each vehicle knows when"):
+        initial_state_worlds(given, channel_of("nominal"))
+    fixed = channel_of("nominal", link_latency_s=0.25, sensing_s=[1, 1])
+    assert initial_state_worlds(given, fixed).vehicles.latency_s.tolist() == [[0.0, 0.25, 0.25]]
+
+
+@pytest.mark.parametrize(
+    ("v2x", "message"),
+    [
+        ("papr", r"v2x.preset = papr: must be paper, clear, nominal, congested, blocked or sensors-only"),
+        ({"preset": "clear", "los": 1}, r"v2x.los: unknown key; did you mean lost"),
+        ({"loss_begins": 0.1}, r"v2x.loss_begins = 0.1: preset paper has no generated messages"),
+        ({"preset": "clear", "senses": "none"}, r"v2x.senses = none: without sight .* would never react"),
+        ({"preset": "clear", "loss_ends": 0}, r"v2x.loss_ends = 0: must be greater than or equal to 0.01"),
+        ({"preset": "clear", "lost": float("nan")}, r"v2x.lost = .nan: must be a finite number"),
+        ({"preset": "clear", "sensing_s": [2, 1]}, r"v2x.sensing_s = .*: low must not be above high"),
+        ({"preset": "clear", "link_latency_s": 0.1, "radio_s": 0.1}, r"v2x.radio_s = 0.1: a fixed link_latency_s"),
+    ],
+)
+def test_v2x__that_cannot_be_is_refused_with_its_place(v2x, message):
+    with pytest.raises(InvalidInput, match=message):
+        PAPER.replace(v2x=v2x)
+
+
+def test_v2x__everybody_may_act_before_the_horizon():
+    with pytest.raises(
+        InvalidInput, match=r"vehicle_3 may have no news until 2.2 s; it must be below horizon_s \(2 s\)"
+    ):
+        PAPER.replace(v2x="blocked", horizon_s=2)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_v2x__declared_is_the_same_scenario(name):
+    scenario = PAPER.replace(v2x=name)
+    assert Scenario(**scenario.declared()) == scenario
