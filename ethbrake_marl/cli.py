@@ -33,6 +33,7 @@ from ethbrake_marl.lineup import (
     EPISODES,
     LIST_SEED,
     PROGRESS_EVERY,
+    SHIELDS,
     check_agents,
     choose_worlds,
     load_driven,
@@ -177,6 +178,9 @@ def evaluate_command(
     episodes: Annotated[int | None, typer.Option(help="Worlds of the list.", show_default=str(EPISODES))] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the list.", show_default=str(LIST_SEED))] = None,
     count: Annotated[HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")] = "first",
+    shield: Annotated[
+        str, typer.Option(metavar="|".join(SHIELDS), help="Put around every learned agent that has none.")
+    ] = "none",
     initial_states: Annotated[
         Path | None, typer.Option(metavar="CSV", help="Your own worlds, one per row, instead of the list.")
     ] = None,
@@ -191,13 +195,14 @@ def evaluate_command(
 
     Agents: full_brake, coast, constant:A (deceleration in m/s2), copy_leader, gentlest_front, e_v2x_bm,
     e_v2x_bm:pairwise, planner, best_harm; ladder: all of these but constant; and of a run or a policy bundle: ppo@PATH,
-    sac@PATH, rehearsed@PATH, hybrid@PATH, hybrid:pairwise@PATH, hybrid:rehearsed@PATH. PATH may be shipped.
+    sac@PATH, rehearsed@PATH, hybrid@PATH, hybrid:pairwise@PATH, hybrid:rehearsed@PATH, step@PATH, step:rehearsed@PATH.
+    PATH may be shipped.
     """
     if per_world is not None:
         check_target(per_world, force=force)
     chosen = load_driven(scenario, vehicle)
     sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
-    lineup = make_lineup(agents.split(","), chosen, count=count)
+    lineup = make_lineup(agents.split(","), chosen, count=count, shield=shield)
     check_agents(lineup, sample.worlds, chosen)
     with interruptible("nothing was written"), progress_bars() as bars:
         evaluation = evaluate(

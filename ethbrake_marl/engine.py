@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.actions import checked_action
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.harm import Ledger
+from ethbrake_marl.objectives import objective_harm
 from ethbrake_marl.observations import Observations, ObservationSpec, observe_packed, scaling
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.packed import (
@@ -30,7 +31,15 @@ from ethbrake_marl.physics.packed import (
     unpack,
 )
 from ethbrake_marl.physics.segment import DONE
-from ethbrake_marl.rewards import Reward, StepOutcome, further_terms, potential, reward_params, weighted_sum
+from ethbrake_marl.rewards import (
+    Reward,
+    StepOutcome,
+    further_terms,
+    potential,
+    resolved_objective,
+    reward_params,
+    weighted_sum,
+)
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.starts import Script, Start, Stream, check_alert, is_state_free, moved, within_capacity
 from ethbrake_marl.stepping import BAD_ACTION, ENDED, OUTCOME_ROWS, START, Step, step_worlds
@@ -80,7 +89,7 @@ class Engine:
         self.deciders = self.learners if deciders is None else tuple(deciders)
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
-        self.reward = reward_params(reward)
+        self.reward, self._objectives = resolved_objective(reward_params(reward), scenario.objective, scenario.vehicles)
         self.observation = observation or ObservationSpec()
         self._scaling = scaling(self.observation)
         self.on_begin: list[OnBegin] = []
@@ -88,9 +97,10 @@ class Engine:
         self._learner_index = np.array(self.learners, np.int64)
         total = float(self.reward.harm_count == "total")
         times = scenario.time_step_s, scenario.horizon_s
-        self._settings = np.array([*times, self.reward.harm, total, self.reward.terminal])
+        shared_harm = 0.0 if self._objectives else self.reward.harm
+        self._settings = np.array([*times, shared_harm, total, self.reward.terminal])
         self._moves_reward = self.reward.collision + self.reward.risk + self.reward.jerk > 0.0
-        self._more_terms = self._moves_reward or self.reward.shaping > 0.0
+        self._more_terms = self._moves_reward or self.reward.shaping > 0.0 or bool(self._objectives)
         self._stream = Stream(scenario, self.deciders, self.scripts, seed)
         self.reset(worlds=worlds)
 
@@ -204,6 +214,7 @@ class Engine:
             worlds = self.worlds
             for vehicle, script in self._remembering.items():
                 self._wanted[:, vehicle] = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
+        before = self._objective_harm() if self._objectives else None
         reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
         world, status = step_worlds(
             self._state, self._params, self._clock, columns, self._learner_index, self._settings, NO_ROWS,
@@ -212,6 +223,8 @@ class Engine:
         if status != DONE:
             self._fail(world, status, columns)
         step = Step(reward, outcome, self.reward, {})
+        if before is not None and self.reward.harm > 0.0:
+            step.further["harm"] = before - self._objective_harm()
         if self._more_terms:
             self._add_further_terms(step)
         return step
@@ -236,6 +249,10 @@ class Engine:
             for c, vehicle in enumerate(self.learners):
                 checked_action(actions[:, c], (self.n,), f"vehicle_{vehicle + 1}")
         raise PhysicsError(f"world {world}: the step from {self._state[world, 0]:g} s failed with status {status}")
+
+    def _objective_harm(self) -> Floats:
+        """What the objective of each vehicle makes of the harm so far, [n, N]."""
+        return objective_harm(self.ledger, self.reward.harm_count, self._objectives)
 
     def _add_further_terms(self, step: Step) -> None:
         """Add the terms that need the motion, or the future, to a step's reward; nothing for rows that stood still."""

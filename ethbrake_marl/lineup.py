@@ -20,6 +20,7 @@ from ethbrake_marl.learning.shipped import SHIPPED, PolicyKind, load_named_polic
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
 from ethbrake_marl.shield.episode import HybridAgent
+from ethbrake_marl.shield.step import StepShieldAgent
 
 EPISODES = 10_000
 PROGRESS_EVERY = 500  # worlds between two signs of life
@@ -39,8 +40,16 @@ LADDER = (  # from no decision at all up to the best that is known
 register_agent("best_harm", make_best_harm)
 
 POLICY_KINDS: tuple[PolicyKind, ...] = ("ppo", "sac", "universal")
-_WITH_SCENARIO = ("rehearsed", "hybrid", "hybrid:pairwise", "hybrid:rehearsed")  # of a policy, for one scenario
-_OF_A_POLICY = (*POLICY_KINDS, "rehearsed", "hybrid")
+_WITH_SCENARIO = (
+    "rehearsed",
+    "hybrid",
+    "hybrid:pairwise",
+    "hybrid:rehearsed",
+    "step",
+    "step:rehearsed",
+)  # of a policy, for one scenario
+_OF_A_POLICY = (*POLICY_KINDS, "rehearsed", "hybrid", "step")
+SHIELDS = ("none", "episode", "step")  # that ``make_lineup`` can put around whatever learned
 _LADDER_SPEC = "ladder"
 
 
@@ -88,22 +97,27 @@ def check_agents(agents: Mapping[str, Agent], worlds: Worlds, scenario: Scenario
         _try_out(agent, worlds if getattr(agent, "state_free", False) else worlds.take([0]), vehicle)
 
 
-def make_lineup(specs: Sequence[str], scenario: Scenario, *, count: HarmCount = "first") -> dict[str, Agent]:
+def make_lineup(
+    specs: Sequence[str], scenario: Scenario, *, count: HarmCount = "first", shield: str = "none"
+) -> dict[str, Agent]:
     """One fresh agent per spec, by its spec, to drive a vehicle of ``scenario``.
 
     Every spec of ``make_agent``, and ``ppo@PATH`` or ``sac@PATH`` (the policy of a run, or a bundle), ``hybrid@PATH``
     (Algorithm 1: that policy or coupled E-V2X-BM, whichever harms less), ``hybrid:pairwise@PATH`` (with the paper's
-    closed form instead), ``rehearsed@PATH`` (``agents.rehearsed``) and ``hybrid:rehearsed@PATH``. PATH may be
-    ``shipped``, the policy that comes with the package for this scenario and count (PPO's for the last four), or
+    closed form instead), ``rehearsed@PATH`` (``agents.rehearsed``), ``hybrid:rehearsed@PATH``, and ``step@PATH`` or
+    ``step:rehearsed@PATH`` (the step shield). PATH may be
+    ``shipped``, the policy that comes with the package for this scenario and count (PPO's for all but sac@shipped), or
     ``shipped/NAME``; ``universal@shipped`` is for all scenarios. ``ladder`` stands for every agent of ``LADDER`` that
-    there is. ``count`` is the harm that optimising and choosing agents minimise. Raises ``InvalidInput`` for a spec
+    there is. ``count`` is the harm that optimising and choosing agents minimise.
+    ``shield`` (one of ``SHIELDS``) is put around every learned agent that has none. Raises ``InvalidInput`` for a spec
     given twice, ``UnknownName`` with a suggestion, and whatever loading a policy raises.
     """
     specs = [each for spec in specs for each in (_ladder() if spec == _LADDER_SPEC else [spec])]
     for k, spec in enumerate(specs):
         if spec in specs[:k]:
             raise InvalidInput(f"agent {spec!r} is given twice; each agent drives every world once")
-    return {spec: _agent(spec, scenario, count) for spec in specs}
+    agents = {spec: _agent(spec, scenario, count) for spec in specs}
+    return {_shielded_name(spec, shield): _shielded(agent, scenario, count, shield) for spec, agent in agents.items()}
 
 
 def choose_worlds(
@@ -175,7 +189,28 @@ def _agent_of_a_policy(spec: str, scenario: Scenario | None, count: HarmCount) -
     driver = Rehearsed(policy, scenario, count=count) if kind.endswith("rehearsed") else policy
     if kind == "rehearsed":
         return driver
+    if kind.startswith("step"):
+        return StepShieldAgent(driver, scenario, count=count)
     return HybridAgent(driver, scenario, bound="pairwise" if kind == "hybrid:pairwise" else "coupled", count=count)
+
+
+def _shielded_name(spec: str, shield: str) -> str:
+    return f"{spec}+{shield}" if shield != "none" and _is_learned(spec) else spec
+
+
+def _is_learned(spec: str) -> bool:
+    return re.split("[:@]", spec, maxsplit=1)[0] in (*POLICY_KINDS, "rehearsed")
+
+
+def _shielded(agent: Agent, scenario: Scenario, count: HarmCount, shield: str) -> Agent:
+    """A learned agent behind the shield; any other agent as it is. Raises ``UnknownName`` for another shield."""
+    if shield not in SHIELDS:
+        raise unknown_name("shield", shield, SHIELDS)
+    if shield == "none" or not isinstance(agent, LearnedAgent | Rehearsed):
+        return agent
+    if shield == "episode":
+        return HybridAgent(agent, scenario, count=count)
+    return StepShieldAgent(agent, scenario, count=count)
 
 
 def _register_policies() -> None:

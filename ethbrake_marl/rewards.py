@@ -3,7 +3,8 @@
 Terms, for vehicle i and one step (the paper's section on the reward, with its printed defects repaired):
 
 =========  =======================================================================================================
-harm       minus the harm of the whole line in this step, each impact once (``harm_count``: first | total)
+harm       minus the harm of the whole line in this step, each impact once (``harm_count``: first | total); or by how
+           much the step raised what the vehicle's ``objective`` makes of the harm so far (``objectives``)
 collision  the paper's r_collision: minus ``sum_p k_energy w_p^2`` over every impact of the step
 risk       the paper's r_risk over the vehicle's own pairs: ``-sigma(-TTC / tau) - sigma(k_d (d_target - d))``; an
            opening pair has TTC = infinity (first part 0) and ``d - d_safe`` is not negative
@@ -22,11 +23,12 @@ from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from scipy.special import expit
 
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput, UnknownName, unknown_name
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.objectives import Declared, Objective, objectives_of, parse_objective
 from ethbrake_marl.physics import Bools, Floats, Worlds, forecast
 
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -41,6 +43,7 @@ class RewardParams(BaseModel):
 
     harm: NonNegative = 1.0
     harm_count: HarmCount = "first"
+    objective: str | Annotated[tuple[str, ...], Field(strict=False)] | None = None  # None: the scenario's
     collision: NonNegative = 0.0
     risk: NonNegative = 0.0
     jerk: NonNegative = 0.0
@@ -52,6 +55,16 @@ class RewardParams(BaseModel):
     safety_buffer_m: NonNegative = 1.0
     target_gap_m: NonNegative = 3.0
     distance_slope_per_m: Positive = 1.0
+
+    @field_validator("objective")
+    @classmethod
+    def _objective(cls, value: Declared | None) -> Declared | None:
+        for each in (value,) if isinstance(value, str) else value or ():
+            try:
+                parse_objective(each)
+            except (InvalidInput, UnknownName) as error:
+                raise ValueError(str(error)) from None
+        return value
 
 
 REWARDS = {
@@ -85,6 +98,21 @@ def reward_params(reward: Reward) -> RewardParams:
     return REWARDS[reward]
 
 
+def resolved_objective(
+    params: RewardParams, of_scenario: Declared, vehicles: int
+) -> tuple[RewardParams, tuple[Objective, ...]]:
+    """The reward with its objective settled (the scenario's where it has none), and that of each vehicle.
+
+    Everybody's harm alike, the usual one, is ``None`` and no objectives: it needs no telling apart.
+    Raises ``InvalidInput`` for an objective that does not fit the number of vehicles.
+    """
+    declared = of_scenario if params.objective is None else params.objective
+    objectives = objectives_of(declared, vehicles)
+    if all(objective.kind == "total" for objective in objectives):
+        return params.model_copy(update={"objective": None}), ()
+    return params.model_copy(update={"objective": declared}), objectives
+
+
 def _from_settings(settings: Mapping[str, Any]) -> RewardParams:
     for name in settings:
         if name not in RewardParams.model_fields:
@@ -94,6 +122,7 @@ def _from_settings(settings: Mapping[str, Any]) -> RewardParams:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         right = first["msg"].replace("Input should be", "must be").replace("a valid number", "a number")
+        right = right.removeprefix("Value error, ")
         raise InvalidInput(f"reward: {first['loc'][0]} = {first['input']!r}: {right}") from None
 
 
@@ -114,10 +143,10 @@ class StepOutcome:
 def shared_terms(params: RewardParams, harm: Value, safe_end: Value) -> dict[str, Value]:
     """The terms that all vehicles share and that need no more than the step's facts, of many worlds [n] or of one.
 
-    ``harm`` as counted; ``safe_end`` is 1 or 0.
+    ``harm`` as counted; ``safe_end`` is 1 or 0. With an objective other than everybody's harm, harm is not shared.
     """
     terms = {}
-    if params.harm > 0.0:
+    if params.harm > 0.0 and params.objective is None:
         terms["harm"] = -harm
     if params.terminal > 0.0:
         terms["terminal"] = safe_end

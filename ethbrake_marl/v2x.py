@@ -21,8 +21,9 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.worlds import Floats, Ints, Vehicles, Worlds
@@ -102,6 +103,12 @@ class V2X(BaseModel):
         right = "without sight of the vehicle ahead, one that hears nothing would never react; use both or front"
         _require(channel.senses != "none" or not needs_sight, "senses", self, right)
         return self
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """A preset's name, or a mapping."""
+        mapping = handler(core)
+        return {"anyOf": [{"enum": list(PRESETS), "type": "string"}, mapping]}
 
     @property
     def channel(self) -> Channel:

@@ -21,6 +21,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("durable_files",),
     ("physics",),
     ("harm",),
+    ("objectives",),
     ("scenario", "v2x"),
     ("actions", "observations", "rewards"),
     ("stepping", "starts", "engine"),

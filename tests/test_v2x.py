@@ -231,9 +231,7 @@ def test_v2x__that_cannot_be_is_refused_with_its_place(v2x, message):
 
 
 def test_v2x__everybody_may_act_before_the_horizon():
-    with pytest.raises(
-        InvalidInput, match=r"vehicle_3 may have no news until 2.2 s; it must be below horizon_s \(2 s\)"
-    ):
+    with pytest.raises(InvalidInput, match=r"vehicle_3 may have no news until 2.2 s; .* below horizon_s \(2 s\)"):
         PAPER.replace(v2x="blocked", horizon_s=2)
 
 

@@ -35,11 +35,16 @@ def make_sb3_vec_env(
     learners: Sequence[str | int] | None = None,
     reward: Reward = "harm",
     observation: ObservationSpec | None = None,
+    horizon_is_end: bool = False,
 ) -> EthBrakeVecEnv:
-    """``n_envs`` worlds for Stable-Baselines3; arguments as ``parallel_env``. ``seed=None``: fresh entropy."""
+    """``n_envs`` worlds for Stable-Baselines3; arguments as ``parallel_env``. ``seed=None``: fresh entropy.
+
+    ``horizon_is_end``: infos report no truncation, so that an algorithm does not add the value it expects beyond the
+    horizon. Harm is counted to the horizon, so nothing lies beyond it; what is imagined there can grow without limit.
+    """
     check_seed(seed)
     engine = make_engine(scenario, n_envs, learners=learners, reward=reward, observation=observation)
-    return EthBrakeVecEnv(engine, fresh_seed() if seed is None else seed)
+    return EthBrakeVecEnv(engine, fresh_seed() if seed is None else seed, horizon_is_end=horizon_is_end)
 
 
 class EthBrakeVecEnv(VecEnv):
@@ -56,10 +61,11 @@ class EthBrakeVecEnv(VecEnv):
 
     render_mode: str | None = None
 
-    def __init__(self, engine: Engine, seed: int) -> None:
+    def __init__(self, engine: Engine, seed: int, *, horizon_is_end: bool = False) -> None:
         if not engine.learners:
             raise InvalidInput(f"scenario {engine.scenario.name!r} has no learner; pass learners=['vehicle_2']")
         self.engine = engine
+        self.horizon_is_end = horizon_is_end
         self._next_seed: int | None = seed
         self._learners = np.array(engine.learners, np.int64)
         self._actions: NDArray[Any] | None = None
@@ -160,7 +166,7 @@ class EthBrakeVecEnv(VecEnv):
         truncated = self._by_row(step.truncated[ended]).tolist()
         gained, steps = self._return.take(rows).tolist(), self._steps.take(rows).tolist()
         for row, info, cut, seen, gain, count in zip(rows.tolist(), told, truncated, final, gained, steps, strict=True):
-            info["TimeLimit.truncated"] = cut
+            info["TimeLimit.truncated"] = cut and not self.horizon_is_end
             info["terminal_observation"] = seen.copy()
             info["episode"] = {"r": gain, "l": count, "t": 0.0}
             infos[row] = info
@@ -176,7 +182,7 @@ class EthBrakeVecEnv(VecEnv):
         """The infos with which the running episodes began, row by row; made when they are asked for."""
         if not self._started:
             return [{} for _ in range(self.num_envs)]
-        return plain_infos(Report(self._begun, None), self._learners)
+        return plain_infos(Report(self._begun, None, report(self.engine).known_from_s), self._learners)
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:

@@ -37,7 +37,9 @@ def environment_tables() -> dict[str, str]:
     }
 
 
-def _plain(value: float | str) -> str:
+def _plain(value: float | str | None) -> str:
+    if value is None:
+        return "the scenario's"
     return value if isinstance(value, str) else f"{value:g}"
 
 

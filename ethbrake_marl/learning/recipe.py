@@ -109,6 +109,7 @@ class TrainingRecipe(_Part):
     learning_rate: LearningRate
     gamma: Fraction
     reward: RewardParams
+    horizon_is_end: bool = False
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     evaluation: EvaluationPlan
     checkpoint_every_updates: Annotated[int, Field(ge=1)]

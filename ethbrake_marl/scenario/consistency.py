@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.objectives import Declared, objectives_of
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.flow_text import flow_text
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, QUANTITIES, QuantityRule
@@ -85,6 +86,14 @@ def check_roles(roles: Mapping[str, str], vehicles: int) -> None:
             refuse((name,), role, str(error))
         if role.startswith(f"{LEARNER}:"):
             refuse((name,), role, f"{LEARNER} takes no argument")
+
+
+def check_objective(declared: Declared, vehicles: int) -> None:
+    """The objective is a known one, and there is one for all vehicles or one for each."""
+    try:
+        objectives_of(declared, vehicles)
+    except InvalidInput as error:
+        refuse((), declared, str(error))
 
 
 def check_alternatives(scenario: Scenario) -> None:

@@ -14,6 +14,7 @@ from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.scenario.consistency import (
     check_alternatives,
     check_entries,
+    check_objective,
     check_roles,
     check_whole,
     complete_roles,
@@ -83,7 +84,12 @@ class Scenario(BaseModel):
         default="keep", description="what happens to worlds with an impact before the first learner may act"
     )
 
-    v2x: V2X = Field(default=V2X(), description="what each vehicle knows when: a preset, or what differs from one")
+    objective: str | Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
+    )
+    v2x: V2X = Field(
+        default_factory=V2X, description="what each vehicle knows when: a preset, and what differs from it"
+    )
 
     def __init__(self, /, **data: Any) -> None:
         name = data.get("name")
@@ -119,6 +125,13 @@ class Scenario(BaseModel):
             return value
         check_roles(value, vehicles)
         return complete_roles(value, vehicles)
+
+    @field_validator("objective")
+    @classmethod
+    def _objective(cls, value: Any, info: ValidationInfo) -> Any:
+        if "vehicles" in info.data:
+            check_objective(value, info.data["vehicles"])
+        return value
 
     @model_validator(mode="after")
     def _whole(self) -> Scenario:

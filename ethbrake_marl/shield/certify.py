@@ -105,8 +105,8 @@ def plan_harm(running: Running, plan: Floats) -> Floats:
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
     """Decide in every world whether the proposed action [n] is applied, or the backup's; see the module's claim.
 
-    ``budget`` [n] is the harm that is guaranteed, at least the backup's. A proposal beyond [-1, 1] is clipped first; one
-    that is no number is replaced. Nothing given is changed. Raises ``InvalidInput`` for shapes that do not fit or a
+    ``budget`` [n] is the harm that is guaranteed, at least the backup's. A proposal beyond [-1, 1] is clipped first;
+    one that is no number is replaced. Nothing given is changed. Raises ``InvalidInput`` for shapes that do not fit or a
     budget below the backup's harm, ``PhysicsError`` if a world cannot be advanced.
     """
     n, problem = running.problem.n, running.problem

@@ -1,9 +1,9 @@
 """The compiled decisions of the step shield.
 
 Everything that is certified is advanced decision by decision with the very operations of the engine's step
-(``run_segment``, ``time_of`` and ``at_rest`` of ``agents.profile_motion``): what was certified is what will be executed,
-to the same bits. Only the search for a promising constant runs in one segment to the horizon; what it finds is
-certified step by step before it counts.
+(``run_segment``, ``time_of`` and ``at_rest`` of ``agents.profile_motion``): what was certified is what will be
+executed, to the same bits. Only the search for a promising constant runs in one segment to the horizon; what it finds
+is certified step by step before it counts.
 """
 
 from __future__ import annotations
@@ -171,8 +171,9 @@ def decide_world(
     out[0], out[1], out[2], out[3] = plan[step], NO_CERTIFICATE, certified, budget - least
     if ended == 0:
         out[2], _ = better_plan(
-            table, harm, latency, clock, vehicle, bounds, after, step + 1, constants, certified, certified, plan, room[1]
-        )
+            table, harm, latency, clock, vehicle, bounds, after, step + 1, constants, certified, certified, plan,
+            room[1],
+        )  # fmt: skip
     return ended
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from ethbrake_marl.shield.certify_kernel import ENDED
 from ethbrake_marl.starts import Script
 
 BROKEN = ENDED + 1  # the last of REASONS
+Number = TypeVar("Number", bound=np.generic)
 _PER_WORLD = ("start", "clock", "bounds", "command", "latency", "mass", "limit", "identity")
 
 
@@ -75,6 +76,8 @@ class StepShield:
         self.scenario, self.vehicle, self.count, self.allowance = scenario, vehicle, count, allowance
         self.log: list[Intervention] | None = [] if logging else None
         self.running: Running | None = None
+        self.backup = Backup(np.zeros((0, 0)), np.zeros(0))
+        self._budget: Floats = np.zeros(0)
         self.first_bound: Floats = np.zeros(0)  # [n] harm of the backup at the first decision
         self.alone_harm: Floats = np.zeros(0)  # [n] of the policy rolled out; infinity without one
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
@@ -116,7 +119,7 @@ class StepShield:
     def decide(self, proposed: Floats, *, seen: Floats | None = None, only: Bools | None = None) -> Decision:
         """Decide in every running episode, or ``only`` in some; the others stay as they are.
 
-        ``seen`` [n, columns]: the worlds as they are now, in the columns of ``Running.states`` (the first ones of them).
+        ``seen`` [n, columns]: the worlds as they are now, in the first columns of ``Running.states``.
         """
         assert self.running is not None
         before = self.running
@@ -174,7 +177,9 @@ class StepShield:
             self.interventions, self.distrusted = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.bool_)
             return
         old = self.running
-        arrays = {name: _put(getattr(old.problem, name), rows, getattr(running.problem, name)) for name in _PER_WORLD}
+        arrays: dict[str, Any] = {
+            name: _put(getattr(old.problem, name), rows, getattr(running.problem, name)) for name in _PER_WORLD
+        }
         self.running = Running(
             replace(old.problem, **arrays),
             _put(old.states, rows, running.states),
@@ -190,14 +195,14 @@ class StepShield:
 
     def _write(self, now: Running, proposed: Floats, decision: Decision, held: Backup) -> None:
         assert self.log is not None
+        times = now.time_s
         for k in np.flatnonzero(decision.intervened).tolist():
-            self.log.append(
-                Intervention(
-                    k, int(now.steps[k]), float(now.time_s[k]), float(proposed[k]), float(decision.applied[k]),
-                    int(decision.reason[k]), float(decision.bound[k]), float(decision.margin[k]), now.states[k].copy(),
-                    held.plan[k].copy(),
-                )  # fmt: skip
-            )
+            row = Intervention(
+                k, int(now.steps[k]), float(times[k]), float(proposed[k]), float(decision.applied[k]),
+                int(decision.reason[k]), float(decision.bound[k]), float(decision.margin[k]), now.states[k].copy(),
+                held.plan[k].copy(),
+            )  # fmt: skip
+            self.log.append(row)
 
 
 def rolled_out(
@@ -231,7 +236,7 @@ class _Recorder:
         return action_to_command(action, worlds.vehicles, vehicle)
 
 
-def _put(old: NDArray[np.generic], rows: Ints, new: NDArray[np.generic]) -> NDArray[np.generic]:
+def _put(old: NDArray[Number], rows: Ints, new: NDArray[Number]) -> NDArray[Number]:
     placed = old.copy()
     placed[rows] = new
     return placed
@@ -239,7 +244,7 @@ def _put(old: NDArray[np.generic], rows: Ints, new: NDArray[np.generic]) -> NDAr
 
 def _taken(running: Running, rows: Ints) -> Running:
     problem = running.problem
-    arrays = {name: getattr(problem, name)[rows] for name in _PER_WORLD}
+    arrays: dict[str, Any] = {name: getattr(problem, name)[rows] for name in _PER_WORLD}
     return Running(replace(problem, **arrays), running.states[rows], running.steps[rows], running.ended[rows])
 
 

@@ -7,20 +7,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pettingzoo import ParallelEnv
+from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
+from pettingzoo.utils.conversions import parallel_to_aec
 
 from ethbrake_marl.actions import checked_action, command_to_action
 from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Ints, Worlds
+from ethbrake_marl.shield.attached import AttachedShield, engine_of, only_shielded
 from ethbrake_marl.shield.episode import Bound, HybridAgent
 
-MODES = ("episode",)
+MODES = ("episode", "step")
 
 
 class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
@@ -29,41 +30,40 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
     Mode ``episode`` is the paper's Algorithm 1: when an episode starts, ``policy`` is rolled out from the alert and its
     harm compared with ``H*`` (``bound``, ``count``); the lower one drives that episode. What is certified is the
     policy, not single actions: while it drives, its own deterministic action is applied, whatever is proposed.
-    ``infos[agent]["shield"]`` holds proposed and applied action, who drives, and both harms. The claim of a bound
-    holds for one shielded vehicle, the others following their scripts.
+    ``infos[agent]["shield"]`` holds proposed and applied action, who drives, and both harms. Mode ``step`` certifies
+    every action that is proposed (by the caller, or by ``policy`` where none is passed), and replaces those that cannot
+    keep the bound: see ``StepShield``; its infos say why. ``bound`` is the episode mode's, ``allowance`` (m2/s2 above
+    the bound) the step mode's. The claim of a bound holds for one shielded vehicle, the others following their scripts.
     """
 
     def __init__(
         self,
         env: ParallelEnv[str, Observations, NDArray[Any]],
-        policy: Agent | LearnedPolicy,
+        policy: Agent | LearnedPolicy | None = None,
         *,
         mode: str = "episode",
         bound: Bound = "coupled",
         count: HarmCount = "first",
+        allowance: float = 0.0,
         agents: Sequence[str] | None = None,
     ) -> None:
         if mode not in MODES:
             raise unknown_name("shield mode", mode, MODES)
-        engine = getattr(getattr(env, "unwrapped", None), "engine", None)
-        if not isinstance(engine, Engine):
-            raise InvalidInput(f"HybridShield: {env} is not one of this package's environments (eb.parallel_env)")
+        engine = engine_of(env)
         super().__init__(env)
         self._engine = engine
         names = engine.scenario.vehicle_names
         shielded = tuple(names[i] for i in engine.learners) if agents is None else _names(agents)
-        if len(engine.learners) != 1:
-            learners = ", ".join(names[i] for i in engine.learners) or "none"
-            raise InvalidInput(
-                f"HybridShield: the environment has {len(engine.learners)} learners ({learners}), mode {mode!r} needs"
-                " exactly one learner: to roll out the policy, every other vehicle must follow a script; pass"
-                " learners=['vehicle_2'] to parallel_env"
-            )
+        only_shielded(engine)
         if len(shielded) != 1 or shielded[0] not in names or names.index(shielded[0]) not in engine.learners:
             raise InvalidInput(f"HybridShield: shields exactly one learner in mode {mode!r}; got {shielded}")
         self.mode = mode
         self.shielded = shielded[0]
         self._vehicle = names.index(self.shielded)
+        self.attached: AttachedShield | None = None
+        if mode == "step":
+            self.attached = AttachedShield(env, policy, count=count, allowance=allowance)
+            return
         if not (isinstance(policy, Agent) or callable(policy)):
             raise InvalidInput(f"HybridShield: policy = {policy!r}: must be an agent or a policy (eb.load_policy)")
         agent = policy if isinstance(policy, Agent) else LearnedAgent(policy)
@@ -76,6 +76,8 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         proposed = actions.get(agent)
         if proposed is not None:
             checked_action(proposed, (1,), agent)
+        if self.attached is not None:
+            return self._certified(self.attached, actions, proposed)
         command = self.hybrid.act(engine.worlds, self._vehicle)
         applied = command_to_action(command, engine.worlds.vehicles, self._vehicle)
         observations, rewards, terminations, truncations, infos = super().step({**actions, agent: applied})
@@ -84,9 +86,27 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
 
     def close(self) -> None:
         """Let go of the environment: it no longer asks this shield when an episode starts."""
+        if self.attached is not None:
+            self.attached.detach()
         if self._begin in self._engine.on_begin:
             self._engine.on_begin.remove(self._begin)
         super().close()
+
+    def _certified(
+        self, attached: AttachedShield, actions: Mapping[str, Any], proposed: Any
+    ) -> tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]:
+        """Advance by one step in mode ``step``."""
+        agent = self.shielded
+        if not self.env.agents:
+            self.env.step(actions)  # says that no episode is running
+        given = attached.proposal() if proposed is None else checked_action(proposed, (1,), agent)
+        applied = attached.decide(given)
+        decision = attached.decision
+        assert decision is not None
+        told: tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]] = super().step({**actions, agent: applied})
+        attached.check_applied()
+        told[4][agent]["shield"] = attached.info(0, float(given[0]), decision)
+        return told
 
     def _begin(self, worlds: Worlds, rows: Ints) -> None:
         self.hybrid.begin(worlds, self._vehicle, rows)
@@ -102,6 +122,16 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
             "policy_harm": float(self.hybrid.policy_harm[0]),
             "bound_harm": float(self.hybrid.bound_harm[0]),
         }
+
+
+def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, **settings: Any) -> Any:
+    """``HybridShield`` with agents acting in turn (AEC), front to rear; arguments as ``HybridShield``.
+
+    ``env`` is the parallel environment: in AEC all actions of a step are known only when the last agent has acted.
+    """
+    if isinstance(env, AECEnv):
+        raise InvalidInput("shielded_aec: give the parallel environment (eb.parallel_env), not the AEC one")
+    return parallel_to_aec(HybridShield(env, *args, **settings))
 
 
 def _names(agents: object) -> tuple[Any, ...]:

@@ -229,3 +229,15 @@ def test_set_options__that_cannot_be_used_fail_one_reset_only() -> None:
     with pytest.raises(InvalidInput):
         env.reset()
     assert (env.reset() == expected).all()
+
+
+@pytest.mark.parametrize("horizon_is_end", [False, True])
+def test_horizon_is_end__hides_the_truncation_and_nothing_else(horizon_is_end: bool) -> None:
+    env = make_sb3_vec_env(PAPER, 3, seed=4, horizon_is_end=horizon_is_end)
+    env.reset()
+    cut = []
+    for _ in range(75):  # 0.5 s to 8 s
+        _, _, done, infos = env.step(np.ones((3, 1), np.float32))  # drives on, so that the horizon cuts the episode off
+        cut += [info["TimeLimit.truncated"] for info in infos if info]
+    assert done.all() and cut == [not horizon_is_end] * 3
+    assert all(info["terminal_observation"].shape == (27,) for info in infos)

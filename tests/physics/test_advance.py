@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from dataclasses import replace
 
@@ -10,7 +11,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.physics import Worlds, advance, make_worlds
+from ethbrake_marl.physics import Worlds, advance, make_worlds, segment
+from ethbrake_marl.physics.parallel import by_parts
 
 
 def line(gaps, speeds, *, mass=1.0, e=0.0, latency=0.0, limit=100.0, braking=10.0, driving=10.0) -> Worlds:
@@ -62,6 +64,15 @@ def test_impact__follows_the_papers_velocity_exchange():
     rows = impacts.rows
     assert rows.time_s.tolist() == [1.0] and rows.closing_speed_mps.tolist() == [10.0] and rows.first.tolist() == [True]
     assert rows.front_speed_change_mps[0] == pytest.approx(9.0) and rows.rear_speed_change_mps[0] == pytest.approx(-6.0)
+
+
+def test_impact__is_listed_only_on_demand_and_then_in_one_run(monkeypatch):
+    module, runs = importlib.import_module("ethbrake_marl.physics.advance"), []
+    monkeypatch.setattr(module, "by_parts", lambda *given: runs.append(given) or by_parts(*given))
+    worlds = line([10.0], [0.0, 10.0])
+    assert advance(worlds, 0.0, 2.0)[1].rows is None
+    assert advance(worlds, 0.0, 2.0, record=True)[1].rows is not None
+    assert len(runs) == 2  # the list was long enough at once
 
 
 def test_impact__closing_speed_is_the_root_of_the_discriminant():
@@ -180,6 +191,7 @@ def test_split__two_half_segments_equal_one():
         (lambda w: advance(w, [float("nan"), 0.0], 1.0), "nan"),
         (lambda w: advance(w, [0.0, 0.0, 0.0], 1.0), "shape"),
         (lambda w: advance(w, [0.0, 0.0], -1.0), "cannot be advanced"),
+        (lambda w: advance(w, [0.0, 0.0], until_s=float("inf")), "world 0 is at 0 s and cannot be advanced to inf s"),
         (lambda w: advance(w, [0.0, 0.0]), "either"),
         (lambda w: line([-1.0], [0.0, 0.0]), r"gaps_m\[0, 0\] = -1"),
         (lambda w: line([1.0], [0.0, 0.0], mass=[1.0, -2.0]), r"mass_t\[0, 1\] = -2"),
@@ -205,9 +217,10 @@ def test_overlap__that_no_advance_could_have_left_is_reported():
         advance(worlds, [0.0, 0.0, 0.0], 2.0)
 
 
-@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="100,000 events take long without compilation")
-def test_bounces__more_than_any_segment_holds_are_reported():
+def test_bounces__more_than_any_segment_holds_are_reported(monkeypatch):
     # e = 1 and a push of 10 m/s2 against a heavy wall: a bounce of 0.2 m/s every 0.04 s for 10,000 s
+    if numba.config.DISABLE_JIT:  # 100,000 events would take long
+        monkeypatch.setattr(segment, "MOST_EVENTS", 50)
     wall = line([0.0], [0.0, 0.2], mass=[2.0**60, 1.0], e=1.0)
     with pytest.raises(PhysicsError, match="world 0: more than 100000 events between 0 s and 10000 s"):
         advance(wall, [-10.0, 10.0], 10_000.0)

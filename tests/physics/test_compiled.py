@@ -8,8 +8,9 @@ from pathlib import Path
 import numba
 import pytest
 
+import ethbrake_marl
 from ethbrake_marl.physics import compiled
-from ethbrake_marl.physics.compiled import cache_folder
+from ethbrake_marl.physics.compiled import cache_folder, compiled_apart
 from ethbrake_marl.physics.compiled import compiled as compile_kernel
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
@@ -29,6 +30,20 @@ def test_compiled__is_strict_and_releases_the_lock():
     options = kernel.targetoptions
     assert options["fastmath"] is False and options["nogil"] is True and options["error_model"] == "numpy"
     assert options["nopython"] is True and "parallel" not in options
+
+
+@pytest.mark.parametrize(("way", "inline"), [(compile_kernel, True), (compiled_apart, False)])
+def test_compiled__asks_for_these_options_and_for_its_own_folder(monkeypatch, way, inline):
+    asked = []
+
+    def compiler(**options):
+        asked.append((options, numba.core.config.CACHE_DIR))
+        return lambda function: function
+
+    monkeypatch.setattr(numba, "njit", compiler)
+    assert way(len) is len
+    options = {"cache": True, "fastmath": False, "nogil": True, "error_model": "numpy", "forceinline": inline}
+    assert asked == [(options, str(cache_folder()))]
 
 
 @needs_compiler
@@ -68,6 +83,23 @@ def test_cache_folder__that_cannot_be_written_is_replaced_by_a_temporary_one(mon
     folder = cache_folder()
     assert folder.is_dir() and folder.name.startswith("ethbrake_marl-") and tmp_path not in folder.parents
     folder.rmdir()
+
+
+def test_cache_folder__that_is_temporary_goes_at_the_end_of_the_process(monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("not a folder", "utf-8")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    at_the_end = []
+    monkeypatch.setattr(compiled.atexit, "register", lambda *call, **options: at_the_end.append((call, options)))
+    folder = cache_folder()
+    (folder / "kernel").write_text("machine code", "utf-8")
+    [((act, *given), options)] = at_the_end
+    act(*given, **options)
+    assert not folder.exists()
+    act(*given, **options)  # also when somebody else has removed it
+
+
+def test_cache_folder__hashes_the_sources_of_this_package():
+    assert Path(ethbrake_marl.__file__).parent == compiled._PACKAGE
 
 
 def test_cache_folder__changes_with_any_kernel_source_and_with_numba_and_with_nothing_else(monkeypatch, tmp_path):

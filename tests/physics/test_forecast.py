@@ -36,6 +36,29 @@ def test_forecast__equals_the_advance_bit_for_bit():
         assert (impacts.total_harm[:, 0] + impacts.total_harm[:, 1]).tolist() == total[:, c].tolist()
 
 
+@pytest.mark.parametrize("vehicle", [0, 1, 2])
+@pytest.mark.parametrize("until", [2.0, 3.5])
+def test_forecast__counts_up_to_its_end_for_any_vehicle_and_up_to_its_capacity(vehicle, until):
+    start = worlds(60)
+    start = start.take(start.time_s < until)
+    capacity = start.vehicles.driving_capacity_mps2[0, vehicle]
+    command = np.tile([-6.0, 2.0, -3.0], (start.n, 1))
+    first, total = forecast(start, command, vehicle, np.full((start.n, 1), capacity), until)
+    command[:, vehicle] = capacity
+    _, impacts = advance(start, command, until_s=until)
+    assert impacts.count.sum() > 5 and not (start.time_s + 1.0 < until).all()
+    assert (impacts.first_impact_harm[:, 0] + impacts.first_impact_harm[:, 1]).tolist() == first[:, 0].tolist()
+    assert (impacts.total_harm[:, 0] + impacts.total_harm[:, 1]).tolist() == total[:, 0].tolist()
+
+
+@pytest.mark.parametrize(("until", "harm"), [(-1.0, 0.0), (0.0, 0.0), (1e-3, 64.0)])
+def test_forecast__an_impact_that_is_due_counts_only_before_the_horizon(until, harm):
+    start = make_worlds(
+        [[0.0]], [0.0, 8.0], braking_capacity_mps2=9, driving_capacity_mps2=9, latency_s=0, mass_t=1, restitution=0
+    )
+    assert forecast(start, np.zeros((1, 2)), 0, np.zeros((1, 1)), until)[0].tolist() == [[harm]]
+
+
 def test_forecast__a_world_at_the_horizon_has_no_harm_left():
     start, _ = advance(worlds(5), [-6.0, -7.0, -6.0], until_s=8.0)
     first, total = forecast(start, np.full((5, 3), -6.0), 1, np.full((5, 2), -1.0), 8.0)
@@ -47,6 +70,7 @@ def test_forecast__a_world_at_the_horizon_has_no_harm_left():
     [
         lambda w: forecast(w, np.zeros((5, 2)), 1, np.zeros((5, 1)), 8.0),
         lambda w: forecast(w, np.zeros((5, 3)), 3, np.zeros((5, 1)), 8.0),
+        lambda w: forecast(w, np.zeros((5, 3)), -1, np.zeros((5, 1)), 8.0),
         lambda w: forecast(w, np.zeros((5, 3)), 1, np.full((5, 1), -7.5), 8.0),
         lambda w: forecast(w, np.zeros((5, 3)), 1, np.full((5, 1), np.nan), 8.0),
     ],

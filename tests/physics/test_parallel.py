@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Worlds, advance, make_worlds
+from ethbrake_marl.physics import Worlds, advance, make_worlds, parallel
 from ethbrake_marl.physics.parallel import by_parts
 from ethbrake_marl.scenario import load_scenario
 
@@ -32,6 +32,12 @@ def test_threads__give_the_same_bits_and_the_same_impacts_in_the_same_order(thre
     for field in dataclasses.fields(serial[1].rows):
         mine, its = getattr(parallel[1].rows, field.name), getattr(serial[1].rows, field.name)
         assert mine.dtype == its.dtype and mine.tobytes() == its.tobytes(), field.name
+
+
+def test_threads__one_is_the_default_and_starts_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "ThreadPoolExecutor", None)
+    worlds, command = braking(10)
+    assert advance(worlds, command, 1.0)[0].time_s.tolist() == [1.0] * 10
 
 
 def test_threads__record_more_impacts_than_expected_in_one_part_only() -> None:

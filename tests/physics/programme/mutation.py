@@ -54,12 +54,16 @@ QUICK = {
     "compiled.py": ("tests/physics/test_compiled.py",),
     "packed.py": ("tests/physics/test_packed.py", "tests/test_engine.py"),
     "parallel.py": ("tests/physics/test_parallel.py",),
-    "sampled.py": ("tests/physics/test_sampled.py", "tests/physics/test_sampled_input.py"),
+    "sampled.py": (
+        "tests/physics/test_sampled_edges.py", "tests/physics/test_sampled.py", "tests/physics/test_sampled_input.py",
+    ),
+    "events.py": ("tests/physics/test_events.py", *KERNEL),
+    "segment.py": (*KERNEL[:3], "tests/physics/test_segment.py", *KERNEL[3:]),
     "forecast.py": ("tests/physics/test_forecast.py",),
     "harm.py": ("tests/test_harm.py", "tests/physics/test_ledger.py"),
     "advance.py": (
         "tests/physics/test_advance.py", "tests/golden/test_physics_hash.py", "tests/physics/test_parallel.py",
-        "tests/physics/test_manufactured.py",
+        "tests/physics/test_manufactured.py", "tests/physics/test_ties.py",
     ),
 }  # fmt: skip
 COMPILED = ("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py")

@@ -1,0 +1,115 @@
+"""Step mode attached to a running engine: what every wrapped face shares."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.physics.packed import command_at, gap_at, harm_at, speed_at
+from ethbrake_marl.shield.certify import REASONS, Decision
+from ethbrake_marl.shield.guard import StepShield
+
+
+class AttachedShield:
+    """A ``StepShield`` that begins with the engine's episodes and sees the engine's worlds.
+
+    ``policy`` (an agent, a loaded policy, or None) is rolled out at each alert, and proposes where nobody else does.
+    Raises ``InvalidInput`` for an environment without an engine, or with another number of learners than one.
+    """
+
+    def __init__(
+        self,
+        env: object,
+        policy: Agent | LearnedPolicy | None,
+        *,
+        count: HarmCount = "first",
+        allowance: float = 0.0,
+        logging: bool = False,
+    ) -> None:
+        self.engine = engine_of(env)
+        self.vehicle = only_shielded(self.engine)
+        if not (policy is None or isinstance(policy, Agent) or callable(policy)):
+            raise InvalidInput(f"shield: policy = {policy!r}: must be an agent, a policy (eb.load_policy) or None")
+        self.policy = policy if policy is None or isinstance(policy, Agent) else LearnedAgent(policy)
+        self.shield = StepShield(
+            self.engine.scenario, self.vehicle, count=count, allowance=allowance, others=self.engine.scripts,
+            logging=logging,
+        )  # fmt: skip
+        self.decision: Decision | None = None
+        self.engine.on_begin.append(self._begin)
+
+    def proposal(self) -> Floats:
+        """What the policy itself would do now, as actions [n]."""
+        if self.policy is None:
+            raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
+        worlds = self.engine.worlds
+        return command_to_action(self.policy.act(worlds, self.vehicle), worlds.vehicles, self.vehicle)
+
+    def decide(self, proposed: Floats) -> Floats:
+        """The actions [n] to apply instead of those proposed."""
+        state, N = self.engine.packed.state, self.engine.scenario.vehicles
+        seen = np.concatenate(
+            [state[:, speed_at(N) : command_at(N)], state[:, gap_at(N) : harm_at(N) + 2 * (N - 1)]], axis=1
+        )
+        self.decision = self.shield.decide(proposed, seen=seen, only=~self.engine.ended)
+        return self.decision.applied
+
+    def check_applied(self) -> None:
+        """Raise ``EthBrakeError`` if the engine did not apply what was certified."""
+        assert self.decision is not None
+        certified = self.shield.commands(self.decision.applied)
+        wanted = self.engine.wanted_mps2[:, self.vehicle]
+        running = self.decision.reason != REASONS.index("ended")
+        if not (wanted == certified)[running].all():
+            raise EthBrakeError("shield: the applied command is not the certified one; is something between them?")
+
+    def info(self, k: int, proposed: float, decision: Decision) -> dict[str, Any]:
+        """What the shield did in world ``k``, for ``infos[agent]["shield"]``."""
+        return {
+            "mode": "step",
+            "proposed_action": proposed,
+            "applied_action": float(decision.applied[k]),
+            "intervened": bool(decision.intervened[k]),
+            "reason": REASONS[decision.reason[k]],
+            "bound_harm": float(decision.bound[k]),
+            "margin": float(decision.margin[k]),
+            "trusted": not self.shield.distrusted[k],
+        }
+
+    def detach(self) -> None:
+        """Let go of the engine: it no longer asks this shield when an episode starts."""
+        if self._begin in self.engine.on_begin:
+            self.engine.on_begin.remove(self._begin)
+
+    def _begin(self, worlds: Worlds, rows: Ints) -> None:
+        if self.policy is not None:
+            self.policy.begin(worlds, self.vehicle, rows)
+        self.shield.begin(worlds, rows, self.policy)
+
+
+def engine_of(env: object) -> Engine:
+    """The engine of one of this package's environments, whatever wraps it."""
+    engine = getattr(getattr(env, "unwrapped", env), "engine", None)
+    if not isinstance(engine, Engine):
+        raise InvalidInput(f"HybridShield: {env} is not one of this package's environments (eb.parallel_env)")
+    return engine
+
+
+def only_shielded(engine: Engine) -> int:
+    """Index of the one learner, which is shielded; ``InvalidInput`` when there is none or more than one."""
+    if len(engine.learners) != 1:
+        learners = ", ".join(engine.scenario.vehicle_names[i] for i in engine.learners) or "none"
+        raise InvalidInput(
+            f"HybridShield: the environment has {len(engine.learners)} learners ({learners}), a shield needs exactly"
+            " one learner: what is certified is known only if every other vehicle follows a script; pass"
+            " learners=['vehicle_2'] to the environment"
+        )
+    return engine.learners[0]

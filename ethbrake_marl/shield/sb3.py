@@ -1,0 +1,74 @@
+"""Step mode as a Stable-Baselines3 ``VecEnvWrapper``: training under the shield. Importing this file imports torch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnvWrapper
+
+from ethbrake_marl.actions import checked_action
+from ethbrake_marl.agents.learned import LearnedPolicy
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, Rewards
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.observations import Observations
+from ethbrake_marl.physics import Bools
+from ethbrake_marl.shield.attached import AttachedShield
+
+
+class ShieldedVecEnv(VecEnvWrapper):
+    """``make_sb3_vec_env`` with one learner behind the step shield: each row's action is certified, or replaced.
+
+    Without a ``policy`` the bound is the coupled optimum's harm. ``intervention_penalty`` is taken off a step's reward
+    (not off the return in ``infos[row]["episode"]``) where something else than the proposal was applied. Each row's
+    infos hold ``shield`` in every step. Raises ``InvalidInput`` for another environment or number of learners.
+    """
+
+    def __init__(
+        self,
+        venv: EthBrakeVecEnv,
+        policy: Agent | LearnedPolicy | None = None,
+        *,
+        count: HarmCount = "first",
+        allowance: float = 0.0,
+        intervention_penalty: float = 0.0,
+        logging: bool = False,
+    ) -> None:
+        if not isinstance(venv, EthBrakeVecEnv):
+            raise InvalidInput(f"ShieldedVecEnv: {venv!r} is not an environment of make_sb3_vec_env")
+        self.attached = AttachedShield(venv, policy, count=count, allowance=allowance, logging=logging)
+        super().__init__(venv)
+        self.intervention_penalty = intervention_penalty
+        self._proposed: NDArray[np.float64] = np.zeros(0)
+
+    def reset(self) -> Observations:
+        """As the environment's own reset."""
+        observation: Observations = self.venv.reset()  # type: ignore[assignment]
+        return observation
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Certify or replace the actions [rows, 1], and pass them on."""
+        if self.attached.shield.running is None:
+            self.venv.step_async(actions)
+            return
+        self._proposed = checked_action(actions, (self.num_envs, 1), "the learners")[:, 0]
+        self.venv.step_async(self.attached.decide(self._proposed)[:, np.newaxis])
+
+    def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
+        """Advance every world by one step."""
+        shield, decision = self.attached, self.attached.decision
+        trusted = ~shield.shield.distrusted
+        observation, reward, done, infos = self.venv.step_wait()
+        assert decision is not None
+        for k, info in enumerate(infos):
+            info["shield"] = shield.info(k, float(self._proposed[k]), decision) | {"trusted": bool(trusted[k])}
+        paid = reward - np.float32(self.intervention_penalty) * decision.intervened.astype(np.float32)
+        return observation, paid, done, infos  # type: ignore[return-value]
+
+    def close(self) -> None:
+        """Let go of the environment, and close it."""
+        self.attached.detach()
+        super().close()

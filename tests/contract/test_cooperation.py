@@ -1,0 +1,97 @@
+"""The contract holds for every cooperation level, over drawn channels, and for lines of 2 to 10 vehicles."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
+
+from ethbrake_marl import ethbrake_v0
+from ethbrake_marl.envs.sb3 import make_sb3_vec_env
+from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
+from tests.contract.faces import FACES, actions, initial_state
+
+LEVELS = [entry.name for entry in list_scenarios() if entry.path.parent.name == "cooperation"]
+ONE_LEARNS = [name for name in LEVELS if len(load_scenario(name).learners) == 1]
+
+
+def line(vehicles: int) -> Scenario:
+    """All that follow learn, over a crowded channel; each for itself and a little for the others."""
+    return Scenario(
+        name=f"line-{vehicles}", vehicles=vehicles, gaps_m={"uniform": [5, 10]}, speeds_mps={"uniform": [18, 22]},
+        braking_capacity_mps2={"uniform": [5, 9]}, driving_capacity_mps2=3, mass_t={"uniform": [1, 8]},
+        latency_s=[0] + [0.3] * (vehicles - 1), horizon_s=12, v2x="congested", objective="social:30",
+        roles={f"vehicle_{i}": "learner" for i in range(2, vehicles + 1)},
+    )  # fmt: skip
+
+
+def named(scenario: str | Scenario) -> str:
+    return scenario if isinstance(scenario, str) else scenario.name
+
+
+def test_levels__are_these():
+    assert LEVELS == [
+        "cooperation-0-sensors",
+        "cooperation-1-front",
+        "cooperation-2-blocked",
+        "cooperation-2-paper",
+        "cooperation-3-congested",
+        "cooperation-3-five",
+        "cooperation-3-pair",
+    ]
+
+
+@pytest.mark.parametrize("name", [name for name in LEVELS if name != "cooperation-3-five"])
+def test_levels__of_three_vehicles_have_the_lines_of_the_random_test(name: str) -> None:
+    paper, worlds = load_scenario("paper-random").sample(40, 7).worlds, load_scenario(name).sample(40, 7).worlds
+    assert worlds.gaps_m.tobytes() == paper.gaps_m.tobytes()
+    assert worlds.speeds_mps.tobytes() == paper.speeds_mps.tobytes()
+    assert (worlds.vehicles.latency_s >= paper.vehicles.latency_s).all()
+
+
+@pytest.mark.parametrize("scenario", [*LEVELS, *(line(vehicles) for vehicles in range(2, 11))], ids=named)
+@pytest.mark.filterwarnings("ignore:reset. unknown option")
+def test_pettingzoo__holds(scenario: Any) -> None:
+    parallel_api_test(ethbrake_v0.parallel_env(scenario=scenario), num_cycles=150)
+    api_test(ethbrake_v0.env(scenario=scenario), num_cycles=150)
+    parallel_seed_test(lambda: ethbrake_v0.parallel_env(scenario=scenario), num_cycles=60)
+
+
+@pytest.mark.parametrize("scenario", [*ONE_LEARNS, line(2)], ids=named)
+def test_faces__agree_on_every_episode(scenario: Any) -> None:
+    loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    bits = {}
+    for name, face in FACES.items():
+        running = face(loaded, 1)
+        bits[name] = [running.reset(7).tobytes(), *(running.step(a).bits() for a in actions(3, 160, 1))]
+    assert all(run == bits["single"] for run in bits.values())
+
+
+@pytest.mark.parametrize("name", FACES)
+def test_batch__of_one_is_row_k_of_a_batch_where_the_channel_is_fixed(name: str) -> None:
+    fixed = {"preset": "nominal", "link_latency_s": 0.6, "hears": "front", "sensing_s": [0.9, 0.9]}
+    scenario = load_scenario("paper-random").replace(v2x=fixed, objective="own", early_impacts="keep")
+    worlds = scenario.sample(4, 7, channel="training").worlds
+    batch = FACES["vector"](scenario, 4)
+    start, columns = batch.reset(7), actions(3, 40, 4)
+    turns = [batch.step(action) for action in columns]
+    for k in range(4):
+        alone = FACES[name](scenario, 1)
+        assert np.array_equal(alone.reset(options={"initial_state": initial_state(worlds, k)})[0], start[k])
+        for turn, action in zip(turns, columns, strict=True):
+            mine = alone.step(action[k : k + 1])
+            assert np.float32(mine.reward[0]) == np.float32(turn.reward[k])
+            if mine.ended[0]:
+                assert mine.harm[0] == turn.harm[k]
+                break
+            assert np.array_equal(mine.observation[0], turn.observation[k])
+
+
+def test_stable_baselines3__tells_the_news_of_each_learner_at_an_episodes_start() -> None:
+    vec = make_sb3_vec_env(line(4), 3, seed=5)
+    vec.reset()
+    known = vec.engine.known_from_s
+    told = [info["known_from_s"].tolist() for info in vec.reset_infos]
+    assert told == [known[k, i].tolist() for k in range(3) for i in (1, 2, 3)]

@@ -1,0 +1,158 @@
+"""The step shield in the engine: bounds hold, nothing fails silently, every intervention is written down."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.coupled import optimise_coupled
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield import HybridAgent, StepShield, StepShieldAgent
+from ethbrake_marl.shield.certify import REASONS
+from ethbrake_marl.shield.forensics import operating_curve, review
+from tests.shield.lines import ADVERSARIES, attack, line
+
+SCENARIO = load_scenario("paper-random")
+WORLDS = SCENARIO.sample(120, 3).worlds
+
+
+class Wavering:
+    """A bad driver that is not constant."""
+
+    name = "wavering"
+
+    def begin(self, worlds, vehicle, rows):
+        pass
+
+    def act(self, worlds, vehicle):
+        wave = np.sin(17.0 * worlds.time_s + worlds.gaps_m[:, 0])
+        return np.where(wave > 0.0, 0.0, wave * worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+
+@pytest.mark.parametrize("name", ADVERSARIES)
+@pytest.mark.parametrize(("N", "count"), [(3, "first"), (5, "total")])
+def test_falsification__no_adversary_gets_above_the_bound(name, N, count):
+    scenario = line(N)
+    found = attack(scenario, scenario.sample(40, 11).worlds, ADVERSARIES[name], count=count)
+    assert (found.realised <= found.bound).all()
+    assert found.realised.tolist() == found.last_bound.tolist()
+
+
+def test_falsification__comes_within_one_percent_of_the_bound_by_accepted_actions():
+    scenario = line(3)
+    found = attack(scenario, scenario.sample(60, 12).worlds, ADVERSARIES["worst_case"])
+    tried = (found.bound > 1.0) & (found.accepted > 0)
+    assert (found.realised[tried] > 0.99 * found.bound[tried]).any()
+
+
+def test_first_bound__is_what_the_coupled_optimum_realises():
+    shield = StepShield(SCENARIO, 1)
+    shield.begin(WORLDS, np.arange(WORLDS.n))
+    optimum = optimise_coupled(WORLDS, 1, horizon_s=SCENARIO.horizon_s)
+    assert shield.first_bound == pytest.approx(optimum.harm, abs=1e-6)
+
+
+@pytest.mark.parametrize("count", ["first", "total"])
+def test_agent__is_never_worse_than_the_episode_mode_nor_than_its_prediction(count):
+    step, hybrid = StepShieldAgent(Wavering(), SCENARIO, count=count), HybridAgent(Wavering(), SCENARIO, count=count)
+    harm = {a.name: drive(WORLDS, a, SCENARIO, 1).ledger.world_harm(count) for a in (step, hybrid)}
+    assert (harm[step.name] <= step.predicted_harm).all()
+    assert (harm[step.name] <= harm[hybrid.name] + 1e-9).all()
+    assert harm[step.name].mean() < harm[hybrid.name].mean() - 0.2
+    assert harm[step.name].tolist() == step.shield.bound.tolist()
+    assert not step.shield.distrusted.any()
+
+
+def test_agent__a_policy_that_keeps_the_bound_is_left_alone():
+    step = StepShieldAgent(make_agent("e_v2x_bm"), SCENARIO)
+    drive(WORLDS, step, SCENARIO, 1)
+    fine = step.shield.alone_harm <= step.shield.first_bound
+    assert fine.mean() > 0.9 and step.chosen_policy[fine].all()
+
+
+def test_agent__a_worlds_outcome_does_not_depend_on_its_batch():
+    whole = drive(WORLDS, StepShieldAgent(Wavering(), SCENARIO), SCENARIO, 1).ledger.world_harm("first")
+    for k in (0, 7, 50):
+        alone = drive(WORLDS.take([k]), StepShieldAgent(Wavering(), SCENARIO), SCENARIO, 1).ledger.world_harm("first")
+        assert alone.tolist() == [whole[k]]
+
+
+def test_begin__of_some_rows_leaves_the_others_alone():
+    shield = StepShield(SCENARIO, 1)
+    shield.begin(WORLDS.take(np.arange(5)), np.arange(5))
+    shield.decide(np.zeros(5))
+    before = shield.bound.copy(), shield.running.steps.copy()
+    shield.begin(WORLDS.take([9]), np.array([2]))
+    assert shield.running.steps.tolist() == [1, 1, 0, 1, 1]
+    assert np.delete(shield.bound, 2).tolist() == np.delete(before[0], 2).tolist()
+
+
+def test_allowance__keeps_what_it_grants_and_no_more():
+    scenario = line(3)
+    worlds = scenario.sample(60, 13).worlds
+    strict, loose = (attack(scenario, worlds, ADVERSARIES["slow_drift"], allowance=a) for a in (0.0, 30.0))
+    assert (loose.realised <= loose.bound + 30.0 + 1e-9).all()
+    assert loose.realised.mean() > strict.realised.mean() + 1.0
+    with pytest.raises(InvalidInput, match="allowance"):
+        StepShield(SCENARIO, 1, allowance=-1.0)
+
+
+def seen_of(shield, rows=None):
+    return shield.running.states[:, :7].copy()  # 3 speeds, 2 gaps, 2 hit flags
+
+
+@pytest.mark.parametrize("what", ["brakes harder", "not a number", "no message"])
+def test_surprise__is_flagged_and_falls_back_for_the_rest_of_that_episode_alone(what):
+    shield = StepShield(SCENARIO, 1)
+    shield.begin(WORLDS.take(np.arange(4)), np.arange(4))
+    stale = seen_of(shield)
+    shield.decide(np.full(4, -0.5), seen=stale)
+    seen = seen_of(shield)
+    assert not shield.distrusted.any()
+    if what == "brakes harder":
+        seen[1, 0] -= 0.3
+    elif what == "not a number":
+        seen[1, 4] = np.nan
+    else:
+        seen[1] = stale[1]
+    for _ in range(3):
+        decision = shield.decide(np.ones(4), seen=seen)
+        assert shield.distrusted.tolist() == [False, True, False, False]
+        assert REASONS[decision.reason[1]] == "assumption broken" and decision.intervened[1]
+        assert decision.applied[1] <= 0.0 and np.isfinite(decision.applied).all() and np.isfinite(shield.bound).all()
+        seen = seen_of(shield)
+    shield.begin(WORLDS.take([5]), np.array([1]))
+    assert not shield.distrusted.any()
+
+
+def test_log__holds_every_intervention_and_forensics_says_what_it_was_good_for():
+    step = StepShieldAgent(make_agent("coast"), SCENARIO, logging=True)
+    drive(WORLDS, step, SCENARIO, 1)
+    log = step.shield.log
+    assert len(log) == step.shield.interventions.sum() > 0
+    assert all(entry.margin < 0.0 and entry.proposed == 0.0 != entry.applied for entry in log)
+    found = review(step, WORLDS, 1)
+    assert found.without.shape == (len(log),)
+    assert found.share("needed") > 0.8
+    assert found.share("needed") + found.share("harmless") + found.share("costly") == pytest.approx(1.0)
+    first = {entry.world: k for k, entry in reversed(list(enumerate(log)))}  # each world's first intervention
+    alone = drive(WORLDS, make_agent("coast"), SCENARIO, 1).ledger.world_harm("first")
+    assert all(found.without[k] == alone[world] for world, k in first.items())
+
+
+def test_operating_curve__fewer_interventions_cost_harm():
+    worlds = WORLDS.take(np.arange(60))
+    points = operating_curve(worlds, make_agent("coast"), SCENARIO, 1, [0.0, 20.0, 1e6])
+    rates, harms = [p.intervention_rate for p in points], [p.harm for p in points]
+    assert rates == sorted(rates, reverse=True) and rates[-1] == 0.0
+    assert harms == sorted(harms) and harms[0] < harms[-1]
+
+
+def test_review__without_a_log_is_refused():
+    step = StepShieldAgent(make_agent("coast"), SCENARIO)
+    drive(WORLDS.take([0]), step, SCENARIO, 1)
+    with pytest.raises(InvalidInput, match="logging=True"):
+        review(step, WORLDS.take([0]), 1)
