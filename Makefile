@@ -15,7 +15,7 @@ ARGS ?=
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume planted-bugs mutation bench-peers
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield planted-bugs shield-bugs mutation bench-peers
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -24,6 +24,8 @@ help:
 	@echo "make check            lint and test"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
+	@echo "make test-shield      try to break the step shield: bound, search, speed"
+	@echo "make shield-bugs      plant 10 bugs in copies of the shield; each must turn a test red"
 	@echo "make planted-bugs     plant 20 bugs in copies of the code; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of physics and harm (ARGS='--sample 100')"
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
@@ -93,6 +95,14 @@ test-physics: $(STAMP)
 test-resume: $(STAMP)
 	@echo "== long programme on resuming: trainings are killed at random moments"
 	@$(BIN)/python -m tests.learning.programme $(ARGS)
+
+test-shield: $(STAMP)
+	@echo "== trying to break the step shield"
+	@$(BIN)/python -m tests.shield.programme $(ARGS)
+
+shield-bugs: $(STAMP)
+	@echo "== planted shield bugs"
+	@$(BIN)/python -m tests.shield.planted_bugs $(ARGS)
 
 planted-bugs: $(STAMP)
 	@echo "== planted bugs"

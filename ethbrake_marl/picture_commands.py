@@ -91,6 +91,39 @@ def picture_deceleration(
     say(f"picture: {target}")
 
 
+@picture_app.command(
+    "shield", epilog="Example: ethbrake picture shield --agents ppo@shipped,full_brake --output shield.png"
+)
+def picture_shield(
+    output: PictureOption,
+    agents: Annotated[str, typer.Option(metavar="A,B,...", help="Who proposes.")] = "full_brake,constant:3",
+    scenario: ScenarioOption = "paper-random",
+    episodes: Annotated[int, typer.Option(help="Worlds of the list.", min=1)] = 500,
+    count: Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")] = "first",
+    vehicle: VehicleOption = None,
+    force: ForceOption = False,
+) -> None:
+    """How often the step shield intervenes against the harm that remains, from no allowance to any."""
+    target = picture_target(output, force=force)
+    from ethbrake_marl.evaluation.figure_style import png_bytes
+    from ethbrake_marl.evaluation.operating_figure import operating_figure
+    from ethbrake_marl.shield.forensics import ALLOWANCES, operating_curve
+
+    chosen = load_driven(scenario, vehicle)
+    worlds = chosen.sample(episodes, LIST_SEED).worlds
+    curves = []
+    with interruptible("nothing was written"), progress_bars() as bars:
+        for name, agent in make_lineup(agents.split(","), chosen, count=count).items():
+            curves.append((name, operating_curve(worlds, agent, chosen, chosen.learners[0], ALLOWANCES, count=count)))
+            bars.show(name, episodes, episodes)
+    caption = (
+        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; step shield, {count} harm. Beside each"
+        " point: what certificates may reach above the bound (m²/s²)."
+    )
+    write_output(target, png_bytes(operating_figure(curves, caption=caption)), force=force)
+    say(f"picture: {target}")
+
+
 def picture_target(output: Path, *, force: bool) -> Path:
     """The file to write, checked before any work; only PNG is written."""
     if output.suffix.lower() != PICTURE_ENDING:

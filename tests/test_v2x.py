@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents.profile_motion import CLOCK_WIDTH
+from ethbrake_marl.agents.profile_problem import identities
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.parallel import parallel_env
@@ -15,7 +17,17 @@ from ethbrake_marl.observations import ObservationSpec, observe
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
 from ethbrake_marl.snapshots import engine_snapshot, restore_engine
-from ethbrake_marl.v2x import CHANNELS, PER_LINK, PRESETS, V2X, burst_periods, known_from, link_delays, with_news
+from ethbrake_marl.v2x import (
+    CHANNELS,
+    PER_LINK,
+    PRESETS,
+    V2X,
+    burst_periods,
+    known_from,
+    link_delays,
+    told_by_link,
+    with_news,
+)
 
 PAPER = load_scenario("paper-random")
 MESSAGES = [name for name in PRESETS if CHANNELS[name].timing == "messages"]
@@ -239,3 +251,10 @@ def test_v2x__everybody_may_act_before_the_horizon():
 def test_v2x__declared_is_the_same_scenario(name):
     scenario = PAPER.replace(v2x=name)
     assert Scenario(**scenario.declared()) == scenario
+
+
+def test_identities__do_not_depend_on_the_news():
+    worlds = PAPER.sample(5, 7).worlds
+    clock, command = np.zeros((5, CLOCK_WIDTH)), -worlds.vehicles.braking_capacity_mps2
+    plain, told = (identities(w, command, clock, np.array([1])) for w in (worlds, told_by_link(worlds)))
+    assert plain.tolist() == told.tolist() and len(set(plain.tolist())) == 5

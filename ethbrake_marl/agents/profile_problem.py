@@ -23,7 +23,7 @@ from ethbrake_marl.agents.profile_motion import (
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance
-from ethbrake_marl.physics.packed import TIME, command_at, gap_at, harm_at, pack, speed_at
+from ethbrake_marl.physics.packed import TIME, command_at, gap_at, harm_at, pack, params_at, speed_at
 
 TIME_STEP_S = 0.1  # between two decisions, where nobody says otherwise
 _MIX = 0xD1342543DE82EF95  # an odd number: spreads seeds over 64 bits
@@ -111,7 +111,7 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
         state[:, [TIME]],
         state[:, speed_at(N) : command_at(N)],
         state[:, gap_at(N) : harm_at(N)],
-        params,
+        params[:, : params_at(5, N)],  # the news of others changes no harm
         command,
         clock[:, [START, TIME_STEP, LAST_STEP, HORIZON]],
         who,

@@ -20,6 +20,7 @@ from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.step import StepShieldAgent
 
 SAME_HARM = 1e-9  # harms (m2/s2) closer than this are one harm
+ALLOWANCES = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 1e6)  # m2/s2, of an operating curve
 VERDICTS = ("needed", "harmless", "costly")
 
 

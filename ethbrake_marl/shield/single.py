@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
+from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import checked_action
@@ -15,7 +16,7 @@ from ethbrake_marl.observations import Observations
 from ethbrake_marl.shield.attached import AttachedShield
 
 
-class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]]):
+class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]], RecordConstructorArgs):
     """``EthBrake-v0`` behind the step shield: each action is certified, or replaced; see ``StepShield``.
 
     ``info["shield"]`` says what was done; ``intervention_penalty`` is taken off the reward of a step in which
@@ -33,6 +34,14 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
         intervention_penalty: float = 0.0,
         logging: bool = False,
     ) -> None:
+        RecordConstructorArgs.__init__(
+            self,
+            policy=policy,
+            count=count,
+            allowance=allowance,
+            intervention_penalty=intervention_penalty,
+            logging=logging,
+        )
         self.attached = AttachedShield(env, policy, count=count, allowance=allowance, logging=logging)
         super().__init__(env)
         self.intervention_penalty = intervention_penalty

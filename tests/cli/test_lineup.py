@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import agent_names
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.experiment import run_folder
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.lineup import LADDER, check_agents, choose_worlds, make_lineup
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield import HybridAgent
+from ethbrake_marl.shield import HybridAgent, StepShieldAgent
 
 SCENARIO = load_scenario("paper-random")
 
@@ -45,6 +45,18 @@ def test_lineup__the_hybrids_bound_and_count_are_as_asked(finished_run, spec, bo
     (agent,) = make_lineup([f"{spec}@{finished_run}"], SCENARIO, count="total").values()
     assert isinstance(agent, HybridAgent)
     assert (agent.bound, agent.count) == (bound, "total")
+
+
+def test_lineup__the_step_shield_by_its_spec_or_around_what_learned(finished_run):
+    spec = f"ppo@{finished_run}"
+    (step,) = make_lineup([f"step@{finished_run}"], SCENARIO, count="total").values()
+    lineup = make_lineup([spec, f"hybrid@{finished_run}", "coast"], SCENARIO, shield="step")
+    assert list(lineup) == [f"{spec}+step", f"hybrid@{finished_run}", "coast"]
+    assert [type(agent) for agent in (step, *lineup.values())][:3] == [StepShieldAgent, StepShieldAgent, HybridAgent]
+    (episode,) = make_lineup([spec], SCENARIO, shield="episode").values()
+    assert isinstance(episode, HybridAgent)
+    with pytest.raises(UnknownName, match="did you mean 'step'"):
+        make_lineup([spec], SCENARIO, shield="stap")
 
 
 def test_check_agents__a_constant_above_the_capacity_of_any_world_is_refused_before_the_work():

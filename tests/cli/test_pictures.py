@@ -26,7 +26,7 @@ def test_deceleration__writes_a_png_of_that_world(ethbrake, tmp_path):
     assert (tmp_path / "curve-0.png").read_bytes() != (tmp_path / "curve-5.png").read_bytes()
 
 
-@pytest.mark.parametrize("picture", ["criticality", "deceleration"])
+@pytest.mark.parametrize("picture", ["criticality", "deceleration", "shield"])
 @pytest.mark.parametrize("name", ["map.pdf", "map", "map.png.svg"])
 def test_picture__only_png_is_written(ethbrake, tmp_path, picture, name):
     answer = ethbrake("picture", picture, "--output", tmp_path / name)
@@ -35,11 +35,11 @@ def test_picture__only_png_is_written(ethbrake, tmp_path, picture, name):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("picture", ["criticality", "deceleration"])
+@pytest.mark.parametrize("picture", ["criticality", "deceleration", "shield"])
 def test_picture__overwrites_only_by_force(ethbrake, tmp_path, picture):
     out = tmp_path / "map.png"
     out.write_bytes(b"mine")
-    more = ("--cells", "2") if picture == "criticality" else ()
+    more = {"criticality": ("--cells", "2"), "deceleration": (), "shield": ("--episodes", "3")}[picture]
     answer = ethbrake("picture", picture, *more, "--output", out)
     assert (answer.status, out.read_bytes()) == (2, b"mine")
     assert "--force" in answer.err

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,9 +27,13 @@ def worlds(n, vehicles):
     return advance(start, -4.0, until_s=rng.uniform(0.5, 3.0, n))[0]
 
 
+@pytest.mark.parametrize("told", [False, True])
 @pytest.mark.parametrize(("n", "vehicles"), [(1, 2), (1, 3), (40, 3), (7, 6)])
-def test_unpack__gives_back_every_bit_in_its_own_memory(n, vehicles):
+def test_unpack__gives_back_every_bit_in_its_own_memory(n, vehicles, told):
     given = worlds(n, vehicles)
+    if told:  # when each vehicle has the news of each other one
+        news = np.arange(float(n * vehicles**2)).reshape(n, -1)
+        given = replace(given, vehicles=replace(given.vehicles, known_from_s=news))
     rows = pack(given)
     back = unpack(rows)
     rows.state[:], rows.params[:] = -1.0, -1.0

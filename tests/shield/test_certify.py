@@ -61,8 +61,10 @@ def test_by_hand__latency_counts():
 
 
 def test_by_hand__a_pair_counts_once_for_the_first_impact_and_each_time_for_the_total():
-    worlds = make_worlds([[1.0]], [[0.0, 10.0]], braking_capacity_mps2=[[8.0, 1.0]], driving_capacity_mps2=0.0, latency_s=0.0,
-                         mass_t=1.0, restitution=0.5)  # fmt: skip
+    worlds = make_worlds(
+        [[1.0]], [[0.0, 10.0]], braking_capacity_mps2=[[8.0, 1.0]], driving_capacity_mps2=0.0, latency_s=0.0,
+        mass_t=1.0, restitution=0.5,
+    )  # fmt: skip
     plan = np.zeros((1, STEPS))
     plan[0, :5] = -1.0
     harm = {}

@@ -35,7 +35,6 @@ EQUIVALENT: dict[str, str] = {
     "segment.py: 0.0 -> 1.0 in `0.0` (20)": UNUSED_FIRST,
     "segment.py: Gt -> GtE in `i > 0` (1)": "nothing in front is infinitely fast: vehicle 0 never closes",
     "segment.py: `table[CONTACT_SPEED, i] = 0.0` removed (1)": "every segment ends with 0 there: an impact uses it up",
-    "segment.py: LtE -> Lt in `table[ONSET, i] <= 0.0` (1)": "the onset then is an event of no length: no bit moves",
     "segment.py: 0.0 -> 1.0 in `0.0` (7)": "where the contact time is infinite, `move` puts the speed to 0",
     "segment.py: Gt -> GtE in `first > 0` (1)": "index -1 is the column behind the last pair, always 0",
     "advance.py: 0 -> 1 in `0` (2)": "all of the arrays have as many rows as the first one",
@@ -72,6 +71,7 @@ EQUIVALENT: dict[str, str] = {
     "sampled.py: 1.0 -> 2.0 in `1.0` (2)": MARK + ": below 0",
     "parallel.py: Sub -> Add in `parts - 1` (1)": "a pool starts a thread for a task at most, and gets parts - 1 tasks",
     "parallel.py: `Result = TypeVar('Result')` removed (1)": "only the type checker, which finds it, uses the name",
-    "packed.py: Sub -> Add in `params.shape[1] - 1` (1)": "floor division by 5 gives the same for 5 N + 1 - 1 and + 1",
+    "packed.py: 4 -> 5 in `4` (1)": "floor division by 8 gives N for 8 N (4 more than the columns) and for 8 N + 1",
+    "packed.py: 3 -> 4 in `3` (1)": "one more group of columns, which nobody takes",
     "harm.py: LtE -> Lt in `front_mass <= rear_mass` (1)": "equal masses: half of the harm by either branch",
 }

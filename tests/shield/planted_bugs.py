@@ -1,0 +1,112 @@
+"""Ten bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
+
+``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
+applied to a temporary copy. There ``test_certify`` and ``test_guard`` run with compilation switched off, and where they
+stay green, the other tests of the shield, compiled. Those two must be green without any bug.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from tests.physics.programme.mutation import ROOT
+from tests.physics.programme.planted_bugs import Patch, red_with
+
+QUICK = ("tests/shield/test_certify.py", "tests/shield/test_guard.py")
+WHOLE = ("tests/shield/test_step.py", "tests/shield/test_faces.py")
+KERNEL, CERTIFY, GUARD = (f"ethbrake_marl/shield/{name}.py" for name in ("certify_kernel", "certify", "guard"))
+
+BUGS: dict[str, tuple[Patch, ...]] = {
+    "pairwise bound used as if it were coupled": (
+        Patch(
+            GUARD,
+            "harm, alone = plan_harm(running, plan), np.full(worlds.n, np.inf)",
+            "harm, alone = plan_harm(running, plan) / 2.0, np.full(worlds.n, np.inf)",
+        ),
+    ),
+    "the budget may rise": (
+        Patch(
+            KERNEL, "    if value <= budget:\n        plan[step]", "    if value <= 2.0 * budget:\n        plan[step]"
+        ),
+    ),
+    "clipped after certifying": (
+        Patch(KERNEL, "min(max(proposed, -1.0), 1.0) if usable", "max(proposed, -1e300) if usable"),
+        Patch(
+            CERTIFY, "applied, bound, margin = out[:, 0].copy(),", "applied, bound, margin = np.clip(out[:, 0], -1, 1),"
+        ),
+    ),
+    "an impact counted again where the pair was hit before": (
+        Patch(KERNEL, "    save(table, harm, after)\n", "    table[HIT, 0] = 0.0\n    save(table, harm, after)\n"),
+        Patch(KERNEL, "import COMMAND, DONE, LIMIT,", "import COMMAND, DONE, HIT, LIMIT,"),
+    ),
+    "harm so far forgotten": (Patch(KERNEL, "    save(table, harm, after)\n", "    save(table, harm * 0.0, after)\n"),),
+    "latency ignored": (
+        Patch(
+            GUARD,
+            "problem = profile_problem(\n            worlds,",
+            "problem = profile_problem(\n            _at_once(worlds),",
+        ),
+        Patch(
+            GUARD,
+            "def rolled_out(",
+            "def _at_once(worlds: Worlds) -> Worlds:\n    v = worlds.vehicles\n"
+            "    return replace(worlds, vehicles=replace(v, latency_s=0.0 * v.latency_s))\n\n\ndef rolled_out(",
+        ),
+    ),
+    "the rest of the plan begins one decision late": (
+        Patch(
+            KERNEL,
+            "value = follow_plan(table, harm, latency, clock, vehicle, bounds, after, step + 1, plan, budget)",
+            "value = follow_plan(table, harm, latency, clock, vehicle, bounds, after, step + 2, plan, budget)",
+        ),
+    ),
+    "the plan of a rejected proposal is kept": (
+        Patch(
+            KERNEL,
+            "        if value <= budget:\n            plan[:] = room[0]",
+            "        if value < math.inf:\n            plan[:] = room[0]",
+        ),
+        Patch(KERNEL, "plan, budget)\n        reason", "plan, math.inf)\n        reason"),
+        Patch(KERNEL, "constants, value, budget, room[0]", "constants, value, math.inf, room[0]"),
+    ),
+    "a constant counts without being certified step by step": (
+        Patch(
+            KERNEL,
+            "certified = follow_plan(table, harm, latency, clock, vehicle, bounds, state, step, trial, most)",
+            "certified = least",
+        ),
+    ),
+    "a surprise is not flagged": (Patch(GUARD, "if not surprising.any():", "if surprising.any() or True:"),),
+}
+
+
+def main() -> int:
+    """Plant every bug and print which test finds it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", default="", help="only bugs whose name contains this")
+    parser.add_argument("--quick", action="store_true", help="only the tests that need no compilation")
+    given = parser.parse_args()
+    for name, patches in BUGS.items():
+        for patch in patches:
+            count = (ROOT / patch.file).read_text("utf-8").count(patch.old)
+            if count != 1:
+                print(f"ERROR  {name}: {patch.file} holds {patch.old!r} {count} times, not once")
+                return 1
+    if red := red_with((), QUICK, compiled=False):
+        print(f"ERROR  red without any bug: {red}")
+        return 1
+    names = [name for name in BUGS if given.only in name]
+    found = 0
+    for name in names:
+        red = red_with(BUGS[name], QUICK, compiled=False)
+        if not red and not given.quick:
+            red = red_with(BUGS[name], WHOLE, compiled=True)
+        found += bool(red)
+        print(f"{'found ' if red else 'MISSED'}  {name:55s} {red.removeprefix('tests/')}", flush=True)
+    print(f"planted shield bugs: {found}/{len(names)} found: {'PASS' if found == len(names) else 'FAIL'}")
+    return 0 if found == len(names) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
