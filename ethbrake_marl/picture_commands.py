@@ -117,8 +117,8 @@ def picture_shield(
             curves.append((name, operating_curve(worlds, agent, chosen, chosen.learners[0], ALLOWANCES, count=count)))
             bars.show(name, episodes, episodes)
     caption = (
-        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; step shield, {count} harm. Beside each"
-        " point: what certificates may reach above the bound (m²/s²)."
+        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; step shield, {count} harm. Beside the"
+        " points: what certificates may reach above the bound (m²/s²)."
     )
     write_output(target, png_bytes(operating_figure(curves, caption=caption)), force=force)
     say(f"picture: {target}")

@@ -11,9 +11,11 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.figure_style import add_caption, new_figure, series_style, style_axes
 from ethbrake_marl.shield.forensics import OperatingPoint
 
+LABELLED = 0.01  # points with fewer interventions lie on top of each other: they get no label
+
 
 def operating_figure(curves: Sequence[tuple[str, Sequence[OperatingPoint]]], *, caption: str = "") -> Figure:
-    """One curve per policy, from the strict shield (allowance 0) to none; each point says its allowance.
+    """One curve per policy, from the strict shield (allowance 0) to none; points off the axis say their allowance.
 
     Raises ``InvalidInput`` without a point.
     """
@@ -25,7 +27,7 @@ def operating_figure(curves: Sequence[tuple[str, Sequence[OperatingPoint]]], *, 
     for number, (name, points) in enumerate(curves):
         rates, harms = [p.intervention_rate for p in points], [p.harm for p in points]
         axes.plot(rates, harms, label=name, **series_style(number))  # type: ignore[arg-type]  # a style's values
-        for point in points:
+        for point in (p for p in points if p.intervention_rate >= LABELLED):
             axes.annotate(
                 f"{point.allowance:g}", (point.intervention_rate, point.harm), fontsize=7.5, xytext=(4, 4),
                 textcoords="offset points",

@@ -9,6 +9,7 @@ from ethbrake_marl.agents.coupled import optimise_coupled
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.operating_figure import operating_figure
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent, StepShield, StepShieldAgent
 from ethbrake_marl.shield.certify import REASONS
@@ -149,6 +150,11 @@ def test_operating_curve__fewer_interventions_cost_harm():
     rates, harms = [p.intervention_rate for p in points], [p.harm for p in points]
     assert rates == sorted(rates, reverse=True) and rates[-1] == 0.0
     assert harms == sorted(harms) and harms[0] < harms[-1]
+    figure = operating_figure([("coast", points)])
+    (line_drawn,) = figure.axes[0].get_lines()
+    assert line_drawn.get_xdata().tolist() == rates
+    with pytest.raises(InvalidInput, match="at least one point"):
+        operating_figure([])
 
 
 def test_review__without_a_log_is_refused():
