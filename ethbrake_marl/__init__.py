@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from ethbrake_marl.envs.registration import register_environments
 
 if TYPE_CHECKING:
-    from ethbrake_marl.agents.registry import make_agent as make_agent
     from ethbrake_marl.engine import Engine as Engine
     from ethbrake_marl.envs.parallel import EthBrakeParallelEnv as EthBrakeParallelEnv
     from ethbrake_marl.envs.parallel import env as env
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError
     from ethbrake_marl.evaluation import evaluate as evaluate
     from ethbrake_marl.learning.bundle import load_policy as load_policy
+    from ethbrake_marl.lineup import make_agent as make_agent
     from ethbrake_marl.observations import ObservationSpec as ObservationSpec
     from ethbrake_marl.physics import Worlds as Worlds
     from ethbrake_marl.physics import advance as advance

@@ -206,7 +206,14 @@ def _config(recipe: TrainingRecipe, scenario: Scenario) -> dict[str, Any]:
 
 @contextmanager
 def _environment(recipe: TrainingRecipe, scenario: Scenario) -> Iterator[VecEnv]:
-    environment = make_sb3_vec_env(scenario, recipe.n_envs, recipe.seed, reward=recipe.reward, observation=OBSERVATION, horizon_is_end=recipe.horizon_is_end)
+    environment = make_sb3_vec_env(
+        scenario,
+        recipe.n_envs,
+        recipe.seed,
+        reward=recipe.reward,
+        observation=OBSERVATION,
+        horizon_is_end=recipe.horizon_is_end,
+    )
     try:
         yield environment
     finally:

@@ -77,7 +77,7 @@ def test_load_recipe__the_papers_table_of_sac() -> None:
     [
         ({"ent_coef": "automatic"}, r"ent_coef = automatic: must be auto or a number of at least 0"),
         ({"ent_coef": -1}, r"ent_coef = -1: must be auto or a number of at least 0"),
-        ({"buffer_size": 63}, r"buffer_size = 63: must be at least n_envs = 64"),
+        ({"buffer_size": 63}, r"buffer_size = 63: must be at least n_envs = 128"),
         ({"n_steps": 3}, r"n_steps: unknown key"),
         ({"tau": 0.0}, r"tau = 0.*: must be greater than 0"),
         ({"algorithm": "td3"}, r"algorithm = td3: must be ppo or sac"),
