@@ -11,7 +11,8 @@ import numpy as np
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.registry import Factory, agent_names, make_agent, register_agent
+from ethbrake_marl.agents.registry import Factory, agent_names, register_agent
+from ethbrake_marl.agents.registry import make_agent as make_agent  # the public one: here all agents are registered
 from ethbrake_marl.agents.rehearsed import Rehearsed
 from ethbrake_marl.analysis.best_harm_shipped import make_best_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name

@@ -87,7 +87,7 @@ def test_shipped_files__round_trip(path):
 def test_unknown_name__is_suggested():
     with pytest.raises(UnknownName, match="unknown scenario 'paper-randon'; did you mean 'paper-random'"):
         load_scenario("paper-randon")
-    with pytest.raises(UnknownName, match="known: cooperation-0-sensors, .*paper-delay-high, "):
+    with pytest.raises(UnknownName, match=r"known: cooperation-0-sensors, .*paper-delay-high, "):
         load_scenario("zzz")
 
 
