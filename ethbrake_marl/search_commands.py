@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shlex
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.analysis.best_harm import BUDGET, search_list
 from ethbrake_marl.analysis.best_harm_table import BestHarmTable, load_table, save_table
 from ethbrake_marl.analysis.driven_profiles import fold_agent
@@ -22,7 +23,7 @@ from ethbrake_marl.evaluation.regret import limits_do_not_apply
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable, make_lineup
 from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.terminal import interruptible, progress_bars, say, write_json
 
 TABLE_ENDING = ".npz"
@@ -72,23 +73,10 @@ def best_harm_command(
     specs = _agent_specs(agents, chosen, controlled)
     drivers = {spec: {each: make_lineup([spec], chosen, count=each)[spec] for each in counts} for spec in specs}
     parts = None if output is None else output.with_name(f".{output.name}.parts")
-    kept = "nothing was written" if parts is None else f"{parts} keeps what was found; the same command goes on"
-    with interruptible(kept), progress_bars() as bars:
-        table = search_list(
-            chosen,
-            sample,
-            counts=counts,
-            vehicles=controlled,
-            budget=budget,
-            seed=search_seed,
-            threads=threads,
-            known=known,
-            chunks=parts,
-            on_progress=lambda done, total: bars.show("best harm", done, total),
-        )
-        for k, (spec, by_count) in enumerate(drivers.items()):
-            bars.show("agents", k, len(drivers))
-            table = fold_agent(table, chosen, sample.worlds, spec, by_count)
+    table = _search(
+        chosen, sample, parts, drivers, counts=counts, vehicles=controlled, budget=budget, seed=search_seed,
+        threads=threads, known=known,
+    )  # fmt: skip
     text = _command_text(scenario, episodes, seed, count, names, budget, search_seed, start, specs)
     table = replace(table, header={**table.header, "episodes": episodes, "list_seed": seed, "command": text})
     if output is not None and parts is not None:
@@ -98,6 +86,29 @@ def best_harm_command(
     _show(
         {**best_harm_figures(table), **_proven(chosen, sample.worlds, controlled or chosen.learners)}, as_json=as_json
     )
+
+
+def _search(
+    scenario: Scenario,
+    sample: Sample,
+    parts: Path | None,
+    drivers: Mapping[str, Mapping[HarmCount, Agent]],
+    **question: Any,
+) -> BestHarmTable:
+    """``search_list`` with a bar, keeping what was found in the folder ``parts``; then the agents drive."""
+    kept = "nothing was written" if parts is None else f"{parts} keeps what was found; the same command goes on"
+    with interruptible(kept), progress_bars() as bars:
+        table = search_list(
+            scenario,
+            sample,
+            chunks=parts,
+            on_progress=lambda done, total: bars.show("best harm", done, total),
+            **question,
+        )
+        for k, (spec, by_count) in enumerate(drivers.items()):
+            bars.show("agents", k, len(drivers))
+            table = fold_agent(table, scenario, sample.worlds, spec, by_count)
+    return table
 
 
 def _agent_specs(agents: str | None, scenario: Scenario, controlled: Sequence[int] | None) -> list[str]:
