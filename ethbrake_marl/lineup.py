@@ -163,7 +163,7 @@ def _agent(spec: str, scenario: Scenario, count: HarmCount) -> Agent:
     if name in _OF_A_POLICY:
         return _agent_of_a_policy(spec, scenario, count)
     if name not in agent_names():
-        raise unknown_name("agent", name, [*agent_names(), *_OF_A_POLICY, _LADDER_SPEC])
+        raise unknown_name("agent", name, {*agent_names(), *_OF_A_POLICY, _LADDER_SPEC})
     return make_agent(spec, count=count, horizon_s=scenario.horizon_s)
 
 
