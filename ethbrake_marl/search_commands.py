@@ -67,11 +67,14 @@ def best_harm_command(
     chosen = load_runnable(scenario)
     names = None if vehicles is None else [name.strip() for name in vehicles.split(",")]
     controlled = None if names is None else chosen.with_learners(names).learners
+    if controlled is None and not chosen.learners:
+        raise InvalidInput(f"scenario {chosen.name!r} has no learner; say who is controlled: --vehicles vehicle_2")
     known = None if start is None else load_table(start)
     sample = chosen.sample(episodes, seed)
     counts: Sequence[HarmCount] = COUNTS if count is None else (count,)
     specs = _agent_specs(agents, chosen, controlled)
-    drivers = {spec: {each: make_lineup([spec], chosen, count=each)[spec] for each in counts} for spec in specs}
+    lineups = {each: make_lineup(specs, chosen, count=each) for each in counts}
+    drivers = {name: {each: lineups[each][name] for each in counts} for name in lineups[counts[0]]}
     parts = None if output is None else output.with_name(f".{output.name}.parts")
     table = _search(
         chosen, sample, parts, drivers, counts=counts, vehicles=controlled, budget=budget, seed=search_seed,

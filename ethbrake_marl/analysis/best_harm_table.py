@@ -155,7 +155,7 @@ def load_table(path: Path) -> BestHarmTable:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         if isinstance(error, CorruptBundle):
             raise
-        raise CorruptBundle(f"{path}: is not a table of best known harm ({error})") from error
+        raise CorruptBundle(f"{path}: is not a table of best known harm") from error
 
 
 def _read_best(arrays: Mapping[str, NDArray[Any]], count: HarmCount) -> Best:

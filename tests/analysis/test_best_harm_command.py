@@ -9,6 +9,7 @@ from ethbrake_marl.analysis.best_harm import realised_harm
 from ethbrake_marl.analysis.best_harm_shipped import TABLES
 from ethbrake_marl.analysis.best_harm_table import load_table
 from ethbrake_marl.cli import run_command
+from ethbrake_marl.lineup import LADDER
 from ethbrake_marl.scenario import load_scenario
 
 SMALL = ["best-harm", "--scenario", "paper-random", "--episodes", "4", "--budget", "60", "--threads", "1"]
@@ -60,6 +61,13 @@ def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path, capsys: 
         assert again.tolist() == after.best[count].harm.tolist()
 
 
+def test_best_harm_command__lets_the_whole_ladder_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "t.npz"
+    small = ["best-harm", "--episodes", "3", "--budget", "60", "--threads", "1", "--count", "total"]
+    assert run_command([*small, "--agents", "ladder", "--output", str(file)]) == 0
+    assert list(load_table(file).header["lowered_by"]) == list(LADDER)
+
+
 @pytest.mark.parametrize(
     ("more", "fragment"),
     [
@@ -74,6 +82,8 @@ def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path, capsys: 
         (["--vehicles", ""], "unknown vehicle ''"),
         (["--vehicles", "vehicle_2,vehicle_2"], "listed twice"),
         (["--count", "some"], "some"),
+        (["--scenario", "cooperation-0-sensors"], "has no learner; say who is controlled"),
+        (["--agents", "planner,planner"], "given twice"),
         (["--agents", "plannr"], "unknown agent 'plannr'"),
         (["--agents", "planner", "--vehicles", "vehicle_3"], "leave out --vehicles"),
         (["--episodes", "0"], "n = 0"),
