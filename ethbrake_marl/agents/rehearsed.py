@@ -1,4 +1,4 @@
-"""A policy that rehearses: at the alert it tries small deviations from itself in the engine, and drives the best."""
+"""A policy that rehearses: at the alert it tries deviations from itself in the engine, and drives the best it found."""
 
 from __future__ import annotations
 
@@ -7,68 +7,95 @@ import copy
 import numpy as np
 
 from ethbrake_marl.agents.driving import drive, introduce, scripted
-from ethbrake_marl.agents.protocol import Agent, place
+from ethbrake_marl.agents.protocol import Agent, Divisible, check_agent, place, recall
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 
-REHEARSALS = 32  # deviations tried beside the policy as it is
-SEGMENT_S = 0.8  # a deviation is constant this long
-SIZES = (0.05, 0.15, 0.4)  # largest deviations, as shares of the braking capacity, in turn
+REHEARSALS = 32  # deviations tried in each round
+ROUNDS = 6  # each starts from the best of the rounds before
+SEGMENT_S = 0.4  # a deviation changes at multiples of this time
+HOLDS = (2, 3, 6)  # segments for which it stays the same, in turn
+SIZES = (0.05, 0.15, 0.4)  # largest change in one round, as shares of the braking capacity, in turn
 _SEGMENTS = 64  # of different deviation; the last one goes on
+_BLOCK = 4096  # worlds rolled out together: bounds memory, changes no result
 
 
 class Rehearsed:
-    """Drives by ``policy`` plus the deviation that did the least harm when all of them were rolled out at the alert.
+    """Drives by ``policy`` plus the deviation that did the least harm when many were rolled out at the alert.
 
-    Deviation 0 is none; each of the other ``rehearsals`` is a fixed sequence of small accelerations, the same in every
-    world. The policy goes on reacting to what it observes. ``predicted_harm`` [n] is the least harm of the rollouts
-    (m2/s2, under ``count``), never above the policy's own, and what is realised if the other vehicles follow their
-    scripts. Equal harms: the smaller number, so a policy that cannot be bettered drives as it is. A world's choice does
-    not depend on its batch. Raises ``InvalidInput`` for what is not an agent, fewer than 1 rehearsals, an unknown
-    count.
+    A deviation is a sequence of accelerations added to what the policy does; the policy goes on reacting to what it
+    observes. The first one is none. In each of ``rounds`` rounds ``rehearsals`` fixed changes, the same in every world,
+    are added to the best deviation so far, and the least harm of all is kept: a random local search around the policy.
+    ``predicted_harm`` [n] is that least harm (m2/s2, under ``count``), never above the policy's own, and what is
+    realised if the other vehicles follow their scripts. Equal harms: the earlier one, so a policy that cannot be
+    bettered drives as it is. A world's choice does not depend on its batch. Raises ``InvalidInput`` for what is not an
+    agent, numbers of rehearsals or rounds outside 1 to 10,000, an unknown count.
     """
 
     def __init__(
-        self, policy: Agent, scenario: Scenario, *, rehearsals: int = REHEARSALS, count: HarmCount = "first"
+        self,
+        policy: Agent,
+        scenario: Scenario,
+        *,
+        rehearsals: int = REHEARSALS,
+        rounds: int = ROUNDS,
+        count: HarmCount = "first",
     ) -> None:
-        if not isinstance(policy, Agent):
-            raise InvalidInput(
-                f"rehearsed: {policy!r} is not an agent; load_policy(path) or make_agent(name) makes one"
-            )
-        if isinstance(rehearsals, bool) or not isinstance(rehearsals, int) or not 1 <= rehearsals <= 10_000:
-            raise InvalidInput(f"rehearsed: rehearsals = {rehearsals!r}: must be a whole number in 1..10000")
+        check_agent(policy, "rehearsed")
+        for name, number in (("rehearsals", rehearsals), ("rounds", rounds)):
+            if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= 10_000:
+                raise InvalidInput(f"rehearsed: {name} = {number!r}: must be a whole number in 1..10000")
         check_count(count)
         self.name = f"rehearsed({policy.name})"
         self.policy = policy
         self.scenario = scenario
+        self.rehearsals = rehearsals
+        self.rounds = rounds
         self.count: HarmCount = count
         self.predicted_harm: Floats = np.empty(0)
-        self._chosen: Floats = np.empty(0)  # [n] number of the deviation that is driven
-        self._deviations = deviations(rehearsals)
+        self._deviation: Floats = np.empty((0, _SEGMENTS))  # [n, segments] that is driven
         self._stage = copy.deepcopy(policy)  # rehearsing must not disturb the policy's memory of running episodes
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Rehearse for these rows; ``worlds`` holds those rows only, at the alert."""
-        harm = np.stack([self._rehearse(worlds, vehicle, k) for k in range(len(self._deviations))])
-        best = harm.argmin(axis=0)
+        best = np.zeros((worlds.n, _SEGMENTS))
+        least = self._harm(worlds, vehicle, best)
+        for number in range(self.rounds):
+            change = changes(number, self.rehearsals)
+            open_rows = np.flatnonzero(least > 0.0)
+            step = max(1, _BLOCK // self.rehearsals)
+            for some in (open_rows[i : i + step] for i in range(0, len(open_rows), step)):
+                tried = best[some, np.newaxis] + change  # [worlds, rehearsals, segments]
+                harm = self._harm(worlds.take(np.repeat(some, len(change))), vehicle, tried.reshape(-1, _SEGMENTS))
+                harm = harm.reshape(len(some), len(change))
+                chosen = harm.argmin(axis=1)
+                better = harm[np.arange(len(some)), chosen] < least[some]
+                best[some[better]] = tried[better, chosen[better]]
+                least[some[better]] = harm[better, chosen[better]]
         introduce(self.policy, vehicle, scripted(self.scenario, but=vehicle))
         self.policy.begin(worlds, vehicle, rows)
-        self._chosen = place(self._chosen, rows, best.astype(np.float64))
-        self.predicted_harm = place(self.predicted_harm, rows, harm[best, np.arange(worlds.n)])
+        self._deviation = place(self._deviation, rows, best)
+        self.predicted_harm = place(self.predicted_harm, rows, least)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """Wanted signed acceleration, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
-        if not (len(self._chosen) >= worlds.n and np.isfinite(self._chosen[: worlds.n]).all()):
-            raise InvalidInput(f"agent {self.name!r}: act on {worlds.n} worlds, but begin was not called for each")
-        chosen = self._deviations[self._chosen[: worlds.n].astype(np.int64)]
-        return deviated(self.policy.act(worlds, vehicle), chosen, worlds, vehicle)
+        deviation = recall(self._deviation, worlds.n, self.name)
+        return deviated(self.policy.act(worlds, vehicle), deviation, worlds, vehicle)
 
-    def _rehearse(self, worlds: Worlds, vehicle: int, number: int) -> Floats:
-        """Harm of one deviation, [n]."""
-        chosen = np.broadcast_to(self._deviations[number], (worlds.n, _SEGMENTS))
-        return drive(worlds, _Deviating(self._stage, chosen), self.scenario, vehicle).ledger.world_harm(self.count)
+    def take(self, rows: Ints) -> Rehearsed:
+        """A copy that drives on in some rows of its batch only; raises ``InvalidInput`` if the policy cannot."""
+        if not isinstance(self.policy, Divisible):
+            raise InvalidInput(f"{self.name}: {self.policy.name} has no take(rows), so it cannot go on in some worlds")
+        part = copy.copy(self)
+        part.policy = self.policy.take(rows)
+        part._deviation, part.predicted_harm = self._deviation[rows], self.predicted_harm[rows]
+        return part
+
+    def _harm(self, worlds: Worlds, vehicle: int, deviation: Floats) -> Floats:
+        """Harm under one deviation per world, [n]."""
+        return drive(worlds, _Deviating(self._stage, deviation), self.scenario, vehicle).ledger.world_harm(self.count)
 
 
 class _Deviating:
@@ -87,15 +114,18 @@ class _Deviating:
         return deviated(self.policy.act(worlds, vehicle), self.deviation, worlds, vehicle)
 
 
-def deviations(rehearsals: int) -> Floats:
-    """No deviation, then ``rehearsals`` sequences, as shares of the braking capacity: [1 + rehearsals, segments].
+def changes(number: int, rehearsals: int) -> Floats:
+    """What round ``number`` adds to a deviation, as shares of the braking capacity: [rehearsals, segments].
 
-    Uniform in plus or minus one of ``SIZES``; the numbers are Philox's integers, the same for ever.
+    Change k is constant over ``HOLDS`` segments and uniform in plus or minus one of ``SIZES``, in turn; the numbers are
+    Philox's integers with the round as their key, the same for ever.
     """
-    integers = np.asarray(np.random.Philox(key=0).random_raw(rehearsals * _SEGMENTS)).reshape(rehearsals, _SEGMENTS)
-    share = (integers >> np.uint64(11)).astype(np.float64) * 2.0**-52 - 1.0
-    size = np.array(SIZES)[np.arange(rehearsals) % len(SIZES), np.newaxis]
-    return np.concatenate([np.zeros((1, _SEGMENTS)), size * share])
+    integers = np.asarray(np.random.Philox(key=number).random_raw(rehearsals * _SEGMENTS))
+    share = (integers >> np.uint64(11)).astype(np.float64).reshape(rehearsals, _SEGMENTS) * 2.0**-52 - 1.0
+    kind = np.arange(rehearsals)
+    hold = np.array(HOLDS)[(kind // len(SIZES)) % len(HOLDS), np.newaxis]
+    held = np.take_along_axis(share, np.arange(_SEGMENTS) // hold, axis=1)
+    return np.array(SIZES)[kind % len(SIZES), np.newaxis] * held
 
 
 def deviated(command_mps2: Floats, deviation: Floats, worlds: Worlds, vehicle: int) -> Floats:

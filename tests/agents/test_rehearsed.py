@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents import rehearsed
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rehearsed import SIZES, Rehearsed, deviated, deviations
+from ethbrake_marl.agents.rehearsed import HOLDS, SIZES, Rehearsed, changes, deviated
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.lineup import make_agent, make_lineup
 from ethbrake_marl.scenario import load_scenario
 
 SCENARIO = load_scenario("paper-random")
@@ -29,8 +30,20 @@ def test_rehearsed__is_never_worse_and_as_predicted(count):
 
 
 def test_rehearsed__of_more_is_never_worse():
-    few, many = (harm(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=k)) for k in (3, 9))
+    few, many = (harm(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=k, rounds=1)) for k in (3, 9))
     assert (many <= few).all() and (many < few).any()
+
+
+def test_rehearsed__of_more_rounds_is_never_worse():
+    few, many = (harm(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=5, rounds=r)) for r in (1, 3))
+    assert (many <= few).all() and (many < few).any()
+
+
+def test_rehearsed__does_not_depend_on_how_the_trials_are_cut(monkeypatch):
+    whole = harm(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=5, rounds=2))
+    monkeypatch.setattr(rehearsed, "_BLOCK", 12)
+    cut = harm(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=5, rounds=2))
+    assert cut.tolist() == whole.tolist()
 
 
 def test_rehearsed__where_nothing_is_better_drives_as_the_policy_does():
@@ -55,13 +68,15 @@ def test_begin__of_some_rows_leaves_the_others_alone():
     assert np.delete(agent.predicted_harm, 2).tolist() == np.delete(before, 2).tolist()
 
 
-def test_deviations__begin_with_none_and_keep_their_sizes():
-    table = deviations(6)
-    assert (table[0] == 0.0).all() and table.shape[0] == 7
-    for k in range(6):
-        largest = np.abs(table[k + 1]).max()
-        assert 0.8 * SIZES[k % 3] < largest <= SIZES[k % 3]
-    assert table[:4].tolist() == deviations(3).tolist()
+def test_changes__keep_their_sizes_and_hold():
+    table = changes(0, 18)
+    assert table.shape == (18, 64)
+    for k, change in enumerate(table):
+        size, hold = SIZES[k % 3], HOLDS[k // 3 % 3]
+        assert 0.5 * size < np.abs(change).max() <= size
+        assert (change[:hold] == change[0]).all() and change[hold] != change[0]
+    assert table[:4].tolist() == changes(0, 4).tolist()
+    assert table.tolist() != changes(1, 18).tolist()
 
 
 def test_deviated__stays_within_the_capacities():
@@ -71,10 +86,24 @@ def test_deviated__stays_within_the_capacities():
     assert set(low.tolist()) == {-7.0} and set(high.tolist()) == {7.0}
 
 
-@pytest.mark.parametrize("rehearsals", [0, -1, True, 2.0, 10_001])
-def test_rehearsed__refuses_a_number_that_is_none(rehearsals):
-    with pytest.raises(InvalidInput, match=r"rehearsals = .*whole number in 1\.\.10000"):
-        Rehearsed(make_agent("coast"), SCENARIO, rehearsals=rehearsals)
+@pytest.mark.parametrize("name", ["rehearsals", "rounds"])
+@pytest.mark.parametrize("number", [0, -1, True, 2.0, 10_001])
+def test_rehearsed__refuses_a_number_that_is_none(name, number):
+    with pytest.raises(InvalidInput, match=rf"{name} = .*whole number in 1\.\.10000"):
+        Rehearsed(make_agent("coast"), SCENARIO, **{name: number})
+
+
+def test_take__goes_on_in_some_worlds_only():
+    policy = make_lineup(["ppo@shipped"], SCENARIO)["ppo@shipped"]
+    agent = Rehearsed(policy, SCENARIO, rehearsals=3, rounds=1)
+    agent.begin(WORLDS, 1, np.arange(WORLDS.n))
+    rows = np.array([5, 90])
+    assert agent.take(rows).act(WORLDS.take(rows), 1).tolist() == agent.act(WORLDS, 1)[rows].tolist()
+
+
+def test_take__of_a_policy_that_cannot_is_refused():
+    with pytest.raises(InvalidInput, match=r"no take\(rows\)"):
+        Rehearsed(make_agent("coast"), SCENARIO).take(np.array([0]))
 
 
 def test_act__before_begin_is_refused():
