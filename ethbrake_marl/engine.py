@@ -16,19 +16,22 @@ from ethbrake_marl.actions import checked_action
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.objectives import objective_harm
-from ethbrake_marl.observations import Observations, ObservationSpec, observe_packed, scaling
+from ethbrake_marl.observations import Observations, ObservationSpec, observation_for, observe_packed, scaling
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.packed import (
     NO_ROWS,
     Packed,
     command_at,
     gap_at,
+    has_hazard,
+    hazard_ledger_columns,
     ledger_columns,
     pack,
     params_at,
     previous_at,
     speed_at,
     unpack,
+    with_hazard_columns,
 )
 from ethbrake_marl.physics.segment import DONE
 from ethbrake_marl.rewards import (
@@ -90,7 +93,7 @@ class Engine:
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
         self.reward, self._objectives = resolved_objective(reward_params(reward), scenario.objective, scenario.vehicles)
-        self.observation = observation or ObservationSpec()
+        self.observation = observation or observation_for(scenario)
         self._scaling = scaling(self.observation)
         self.on_begin: list[OnBegin] = []
         self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
@@ -130,7 +133,7 @@ class Engine:
         vehicles = self.scenario.vehicles
         first, total, count = ledger_columns(self._state, vehicles)
         mass = self._params[:, params_at(3, vehicles) : params_at(4, vehicles)].copy()
-        return Ledger(first, total, count, mass)
+        return Ledger(first, total, count, *hazard_ledger_columns(self._state, vehicles), mass)
 
     @property
     def known_from_s(self) -> Floats:
@@ -157,7 +160,8 @@ class Engine:
         start = stream.take(self.n) if worlds is None else stream.prepare(worlds)
         before = self.__dict__.copy()
         self._stream = stream
-        self._state, self._params = start.packed.state.copy(), start.packed.params.copy()
+        self._hazard = self.scenario.hazard_gap_m is not None or has_hazard(start.packed.state, self.scenario.vehicles)
+        self._state, self._params = self._kept(start.packed.state).copy(), start.packed.params.copy()
         self._clock, self._wanted = start.clock.copy(), start.wanted.copy()
         self._potential = np.zeros(self._wanted.shape)
         try:
@@ -186,9 +190,13 @@ class Engine:
         state, params = start.packed
         if params.shape[1] < self._params.shape[1]:  # worlds that were given have news by link, those of the stream not
             params = pack(told_by_link(unpack(start.packed))).params
-        self._state[rows], self._params[rows] = state, params
+        self._state[rows], self._params[rows] = self._kept(state), params
         self._clock[rows], self._wanted[rows] = start.clock, start.wanted
         self._begin(rows, start)
+
+    def _kept(self, state: Floats) -> Floats:
+        """Rows as wide as they are kept: with an obstacle's columns if the stream or the given worlds have one."""
+        return with_hazard_columns(state, self.scenario.vehicles) if self._hazard else state
 
     def observe(self, vehicle: int) -> Observations:
         """Current observation of one vehicle, [n, F]."""
@@ -287,8 +295,8 @@ class Engine:
     def _potentials(self, worlds: Worlds) -> Floats:
         """Potential of every learner, 0 for other vehicles, [n, N]."""
         potentials = np.zeros(worlds.speeds_mps.shape)
-        for vehicle in self.learners:
-            potentials[:, vehicle] = potential(self.reward, worlds, vehicle, self.scenario.horizon_s)
+        shared = potential(self.reward, worlds, self.learners, self.scenario.horizon_s)
+        potentials[:, self._learner_index] = shared[:, np.newaxis]
         return potentials
 
     def _begin(self, rows: Ints, start: Start) -> None:
@@ -306,9 +314,9 @@ class Engine:
 
     def _begin_with_memory(self, rows: Ints, alert: Worlds, start_s: Floats) -> None:
         """Scripts with a memory act at the alert on the whole batch; then the new worlds move to the first decision."""
-        self._state[rows] = pack(alert).state
+        self._state[rows] = self._kept(pack(alert).state)
         worlds = self.worlds
         for vehicle, script in self._remembering.items():
             wanted = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
             self._wanted[rows, vehicle] = wanted[rows]
-        self._state[rows] = moved(alert, self._wanted[rows], start_s).state
+        self._state[rows] = self._kept(moved(alert, self._wanted[rows], start_s).state)

@@ -3,10 +3,14 @@
 An observation is the vehicle's own features followed by those of its nearest neighbours, front ones first. Each
 feature is ``clip(value / scale, low, high)``. What this vehicle does not know, or a neighbour that is absent, reads 0
 with its ``known`` flag 0. There are no running statistics: an observation means the same in every run.
+
+Where an obstacle stands ahead of Vehicle 1 (``observation_for``), the vehicle's place in the line and what it knows of
+the obstacle follow. Vehicle 1 sees it; any other vehicle knows of it as soon as it has Vehicle 1's news.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
@@ -17,7 +21,18 @@ from numpy.typing import NDArray
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.packed import RESTITUTION, TIME, command_at, gap_at, pack, params_at, speed_at, vehicles_in
+from ethbrake_marl.physics.packed import (
+    RESTITUTION,
+    TIME,
+    command_at,
+    gap_at,
+    pack,
+    params_at,
+    speed_at,
+    state_width,
+    vehicles_in,
+)
+from ethbrake_marl.scenario import Scenario
 
 Observations = NDArray[np.float32]
 
@@ -63,21 +78,39 @@ NEIGHBOUR_FEATURES = (
     ),
 )
 
+ROLE_FEATURES = (
+    Feature("vehicles_ahead", "1", 1.0, 0.0, 2.0, "how many vehicles are ahead in the line; 2 stands for 2 or more"),
+    Feature("vehicles_behind", "1", 1.0, 0.0, 2.0, "how many are behind"),
+)
+HAZARD_FEATURES = (
+    Feature("known", "1", 1.0, 0.0, 1.0, "1 if there is an obstacle ahead of the line and this vehicle knows of it"),
+    Feature("gap", "m", 10.0, 0.0, 10.0, "free distance to it, vehicles between not counted as length"),
+    Feature("hit", "1", 1.0, 0.0, 1.0, "1 if Vehicle 1 has had an impact with it"),
+    Feature("stopping_margin", "m", 10.0, -15.0, 20.0, "distance left at rest after braking fully as soon as possible"),
+    Feature("fitting_deceleration", "m/s2", 10.0, 0.0, 2.0, "own constant deceleration that ends at rest, touching it"),
+)
+
 _OWN, _NEIGHBOUR = len(OWN_FEATURES), len(NEIGHBOUR_FEATURES)
+_ROLE, _HAZARD = len(ROLE_FEATURES), len(HAZARD_FEATURES)
 
 
 @dataclass(frozen=True, slots=True)
 class ObservationSpec:
-    """How many neighbours an observation holds on each side."""
+    """How many neighbours an observation holds on each side, and whether its own place and an obstacle follow."""
 
     front: int = 1
     rear: int = 1
+    role: bool = False  # ROLE_FEATURES
+    hazard: bool = False  # HAZARD_FEATURES
 
     def __post_init__(self) -> None:
         """Refuse what is not a number of neighbours."""
         for side, count in (("front", self.front), ("rear", self.rear)):
             if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= 64:
                 raise InvalidInput(f"observation: {side} = {count!r}; must be a whole number in 0..64")
+        for name, shown in (("role", self.role), ("hazard", self.hazard)):
+            if not isinstance(shown, bool):
+                raise InvalidInput(f"observation: {name} = {shown!r}; must be True or False")
 
     @property
     def sides(self) -> tuple[tuple[str, int], ...]:
@@ -89,6 +122,8 @@ class ObservationSpec:
     def features(self) -> tuple[Feature, ...]:
         """Every number of an observation in order; names are unique (``own.speed``, ``front_1.gap``)."""
         groups = [("own", OWN_FEATURES), *((prefix, NEIGHBOUR_FEATURES) for prefix, _ in self.sides)]
+        groups += [("role", ROLE_FEATURES)] if self.role else []
+        groups += [("hazard", HAZARD_FEATURES)] if self.hazard else []
         return tuple(
             Feature(f"{prefix}.{f.name}", f.unit, f.scale, f.low, f.high, f.meaning)
             for prefix, group in groups
@@ -98,7 +133,17 @@ class ObservationSpec:
     @property
     def size(self) -> int:
         """Length F of an observation."""
-        return _OWN + (self.front + self.rear) * _NEIGHBOUR
+        further = self.role * len(ROLE_FEATURES) + self.hazard * len(HAZARD_FEATURES)
+        return _OWN + (self.front + self.rear) * _NEIGHBOUR + further
+
+
+def observation_for(scenario: Scenario) -> ObservationSpec:
+    """What vehicles observe in this scenario unless somebody says otherwise: one neighbour on each side.
+
+    Where Vehicle 1 has an obstacle ahead (``hazard_gap_m``), also the own place in the line and the obstacle.
+    """
+    hazard = scenario.hazard_gap_m is not None
+    return ObservationSpec(role=hazard, hazard=hazard)
 
 
 def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
@@ -113,6 +158,8 @@ class Scaling(NamedTuple):
     """A specification as the kernel wants it."""
 
     offsets: Ints  # of the neighbours in the line
+    role: bool
+    hazard: bool
     features: Floats  # [3, F] 1 / scale, low, high
 
 
@@ -122,6 +169,8 @@ def scaling(spec: ObservationSpec) -> Scaling:
     features = spec.features
     return Scaling(
         np.array([offset for _, offset in spec.sides], np.int64),
+        spec.role,
+        spec.hazard,
         np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]]),
     )
 
@@ -134,10 +183,11 @@ def observe_packed(state: Floats, params: Floats, vehicles: Ints, scale: Scaling
 
 
 @compiled
-def _observe_rows(
-    state: Floats, params: Floats, observers: Ints, offsets: Ints, features: Floats, out: Observations
-) -> None:
-    """Fill ``out`` with the clipped features of each observer, in the order of OWN_FEATURES and NEIGHBOUR_FEATURES.
+def _observe_rows(  # noqa: C901
+    state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, hazard: bool, features: Floats,
+    out: Observations,
+) -> None:  # fmt: skip
+    """Fill ``out`` with the clipped features of each observer, in the order of the lists of features above.
 
     One long loop on purpose: handing these arrays on to functions made it four times as slow.
     """
@@ -145,8 +195,8 @@ def _observe_rows(
     speed, command, gap_column = speed_at(N), command_at(N), gap_at(N)
     hit = gap_column + N - 1
     braking, driving, latency, mass = params_at(0, N), params_at(1, N), params_at(2, N), params_at(3, N)
-    news = params_at(5, N)
-    by_link = params.shape[1] > news
+    news, obstacle = params_at(5, N), state_width(N)
+    by_link, some_obstacle = params.shape[1] > news, state.shape[1] > obstacle
     value = np.zeros(out.shape[2])
     for k in range(out.shape[0]):
         time = state[k, TIME]
@@ -187,6 +237,23 @@ def _observe_rows(
                 value[c + 8] = gap + other_stop - own_stop if in_front else gap + own_stop - other_stop
                 value[c + 9] = _fitting_deceleration(own_speed, own_latency, room)
                 c += _NEIGHBOUR
+            if role:
+                value[c] = i
+                value[c + 1] = N - 1 - i
+                c += _ROLE
+            if hazard:
+                told = i == 0 or time >= params[k, news + i * N if by_link else latency + i]
+                for absent in range(c, c + _HAZARD):
+                    value[absent] = 0.0
+                if told and some_obstacle and state[k, obstacle] < math.inf:
+                    gap = state[k, obstacle]
+                    for p in range(i):
+                        gap += state[k, gap_column + p]
+                    value[c] = 1.0
+                    value[c + 1] = gap
+                    value[c + 2] = state[k, obstacle + 1]
+                    value[c + 3] = gap - own_stop
+                    value[c + 4] = _fitting_deceleration(own_speed, own_latency, gap)
             for c in range(out.shape[2]):
                 out[k, o, c] = min(max(value[c] * features[0, c], features[1, c]), features[2, c])
 

@@ -5,6 +5,7 @@ Worlds are rows of ``physics.packed``; ``clock`` [n, 4] holds what an episode ne
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from ethbrake_marl.actions import command_of
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
+from ethbrake_marl.physics.obstacle import FAR_AWAY_M, place_obstacle
 from ethbrake_marl.physics.packed import (
     RESTITUTION,
     TIME,
@@ -22,6 +24,7 @@ from ethbrake_marl.physics.packed import (
     params_at,
     previous_at,
     speed_at,
+    state_width,
 )
 from ethbrake_marl.physics.segment import (
     COMMAND,
@@ -137,8 +140,9 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     braking, driving, latency, mass, limit = (
         params_at(0, N), params_at(1, N), params_at(2, N), params_at(3, N), params_at(4, N),
     )  # fmt: skip
-    P = N - 1
-    table = np.zeros((TABLE_ROWS, N))
+    P, hazard = N - 1, state_width(N)
+    at = 1 if state.shape[1] > hazard else 0  # vehicle i stands in column at + i, behind an obstacle
+    table = np.zeros((TABLE_ROWS, N + at))
     for k in range(n):
         if clock[k, ENDED] == 1.0:
             for f in range(OUTCOME_ROWS):
@@ -153,34 +157,45 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         at_horizon = clock[k, STEP] >= clock[k, LAST_STEP]
         time = state[k, TIME]
         until = settings[HORIZON] if at_horizon else clock[k, START] + clock[k, STEP] * settings[TIME_STEP]
+        if at == 1:
+            place_obstacle(table, min(state[k, hazard], FAR_AWAY_M), state[k, hazard + 1])
         for i in range(N):
-            table[SPEED, i] = state[k, speed + i]
-            table[COMMAND, i] = wanted[k, i]
-            table[MASS, i] = params[k, mass + i]
-            table[LIMIT, i] = params[k, limit + i]
-            table[ONSET, i] = params[k, latency + i] - time
+            table[SPEED, at + i] = state[k, speed + i]
+            table[COMMAND, at + i] = wanted[k, i]
+            table[MASS, at + i] = params[k, mass + i]
+            table[LIMIT, at + i] = params[k, limit + i]
+            table[ONSET, at + i] = params[k, latency + i] - time
             state[k, previous + i] = state[k, command + i]
             state[k, command + i] = wanted[k, i] if params[k, latency + i] <= until else 0.0
         for p in range(P):
-            table[GAP, p] = state[k, gap + p]
-            table[HIT, p] = state[k, gap + P + p]
+            table[GAP, at + p] = state[k, gap + p]
+            table[HIT, at + p] = state[k, gap + P + p]
         status = advance_table(table, params[k, RESTITUTION], until - time, time, k, no_rows, 0)[1]
         if status != DONE:
             return k, status
         state[k, TIME] = until
         at_rest = True
         for i in range(N):
-            state[k, speed + i] = table[SPEED, i]
-            at_rest = at_rest and table[SPEED, i] == 0.0 and wanted[k, i] <= 0.0
+            state[k, speed + i] = table[SPEED, at + i]
+            at_rest = at_rest and table[SPEED, at + i] == 0.0 and wanted[k, i] <= 0.0
         impacts, first_harm, total_harm = 0.0, 0.0, 0.0
+        if at == 1 and state[k, hazard] < math.inf:
+            state[k, hazard] = table[GAP, 0]
+            state[k, hazard + 1] = table[HIT, 0]
+            state[k, hazard + 2] += table[FIRST_HARM, 0]
+            state[k, hazard + 3] += table[TOTAL_HARM, 0]
+            state[k, hazard + 4] += table[COUNT, 0]
+            first_harm = table[FIRST_HARM, 0]
+            total_harm = table[TOTAL_HARM, 0]
+            impacts = state[k, hazard + 4]
         for p in range(P):
-            state[k, gap + p] = table[GAP, p]
-            state[k, gap + P + p] = table[HIT, p]
-            state[k, harm + p] += table[FIRST_HARM, p]
-            state[k, harm + P + p] += table[TOTAL_HARM, p]
-            state[k, harm + 2 * P + p] += table[COUNT, p]
-            first_harm += table[FIRST_HARM, p]
-            total_harm += table[TOTAL_HARM, p]
+            state[k, gap + p] = table[GAP, at + p]
+            state[k, gap + P + p] = table[HIT, at + p]
+            state[k, harm + p] += table[FIRST_HARM, at + p]
+            state[k, harm + P + p] += table[TOTAL_HARM, at + p]
+            state[k, harm + 2 * P + p] += table[COUNT, at + p]
+            first_harm += table[FIRST_HARM, at + p]
+            total_harm += table[TOTAL_HARM, at + p]
             impacts += state[k, harm + 2 * P + p]
         outcome[STEP_FIRST_HARM, k] = first_harm
         outcome[STEP_TOTAL_HARM, k] = total_harm

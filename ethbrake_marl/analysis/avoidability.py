@@ -71,7 +71,8 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
     of the deciding trajectories of up to 1e-12 m counts as a touch, hence as avoided.
 
     Raises ``InvalidInput`` for another line, another script than full_brake, a front vehicle that may brake only after
-    the controlled one acts, or a vehicle that moves backward.
+    the controlled one acts, a vehicle that moves backward, or an obstacle (``hazard_gap_m``) that vehicle_1 could reach
+    before any contact.
     """
     _check(worlds, vehicle, scripts or {})
     v = worlds.vehicles
@@ -92,7 +93,16 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
 
 
 def _check(worlds: Worlds, vehicle: int, scripts: Mapping[int, str]) -> None:
-    """Refuse what the theorem does not cover."""
+    """Refuse what the theorem does not cover.
+
+    An obstacle that Vehicle 1 cannot reach by braking fully changes nothing: only a push could bring it there, and that
+    is an impact already.
+    """
+    v1, own = worlds.speeds_mps[:, 0], np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
+    way = v1 * own + v1 * v1 / (2.0 * worlds.vehicles.braking_capacity_mps2[:, 0])
+    _refuse(~(way < worlds.hazard_gap_m), worlds.hazard_gap_m, "hazard_gap_m", None, "beyond full braking of vehicle_1")
+    if vehicle == 0 and np.isfinite(worlds.hazard_gap_m).any():
+        raise InvalidInput("avoidability: vehicle_1 controlled, with an obstacle ahead (hazard_gap_m): not decided")
     if (worlds.N, vehicle) not in ((3, 1), (2, 0), (2, 1)):
         raise InvalidInput(
             f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles; it is decided exactly for vehicle_2 of 3 and"
@@ -108,7 +118,8 @@ def _check(worlds: Worlds, vehicle: int, scripts: Mapping[int, str]) -> None:
         _refuse(~(worlds.speeds_mps[:, i] >= 0.0), worlds.speeds_mps[:, i], "speeds_mps", i, ">= 0")
 
 
-def _refuse(bad: Bools, values: Floats, name: str, i: int, right: str) -> None:
+def _refuse(bad: Bools, values: Floats, name: str, i: int | None, right: str) -> None:
     if bad.any():
         k = int(np.argmax(bad))
-        raise InvalidInput(f"avoidability: {name}[{k}, {i}] = {values[k]:g}: must be {right}")
+        place = f"{k}" if i is None else f"{k}, {i}"
+        raise InvalidInput(f"avoidability: {name}[{place}] = {values[k]:g}: must be {right}")

@@ -46,8 +46,9 @@ def avoidable_by_lp(
     six times; a verdict within that tolerance is not ``certain``. ``horizon_s`` counts from the world's time; the
     default is the last standstill or latency of all, plus ``limit / a`` of each controlled vehicle.
 
-    Raises ``InvalidInput`` unless ``world`` is a single one that moves forward, ``controlled`` are different vehicles
-    of it (at least one), and 0 < step_s and the controlled vehicles' latencies lie below the horizon.
+    Raises ``InvalidInput`` unless ``world`` is a single one that moves forward, without an obstacle ahead,
+    ``controlled`` are different vehicles of it (at least one), and 0 < step_s and the controlled vehicles' latencies
+    lie below the horizon.
     """
     _check(world, controlled)
     cars = tuple(sorted(controlled))
@@ -201,3 +202,5 @@ def _check(world: Worlds, controlled: Sequence[int]) -> None:
         )
     if not np.all(world.speeds_mps >= 0.0):
         raise InvalidInput(f"avoidable_by_lp: speeds_mps {world.speeds_mps[0].tolist()}: all must be >= 0")
+    if np.isfinite(world.hazard_gap_m[0]):
+        raise InvalidInput(f"avoidable_by_lp: hazard_gap_m {world.hazard_gap_m[0]:g}: the programme knows no obstacle")

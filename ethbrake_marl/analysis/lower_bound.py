@@ -38,7 +38,7 @@ from ethbrake_marl.analysis.avoidability_meetings import (
     WIDTH,
 )
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount, check_count, line_sum
+from ethbrake_marl.harm import HarmCount, check_count, empty_ledger
 from ethbrake_marl.physics import Bools, Floats, Worlds, advance
 
 
@@ -73,16 +73,18 @@ def lower_bound(
     brakes at least as hard as both neighbours; elsewhere it is 0. What may come only after the horizon counts as 0, and
     so does the next impact of a pair that was hit before where ``count`` is "first".
 
-    Covers the same lines as ``avoidability`` and raises ``InvalidInput`` where that does, for an unknown ``count``, and
-    for a horizon that is not finite or lies before the vehicle may act.
+    Covers the same lines as ``avoidability``, without an obstacle ahead, and raises ``InvalidInput`` for others, for an
+    unknown ``count``, and for a horizon that is not finite or lies before the vehicle may act.
     """
     check_count(count)
+    if np.isfinite(worlds.hazard_gap_m).any():
+        raise InvalidInput("lower_bound: worlds with an obstacle ahead (hazard_gap_m); the proofs know none")
     verdict = avoidability(worlds, vehicle, scripts=scripts)
     start = np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
         raise InvalidInput(f"lower_bound: horizon_s {horizon_s!r}: must be finite and at least {start.max():g} s")
     at_onset, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=start)
-    early = line_sum(impacts.first_impact_harm if count == "first" else impacts.total_harm)
+    early = empty_ledger(worlds).add(impacts).world_harm(count)
     counts = ~at_onset.pair_hit if count == "first" else np.ones_like(at_onset.pair_hit)
     forward = at_onset.speeds_mps >= 0.0
     open_pair = counts & forward[:, 1:] & forward[:, :-1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
@@ -17,15 +17,18 @@ from ethbrake_marl.envs.build import make_engine
 from ethbrake_marl.envs.infos import Report, plain_infos, report
 from ethbrake_marl.envs.restart import INITIAL_STATE, check_seed, fresh_seed, restart_from, warn_of_unknown
 from ethbrake_marl.envs.spaces import action_box, feature_box
+from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Observations, ObservationSpec
+from ethbrake_marl.observations import Feature, Observations, ObservationSpec
 from ethbrake_marl.physics import Bools, Ints, Worlds, concatenate
+from ethbrake_marl.physics.packed import Packed, unpack
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario, initial_state_worlds
 from ethbrake_marl.snapshots import Arrays, engine_snapshot, restore_engine
 from ethbrake_marl.stepping import Step
 
 Rewards = NDArray[np.float32]
+Appended = Literal["number", "state"]
 
 
 def make_sb3_vec_env(
@@ -36,15 +39,19 @@ def make_sb3_vec_env(
     reward: Reward = "harm",
     observation: ObservationSpec | None = None,
     horizon_is_end: bool = False,
+    appended: Appended | None = None,
 ) -> EthBrakeVecEnv:
     """``n_envs`` worlds for Stable-Baselines3; arguments as ``parallel_env``. ``seed=None``: fresh entropy.
 
     ``horizon_is_end``: infos report no truncation, so that an algorithm does not add the value it expects beyond the
     horizon. Harm is counted to the horizon, so nothing lies beyond it; what is imagined there can grow without limit.
+    ``appended``: what a row holds behind the vehicle's own observation: ``number``, the learner's place among the
+    learners (0 = the foremost), or ``state``, the full state of the line (``envs.state``), for a central critic.
     """
     check_seed(seed)
     engine = make_engine(scenario, n_envs, learners=learners, reward=reward, observation=observation)
-    return EthBrakeVecEnv(engine, fresh_seed() if seed is None else seed, horizon_is_end=horizon_is_end)
+    begin = fresh_seed() if seed is None else seed
+    return EthBrakeVecEnv(engine, begin, horizon_is_end=horizon_is_end, appended=appended)
 
 
 class EthBrakeVecEnv(VecEnv):
@@ -61,11 +68,14 @@ class EthBrakeVecEnv(VecEnv):
 
     render_mode: str | None = None
 
-    def __init__(self, engine: Engine, seed: int, *, horizon_is_end: bool = False) -> None:
+    def __init__(
+        self, engine: Engine, seed: int, *, horizon_is_end: bool = False, appended: Appended | None = None
+    ) -> None:
         if not engine.learners:
             raise InvalidInput(f"scenario {engine.scenario.name!r} has no learner; pass learners=['vehicle_2']")
         self.engine = engine
         self.horizon_is_end = horizon_is_end
+        self.appended = appended
         self._next_seed: int | None = seed
         self._learners = np.array(engine.learners, np.int64)
         self._actions: NDArray[Any] | None = None
@@ -74,7 +84,7 @@ class EthBrakeVecEnv(VecEnv):
         self._steps = np.zeros(rows, np.int64)
         self._begun = np.zeros(0)  # values of the report at each episode's beginning
         self._started = False
-        super().__init__(rows, feature_box(engine.observation.features), action_box())
+        super().__init__(rows, feature_box(_row_features(engine, appended)), action_box())
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Start the stream of ``seed`` at the next reset (None: fresh entropy); one stream serves all rows."""
@@ -191,7 +201,17 @@ class EthBrakeVecEnv(VecEnv):
     def _observe(self, worlds: Ints | None = None) -> Observations:
         """Observations of all learners, row by row, in their own memory; only of some worlds if given."""
         every = self.engine.observe_all(self._learners, worlds)
-        return every.reshape(-1, every.shape[2])
+        rows = every.reshape(-1, every.shape[2])
+        if self.appended is None:
+            return rows
+        count, width = every.shape[:2]
+        if self.appended == "number":
+            more = np.tile(np.arange(width, dtype=np.float32), count)[:, np.newaxis]
+        else:
+            state, params = self.engine.packed
+            some = slice(None) if worlds is None else worlds
+            more = full_state(unpack(Packed(state[some], params[some])), self.engine.scenario).repeat(width, axis=0)
+        return np.concatenate([rows, more], axis=1, dtype=np.float32)
 
     def _by_row(self, worlds: Bools) -> Bools:
         return worlds.repeat(len(self._learners))
@@ -217,3 +237,14 @@ class EthBrakeVecEnv(VecEnv):
     def _refuse_some_rows(self, what: str, indices: VecEnvIndices) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):
             raise InvalidInput(f"{what}: indices {indices!r}; rows share one batch, so leave indices out")
+
+
+def _row_features(engine: Engine, appended: Appended | None) -> tuple[Feature, ...]:
+    """Every number of a row in order."""
+    own = engine.observation.features
+    if appended is None:
+        return own
+    if appended == "state":
+        return (*own, *state_features(engine.scenario))
+    last = len(engine.learners) - 1
+    return (*own, Feature("learner", "1", 1.0, 0.0, float(max(last, 1)), "the learner's place among the learners"))

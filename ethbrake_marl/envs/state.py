@@ -9,29 +9,49 @@ from dataclasses import replace
 
 import numpy as np
 
-from ethbrake_marl.observations import NEIGHBOUR_FEATURES, OWN_FEATURES, Feature, Observations, ObservationSpec, observe
+from ethbrake_marl.observations import (
+    HAZARD_FEATURES,
+    NEIGHBOUR_FEATURES,
+    OWN_FEATURES,
+    Feature,
+    Observations,
+    ObservationSpec,
+    observe,
+)
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario
 
 _OWN_ONLY = ObservationSpec(front=0, rear=0)
 _PAIR_MEANING = {"gap": "free distance between the two", "hit": "1 if the pair has had an impact"}
+_HAZARD_FEATURES = tuple(
+    replace(f, name=f"hazard.{f.name}", meaning=meaning)
+    for f in HAZARD_FEATURES
+    for name, meaning in (("gap", "distance from Vehicle 1 to the obstacle"), ("hit", f.meaning))
+    if f.name == name
+)
 _PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in NEIGHBOUR_FEATURES if f.name in _PAIR_MEANING)
 
 
 def state_features(scenario: Scenario) -> tuple[Feature, ...]:
-    """Every number of the state in order: each vehicle's own features, each pair's gap and hit flag, the time."""
+    """Every number of the state in order: each vehicle's own features, each pair's gap and hit flag, the time.
+
+    Where there is an obstacle ahead of Vehicle 1, its gap and hit flag follow.
+    """
     vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in OWN_FEATURES]
     pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
     time = Feature("time", "s", scenario.horizon_s, 0.0, 1.0, "time since Vehicle 1 began to brake; scale: the horizon")
-    return (*vehicles, *pairs, time)
+    hazard = [] if scenario.hazard_gap_m is None else _HAZARD_FEATURES
+    return (*vehicles, *pairs, time, *hazard)
 
 
 def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
-    """State of every world, [n, S] float32 in its own memory; S = 7 N + 2 P + 1."""
+    """State of every world, [n, S] float32 in its own memory; S = 7 N + 2 P + 1, and 2 more with an obstacle ahead."""
     vehicles = [observe(worlds, i, _OWN_ONLY) for i in range(worlds.N)]
     pair_values = {"gap": worlds.gaps_m, "hit": worlds.pair_hit.astype(np.float64)}
     columns = [pair_values[f.name][:, p] for p in range(worlds.N - 1) for f in _PAIR_FEATURES]
     columns.append(worlds.time_s)
+    if scenario.hazard_gap_m is not None:
+        columns += [worlds.hazard_gap_m, worlds.hazard_hit.astype(np.float64)]
     features = state_features(scenario)[-len(columns) :]
     rest = [np.clip(c / f.scale, f.low, f.high) for c, f in zip(columns, features, strict=True)]
     return np.concatenate([*vehicles, np.stack(rest, axis=1)], axis=1, dtype=np.float32)

@@ -10,11 +10,11 @@ from ethbrake_marl.rewards import REWARDS, RewardParams
 from ethbrake_marl.scenario import load_scenario
 
 
-def feature_table(features: Sequence[Feature]) -> str:
-    """Markdown table of features, one line each, in the order of the vector."""
+def feature_table(features: Sequence[Feature], first: int = 0) -> str:
+    """Markdown table of features from number ``first`` on, one line each, in the order of the vector."""
     rows = [
         (str(k), f"`{f.name}`", f.unit, f"{f.scale:g}", f"{f.low:g}", f"{f.high:g}", f.meaning)
-        for k, f in enumerate(features)
+        for k, f in enumerate(features[first:], first)
     ]
     return _markdown(("#", "feature", "unit", "scale", "low", "high", "meaning"), rows)
 
@@ -32,6 +32,7 @@ def environment_tables() -> dict[str, str]:
     """Every table of docs/environment.md by its marker."""
     return {
         "observation": feature_table(ObservationSpec().features),
+        "hazard": feature_table(ObservationSpec(role=True, hazard=True).features, ObservationSpec().size),
         "state": feature_table(state_features(load_scenario("paper-random"))),
         "rewards": reward_table(REWARDS),
     }

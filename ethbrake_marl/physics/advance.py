@@ -8,7 +8,7 @@ of a segment belongs to that segment.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
+from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle, without_obstacle
 from ethbrake_marl.physics.parallel import by_parts
 from ethbrake_marl.physics.segment import (
     COMMAND,
@@ -42,7 +43,7 @@ from ethbrake_marl.physics.segment import (
     TOTAL_HARM,
     advance_table,
 )
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, concatenate
 
 _BAD_COMMAND, _BAD_END = 10, 11
 
@@ -52,7 +53,7 @@ class ImpactRows:
     """Every impact of a segment, by world and then by time; arrays [k]."""
 
     world: Ints
-    pair: Ints
+    pair: Ints  # -1: Vehicle 1 and the obstacle ahead
     time_s: Floats  # since Vehicle 1 began to brake
     closing_speed_mps: Floats  # immediately before, > 0
     first: Bools  # the pair had no impact before
@@ -67,6 +68,9 @@ class Impacts:
     first_impact_harm: Floats  # [n, P] only impacts of pairs that had none before
     total_harm: Floats  # [n, P] every impact
     count: Ints  # [n, P]
+    hazard_first_harm: Floats  # [n] the same of Vehicle 1's impacts with the obstacle ahead
+    hazard_total_harm: Floats  # [n]
+    hazard_count: Ints  # [n]
     rows: ImpactRows | None = None  # only when recorded
 
 
@@ -135,17 +139,28 @@ def advance(
     Raises ``InvalidInput`` for a command that is not finite or exceeds a vehicle's capacity, an end before the worlds'
     time, or ``threads`` below 1; ``PhysicsError`` if a check inside the kernel fails.
     """
-    vehicles = worlds.vehicles
     command = _shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
     if (duration_s is None) == (until_s is None):
         raise InvalidInput("advance: give either duration_s or until_s")
     end = until_s if duration_s is None else worlds.time_s + _shaped("duration_s", duration_s, (worlds.n,))
     until = _shaped("until_s", end, (worlds.n,))
+    hazard = obstacle_ahead(worlds)
+    if not hazard.any():
+        return _advance(worlds, command, until, record, threads)
+    _refuse_bad(worlds, command, until)
+    if hazard.all():
+        return _advance_with_obstacle(worlds, command, until, record, threads)
+    return _advance_mixed(worlds, command, until, record, threads, hazard)
+
+
+def _advance(worlds: Worlds, command: Floats, until: Floats, record: bool, threads: int) -> tuple[Worlds, Impacts]:
+    """``advance`` of worlds without an obstacle, or with one that is written out as a vehicle."""
+    vehicles = worlds.vehicles
     capacity = 4 * worlds.n + 64 if record else 0
     while True:
         after = Worlds(
             vehicles, worlds.gaps_m.copy(), worlds.speeds_mps.copy(), worlds.time_s.copy(), worlds.pair_hit.copy(),
-            np.empty(worlds.speeds_mps.shape),
+            np.empty(worlds.speeds_mps.shape), worlds.hazard_gap_m.copy(), worlds.hazard_hit.copy(),
         )  # fmt: skip
         shape = worlds.gaps_m.shape
         first_harm, total_harm, count = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
@@ -158,12 +173,60 @@ def advance(
         for part in parts:
             if part.status != DONE:
                 raise _failure(worlds, command, until, part.world, part.status)
+        impacts = Impacts(first_harm, total_harm, count, *no_hazard_harm(worlds.n))
         if not record:
-            return after, Impacts(first_harm, total_harm, count)
+            return after, impacts
         most = max(part.recorded for part in parts)
         if most <= capacity:
-            return after, Impacts(first_harm, total_harm, count, _impact_rows(parts))
+            return after, replace(impacts, rows=_impact_rows(parts))
         capacity = most
+
+
+def _advance_with_obstacle(
+    worlds: Worlds, command: Floats, until: Floats, record: bool, threads: int
+) -> tuple[Worlds, Impacts]:
+    """``advance`` of worlds that all have an obstacle: pair 0 of the lines in which it is written out."""
+    after, found = _advance(with_obstacle(worlds), ahead(0.0, command), until, record, threads)
+    first, total, count = found.first_impact_harm, found.total_harm, found.count
+    impacts = Impacts(
+        first[:, 1:].copy(), total[:, 1:].copy(), count[:, 1:].copy(), first[:, 0].copy(), total[:, 0].copy(),
+        count[:, 0].copy(), None if found.rows is None else replace(found.rows, pair=found.rows.pair - 1),
+    )  # fmt: skip
+    return without_obstacle(after, worlds.vehicles), impacts
+
+
+def _advance_mixed(
+    worlds: Worlds, command: Floats, until: Floats, record: bool, threads: int, hazard: Bools
+) -> tuple[Worlds, Impacts]:
+    """``advance`` of worlds of which only those marked have an obstacle."""
+    places = [np.flatnonzero(~hazard), np.flatnonzero(hazard)]
+    parts = [
+        run(worlds.take(at), command[at], until[at], record, threads)
+        for run, at in zip((_advance, _advance_with_obstacle), places, strict=True)
+    ]
+    order = np.argsort(np.concatenate(places))
+    after = concatenate([part for part, _ in parts]).take(order)
+    found = [impacts for _, impacts in parts]
+
+    def joined(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(impacts, name) for impacts in found])[order]
+
+    impacts = Impacts(
+        joined("first_impact_harm"), joined("total_harm"), joined("count"), joined("hazard_first_harm"),
+        joined("hazard_total_harm"), joined("hazard_count"),
+    )  # fmt: skip
+    lists = [each.rows for each in found if each.rows is not None]
+    if not lists:
+        return after, impacts
+    world = np.concatenate([at[rows.world] for at, rows in zip(places, lists, strict=True)])
+    columns = (np.concatenate([getattr(rows, f.name) for rows in lists]) for f in fields(ImpactRows)[1:])
+    by_world = np.argsort(world, kind="stable")
+    return after, replace(impacts, rows=ImpactRows(world[by_world], *(column[by_world] for column in columns)))
+
+
+def no_hazard_harm(n: int) -> tuple[Floats, Floats, Ints]:
+    """Harm, by both counts, and impacts of ``n`` worlds without an obstacle."""
+    return np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
 
 
 class _Part(NamedTuple):
@@ -207,6 +270,17 @@ def _failure(worlds: Worlds, command: Floats, until: Floats, k: int, status: int
         return InvalidInput(f"command_mps2[{k}, {i}] = {command[k, i]:g}: must be in [{low[i]:g}, {high[i]:g}] m/s2")
     reason = {PENETRATED: "a contact was missed", STUCK: f"more than {MOST_EVENTS} events"}[status]
     return PhysicsError(f"world {k}: {reason} between {worlds.time_s[k]:g} s and {until[k]:g} s")
+
+
+def _refuse_bad(worlds: Worlds, command: Floats, until: Floats) -> None:
+    """Refuse what the kernel would refuse, by the numbers of the vehicles as everybody knows them."""
+    vehicles = worlds.vehicles
+    in_time = (until >= worlds.time_s) & (until < math.inf)
+    in_range = (command >= -vehicles.braking_capacity_mps2) & (command <= vehicles.driving_capacity_mps2)
+    good = in_time & in_range.all(axis=1)
+    if not good.all():
+        k = int(np.argmin(good))
+        raise _failure(worlds, command, until, k, _BAD_COMMAND if in_time[k] else _BAD_END)
 
 
 def _impact_rows(parts: list[_Part]) -> ImpactRows:

@@ -10,6 +10,7 @@ import numpy as np
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
+from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle
 from ethbrake_marl.physics.segment import (
     COMMAND,
     DONE,
@@ -30,6 +31,7 @@ def forecast(
 ) -> tuple[Floats, Floats]:
     """First-impact and total harm from now to ``until_s`` if ``vehicle`` held each candidate command, [n, K] each.
 
+    Harm is that of all pairs and of the obstacle ahead, if there is one.
     ``command_mps2`` [n, N] are the other vehicles' commands (the vehicle's own column is ignored);
     ``candidates_mps2`` [n, K]. Worlds at or beyond ``until_s`` have no harm left. Pairs hit before do not count
     again in first-impact harm. Raises ``InvalidInput`` for shapes that do not fit or a candidate beyond capacity.
@@ -49,6 +51,24 @@ def forecast(
         raise InvalidInput(
             f"forecast: candidate {candidates_mps2[~good][0]:g} m/s2 is beyond vehicle_{vehicle + 1}'s capacity"
         )
+    hazard = obstacle_ahead(worlds)
+    if not hazard.any():
+        return _forecast(worlds, command_mps2, vehicle, candidates_mps2, until_s)
+    first, total = np.empty(candidates_mps2.shape), np.empty(candidates_mps2.shape)
+    with_one, without = np.flatnonzero(hazard), np.flatnonzero(~hazard)
+    lines, command = with_obstacle(worlds.take(with_one)), ahead(0.0, command_mps2[with_one])
+    first[with_one], total[with_one] = _forecast(lines, command, vehicle + 1, candidates_mps2[with_one], until_s)
+    first[without], total[without] = _forecast(
+        worlds.take(without), command_mps2[without], vehicle, candidates_mps2[without], until_s
+    )
+    return first, total
+
+
+def _forecast(
+    worlds: Worlds, command_mps2: Floats, vehicle: int, candidates_mps2: Floats, until_s: float
+) -> tuple[Floats, Floats]:
+    """``forecast`` of worlds without an obstacle, or with one that is written out as a vehicle."""
+    v = worlds.vehicles
     first, total = np.zeros(candidates_mps2.shape), np.zeros(candidates_mps2.shape)
     failed = forecast_worlds(
         worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, np.ascontiguousarray(command_mps2), vehicle,

@@ -16,6 +16,8 @@ array is cheap to hand from function to function; twenty small ones cost more th
 
 from __future__ import annotations
 
+import math
+
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.events import PLASTIC_SPEED_MPS, TOUCH_SPEED_MPS, settle
 from ethbrake_marl.physics.worlds import Floats
@@ -43,14 +45,15 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
     """Mass-weighted isotonic regression of vehicles ``first..last`` (inclusive) into row ``out``; the number of blocks.
 
     Rows ``low`` and ``high`` bound each vehicle's own value (equal for an ordinary one). All members of a pooled
-    block get the same bits. Rows BLOCK_* describe the blocks.
+    block get the same bits. Rows BLOCK_* describe the blocks. A vehicle of infinite mass (``obstacle``) stands, and
+    so does its block.
     """
     count = 0
     for i in range(first, last + 1):
         mass = table[MASS, i]
         table[BLOCK_MASS, count] = mass
-        table[BLOCK_LOW, count] = mass * table[low, i]
-        table[BLOCK_HIGH, count] = mass * table[high, i]
+        table[BLOCK_LOW, count] = mass * table[low, i] if mass < math.inf else 0.0
+        table[BLOCK_HIGH, count] = mass * table[high, i] if mass < math.inf else 0.0
         table[BLOCK_FIRST, count] = i
         top = count + first
         table[out, top] = settle(table[low, i], table[high, i])
@@ -88,10 +91,11 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
     for block in range(pool(table, SPEED, SPEED, first, last, POOLED) - 1, -1, -1):
         head = int(table[BLOCK_FIRST, block])
         pooled = table[POOLED, head]
-        rest = 0.0
-        for i in range(head, end):
-            rest += table[MASS, i] * (table[SPEED, i] - pooled)
-        pooled += rest / table[BLOCK_MASS, block]
+        if table[BLOCK_MASS, block] < math.inf:
+            rest = 0.0
+            for i in range(head, end):
+                rest += table[MASS, i] * (table[SPEED, i] - pooled)
+            pooled += rest / table[BLOCK_MASS, block]
         for i in range(head, end):
             table[SPEED, i] = pooled + bounce * (pooled - table[SPEED, i])
         end = head

@@ -6,7 +6,8 @@ cheaper to hand to a kernel, to copy and to replace row by row than a dozen. ``W
 Columns, for N vehicles and P = N - 1 pairs; the ``_at`` functions give the first column of each group:
 
 state   time, speeds N, commands in force N, commands in force before N, gaps P, hit flags P; and since the
-        episode began: first-impact harm P, total harm P, impacts P
+        episode began: first-impact harm P, total harm P, impacts P; and, where worlds have an obstacle ahead: gap to it
+        (infinite: none), hit flag, and since the episode began: first-impact harm, total harm, impacts
 params  restitution, braking N, driving N, latency N, mass N, speed limit N; and, where it is told, when vehicle i has
         the news of vehicle j, N * N columns (``Vehicles.known_from_s``)
 """
@@ -17,12 +18,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.physics.advance import no_hazard_harm
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.physics.segment import ROW_WIDTH
 from ethbrake_marl.physics.worlds import Floats, Ints, Vehicles, Worlds
 
 TIME = 0
 RESTITUTION = 0
+HAZARD_WIDTH = 5
 
 
 @compiled
@@ -57,7 +61,7 @@ def harm_at(vehicles: int) -> int:
 
 @compiled
 def state_width(vehicles: int) -> int:
-    """Columns of the state."""
+    """Columns of the state without an obstacle; with one, HAZARD_WIDTH more follow."""
     return 1 + 3 * vehicles + 5 * (vehicles - 1)
 
 
@@ -81,7 +85,7 @@ class Packed(NamedTuple):
 
 
 def pack(worlds: Worlds) -> Packed:
-    """Worlds by rows, with no harm so far."""
+    """Worlds by rows, with no harm so far; with columns of the obstacle if any world has one."""
     n, N = worlds.speeds_mps.shape
     state = np.zeros((n, state_width(N)))
     state[:, TIME] = worlds.time_s
@@ -102,7 +106,22 @@ def pack(worlds: Worlds) -> Packed:
         ],
         axis=1,
     )
+    if obstacle_ahead(worlds).any():
+        none = np.zeros((n, HAZARD_WIDTH - 2))
+        state = np.concatenate([state, np.column_stack([worlds.hazard_gap_m, worlds.hazard_hit]), none], axis=1)
     return Packed(state, params)
+
+
+def has_hazard(state: Floats, vehicles: int) -> bool:
+    """Whether these rows have columns of an obstacle."""
+    return bool(state.shape[1] > state_width(vehicles))
+
+
+def with_hazard_columns(state: Floats, vehicles: int) -> Floats:
+    """The rows with columns of an obstacle; where there were none, they say that there is none."""
+    if has_hazard(state, vehicles):
+        return state
+    return np.concatenate([state, np.full((len(state), 1), np.inf), np.zeros((len(state), HAZARD_WIDTH - 1))], axis=1)
 
 
 def unpack(packed: Packed) -> Worlds:
@@ -111,6 +130,7 @@ def unpack(packed: Packed) -> Worlds:
     N = vehicles_in(state)
     braking, driving, latency, mass, limit = (params[:, params_at(g, N) : params_at(g + 1, N)].copy() for g in range(5))
     gaps, news = gap_at(N), params[:, params_at(5, N) :].copy()
+    hazard = with_hazard_columns(state, N)[:, state_width(N) :]
     return Worlds(
         Vehicles(braking, driving, latency, mass, limit, params[:, RESTITUTION].copy(), news),
         state[:, gaps : gaps + N - 1].copy(),
@@ -118,6 +138,8 @@ def unpack(packed: Packed) -> Worlds:
         state[:, TIME].copy(),
         state[:, gaps + N - 1 : harm_at(N)] == 1.0,
         state[:, command_at(N) : previous_at(N)].copy(),
+        hazard[:, 0].copy(),
+        hazard[:, 1] == 1.0,
     )
 
 
@@ -126,6 +148,14 @@ def ledger_columns(state: Floats, vehicles: int) -> tuple[Floats, Floats, Ints]:
     pairs, first = vehicles - 1, harm_at(vehicles)
     groups = [state[:, first + g * pairs : first + (g + 1) * pairs].copy() for g in range(3)]
     return groups[0], groups[1], groups[2].astype(np.int64)
+
+
+def hazard_ledger_columns(state: Floats, vehicles: int) -> tuple[Floats, Floats, Ints]:
+    """The same of the impacts with the obstacle, [n] each."""
+    if not has_hazard(state, vehicles):
+        return no_hazard_harm(len(state))
+    first, total, count = (state[:, state_width(vehicles) + g].copy() for g in (2, 3, 4))
+    return first, total, count.astype(np.int64)
 
 
 NO_ROWS = np.empty((0, ROW_WIDTH))  # for kernels that keep no list of impacts

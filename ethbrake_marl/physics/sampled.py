@@ -37,9 +37,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics.advance import Impacts
+from ethbrake_marl.physics.advance import Impacts, no_hazard_harm
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.events import TOUCH_SPEED_MPS, solo_motion
+from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
 
 SHORTEST_STEP_S = 1e-6
@@ -159,9 +160,15 @@ def advance_sampled(
     Gaps of the result may be negative: it can be continued here, but not by ``advance``.
 
     Raises ``InvalidInput`` for a command beyond a vehicle's capacity, an end before a world's time, a step below
-    1e-6 s, a world whose time is between two samples, or negative speeds before the first sample.
+    1e-6 s, a world whose time is between two samples, negative speeds before the first sample, or an obstacle ahead.
     """
     vehicles = worlds.vehicles
+    if obstacle_ahead(worlds).any():
+        k = int(np.argmax(obstacle_ahead(worlds)))
+        raise InvalidInput(
+            f"advance_sampled: world {k} has an obstacle ahead (hazard_gap_m = {worlds.hazard_gap_m[k]:g}); the paper's"
+            " fixed-step map knows none, use advance"
+        )
     command = _checked_command(worlds, command_mps2)
     until = _shaped("until_s", until_s, (worlds.n,))
     first, last = _samples(worlds, until, step_s)
@@ -174,7 +181,10 @@ def advance_sampled(
         vehicles.speed_limit_mps, vehicles.restitution, first_harm, total_harm, count,
     )  # fmt: skip
     in_force = np.where(vehicles.latency_s <= time[:, None] + _ON_SAMPLE * step_s, command, 0.0)
-    return Worlds(vehicles, gaps, speeds, time, hit, in_force), Impacts(first_harm, total_harm, count)
+    after = Worlds(
+        vehicles, gaps, speeds, time, hit, in_force, worlds.hazard_gap_m.copy(), worlds.hazard_hit.copy()
+    )  # fmt: skip
+    return after, Impacts(first_harm, total_harm, count, *no_hazard_harm(worlds.n))
 
 
 def _samples(worlds: Worlds, until: Floats, step_s: float) -> tuple[Ints, Ints]:

@@ -122,6 +122,9 @@ def check_whole(scenario: Scenario) -> None:
     if scenario.time_gaps_s is not None:
         _check_time_gaps(scenario)
     _check_constant_scripts(scenario)
+    if 0 in scenario.learners and scenario.hazard_gap_m is None:
+        right = "has nothing to lose without an obstacle ahead; give hazard_gap_m too, for instance hazard_gap_m: 42"
+        refuse(("roles", "vehicle_1"), LEARNER, right)
     if scenario.early_impacts == "reject" and scenario.learners:
         _check_rejection(scenario)
 

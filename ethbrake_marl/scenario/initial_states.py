@@ -16,7 +16,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds, make_worlds
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.numerals import parse_numeral
-from ethbrake_marl.scenario.quantities import QUANTITIES, suggestion
+from ethbrake_marl.scenario.quantities import DECLARED, OPTIONAL, QUANTITIES, QuantityRule, suggestion
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.v2x import fixed_news
 
@@ -38,8 +38,8 @@ class _Naming:
     def entry(self, entry: Entry) -> str:
         field, index = entry
         if self.kind != "state":
-            return f"column {QUANTITIES[field].column_of(index)}"
-        return field if QUANTITIES[field].per == "world" else f"{field}[{index}]"
+            return f"column {DECLARED[field].column_of(index)}"
+        return field if DECLARED[field].per == "world" else f"{field}[{index}]"
 
     def value(self, entry: Entry, row: int) -> str:
         if self.kind == "state":
@@ -48,11 +48,17 @@ class _Naming:
         return f"{self.where}, {place}, {self.entry(entry)}"
 
 
+def _quantities(scenario: Scenario) -> dict[str, QuantityRule]:
+    """What a world of this scenario has."""
+    optional = {field: rule for field, rule in OPTIONAL.items() if getattr(scenario, field) is not None}
+    return {**QUANTITIES, **optional}
+
+
 def table_columns(scenario: Scenario) -> dict[str, Entry]:
     """Columns that a table of initial states may have for this scenario: ``gap_1_m``, ``speed_1_mps``, ..."""
     return {
         rule.column_of(index): (field, index)
-        for field, rule in QUANTITIES.items()
+        for field, rule in _quantities(scenario).items()
         for index in range(rule.count(scenario.vehicles))
     }
 
@@ -83,8 +89,9 @@ def worlds_from_table(columns: Mapping[str, ArrayLike], scenario: Scenario) -> W
     """Worlds from columns of equal length n: ``gap_1_m`` ..., ``speed_1_mps`` ..., and optionally the others.
 
     Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``,
-    ``speed_limit_1_mps`` and so on for each vehicle, and ``restitution``. What is left out comes from the scenario,
-    where it must be a fixed number. Raises ``InvalidInput`` naming the column and the row (from 0).
+    ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``hazard_gap_m`` where the scenario has it.
+    What is left out comes from the scenario, where it must be a fixed number. Raises ``InvalidInput`` naming the column
+    and the row (from 0).
     """
     entries = _known_columns(list(columns), scenario, "initial states")
     given = {
@@ -107,11 +114,14 @@ def initial_state_worlds(initial_state: Mapping[str, Any], scenario: Scenario) -
     if not isinstance(initial_state, Mapping):
         raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
     given: dict[Entry, Floats] = {}
+    known = _quantities(scenario)
     for field, value in initial_state.items():
-        if field not in QUANTITIES:
-            hint = suggestion(str(field), QUANTITIES) or f"known: {', '.join(QUANTITIES)}"
+        if field not in known:
+            if field in OPTIONAL:
+                raise InvalidInput(f"initial_state: {field} is not of this scenario: {scenario.name!r} has no {field}")
+            hint = suggestion(str(field), known) or f"known: {', '.join(known)}"
             raise InvalidInput(f"initial_state: unknown key {field!r}; {hint}")
-        count = QUANTITIES[field].count(scenario.vehicles)
+        count = known[field].count(scenario.vehicles)
         numbers = _numbers(f"initial_state: {field}", value)
         if numbers.shape not in ((), (count,)):
             raise InvalidInput(
@@ -127,7 +137,8 @@ def _worlds(given: Mapping[Entry, Floats], scenario: Scenario, naming: _Naming) 
     """Check the given columns, each [n], fill in the scenario's fixed numbers, and build the worlds."""
     n = len(next(iter(given.values()))) if given else 1
     full: dict[str, Floats] = {}
-    for field, rule in sorted(QUANTITIES.items(), key=lambda item: item[0] == "gaps_m"):  # gaps may need the speeds
+    rules = _quantities(scenario)
+    for field, rule in sorted(rules.items(), key=lambda item: item[0] == "gaps_m"):  # gaps may need the speeds
         full[field] = np.empty((n, rule.count(scenario.vehicles)))
         for index in range(rule.count(scenario.vehicles)):
             column = given.get((field, index))
@@ -140,15 +151,17 @@ def _worlds(given: Mapping[Entry, Floats], scenario: Scenario, naming: _Naming) 
             _require(good, naming, (field, index), column, f"must be {rule.interval}")
             full[field][:, index] = column
     _check_together(full, scenario, naming)
-    restitution = full.pop("restitution")[:, 0]
-    worlds = make_worlds(full.pop("gaps_m"), full.pop("speeds_mps"), restitution=restitution, **full)
+    of_world = {field: full.pop(field)[:, 0] for field, rule in rules.items() if rule.per == "world"}
+    worlds = make_worlds(full.pop("gaps_m"), full.pop("speeds_mps"), **of_world, **full)
     return replace(worlds, vehicles=fixed_news(scenario.v2x, worlds.vehicles, naming.where))
 
 
 def _fixed(scenario: Scenario, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:
     """What the scenario fixes for this entry, [n] or [1]: a time gap at the speeds in ``full``; None if random."""
     by_time = field == "gaps_m" and scenario.time_gaps_s is not None
-    low, high = support(scenario.quantities("time_gaps_s")[index]) if by_time else scenario.bounds(field)[index]
+    declared = "time_gaps_s" if by_time else field
+    drawn = by_time or field in OPTIONAL
+    low, high = support(scenario.quantities(declared)[index]) if drawn else scenario.bounds(field)[index]
     if low != high:
         return None
     return low * full["speeds_mps"][:, index + 1] if by_time else np.array([low])

@@ -127,7 +127,17 @@ OTHERWISE = {
         ),
     )
 }  # fmt: skip
-DECLARED = {**QUANTITIES, **OTHERWISE}  # every key that declares a quantity
+# What a world need not have. It has a stream of random numbers of its own.
+OPTIONAL = {
+    rule.name: rule
+    for rule in (
+        QuantityRule(
+            "hazard_gap_m", "m", "world", 1e4, True, 0, "hazard_gap_m",
+            "distance from the front of vehicle_1 to an unmovable obstacle ahead, at the alert", "42",
+        ),
+    )
+}  # fmt: skip
+DECLARED = {**QUANTITIES, **OTHERWISE, **OPTIONAL}  # every key that declares a quantity
 ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps"}  # a scenario has exactly one of each two
 
 

@@ -17,6 +17,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, concatenate, make_worlds
 from ethbrake_marl.scenario.derivation import drawn_quantities
+from ethbrake_marl.scenario.distributions import values
 from ethbrake_marl.scenario.quantities import BLOCK
 from ethbrake_marl.scenario.scripts import constant_command
 from ethbrake_marl.v2x import PER_LINK, with_news
@@ -28,6 +29,8 @@ Channel = Literal["list", "training"]
 
 CHANNELS: dict[str, int] = {"list": 0, "training": 1}
 V2X_NEWS = (1,)  # the stream of the links' delays and losses
+HAZARD = (2,)  # the stream of the obstacle's distance
+HAZARD_WIDTH = 4  # its numbers per world, of which the first is used
 MOST_ATTEMPTS = 1000  # draws of one world before its scenario is declared unusable
 _PATIENCE = 10  # attempts of a whole list before one world is tried to its end
 
@@ -91,7 +94,7 @@ def early_impact(scenario: Scenario, worlds: Worlds) -> Bools:
         command[:, i] = scripted
     first_action_s = vehicles.latency_s[:, list(scenario.learners)].min(axis=1)
     _, impacts = advance(worlds, command, until_s=first_action_s)
-    return np.asarray(impacts.count.sum(axis=1) > 0)
+    return np.asarray(impacts.count.sum(axis=1) + impacts.hazard_count > 0)
 
 
 def _redraw(scenario: Scenario, seed: int, channel: Channel, index: Ints, worlds: Worlds, early: Bools) -> Sample:
@@ -140,7 +143,13 @@ def _draw(scenario: Scenario, seed: int, channel: Channel, attempt: int, index: 
         u = u[index - first]
     drawn = drawn_quantities(scenario, u)
     restitution = drawn.pop("restitution")[:, 0]
-    worlds = make_worlds(drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, **drawn)
+    hazard_gap_m = None
+    if scenario.hazard_gap_m is not None:
+        u_hazard = uniform_numbers(seed, channel, attempt, first, last - first + 1, HAZARD_WIDTH, of=HAZARD)
+        hazard_gap_m = values(scenario.hazard_gap_m, u_hazard[index - first, 0])
+    worlds = make_worlds(
+        drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, hazard_gap_m=hazard_gap_m, **drawn
+    )
     if not scenario.v2x.by_link:
         return worlds
     width = PER_LINK * scenario.vehicles * scenario.vehicles

@@ -22,7 +22,7 @@ from ethbrake_marl.scenario.consistency import (
 )
 from ethbrake_marl.scenario.derivation import quantity_bounds
 from ethbrake_marl.scenario.distributions import Choice, LogUniform, Normal, Quantity, Uniform
-from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OPTIONAL
 from ethbrake_marl.scenario.sampling import Channel, Sample, draw_list
 from ethbrake_marl.scenario.scenario_wording import ScenarioWording
 from ethbrake_marl.scenario.scripts import LEARNER
@@ -80,6 +80,7 @@ class Scenario(BaseModel):
         default_factory=lambda data: complete_roles(None, data.get("vehicles", 3)),
         description="learner or a script for each vehicle; vehicles left out of a given mapping brake fully",
     )
+    hazard_gap_m: Quantity | None = Field(default=None, description=DECLARED["hazard_gap_m"].meaning)
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="what happens to worlds with an impact before the first learner may act"
     )
@@ -103,7 +104,7 @@ class Scenario(BaseModel):
         _build(scenario, document)
         return scenario
 
-    @field_validator(*ALTERNATIVES, *ALTERNATIVES.values(), mode="before")
+    @field_validator(*ALTERNATIVES, *ALTERNATIVES.values(), *OPTIONAL, mode="before")
     @classmethod
     def _given(cls, value: Any) -> Any:
         """``null`` is no value: a key that is not used is left out."""

@@ -1,9 +1,10 @@
 """The model in rational numbers: an event simulator that shares nothing with the package.
 
 It works with ``fractions.Fraction`` throughout, so nothing is ever rounded; isotonic regression is done by the min-max
-formula. A contact time is a root of a quadratic: where the root is rational it is exact; otherwise ``simulate`` raises
-``Unexact``, or, when ``bits`` is given, takes the root to that many significant binary digits (and then keeps every
-number of the state to so many digits, lest they grow without end).
+formula, and an obstacle ahead bounds that of the vehicles which touch it above by 0. A contact time is a root of a
+quadratic: where the root is rational it is exact; otherwise ``simulate`` raises ``Unexact``, or, when ``bits`` is
+given, takes the root to that many significant binary digits (and then keeps every number of the state to so many
+digits, lest they grow without end).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
 from itertools import pairwise
-from math import isqrt
+from math import inf, isqrt
 from typing import NamedTuple
 
 from ethbrake_marl.physics import Worlds
@@ -40,13 +41,14 @@ class Line:
     mass: Rationals
     limit: Rationals
     restitution: Fraction
+    hazard: Fraction | None = None  # distance to an obstacle ahead
 
 
 class Hit(NamedTuple):
     """One impact of one pair."""
 
     time: Fraction
-    pair: int
+    pair: int  # -1: the front vehicle and the obstacle
     closing: Fraction
     first: bool
     front_change: Fraction
@@ -61,13 +63,15 @@ class Outcome:
     speeds: Rationals
     hits: list[Hit] = field(default_factory=list)
     kinds: Counter[str] = field(default_factory=Counter)
+    hazard: Fraction | None = None
 
 
 def line_of(worlds: Worlds, command: list[float], k: int) -> Line:
     """World ``k`` of a batch, exactly."""
     v = worlds.vehicles
     rows = (worlds.gaps_m[k], worlds.speeds_mps[k], command, v.latency_s[k], v.mass_t[k], v.speed_limit_mps[k])
-    return Line(*(tuple(Fraction(float(x)) for x in row) for row in rows), Fraction(float(v.restitution[k])))
+    hazard = Fraction(float(worlds.hazard_gap_m[k])) if worlds.hazard_gap_m[k] < inf else None
+    return Line(*(tuple(Fraction(float(x)) for x in row) for row in rows), Fraction(float(v.restitution[k])), hazard)
 
 
 def simulate(
@@ -86,6 +90,8 @@ class _Run:
         self.n = len(line.speeds)
         self.g = list(line.gaps)
         self.v = list(line.speeds)
+        self.h = line.hazard
+        self.leaning = False  # the front vehicle rests against the obstacle
         self.hit: set[int] = set()
         self.joined: list[bool] = [False] * (self.n - 1)
         self.out = Outcome((), ())
@@ -93,12 +99,13 @@ class _Run:
     def to(self, until: Fraction) -> Outcome:
         while True:
             self.impacts()
-            self.check_grid((self.time, *self.g, *self.v))
+            self.check_grid((self.time, *self.g, *self.v, self.h or ZERO))
             if self.time >= until:
                 break
             self.step(until)
         self.out.gaps = tuple(self.g)
         self.out.speeds = tuple(self.v)
+        self.out.hazard = self.h
         return self.out
 
     def check_grid(self, numbers: Iterable[Fraction]) -> None:
@@ -114,7 +121,8 @@ class _Run:
             if self.line.latency[i] > self.time:
                 soonest = min(soonest, self.line.latency[i] - self.time)
             soonest = min([soonest, *self.speed_times(i, a[i])])
-        contacts = {p: found for p in range(self.n - 1) if (found := self.contact(p, a)) is not None}
+        ahead = range(0 if self.h is None else -1, self.n - 1)
+        contacts = {p: found for p in ahead if (found := self.contact(p, a)) is not None}
         first = min((t for t, _ in contacts.values()), default=soonest)
         if first <= soonest and any(t == first and not exact for t, exact in contacts.values()) and self.bits is None:
             raise Unexact
@@ -122,11 +130,14 @@ class _Run:
         way = [(v + acceleration * soonest / 2) * soonest for v, acceleration in zip(self.v, a, strict=True)]
         meets = [p in contacts and contacts[p][0] == soonest for p in range(self.n - 1)]
         self.g = [ZERO if meets[p] else g + way[p] - way[p + 1] for p, g in enumerate(self.g)]
+        if self.h is not None:
+            self.h = ZERO if -1 in contacts and contacts[-1][0] == soonest else self.h - way[0]
         self.v = [v + acceleration * soonest for v, acceleration in zip(self.v, a, strict=True)]
         self.time += soonest
         if self.bits is not None:
             self.g, self.v = ([significant(x, self.bits) for x in row] for row in (self.g, self.v))
             self.time = significant(self.time, self.bits)
+            self.h = self.h and significant(self.h, self.bits)
         self.out.kinds["touch"] += sum(met and self.v[p] == self.v[p + 1] for p, met in enumerate(meets))
         self.note_events(a)
 
@@ -145,10 +156,13 @@ class _Run:
         return [t for target in targets if a != 0 and (t := (target - self.v[i]) / a) > 0]
 
     def contact(self, p: int, a: list[Fraction]) -> tuple[Fraction, bool] | None:
-        """Time to the contact of pair p, and whether it is exact; None when there is none."""
-        if self.joined[p]:
+        """Time to the contact of pair p (-1: with the obstacle), and whether it is exact; None when there is none."""
+        if self.leaning if p < 0 else self.joined[p]:
             return None
-        g, w, b = self.g[p], self.v[p + 1] - self.v[p], a[p + 1] - a[p]
+        if p < 0:
+            g, w, b = self.h or ZERO, self.v[0], a[0]
+        else:
+            g, w, b = self.g[p], self.v[p + 1] - self.v[p], a[p + 1] - a[p]
         square = w * w + 2 * b * g
         if square < 0 or (w <= 0 and b <= 0):
             return None
@@ -159,7 +173,11 @@ class _Run:
         return 2 * g / (w + speed), exact
 
     def touching(self, p: int) -> bool:
-        return self.g[p] == 0
+        return self.h == 0 if p < 0 else self.g[p] == 0
+
+    def speed_ahead(self, p: int, speeds: list[Fraction]) -> Fraction:
+        """Speed of the front vehicle of pair p; the obstacle stands."""
+        return ZERO if p < 0 else speeds[p]
 
     def accelerations(self) -> list[Fraction]:
         """Accelerations of all vehicles, coupled in runs that touch and move alike."""
@@ -169,8 +187,12 @@ class _Run:
         for k in range(self.n):
             if k + 1 < self.n and self.touching(k) and self.v[k] == self.v[k + 1]:
                 continue
-            a += regression(self.line.mass[head : k + 1], low[head : k + 1], high[head : k + 1])
+            found = regression(self.line.mass[head : k + 1], low[head : k + 1], high[head : k + 1])
+            against = head == 0 and self.touching(-1) and self.v[0] == 0
+            a += [min(value, ZERO) for value in found] if against else found
             head = k + 1
+        self.leaning = self.touching(-1) and self.v[0] == 0 and a[0] == 0
+        self.out.kinds["leaning"] += self.leaning
         for p in range(self.n - 1):
             together = self.touching(p) and self.v[p] == self.v[p + 1]
             joined = together and a[p] == a[p + 1]
@@ -193,24 +215,26 @@ class _Run:
 
     def impacts(self) -> None:
         """Resolve all approaching pairs that touch, round after round."""
-        while any(self.touching(p) and self.v[p + 1] > self.v[p] for p in range(self.n - 1)):
+        pairs = range(-1, self.n - 1)
+        while any(self.touching(p) and self.v[p + 1] > self.speed_ahead(p, self.v) for p in pairs):
             head, before = 0, list(self.v)
             for k in range(self.n):
                 if k + 1 < self.n and self.touching(k):
                     continue
                 self.cluster(head, k)
                 head = k + 1
-            for p in range(self.n - 1):
+            for p in pairs:
                 self.note_hit(p, before)
 
     def note_hit(self, p: int, before: list[Fraction]) -> None:
-        closing = before[p + 1] - before[p]
+        closing = before[p + 1] - self.speed_ahead(p, before)
         if not self.touching(p) or closing <= 0:
             return
         if closing <= TOUCH_MPS:
             self.out.kinds["touch"] += 1
             return
-        changes = self.v[p] - before[p], self.v[p + 1] - before[p + 1]
+        front_change = self.speed_ahead(p, self.v) - self.speed_ahead(p, before)
+        changes = front_change, self.v[p + 1] - before[p + 1]
         self.out.hits.append(Hit(self.time, p, closing, p not in self.hit, *changes))
         self.hit.add(p)
         self.out.kinds["impact"] += 1
@@ -218,11 +242,13 @@ class _Run:
 
     def cluster(self, first: int, last: int) -> None:
         v = self.v[first : last + 1]
-        closing = max((b - a for a, b in pairwise(v)), default=ZERO)
+        against = first == 0 and self.touching(-1)
+        closing = max((b - a for a, b in pairwise([ZERO, *v] if against else v)), default=ZERO)
         if closing <= 0:
             return
         e = self.line.restitution if closing >= PLASTIC_MPS else ZERO
         pooled = regression(self.line.mass[first : last + 1], v, v)
+        pooled = [min(value, ZERO) for value in pooled] if against else pooled
         self.check_grid(pooled)
         self.v[first : last + 1] = [(1 + e) * p - e * old for p, old in zip(pooled, v, strict=True)]
 

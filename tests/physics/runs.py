@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ from ethbrake_marl.physics.tolerances import FEW_IMPACTS
 from tests.physics.random_worlds import Batch, driving_lines
 
 HORIZON_S = 6.0
+HARMS = [f.name for f in fields(Impacts) if f.name != "rows"]
 
 
 def once(batch: Batch) -> tuple[Worlds, Impacts]:
@@ -21,8 +22,8 @@ def once(batch: Batch) -> tuple[Worlds, Impacts]:
 
 def state_bytes(worlds: Worlds, impacts: Impacts) -> tuple[bytes, ...]:
     """Every bit of a result."""
-    columns = (worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, worlds.command_mps2)
-    return tuple(c.tobytes() for c in (*columns, impacts.first_impact_harm, impacts.total_harm, impacts.count))
+    columns = [getattr(worlds, f.name) for f in fields(worlds)[1:]] + [getattr(impacts, name) for name in HARMS]
+    return tuple(column.tobytes() for column in columns)
 
 
 def relative_changes(mine: Worlds, theirs: Worlds, total_harm: Floats, other_harm: Floats) -> Floats:

@@ -108,6 +108,43 @@ def test_advance__agrees_with_the_tiny_step_reference(N: int, e: float) -> None:
     assert outcome.momentum_error.max() < 1e-12
 
 
+POST_T, POST_BRAKES_MPS2 = 1e12, 1e6  # a vehicle that an impact moves by less than doubles can tell, and brakes at once
+
+
+@pytest.mark.parametrize("N", [2, 3])
+def test_obstacle__is_what_a_braked_vehicle_becomes_that_is_far_too_heavy_to_move(N: int) -> None:
+    n = 80
+    case = random_case(24, n, N, 0.1)
+    gap = np.random.default_rng([25, N]).uniform(5.0, 40.0, n)
+    end, impacts = advance(replace(case.worlds, hazard_gap_m=gap), case.command_mps2, until_s=case.horizon_s)
+    vehicles = case.worlds.vehicles
+    outcome = simulate(
+        _in_front(gap, case.worlds.gaps_m),
+        _in_front(0.0, case.worlds.speeds_mps),
+        _in_front(-POST_BRAKES_MPS2, case.command_mps2),
+        latency_s=_in_front(0.0, vehicles.latency_s),
+        mass_t=_in_front(POST_T, vehicles.mass_t),
+        speed_limit_mps=_in_front(1.0, vehicles.speed_limit_mps),
+        restitution=vehicles.restitution,
+        horizon_s=case.horizon_s,
+        step_s=STEP_S,
+    )
+    apart = np.abs(impacts.hazard_first_harm - outcome.first_impact_harm[:, 0]) > HARM_M2PS2
+    apart |= np.abs(impacts.hazard_total_harm - outcome.total_harm[:, 0]) > HARM_M2PS2
+    apart |= (impacts.hazard_count > 0) != (outcome.count[:, 0] > 0)
+    apart |= np.any(np.abs(impacts.total_harm - outcome.total_harm[:, 1:]) > HARM_M2PS2, axis=1)
+    apart |= np.abs(end.hazard_gap_m - outcome.gaps_m[:, 0]) > STATE
+    apart |= np.any(np.abs(end.gaps_m - outcome.gaps_m[:, 1:]) > STATE, axis=1)
+    apart |= np.any(np.abs(end.speeds_mps - outcome.speeds_mps[:, 1:]) > STATE, axis=1)
+    assert not apart.any() and (impacts.hazard_count > 0).sum() > n / 2
+
+
+def _in_front(value: float | Floats, columns: Floats) -> Floats:
+    """One more column, in front."""
+    first = np.broadcast_to(np.asarray(value, np.float64), len(columns))
+    return np.column_stack([first, columns])
+
+
 def test_disagreements__finds_a_planted_error_of_which_the_reference_is_certain() -> None:
     case = random_case(22, 40, 3, 0.1)
     end, impacts = advance(case.worlds, case.command_mps2, until_s=case.horizon_s)

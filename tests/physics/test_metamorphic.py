@@ -11,7 +11,7 @@ import pytest
 from ethbrake_marl.physics import Impacts, advance, concatenate, make_worlds
 from ethbrake_marl.physics.tolerances import SPLIT, SPLIT_CASCADE
 from tests.physics.random_worlds import Batch, driving_lines
-from tests.physics.runs import HORIZON_S, last_digit_errors, once, split_errors, state_bytes
+from tests.physics.runs import HARMS, HORIZON_S, last_digit_errors, once, split_errors, state_bytes
 
 # ---------------------------------------------------------------- cutting a segment
 
@@ -77,7 +77,7 @@ def test_batch__of_one_of_many_and_in_any_order_are_the_same_bits(N):
     assert shuffled[1].total_harm[back].tobytes() == whole[1].total_harm.tobytes()
     singles = [once(Batch(batch.worlds.take([k]), batch.command[[k]])) for k in range(300)]
     joined = concatenate([world for world, _ in singles])
-    harm = [np.concatenate([getattr(i, f) for _, i in singles]) for f in ("first_impact_harm", "total_harm", "count")]
+    harm = [np.concatenate([getattr(i, f) for _, i in singles]) for f in HARMS]
     assert state_bytes(joined, Impacts(*harm)) == state_bytes(*whole)
     assert whole[1].count.sum() > 100
 
@@ -109,7 +109,7 @@ def test_threads__two_give_the_bits_of_one():
     chunks = [Batch(batch.worlds.take(rows), batch.command[rows]) for rows in np.array_split(np.arange(4_000), 16)]
     with ThreadPoolExecutor(2) as pool:
         parts = list(pool.map(once, chunks))
-    harm = [np.concatenate([getattr(i, f) for _, i in parts]) for f in ("first_impact_harm", "total_harm", "count")]
+    harm = [np.concatenate([getattr(i, f) for _, i in parts]) for f in HARMS]
     assert state_bytes(concatenate([world for world, _ in parts]), Impacts(*harm)) == state_bytes(*whole)
 
 

@@ -47,23 +47,25 @@ THRESHOLD = 0.95
 KERNEL = (
     "tests/physics/test_advance.py", "tests/physics/test_ties.py", "tests/golden/test_physics_hash.py",
     "tests/physics/test_completeness.py", "tests/physics/test_manufactured.py", "tests/physics/test_clusters.py",
-    "tests/physics/test_against_exact.py",
+    "tests/physics/test_against_exact.py", "tests/physics/test_obstacle.py",
 )  # fmt: skip
 QUICK = {
     "worlds.py": ("tests/physics/test_worlds.py", "tests/physics/test_advance.py"),
     "compiled.py": ("tests/physics/test_compiled.py",),
-    "packed.py": ("tests/physics/test_packed.py", "tests/test_engine.py"),
+    "obstacle.py": ("tests/physics/test_obstacle.py", "tests/test_engine_hazard.py"),
+    "packed.py": ("tests/physics/test_packed.py", "tests/test_engine.py", "tests/test_engine_hazard.py"),
     "parallel.py": ("tests/physics/test_parallel.py",),
     "sampled.py": (
         "tests/physics/test_sampled_edges.py", "tests/physics/test_sampled.py", "tests/physics/test_sampled_input.py",
+        "tests/physics/test_obstacle.py",
     ),
     "events.py": ("tests/physics/test_events.py", *KERNEL),
     "segment.py": (*KERNEL[:3], "tests/physics/test_segment.py", *KERNEL[3:]),
-    "forecast.py": ("tests/physics/test_forecast.py",),
-    "harm.py": ("tests/test_harm.py", "tests/physics/test_ledger.py"),
+    "forecast.py": ("tests/physics/test_forecast.py", "tests/physics/test_obstacle.py"),
+    "harm.py": ("tests/test_harm.py", "tests/physics/test_ledger.py", "tests/physics/test_obstacle.py"),
     "advance.py": (
         "tests/physics/test_advance.py", "tests/golden/test_physics_hash.py", "tests/physics/test_parallel.py",
-        "tests/physics/test_manufactured.py", "tests/physics/test_ties.py",
+        "tests/physics/test_manufactured.py", "tests/physics/test_ties.py", "tests/physics/test_obstacle.py",
     ),
 }  # fmt: skip
 COMPILED = ("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py")

@@ -1,4 +1,4 @@
-"""Twenty bugs that such a simulator could have: each, planted in a copy of the repository, must turn some test red.
+"""Twenty-three bugs that such a simulator could have: planted in a copy of the repository, each must turn a test red.
 
 ``make planted-bugs`` (or ``python -m tests.physics.programme.planted_bugs [--jobs J] [--only WORD]``). A bug is a
 textual patch of the kernel or the ledger. It is applied to a temporary copy, never to the working tree. There some test
@@ -24,7 +24,13 @@ from tests.physics.programme.mutation import ROOT, copy_repository
 
 QUICK = tuple(
     f"tests/{name}.py"
-    for name in ("physics/test_advance", "physics/test_ties", "physics/test_against_exact", "test_harm")
+    for name in (
+        "physics/test_advance",
+        "physics/test_ties",
+        "physics/test_against_exact",
+        "test_harm",
+        "physics/test_obstacle",
+    )
 )
 WHOLE = ("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py")
 LIMIT_S = 900.0
@@ -32,7 +38,7 @@ LIMIT_S = 900.0
 EVENTS, IMPACT, SEGMENT, ADVANCE = (
     f"ethbrake_marl/physics/{name}.py" for name in ("events", "impact", "segment", "advance")
 )
-HARM = "ethbrake_marl/harm.py"
+HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/obstacle.py"
 
 
 class Patch(NamedTuple):
@@ -131,6 +137,17 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     ),
     "shares of harm given to the wrong vehicle": (
         Patch(HARM, "return rear_mass / (front_mass + rear_mass)", "return front_mass / (front_mass + rear_mass)"),
+    ),
+    "obstacle that gives way a little": (Patch(OBSTACLE, "UNMOVABLE_T = math.inf", "UNMOVABLE_T = 1e9"),),
+    "harm of an impact with the obstacle shared as with a vehicle": (
+        Patch(HARM, "harm[:, 0] += self.hazard_harm(count)", "harm[:, 0] += 0.5 * self.hazard_harm(count)"),
+    ),
+    "later impacts with the obstacle counted as first ones": (
+        Patch(
+            OBSTACLE,
+            "np.concatenate([worlds.hazard_hit[:, np.newaxis], worlds.pair_hit], axis=1)",
+            "np.concatenate([False & worlds.hazard_hit[:, np.newaxis], worlds.pair_hit], axis=1)",
+        ),
     ),
 }
 

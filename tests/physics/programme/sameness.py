@@ -12,7 +12,7 @@ from ethbrake_marl.physics import Impacts, Worlds, advance, concatenate
 from ethbrake_marl.physics.tolerances import BOUNCE_SERIES_EPS, EPS, SPLIT, SPLIT_CASCADE
 from tests.physics.programme.gates import Figure, gate
 from tests.physics.random_worlds import Batch, driving_lines, touching_lines
-from tests.physics.runs import HORIZON_S, Split, last_digit_errors, once, split_errors, state_bytes
+from tests.physics.runs import HARMS, HORIZON_S, Split, last_digit_errors, once, split_errors, state_bytes
 from tests.physics.state_hash import GOLDEN, figures
 
 # ---------------------------------------------------------------- what must not matter
@@ -82,7 +82,7 @@ def batches() -> Figure:
     whole = state_bytes(*once(batch))
 
     def together(parts: list[tuple[Worlds, Impacts]]) -> tuple[bytes, ...]:
-        harm = [np.concatenate([getattr(i, f) for _, i in parts]) for f in ("first_impact_harm", "total_harm", "count")]
+        harm = [np.concatenate([getattr(i, f) for _, i in parts]) for f in HARMS]
         return state_bytes(concatenate([world for world, _ in parts]), Impacts(*harm))
 
     def chunk(rows: np.ndarray) -> tuple[Worlds, Impacts]:
@@ -96,7 +96,7 @@ def batches() -> Figure:
         order = np.random.default_rng(seed).permutation(n)
         world, impacts = chunk(order)
         back = np.argsort(order)
-        harm = (impacts.first_impact_harm[back], impacts.total_harm[back], impacts.count[back])
+        harm = [getattr(impacts, f)[back] for f in HARMS]
         changed += state_bytes(world.take(back), Impacts(*harm)) != whole
     return Figure(changed, 0, f"{n:,} worlds alone, on 2 threads (threads=2, and 64 parts by hand), in 10 orders")
 
