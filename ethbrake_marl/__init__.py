@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.learning.bundle import load_policy as load_policy
     from ethbrake_marl.lineup import make_agent as make_agent
     from ethbrake_marl.observations import ObservationSpec as ObservationSpec
+    from ethbrake_marl.observations import observation_for as observation_for
     from ethbrake_marl.physics import Worlds as Worlds
     from ethbrake_marl.physics import advance as advance
     from ethbrake_marl.physics import make_worlds as make_worlds
@@ -58,6 +59,7 @@ _HOME = {
     "make_agent": "lineup",  # above the registry: best_harm and trained policies are registered there
     "make_sb3_vec_env": "envs.sb3",
     "make_worlds": "physics",
+    "observation_for": "observations",
     "parallel_env": "envs.parallel",
     "raw_env": "envs.parallel",
 }

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
+from ethbrake_marl.ablation_commands import ablate_command, generalise_command
 from ethbrake_marl.bench_commands import bench_command
 from ethbrake_marl.command_options import (
     ForceOption,
@@ -25,20 +26,14 @@ from ethbrake_marl.command_options import (
 )
 from ethbrake_marl.doctor import diagnose
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.evaluation import SummaryRow, check_target, evaluate, rich_table, summarise, write_per_world_csv
+from ethbrake_marl.evaluate_command import evaluate_command, show_rows
 from ethbrake_marl.evaluation.output_files import write_output
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.lineup import (
     EPISODES,
     LIST_SEED,
-    PROGRESS_EVERY,
-    SHIELDS,
-    check_agents,
-    choose_worlds,
     load_driven,
     load_runnable,
-    make_lineup,
 )
 from ethbrake_marl.picture_commands import picture_app
 from ethbrake_marl.policy_commands import export_command, import_legacy_command
@@ -50,11 +45,11 @@ from ethbrake_marl.scenario import (
     scenario_path,
 )
 from ethbrake_marl.search_commands import best_harm_command
+from ethbrake_marl.shield_commands import shield_command
 from ethbrake_marl.terminal import (
     abandon_output,
     interruptible,
     progress_bars,
-    result_console,
     say,
     tolerate_narrow_streams,
     write_json,
@@ -91,11 +86,16 @@ app.command("resume", epilog="Example: ethbrake resume runs/paper-random-ppo-see
 app.command(
     "learning-curves", epilog="Example: ethbrake learning-curves --scenario paper-delay-low --output runs/low-delay"
 )(learning_curves_command)
+app.command("ablate", epilog="Example: ethbrake ablate --quick --output runs/ablation-quick")(ablate_command)
+app.command(
+    "generalise", epilog="Example: ethbrake generalise --runs runs/cooperation-4-all-cooperation-seed0 --vehicles 3,5,10"
+)(generalise_command)
 app.command("export", epilog="Example: ethbrake export runs/early --onnx early.onnx")(export_command)
 app.command(
     "import-legacy", epilog="Example: ethbrake import-legacy old.zip --output old --algorithm sac --i-trust-this-file"
 )(import_legacy_command)
 app.command("best-harm", epilog="Example: ethbrake best-harm --episodes 200 --budget 20000 --json")(best_harm_command)
+app.command("shield", epilog="Example: ethbrake shield --agents ppo@shipped,full_brake --episodes 500")(shield_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
 
 
@@ -164,59 +164,14 @@ def run(
                 force=force,
                 on_stage=lambda stage: bars.show(stage.name, stage.done, stage.total, stage.metrics, stage.note),
             )
-    _show_rows(result.rows, as_json)
+    show_rows(result.rows, as_json)
     say(f"report: {result.report}")
     end_of_training(result.status, result.steps, folder)
 
 
-@app.command("evaluate", epilog="Example: ethbrake evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000")
-def evaluate_command(
-    scenario: ScenarioOption = "paper-random",
-    agents: Annotated[
-        str, typer.Option(metavar="A,B,...", help="Who drives, with commas between them.")
-    ] = "full_brake,e_v2x_bm,e_v2x_bm:pairwise",
-    episodes: Annotated[int | None, typer.Option(help="Worlds of the list.", show_default=str(EPISODES))] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the list.", show_default=str(LIST_SEED))] = None,
-    count: Annotated[HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")] = "first",
-    shield: Annotated[
-        str, typer.Option(metavar="|".join(SHIELDS), help="Put around every learned agent that has none.")
-    ] = "none",
-    initial_states: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Your own worlds, one per row, instead of the list.")
-    ] = None,
-    vehicle: VehicleOption = None,
-    per_world: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Also write one row per world and agent to this file.")
-    ] = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Compare agents on the same fixed list of worlds.
-
-    Agents: full_brake, coast, constant:A (deceleration in m/s2), copy_leader, gentlest_front, e_v2x_bm,
-    e_v2x_bm:pairwise, planner, best_harm; ladder: all of these but constant; and of a run or a policy bundle: ppo@PATH,
-    sac@PATH, rehearsed@PATH, hybrid@PATH, hybrid:pairwise@PATH, hybrid:rehearsed@PATH, step@PATH, step:rehearsed@PATH.
-    PATH may be shipped.
-    """
-    if per_world is not None:
-        check_target(per_world, force=force)
-    chosen = load_driven(scenario, vehicle)
-    sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
-    lineup = make_lineup(agents.split(","), chosen, count=count, shield=shield)
-    check_agents(lineup, sample.worlds, chosen)
-    with interruptible("nothing was written"), progress_bars() as bars:
-        evaluation = evaluate(
-            sample,
-            lineup,
-            scenario=chosen,
-            seed=list_seed,
-            chunk=PROGRESS_EVERY,
-            on_progress=lambda agent, done: bars.show(agent, done, sample.worlds.n),
-        )
-    if per_world is not None:
-        write_per_world_csv(per_world, evaluation, force=force)
-        say(f"every world: {per_world}")
-    _show_rows(summarise(evaluation), as_json)
+app.command("evaluate", epilog="Example: ethbrake evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000")(
+    evaluate_command
+)
 
 
 @scenario_app.command("list", epilog="Example: ethbrake scenario list")
@@ -291,10 +246,3 @@ def _refuse(reason: str) -> int:
     """Say why, in one line; gives the exit status."""
     say(f"ethbrake: error: {' '.join(reason.split())}")
     return BAD_INPUT
-
-
-def _show_rows(rows: Sequence[SummaryRow], as_json: bool) -> None:
-    if as_json:
-        write_json([row.to_json() for row in rows])
-    else:
-        result_console().print(rich_table(rows))

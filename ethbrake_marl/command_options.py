@@ -13,6 +13,14 @@ ScenarioOption = Annotated[
 RecipeOption = Annotated[
     str, typer.Option("--recipe", metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file.")
 ]
+SchemeOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="single|shared|independent|centralised",
+        help="How several learners are trained together.",
+        show_default="the recipe's; else single, or shared for several learners",
+    ),
+]
 StepsOption = Annotated[int | None, typer.Option(help="Training steps (decisions).", show_default="the recipe's")]
 TrainingSeedOption = Annotated[
     int | None, typer.Option("--seed", help="Seed of the training alone.", show_default="the recipe's")

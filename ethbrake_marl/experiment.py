@@ -18,12 +18,13 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, evaluate, parameter_line, summarise
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.learning.bundle import Policy
-from ethbrake_marl.learning.callback import Evaluate, Progress
+from ethbrake_marl.learning.callback import Progress
+from ethbrake_marl.learning.measure import measure_on_list
 from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.learning.run_directory import RunDirectory, RunStatus
 from ethbrake_marl.learning.train import TrainResult, resume, train
 from ethbrake_marl.learning.versions import installed_versions
-from ethbrake_marl.lineup import EPISODES, LIST_SEED, PROGRESS_EVERY, make_lineup
+from ethbrake_marl.lineup import EPISODES, LIST_SEED, PROGRESS_EVERY, make_agents
 from ethbrake_marl.results_folder import write_figures, write_page, write_results
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import Sample, Scenario
@@ -70,7 +71,8 @@ def run_folder(
 ) -> Path:
     """Folder of a run: ``output``, or ``runs/<name>``, by default ``runs/<scenario>-<recipe>-seed<seed>``.
 
-    Raises ``InvalidInput`` when both are given, or for a name that is not a plain folder name.
+    The default has the scheme behind the recipe where the recipe names one. Raises ``InvalidInput`` when both are
+    given, or for a name that is not a plain folder name.
     """
     if output is not None:
         if name is not None:
@@ -80,7 +82,8 @@ def run_folder(
         raise InvalidInput(
             f"run name {name!r:.60}: must be up to 128 letters, digits, . _ -, not beginning with . or -"
         )
-    return RUNS / (name or f"{scenario.name}-{recipe.name}-seed{recipe.seed if seed is None else seed}")
+    plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
+    return RUNS / (name or f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}")
 
 
 def train_measured(
@@ -114,19 +117,6 @@ def resume_measured(
 ) -> TrainResult:
     """Go on with a training of ``train_measured`` or ``run_experiment``, as ``learning.train.resume`` does."""
     return resume(directory, evaluate=measure_on_list, on_progress=on_progress, other_versions=other_versions)
-
-
-def measure_on_list(recipe: TrainingRecipe, scenario: Scenario) -> Evaluate | None:
-    """What measures a policy on the recipe's fixed list; None with several learners, of whom none is *the* vehicle."""
-    if len(scenario.learners) != 1:
-        return None
-    worlds = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
-
-    def measure(policy: Policy) -> dict[str, float]:
-        row = summarise(evaluate(worlds, {"policy": LearnedAgent(policy)}, scenario=scenario))[0]
-        return {name: getattr(row, name).value for name in ("first_impact_harm", "total_harm", "collision_rate")}
-
-    return measure
 
 
 def run_experiment(
@@ -180,7 +170,7 @@ def _agents(policy: Policy, scenario: Scenario) -> dict[str, Agent]:
         name: LearnedAgent(policy, name),
         "hybrid": HybridAgent(LearnedAgent(policy, name), scenario),
     }
-    return {**make_lineup(BASELINES, scenario), **learned}
+    return {**make_agents(BASELINES, scenario), **learned}
 
 
 def _evaluated(

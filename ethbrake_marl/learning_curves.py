@@ -20,7 +20,7 @@ from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
 from ethbrake_marl.experiment import resume_measured, train_measured
 from ethbrake_marl.learning.callback import Progress
 from ethbrake_marl.learning.course import HARM_METRIC
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of
 from ethbrake_marl.learning.run_directory import RunDirectory
 from ethbrake_marl.scenario import Scenario
 
@@ -113,7 +113,7 @@ def _train_one(scenario: Scenario, recipe: TrainingRecipe, path: Path, tell: Cal
     if not run.status.is_file():
         return train_measured(scenario, path, recipe=recipe, on_progress=tell).status == "finished"
     config = json.loads(run.config.read_text("utf-8"))
-    same = config["recipe"] == recipe.model_dump(mode="json") and config["scenario"].get("name") == scenario.name
+    same = recipe_of(json.dumps(config["recipe"])) == recipe and config["scenario"].get("name") == scenario.name
     if not same:
         raise InvalidInput(f"{path}: holds the training of another recipe or scenario; give another folder (--output)")
     if json.loads(run.status.read_text("utf-8"))["status"] == "finished":

@@ -9,19 +9,23 @@ from pathlib import Path
 
 import numpy as np
 
+from ethbrake_marl.agents.driving import introduce, scripted
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import Factory, agent_names, register_agent
 from ethbrake_marl.agents.registry import make_agent as make_agent  # the public one: here all agents are registered
 from ethbrake_marl.agents.rehearsed import Rehearsed
+from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.analysis.best_harm_shipped import make_best_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.shipped import SHIPPED, PolicyKind, load_named_policy
+from ethbrake_marl.learning.team_file import is_team, load_team
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
 from ethbrake_marl.shield.episode import HybridAgent
 from ethbrake_marl.shield.step import StepShieldAgent
+from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
 
 EPISODES = 10_000
 PROGRESS_EVERY = 500  # worlds between two signs of life
@@ -48,9 +52,12 @@ _WITH_SCENARIO = (
     "hybrid:rehearsed",
     "step",
     "step:rehearsed",
+    "robust",
+    "robust:rehearsed",
 )  # of a policy, for one scenario
-_OF_A_POLICY = (*POLICY_KINDS, "rehearsed", "hybrid", "step")
-SHIELDS = ("none", "episode", "step")  # that ``make_lineup`` can put around whatever learned
+_TEAM = "team"  # of a run: every learner driven as it was trained
+_OF_A_POLICY = (*POLICY_KINDS, "rehearsed", "hybrid", "step", "robust")
+SHIELDS = ("none", "episode", "step", "robust")  # that ``make_lineup`` can put around whatever learned
 _LADDER_SPEC = "ladder"
 
 
@@ -88,37 +95,74 @@ def load_driven(name_or_path: str, vehicle: str | None) -> Scenario:
     return scenario
 
 
-def check_agents(agents: Mapping[str, Agent], worlds: Worlds, scenario: Scenario) -> None:
+def load_evaluated(name_or_path: str, vehicle: str | None) -> Scenario:
+    """A runnable scenario whose learners are to be driven: ``vehicle`` alone, by default all learners there are.
+
+    Raises ``InvalidInput`` when there is no such vehicle, or no learner.
+    """
+    scenario = load_runnable(name_or_path)
+    if vehicle is None and len(scenario.learners) > 1:
+        return scenario
+    return load_driven(name_or_path, vehicle)
+
+
+def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario) -> None:
     """Try every agent before the first of them starts a long evaluation; raises what it would raise then.
 
     Scripts that need no state are tried on all worlds, which takes no time; all others on the first.
     """
-    (vehicle,) = scenario.learners
     for agent in agents.values():
-        _try_out(agent, worlds if getattr(agent, "state_free", False) else worlds.take([0]), vehicle)
+        team = team_of(agent, scenario.learners)
+        scripts = scripted(scenario, but=team.drivers)
+        for vehicle, driver in team.drivers.items():
+            introduce(driver, vehicle, scripts)
+            _try_out(driver, worlds if getattr(driver, "state_free", False) else worlds.take([0]), vehicle)
 
 
 def make_lineup(
-    specs: Sequence[str], scenario: Scenario, *, count: HarmCount = "first", shield: str = "none"
-) -> dict[str, Agent]:
-    """One fresh agent per spec, by its spec, to drive a vehicle of ``scenario``.
+    specs: Sequence[str],
+    scenario: Scenario,
+    *,
+    count: HarmCount = "first",
+    shield: str = "none",
+    uncertainty: Uncertainty | None = None,
+) -> dict[str, Driver]:
+    """One fresh agent per spec, by its spec, to drive the learners of ``scenario``.
 
     Every spec of ``make_agent``, and ``ppo@PATH`` or ``sac@PATH`` (the policy of a run, or a bundle), ``hybrid@PATH``
     (Algorithm 1: that policy or coupled E-V2X-BM, whichever harms less), ``hybrid:pairwise@PATH`` (with the paper's
     closed form instead), ``rehearsed@PATH`` (``agents.rehearsed``), ``hybrid:rehearsed@PATH``, and ``step@PATH`` or
-    ``step:rehearsed@PATH`` (the step shield). PATH may be
+    ``step:rehearsed@PATH`` (the step shield); ``team@PATH`` is the team of a run, as ``ppo@PATH`` and ``sac@PATH`` are
+    where each learner has its own policy. PATH may be
     ``shipped``, the policy that comes with the package for this scenario and count (PPO's for all but sac@shipped), or
     ``shipped/NAME``; ``universal@shipped`` is for all scenarios. ``ladder`` stands for every agent of ``LADDER`` that
     there is. ``count`` is the harm that optimising and choosing agents minimise.
-    ``shield`` (one of ``SHIELDS``) is put around every learned agent that has none. Raises ``InvalidInput`` for a spec
-    given twice, ``UnknownName`` with a suggestion, and whatever loading a policy raises.
+    ``shield`` (one of ``SHIELDS``) is put around every learned agent that has none. ``robust@PATH``,
+    ``robust:rehearsed@PATH`` and the shield ``robust`` certify against an ``uncertainty``. Raises ``InvalidInput`` for
+    a spec given twice, or an uncertainty that is missing or that nobody uses, ``UnknownName`` with a suggestion, and
+    whatever loading a policy raises.
     """
     specs = [each for spec in specs for each in (_ladder() if spec == _LADDER_SPEC else [spec])]
     for k, spec in enumerate(specs):
         if spec in specs[:k]:
             raise InvalidInput(f"agent {spec!r} is given twice; each agent drives every world once")
-    agents = {spec: _agent(spec, scenario, count) for spec in specs}
-    return {_shielded_name(spec, shield): _shielded(agent, scenario, count, shield) for spec, agent in agents.items()}
+    if uncertainty is not None and shield != "robust" and not any(spec.startswith("robust") for spec in specs):
+        raise InvalidInput(f"uncertainty {uncertainty}: nobody uses it; shield robust or an agent robust@PATH does")
+    agents = {spec: _driver(spec, scenario, count, uncertainty) for spec in specs}
+    return {
+        _shielded_name(spec, shield): _shielded(agent, scenario, count, shield, uncertainty)
+        for spec, agent in agents.items()
+    }
+
+
+def make_agents(specs: Sequence[str], scenario: Scenario, *, count: HarmCount = "first") -> dict[str, Agent]:
+    """``make_lineup`` where one vehicle is driven; raises ``InvalidInput`` for a team too."""
+    alone = {}
+    for spec, agent in make_lineup(specs, scenario, count=count).items():
+        if isinstance(agent, Team):
+            raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
+        alone[spec] = agent
+    return alone
 
 
 def choose_worlds(
@@ -158,16 +202,25 @@ def _ladder() -> list[str]:
     return [spec for spec in LADDER if spec.partition(":")[0] in agent_names()]
 
 
-def _agent(spec: str, scenario: Scenario, count: HarmCount) -> Agent:
+def _driver(spec: str, scenario: Scenario, count: HarmCount, uncertainty: Uncertainty | None) -> Driver:
+    kind, at, path = spec.partition("@")
+    if at and (kind == _TEAM or (kind in ("ppo", "sac") and is_team(path))):
+        return load_team(path, scenario, spec)
+    return _agent(spec, scenario, count, uncertainty)
+
+
+def _agent(spec: str, scenario: Scenario, count: HarmCount, uncertainty: Uncertainty | None) -> Agent:
     name = re.split("[:@]", spec, maxsplit=1)[0]
     if name in _OF_A_POLICY:
-        return _agent_of_a_policy(spec, scenario, count)
+        return _agent_of_a_policy(spec, scenario, count, uncertainty)
     if name not in agent_names():
-        raise unknown_name("agent", name, {*agent_names(), *_OF_A_POLICY, _LADDER_SPEC})
+        raise unknown_name("agent", name, {*agent_names(), *_OF_A_POLICY, _TEAM, _LADDER_SPEC})
     return make_agent(spec, count=count, horizon_s=scenario.horizon_s)
 
 
-def _agent_of_a_policy(spec: str, scenario: Scenario | None, count: HarmCount) -> Agent:
+def _agent_of_a_policy(
+    spec: str, scenario: Scenario | None, count: HarmCount, uncertainty: Uncertainty | None = None
+) -> Agent:
     """A policy alone, or behind its shield, which needs the scenario."""
     kind, _, path = spec.partition("@")
     if not path or kind not in (*POLICY_KINDS, *_WITH_SCENARIO):
@@ -192,6 +245,8 @@ def _agent_of_a_policy(spec: str, scenario: Scenario | None, count: HarmCount) -
         return driver
     if kind.startswith("step"):
         return StepShieldAgent(driver, scenario, count=count)
+    if kind.startswith("robust"):
+        return StepShieldAgent(driver, scenario, count=count, uncertainty=mode_uncertainty("robust", uncertainty, spec))
     return HybridAgent(driver, scenario, bound="pairwise" if kind == "hybrid:pairwise" else "coupled", count=count)
 
 
@@ -203,15 +258,18 @@ def _is_learned(spec: str) -> bool:
     return re.split("[:@]", spec, maxsplit=1)[0] in (*POLICY_KINDS, "rehearsed")
 
 
-def _shielded(agent: Agent, scenario: Scenario, count: HarmCount, shield: str) -> Agent:
+def _shielded(
+    agent: Driver, scenario: Scenario, count: HarmCount, shield: str, uncertainty: Uncertainty | None
+) -> Driver:
     """A learned agent behind the shield; any other agent as it is. Raises ``UnknownName`` for another shield."""
     if shield not in SHIELDS:
         raise unknown_name("shield", shield, SHIELDS)
+    intervals = mode_uncertainty(shield, uncertainty, "shield") if shield == "robust" else None
     if shield == "none" or not isinstance(agent, LearnedAgent | Rehearsed):
         return agent
     if shield == "episode":
         return HybridAgent(agent, scenario, count=count)
-    return StepShieldAgent(agent, scenario, count=count)
+    return StepShieldAgent(agent, scenario, count=count, uncertainty=intervals)
 
 
 def _register_policies() -> None:

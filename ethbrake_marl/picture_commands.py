@@ -7,13 +7,14 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.command_options import ForceOption, ScenarioOption, VehicleOption
+from ethbrake_marl.command_options import ForceOption, JsonOption, ScenarioOption, VehicleOption
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.output_files import write_output
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.lineup import LIST_SEED, load_driven, make_lineup
-from ethbrake_marl.terminal import interruptible, progress_bars, say
+from ethbrake_marl.lineup import LIST_SEED, load_driven, make_agents
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.terminal import interruptible, progress_bars, result_console, say, write_json
 
 PICTURE_ENDING = ".png"
 
@@ -52,7 +53,7 @@ def picture_criticality(
     from ethbrake_marl.evaluation.figure_style import png_bytes
 
     chosen = load_driven(scenario, None)
-    lineup = make_lineup([agent], chosen, count=count)
+    lineup = make_agents([agent], chosen, count=count)
     with interruptible("nothing was written"), progress_bars() as bars:
         found = criticality_map(
             chosen,
@@ -113,7 +114,7 @@ def picture_shield(
     worlds = chosen.sample(episodes, LIST_SEED).worlds
     curves = []
     with interruptible("nothing was written"), progress_bars() as bars:
-        for name, agent in make_lineup(agents.split(","), chosen, count=count).items():
+        for name, agent in make_agents(agents.split(","), chosen, count=count).items():
             curves.append((name, operating_curve(worlds, agent, chosen, chosen.learners[0], ALLOWANCES, count=count)))
             bars.show(name, episodes, episodes)
     caption = (
@@ -121,6 +122,51 @@ def picture_shield(
         " points: what certificates may reach above the bound (m²/s²)."
     )
     write_output(target, png_bytes(operating_figure(curves, caption=caption)), force=force)
+    say(f"picture: {target}")
+
+
+@picture_app.command(
+    "robustness", epilog="Example: ethbrake picture robustness --agent ppo@shipped --episodes 100 --output robust.png"
+)
+def picture_robustness(
+    output: PictureOption,
+    agent: Annotated[str, typer.Option(help="Who proposes; any agent of `ethbrake evaluate`.")] = "full_brake",
+    uncertainty: Annotated[
+        str, typer.Option(metavar="QUANTITY=WIDTH,...", help="The intervals; drawn at 0 to 2 times their width.")
+    ] = "braking_capacity_mps2=10%,gaps_m=0.5",
+    scenario: ScenarioOption = "paper-random",
+    episodes: Annotated[int, typer.Option(help="Worlds of the list.", min=1)] = 200,
+    count: Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")] = "first",
+    vehicle: VehicleOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """What it costs not to know a world: the robust shield's price, and both shields where the truth differs.
+
+    Prints the figures, too.
+    """
+    target, intervals = picture_target(output, force=force), parse_uncertainty(uncertainty)
+    from ethbrake_marl.evaluation.figure_style import png_bytes
+    from ethbrake_marl.evaluation.robustness_figure import robustness_figure, robustness_table
+    from ethbrake_marl.shield.robustness import robustness
+
+    chosen = load_driven(scenario, vehicle)
+    worlds = chosen.sample(episodes, LIST_SEED).worlds
+    (policy,) = make_agents([agent], chosen, count=count).values()
+    with interruptible("nothing was written"), progress_bars() as bars:
+        points = robustness(
+            worlds, policy, chosen, chosen.learners[0], intervals, count=count,
+            on_progress=lambda what, done: bars.show(what, done, episodes),
+        )  # fmt: skip
+    caption = (
+        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; {agent} proposes; {count} harm."
+        f" Intervals of width 1: {intervals}."
+    )
+    write_output(target, png_bytes(robustness_figure(points, caption=caption)), force=force)
+    if as_json:
+        write_json([point._asdict() for point in points])
+    else:
+        result_console().print(robustness_table(points))
     say(f"picture: {target}")
 
 

@@ -18,7 +18,7 @@ shaping    for learners: ``discount Phi(after) - Phi(before)``, Phi = minus the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
@@ -74,6 +74,7 @@ REWARDS = {
 }
 
 _BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
+_ROUNDS = 2  # of several learners
 
 
 Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
@@ -174,16 +175,23 @@ def further_terms(params: RewardParams, step: StepOutcome) -> dict[str, Floats]:
     return terms
 
 
-def potential(params: RewardParams, worlds: Worlds, vehicle: int, horizon_s: float) -> Floats:
-    """Minus the least harm ahead, [n]: the best of nine constant decelerations of ``vehicle`` from now on.
+def potential(params: RewardParams, worlds: Worlds, learners: Sequence[int], horizon_s: float) -> Floats:
+    """Minus the least harm ahead, [n], that was found with a constant deceleration of each learner from now on.
 
     All others brake fully; harm is what ``harm_count`` counts, from now to the horizon, in the engine's own physics.
+    One learner takes the best of nine shares of its capacity. Several begin with full braking and choose so one after
+    the other, front to rear, twice round, each given what the others have chosen: all have the same potential.
     """
-    command = -worlds.vehicles.braking_capacity_mps2
-    candidates = command[:, vehicle, np.newaxis] * _BRAKING_SHARES
-    harm = forecast(worlds, command, vehicle, candidates, horizon_s)[0 if params.harm_count == "first" else 1]
-    least: Floats = -harm.min(axis=1)
-    return least
+    braking = worlds.vehicles.braking_capacity_mps2
+    command, least = -braking, np.zeros(worlds.n)
+    for _ in range(1 if len(learners) == 1 else _ROUNDS):
+        for vehicle in learners:
+            candidates = -braking[:, vehicle, np.newaxis] * _BRAKING_SHARES
+            harm = forecast(worlds, command, vehicle, candidates, horizon_s)[0 if params.harm_count == "first" else 1]
+            choice = harm.argmin(axis=1)[:, np.newaxis]
+            command[:, vehicle] = np.take_along_axis(candidates, choice, axis=1)[:, 0]
+            least = np.take_along_axis(harm, choice, axis=1)[:, 0]
+    return -least
 
 
 def weighted_sum(params: RewardParams, terms: Mapping[str, Floats], shape: tuple[int, ...]) -> Floats:

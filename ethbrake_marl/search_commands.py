@@ -21,7 +21,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.regret import limits_do_not_apply
 from ethbrake_marl.harm import COUNTS, HarmCount
-from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable, make_lineup
+from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable, make_agents
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.terminal import interruptible, progress_bars, say, write_json
@@ -73,7 +73,7 @@ def best_harm_command(
     sample = chosen.sample(episodes, seed)
     counts: Sequence[HarmCount] = COUNTS if count is None else (count,)
     specs = _agent_specs(agents, chosen, controlled)
-    lineups = {each: make_lineup(specs, chosen, count=each) for each in counts}
+    lineups = {each: make_agents(specs, chosen, count=each) for each in counts}
     drivers = {name: {each: lineups[each][name] for each in counts} for name in lineups[counts[0]]}
     parts = None if output is None else output.with_name(f".{output.name}.parts")
     table = _search(

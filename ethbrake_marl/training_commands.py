@@ -14,17 +14,19 @@ from ethbrake_marl.command_options import (
     OutputOption,
     RecipeOption,
     ScenarioOption,
+    SchemeOption,
     StepsOption,
     TrainingSeedOption,
 )
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.schemes import check_scheme, drivers, scheme_of, who_drives_what
 from ethbrake_marl.lineup import load_runnable
 from ethbrake_marl.terminal import INTERRUPTED, Bars, interruptible, progress_bars, say, write_json
 
 if TYPE_CHECKING:
     from ethbrake_marl.learning.callback import Progress
-    from ethbrake_marl.learning.train import TrainResult
+    from ethbrake_marl.learning.teams import TeamResult
 
 KEPT = "if the training had begun, the run's folder keeps the last good policy, and ethbrake resume FOLDER goes on"
 
@@ -32,6 +34,7 @@ KEPT = "if the training had begun, the run's folder keeps the last good policy, 
 def train_command(
     scenario: ScenarioOption = "paper-random",
     recipe: RecipeOption = "ppo",
+    scheme: SchemeOption = None,
     steps: StepsOption = None,
     seed: TrainingSeedOption = None,
     name: NameOption = None,
@@ -39,26 +42,25 @@ def train_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train a policy into a run's folder.
+    """Train a policy, or the policies of several learners, into a run's folder.
 
-    Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,hybrid@FOLDER`.
+    Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,hybrid@FOLDER`; of several learners: `team@FOLDER`.
     Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake resume FOLDER` goes on.
     """
     with interruptible(KEPT):
         # Here and in other commands that learn: torch takes seconds to load, and no other command needs it.
-        from ethbrake_marl.experiment import run_folder, train_measured
+        from ethbrake_marl.experiment import run_folder
+        from ethbrake_marl.learning.teams import train_team
 
         chosen, plan = load_runnable(scenario), load_recipe(recipe)
+        if scheme is not None:
+            plan = plan.replace(scheme=check_scheme(scheme))
+        used = scheme_of(plan, chosen)
         folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
+        say(f"scheme {used}: {who_drives_what(drivers(used, chosen))}")
         with progress_bars() as bars:
-            result = train_measured(
-                chosen,
-                folder,
-                recipe=plan,
-                steps=steps,
-                seed=seed,
-                force=force,
-                on_progress=lambda p: show_progress(bars, p),
+            result = train_team(
+                plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=lambda p: show_progress(bars, p)
             )
     _show_result(result, as_json)
 
@@ -75,12 +77,10 @@ def resume_command(
     The policy is the one that the training would have come to without the stop, bit for bit.
     """
     with interruptible(KEPT):
-        from ethbrake_marl.experiment import resume_measured
+        from ethbrake_marl.learning.teams import resume_team
 
         with progress_bars() as bars:
-            result = resume_measured(
-                folder, on_progress=lambda p: show_progress(bars, p), other_versions=other_versions
-            )
+            result = resume_team(folder, on_progress=lambda p: show_progress(bars, p), other_versions=other_versions)
     _show_result(result, as_json)
 
 
@@ -137,10 +137,11 @@ def end_of_training(status: str, steps: int, folder: Path) -> None:
     say(f"{status} after {steps:,} training steps: {folder}")
 
 
-def _show_result(result: TrainResult, as_json: bool) -> None:
+def _show_result(result: TeamResult, as_json: bool) -> None:
     if as_json:
         last = result.evaluations[-1] if result.evaluations else None
         content = {"directory": str(result.directory), "status": result.status, "steps": result.steps}
-        best = result.policy.manifest.steps
-        write_json({**content, "evaluation": last, "policy_steps": best, "alarms": list(result.alarms)})
+        best = next(iter(result.policies.values())).manifest.steps
+        team = {"scheme": result.scheme, "drivers": dict(result.drivers)}
+        write_json({**content, **team, "evaluation": last, "policy_steps": best, "alarms": list(result.alarms)})
     end_of_training(result.status, result.steps, result.directory)

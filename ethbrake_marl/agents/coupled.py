@@ -108,15 +108,15 @@ class _Search:
     def simulate(self, rows: Ints, deceleration: Floats) -> tuple[Floats, Floats, Floats]:
         """First-impact and total harm and course [k] of world ``rows[k]`` under ``deceleration[k]``."""
         first, total, course = np.empty(rows.size), np.empty(rows.size), np.empty(rows.size)
-        digits = _DIGIT ** np.arange(self._worlds.N - 1.0)
+        digits = _DIGIT ** np.arange(float(self._worlds.N))
         for start in range(0, rows.size, _SIMULATIONS_AT_ONCE):
             part = slice(start, start + _SIMULATIONS_AT_ONCE)
             command = self._command[rows[part]]
             command[:, self._vehicle] = -deceleration[part]
             _, impacts = advance(self._worlds.take(rows[part]), command, until_s=self._horizon_s)
-            first[part] = impacts.first_impact_harm.sum(axis=1)
-            total[part] = impacts.total_harm.sum(axis=1)
-            course[part] = impacts.count @ digits
+            first[part] = impacts.first_impact_harm.sum(axis=1) + impacts.hazard_first_harm
+            total[part] = impacts.total_harm.sum(axis=1) + impacts.hazard_total_harm
+            course[part] = impacts.count @ digits[:-1] + impacts.hazard_count * digits[-1]
         return first, total, course
 
     def evaluate(self, rows: Ints, deceleration: Floats) -> Samples:

@@ -1,15 +1,17 @@
-"""Letting an agent drive one vehicle through whole episodes: the loop of every evaluation and of every prediction."""
+"""Letting agents drive through whole episodes: the loop of every evaluation and of every prediction."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, LookingAhead
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine import Engine
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Bools, Worlds
 from ethbrake_marl.scenario import Scenario
@@ -25,9 +27,10 @@ class Episodes:
     at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
 
 
-def scripted(scenario: Scenario, *, but: int | None = None) -> dict[int, Agent]:
-    """Fresh agents for the scenario's scripts, by vehicle index, ``but`` one; those that look ahead know the others."""
-    specs = {i: spec for i, spec in scenario.scripts.items() if i != but}
+def scripted(scenario: Scenario, *, but: int | Collection[int] | None = None) -> dict[int, Agent]:
+    """Fresh agents for the scenario's scripts, by vehicle, ``but`` some; those that look ahead know the others."""
+    left_out = () if but is None else (but,) if isinstance(but, int) else but
+    specs = {i: spec for i, spec in scenario.scripts.items() if i not in left_out}
     scripts = {i: make_agent(spec, horizon_s=scenario.horizon_s) for i, spec in specs.items()}
     for vehicle, script in scripts.items():
         introduce(script, vehicle, scripts)
@@ -40,21 +43,32 @@ def introduce(agent: Agent, vehicle: int, scripts: Mapping[int, Script]) -> None
         agent.others = {i: script for i, script in scripts.items() if i != vehicle}
 
 
-def episode_engine(worlds: Worlds, agent: Agent, scenario: Scenario, vehicle: int) -> Engine:
-    """An engine over ``worlds`` in which ``agent`` drives ``vehicle`` and the others follow the scenario's scripts.
+def episode_engine(worlds: Worlds, agent: Agent | Team, scenario: Scenario, vehicle: int | None = None) -> Engine:
+    """An engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team its vehicles; the others are scripted.
 
-    The agent decides when that vehicle's latency has elapsed and every time step from then on, as a learner does; its
-    commands are applied unrounded.
+    They decide when their first vehicle's latency has elapsed and every time step from then on, as learners do; their
+    commands are applied unrounded. An agent that looks ahead knows the scripts, and takes the other driven vehicles to
+    brake fully. Raises ``InvalidInput`` for a learner that nobody drives.
     """
-    scripts = scripted(scenario, but=vehicle)
-    introduce(agent, vehicle, scripts)
+    team = agent if isinstance(agent, Team) else Team({} if vehicle is None else {vehicle: agent}, agent.name)
+    drivers = team.drivers
+    undriven = [scenario.vehicle_names[i] for i in scenario.learners if i not in drivers]
+    if undriven:
+        raise InvalidInput(
+            f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
+            f" {', '.join(undriven)} of scenario {scenario.name!r} must be driven too. An agent that rolls itself out"
+            " (hybrid, rehearsed, step) can drive one learner, the others need scripts: --vehicle NAME"
+        )
+    scripts = scripted(scenario, but=drivers)
+    for i, driver in drivers.items():
+        introduce(driver, i, scripts)
     return Engine(
-        scenario, worlds.n, learners=(), scripts={**scripts, vehicle: agent}, deciders=(vehicle,), worlds=worlds
+        scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, deciders=tuple(drivers), worlds=worlds
     )
 
 
-def drive(worlds: Worlds, agent: Agent, scenario: Scenario, vehicle: int) -> Episodes:
-    """Let ``agent`` drive ``vehicle`` through every world (at t = 0) to its episode's end."""
+def drive(worlds: Worlds, agent: Agent | Team, scenario: Scenario, vehicle: int | None = None) -> Episodes:
+    """Let ``agent`` drive ``vehicle``, or a team its vehicles, through every world (at t = 0) to its episode's end."""
     engine = episode_engine(worlds, agent, scenario, vehicle)
     at_rest = np.zeros(worlds.n, np.bool_)
     while not engine.ended.all():

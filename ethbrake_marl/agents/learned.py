@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.actions import action_to_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations, ObservationSpec, observe
-from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.physics import Floats, Ints, Worlds
 
 
 class LearnedPolicy(Protocol):
@@ -44,3 +44,7 @@ class LearnedAgent:
                 f"{self.name}: actions of shape {action.shape}; one per world is needed, ({worlds.n}, 1)"
             )
         return action_to_command(action[:, 0], worlds.vehicles, vehicle)
+
+    def take(self, rows: Ints) -> LearnedAgent:
+        """The same agent: it remembers nothing."""
+        return self

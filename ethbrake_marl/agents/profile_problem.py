@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from ethbrake_marl.agents.profile_motion import (
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance
+from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle
 from ethbrake_marl.physics.packed import TIME, command_at, gap_at, harm_at, pack, params_at, speed_at
 
 TIME_STEP_S = 0.1  # between two decisions, where nobody says otherwise
@@ -33,7 +34,7 @@ _MIX = 0xD1342543DE82EF95  # an odd number: spreads seeds over 64 bits
 class ProfileProblem:
     """Whose commands are chosen, in which worlds, on which grid of decisions. Build it with ``profile_problem``."""
 
-    vehicles: Ints  # [C] controlled, index from 0
+    vehicles: Ints  # [C] controlled, index from 0; in lines with an obstacle from 1, it being vehicle 0 of every column
     start: Floats  # [n, S] at the first decision
     clock: Floats  # [n, CLOCK_WIDTH]
     bounds: Floats  # [n, C, 2] m/s2
@@ -67,9 +68,11 @@ def profile_problem(
     """The problem of choosing the whole profiles of ``vehicles`` (indices from 0) so as to do the least harm.
 
     The first decision falls on the smallest latency of the ``deciders`` (default: ``vehicles``) or on the worlds' time,
-    whichever is later; one follows every ``time_step_s``. The other vehicles follow ``others_mps2`` [n, N] (default:
-    full braking; the columns of ``vehicles`` are ignored). Raises ``InvalidInput`` for no vehicle, one given twice or
-    not there, an unknown count, a command beyond capacity, or a horizon before the first decision.
+    whichever is later; one follows every ``time_step_s``. An obstacle ahead is written out as a vehicle in front
+    (``physics.obstacle``): all columns of the problem are those of that line. The other vehicles follow ``others_mps2``
+    [n, N] (default: full braking; the columns of ``vehicles`` are ignored). Raises ``InvalidInput`` for no vehicle, one
+    given twice or not there, an unknown count, a command beyond capacity, a horizon before the first decision, or
+    worlds of which only some have an obstacle.
     """
     chosen = _checked_vehicles(vehicles, worlds.N)
     check_count(count)
@@ -80,6 +83,19 @@ def profile_problem(
     if command.shape != worlds.speeds_mps.shape:
         raise InvalidInput(f"others_mps2: shape {command.shape}; {worlds.speeds_mps.shape} is needed")
     command[:, chosen] = 0.0
+    hazard = obstacle_ahead(worlds)
+    if hazard.any():
+        if not hazard.all():
+            raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (hazard_gap_m), not all")
+        return profile_problem(
+            with_obstacle(worlds),
+            [i + 1 for i in chosen.tolist()],
+            count=count,
+            horizon_s=horizon_s,
+            time_step_s=time_step_s,
+            others_mps2=ahead(0.0, command),
+            deciders=None if deciders is None else [i + 1 for i in deciders],
+        )
     decide = _checked_vehicles(vehicles if deciders is None else deciders, worlds.N)
     first = np.maximum(v.latency_s[:, decide].min(axis=1), worlds.time_s)
     if not (first < horizon_s).all():
@@ -95,6 +111,34 @@ def profile_problem(
         chosen, np.concatenate(start, axis=1), clock, np.ascontiguousarray(bounds), command, v.latency_s, v.mass_t,
         v.speed_limit_mps, identities(worlds, command, clock, chosen),
     )  # fmt: skip
+
+
+def state_columns(worlds: Worlds) -> Floats:
+    """The worlds as they are now, in the columns of ``ProfileProblem.start`` before the harm: speeds, gaps, hit flags.
+
+    Raises ``InvalidInput`` for worlds of which only some have an obstacle ahead.
+    """
+    hazard = obstacle_ahead(worlds)
+    if hazard.any():
+        if not hazard.all():
+            raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (hazard_gap_m), not all")
+        worlds = with_obstacle(worlds)
+    return np.concatenate([worlds.speeds_mps, worlds.gaps_m, worlds.pair_hit], axis=1)
+
+
+def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
+    """These worlds in the states [n, S] of a problem with them: speeds, gaps, hit flags, and those of the obstacle."""
+    added = int(obstacle_ahead(worlds).any())  # columns in front of each group
+    N = worlds.N + added
+    gaps, hit = states[:, N : 2 * N - 1], states[:, 2 * N - 1 : 3 * N - 2] == 1.0
+    return replace(
+        worlds,
+        speeds_mps=states[:, added:N].copy(),
+        gaps_m=gaps[:, added:].copy(),
+        pair_hit=hit[:, added:].copy(),
+        hazard_gap_m=gaps[:, 0].copy() if added else worlds.hazard_gap_m,
+        hazard_hit=hit[:, 0].copy() if added else worlds.hazard_hit,
+    )
 
 
 def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> Words:

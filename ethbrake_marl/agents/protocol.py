@@ -33,11 +33,30 @@ class LookingAhead(Protocol):
     others: Mapping[int, Script]  # by vehicle index; vehicles without an entry brake fully
 
 
+@runtime_checkable
+class Divisible(Protocol):
+    """An agent that can go on apart, in some worlds of its batch only."""
+
+    def take(self, rows: Ints) -> Agent:
+        """An agent with this one's memory of these rows; what it does leaves this one as it is."""
+        ...
+
+
+def check_agent(agent: object, where: str) -> None:
+    """Raise ``InvalidInput`` for what is not an agent."""
+    if not isinstance(agent, Agent):
+        raise InvalidInput(
+            f"{where}: a {type(agent).__name__} is not an agent; make_agent(name) makes one, and"
+            " LearnedAgent(load_policy(path)) one of a policy"
+        )
+
+
 def place(stored: Floats, rows: Ints, values: Floats) -> Floats:
-    """Per-world values after new episodes in ``rows``; grows to the largest row seen, NaN where none began yet."""
-    size = max(stored.size, int(rows.max(initial=-1)) + 1)
-    placed = np.full(size, np.nan)
-    placed[: stored.size] = stored
+    """Per-world values [k, ...] after new episodes in ``rows``; grows to the largest row, NaN where none began yet."""
+    size = max(len(stored), int(rows.max(initial=-1)) + 1)
+    placed = np.full((size, *values.shape[1:]), np.nan)
+    if len(stored):
+        placed[: len(stored)] = stored
     placed[rows] = values
     return placed
 
@@ -45,6 +64,6 @@ def place(stored: Floats, rows: Ints, values: Floats) -> Floats:
 def recall(stored: Floats, n: int, name: str) -> Floats:
     """The values of a batch of ``n`` (own memory). Raises ``InvalidInput`` if an episode in it never began."""
     values = stored[:n].copy()
-    if values.size < n or not np.all(np.isfinite(values)):
+    if len(values) < n or not np.all(np.isfinite(values)):
         raise InvalidInput(f"agent {name!r}: act on {n} worlds, but begin was not called for each of them")
     return values

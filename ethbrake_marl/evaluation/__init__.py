@@ -8,6 +8,7 @@ from ethbrake_marl.evaluation.parameters import parameter_line, parameters
 from ethbrake_marl.evaluation.per_world import write_per_world_csv
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.evaluation.rendering import markdown_table, rich_table
+from ethbrake_marl.evaluation.rescoring import Rescored, declared_objectives, rescored, rescored_table
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome, evaluate
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.evaluation.table import SummaryRow, summarise
@@ -17,13 +18,17 @@ __all__ = [
     "Estimate",
     "Evaluation",
     "Outcome",
+    "Rescored",
     "SummaryRow",
     "check_target",
+    "declared_objectives",
     "evaluate",
     "markdown_table",
     "parameter_line",
     "parameters",
     "record_episode",
+    "rescored",
+    "rescored_table",
     "rich_table",
     "summarise",
     "write_per_world_csv",

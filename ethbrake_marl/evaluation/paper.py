@@ -64,6 +64,6 @@ def is_papers_test(evaluation: Evaluation) -> bool:
     Every value of the scenario counts, not its name; Vehicle 2 is driven, and the worlds are no table of the user's.
     """
     scenario = evaluation.scenario
-    if scenario.name not in _SHOWN_WITH or evaluation.seed is None or evaluation.vehicle != 1:
+    if scenario.name not in _SHOWN_WITH or evaluation.seed is None or evaluation.vehicles != (1,):
         return False
     return scenario.model_dump(exclude=_TEXTS) == load_scenario(scenario.name).model_dump(exclude=_TEXTS)

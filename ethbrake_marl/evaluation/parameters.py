@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.evaluation.regret import limits_do_not_apply
+from ethbrake_marl.evaluation.regret import no_limits_because
 from ethbrake_marl.evaluation.rollout import Evaluation
 from ethbrake_marl.physics import Floats, Worlds
-from ethbrake_marl.scenario.quantities import QUANTITIES
+from ethbrake_marl.scenario.quantities import DECLARED, OPTIONAL, QUANTITIES, QuantityRule
 
 _SYMBOLS = {
     "gaps_m": ("d", "m"),
@@ -20,15 +20,21 @@ _SYMBOLS = {
     "latency_s": ("τ", "s"),
     "mass_t": ("m", "t"),
     "restitution": ("e", ""),
+    "hazard_gap_m": ("obstacle at", "m"),
 }
 _STAY = "\u00a0"  # a blank at which no line is broken
 
 
 def quantity(worlds: Worlds, field: str) -> Floats:
     """A quantity of every world, [n, entries]: one entry per vehicle, pair or world (see ``QUANTITIES``)."""
-    holder = worlds if field in ("gaps_m", "speeds_mps") else worlds.vehicles
+    holder = worlds if field in ("gaps_m", "speeds_mps", *OPTIONAL) else worlds.vehicles
     values: Floats = getattr(holder, field)
     return values.reshape(worlds.n, -1)
+
+
+def quantity_rules(worlds: Worlds) -> dict[str, QuantityRule]:
+    """The quantities that these worlds have: the distance to an obstacle only where there is one."""
+    return {**QUANTITIES, **OPTIONAL} if np.isfinite(worlds.hazard_gap_m).all() else QUANTITIES
 
 
 def quantities(worlds: Worlds) -> dict[str, Any]:
@@ -37,7 +43,7 @@ def quantities(worlds: Worlds) -> dict[str, Any]:
     An entry is a number where all worlds agree, else its ``[least, largest]`` value.
     """
     found: dict[str, Any] = {}
-    for field, rule in QUANTITIES.items():
+    for field, rule in quantity_rules(worlds).items():
         entries = [_entry(column) for column in quantity(worlds, field).T]
         found[field] = entries[0] if rule.per == "world" else entries
     return found
@@ -46,16 +52,18 @@ def quantities(worlds: Worlds) -> dict[str, Any]:
 def parameters(evaluation: Evaluation) -> dict[str, Any]:
     """Conditions of an evaluation as plain data: scenario, seed, count, who drove what, and all ``quantities``."""
     scenario = evaluation.scenario
-    scripts = {scenario.vehicle_names[i]: script for i, script in scenario.scripts.items() if i != evaluation.vehicle}
+    driven = [scenario.vehicle_names[i] for i in evaluation.vehicles]
+    scripts = {scenario.vehicle_names[i]: script for i, script in scenario.scripts.items()}
+    scripts = {name: script for name, script in scripts.items() if name not in driven}
     return {
         "scenario": scenario.name,
         "seed": evaluation.seed,
         "count": evaluation.worlds.n,
-        "controlled_vehicle": scenario.vehicle_names[evaluation.vehicle],
+        **({"controlled_vehicle": driven[0]} if len(driven) == 1 else {"controlled_vehicles": driven}),
         "scripts": scripts,
         "time_step_s": scenario.time_step_s,
         "horizon_s": scenario.horizon_s,
-        "no_limits_because": limits_do_not_apply(evaluation.worlds, scenario, evaluation.vehicle),
+        "no_limits_because": no_limits_because(evaluation),
         **quantities(evaluation.worlds),
     }
 
@@ -70,7 +78,9 @@ def quantity_line(found: Mapping[str, Any]) -> str:
     """The ``quantities`` in one line, each with its symbol and unit: ``d = 7 m; v = (20, 18, 20) m/s; ...``."""
     parts = []
     for field, (symbol, unit) in _SYMBOLS.items():
-        entries = [found[field]] if QUANTITIES[field].per == "world" else found[field]
+        if field not in found:
+            continue
+        entries = [found[field]] if DECLARED[field].per == "world" else found[field]
         parts.append(f"{symbol}{_STAY}={_STAY}{_entries(entries)}{f'{_STAY}{unit}' if unit else ''}")
     return "; ".join(parts)
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.evaluation.output_files import check_target, write_output
-from ethbrake_marl.evaluation.parameters import quantity
+from ethbrake_marl.evaluation.parameters import quantity, quantity_rules
 from ethbrake_marl.evaluation.regret import Regrets, assess
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
-from ethbrake_marl.scenario.quantities import QUANTITIES
+from ethbrake_marl.harm import COUNTS
+from ethbrake_marl.objectives import Declared, scored
 
 Columns = dict[str, list[Any]]
 
@@ -29,11 +31,13 @@ REGRET_COLUMNS = (
     "regret_total_harm",
 )
 
-_ALWAYS = ("gaps_m", "speeds_mps")
+_ALWAYS = ("gaps_m", "speeds_mps", "hazard_gap_m")
 
 
-def write_per_world_csv(path: str | Path, evaluation: Evaluation, *, force: bool = False) -> None:
-    """Write one row per agent and world; docs/evaluation.md lists the columns.
+def write_per_world_csv(
+    path: str | Path, evaluation: Evaluation, *, objectives: Sequence[Declared] = (), force: bool = False
+) -> None:
+    """Write one row per agent and world; docs/evaluation.md lists the columns. ``objectives`` adds theirs.
 
     The file appears whole or not at all. Raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` without a folder.
     """
@@ -43,7 +47,7 @@ def write_per_world_csv(path: str | Path, evaluation: Evaluation, *, force: bool
     initial, regrets = initial_columns(evaluation), assess(evaluation)
     for number, (agent, outcome) in enumerate(evaluation.outcomes.items()):
         columns = {"agent": [agent] * evaluation.worlds.n, **initial, **outcome_columns(outcome)}
-        columns |= regret_columns(outcome, regrets)
+        columns |= regret_columns(outcome, regrets) | objective_columns(outcome, objectives)
         if number == 0:
             writer.writerow(columns)
         writer.writerows(zip(*columns.values(), strict=True))
@@ -56,7 +60,7 @@ def initial_columns(evaluation: Evaluation) -> Columns:
     Named as in a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``.
     """
     columns: Columns = {"world": evaluation.index.tolist()}
-    for field, rule in QUANTITIES.items():
+    for field, rule in quantity_rules(evaluation.worlds).items():
         values = quantity(evaluation.worlds, field)
         if field in _ALWAYS or np.ptp(values, axis=0).any():
             columns |= {rule.column_of(i): values[:, i].tolist() for i in range(values.shape[1])}
@@ -81,6 +85,17 @@ def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
     return {name: column.tolist() for name, column in zip(REGRET_COLUMNS, columns, strict=True)}
 
 
+def objective_columns(outcome: Outcome, objectives: Sequence[Declared]) -> Columns:
+    """What each objective is for each vehicle under both counts (m2/s2): ``social:45_first_2``."""
+    return {
+        f"{objective}_{count}_{i + 1}": values[:, i].tolist()
+        for objective in objectives
+        for count in COUNTS
+        for values in scored(outcome.ledger, count, [objective]).values()
+        for i in range(values.shape[1])
+    }
+
+
 def outcome_columns(outcome: Outcome) -> Columns:
     """What happened in each world; a column that the agent says nothing about is empty."""
     n = len(outcome.collided)
@@ -92,6 +107,10 @@ def outcome_columns(outcome: Outcome) -> Columns:
         columns |= {f"{name}_{i + 1}": harm[:, i].tolist() for i in range(harm.shape[1])}
     columns |= {"first_impact_harm": outcome.first_impact_harm.tolist(), "total_harm": outcome.total_harm.tolist()}
     final = outcome.final
+    if np.isfinite(final.hazard_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
+        columns |= {"hazard_first_impact_harm": outcome.ledger.hazard_harm("first").tolist()}
+        columns |= {"hazard_total_harm": outcome.ledger.hazard_harm("total").tolist()}
+        columns |= {"final_hazard_gap_m": final.hazard_gap_m.tolist()}
     columns |= {f"final_gap_{p + 1}_m": final.gaps_m[:, p].tolist() for p in range(final.N - 1)}
     columns |= {f"final_speed_{i + 1}_mps": final.speeds_mps[:, i].tolist() for i in range(final.N)}
     columns |= {"end_s": final.time_s.tolist(), "ended": outcome.ended.tolist()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.harm import Ledger
-from ethbrake_marl.physics import Floats, ImpactRows, Vehicles, Worlds, advance
+from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
 from ethbrake_marl.scenario import Scenario
 
 SAMPLE_S = 0.02
@@ -78,22 +78,31 @@ def record_episode(
 def _samples(segments: list[Segment], sample_s: float) -> Iterator[tuple[Floats, ...]]:
     """Rows of (time, gaps, speeds, positions, command from then on), segment by segment, the last with its end.
 
-    Worlds know gaps and speeds only. A post that stands still, ahead of Vehicle 1, makes its position one more gap.
+    Worlds know gaps and speeds only. An obstacle ahead of Vehicle 1, the world's own or one that is out of reach, makes
+    its position one more gap.
     """
     front = 0.0  # position of Vehicle 1 at the start of the segment
     for number, (before, command, end) in enumerate(segments):
         start = float(before.time_s[0])
         count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
         times = np.linspace(start, end, count + 1)
-        distance = _farthest(before, end - start) + 1.0
-        copies = _with_post(before, distance).take(np.zeros(count + 1, np.int64))
-        moved, _ = advance(copies, _ahead(-1.0, command), until_s=times)
-        position, gaps, speeds = front + (distance - moved.gaps_m[:, 0]), moved.gaps_m[:, 1:], moved.speeds_mps[:, 1:]
+        distance, post = _post_ahead(before, end - start)
+        copies = post.take(np.zeros(count + 1, np.int64))
+        moved, _ = advance(copies, command, until_s=times)
+        position, gaps, speeds = front + (distance - moved.hazard_gap_m), moved.gaps_m, moved.speeds_mps
         in_force = np.where(before.vehicles.latency_s <= times[:, np.newaxis], command, 0.0)
         rows = slice(None) if number == len(segments) - 1 else slice(count)
         columns = (times, gaps, speeds, _positions(position, gaps), in_force)
         yield tuple(column[rows] for column in columns)
         front = float(position[-1])
+
+
+def _post_ahead(world: Worlds, duration_s: float) -> tuple[float, Worlds]:
+    """The distance to an obstacle ahead, and the world with it."""
+    if np.isfinite(world.hazard_gap_m[0]):
+        return float(world.hazard_gap_m[0]), world
+    distance = _farthest(world, duration_s) + 1.0
+    return distance, replace(world, hazard_gap_m=np.array([distance]))
 
 
 def _farthest(world: Worlds, duration_s: float) -> float:
@@ -110,34 +119,6 @@ def _farthest(world: Worlds, duration_s: float) -> float:
 def _positions(front: Floats, gaps: Floats) -> Floats:
     """Positions [k, N] from those of Vehicle 1 [k] and the gaps [k, P]."""
     return np.concatenate([front[:, np.newaxis], front[:, np.newaxis] - np.cumsum(gaps, axis=1)], axis=1)
-
-
-def _with_post(world: Worlds, distance: float) -> Worlds:
-    """The world with one more vehicle in front that stands and holds, ``distance`` ahead of Vehicle 1."""
-    vehicles = world.vehicles
-    with_post = Vehicles(
-        _ahead(1.0, vehicles.braking_capacity_mps2),
-        _ahead(0.0, vehicles.driving_capacity_mps2),
-        _ahead(0.0, vehicles.latency_s),
-        _ahead(1.0, vehicles.mass_t),
-        _ahead(1.0, vehicles.speed_limit_mps),
-        vehicles.restitution,
-        np.empty((world.n, 0)),
-    )
-    no_hit = np.zeros((world.n, 1), np.bool_)
-    return Worlds(
-        with_post,
-        _ahead(distance, world.gaps_m),
-        _ahead(0.0, world.speeds_mps),
-        world.time_s,
-        np.concatenate([no_hit, world.pair_hit], axis=1),
-        _ahead(0.0, world.command_mps2),
-    )
-
-
-def _ahead(value: float, columns: Floats) -> Floats:
-    """One more column, in front."""
-    return np.concatenate([np.full((len(columns), 1), value), columns], axis=1)
 
 
 def _impacts(segments: list[Segment]) -> ImpactRows:

@@ -122,11 +122,21 @@ def limits_do_not_apply(worlds: Worlds, scenario: Scenario, vehicle: int) -> str
         script = scenario.scripts.get(i, "full_brake")
         if script != "full_brake":
             return f"{scenario.vehicle_names[i]} follows {script}; avoidability is proven where it follows full_brake"
+    if np.isfinite(worlds.hazard_gap_m).any():
+        return "an obstacle stands ahead of vehicle_1 (hazard_gap_m); no harm is proven then"
     latency_s = worlds.vehicles.latency_s
     if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():
         front, driven = scenario.vehicle_names[: _DRIVEN + 1]
         return f"{front} may brake later than {driven}; nothing is proven then"
     return None
+
+
+def no_limits_because(evaluation: Evaluation) -> str | None:
+    """Why nothing is proven for what was evaluated, as a clause; None when it is."""
+    if len(evaluation.vehicles) != 1:
+        driven = ", ".join(evaluation.scenario.vehicle_names[i] for i in evaluation.vehicles)
+        return f"driven are: {driven or 'none'}; avoidability is proven for one vehicle"
+    return limits_do_not_apply(evaluation.worlds, evaluation.scenario, evaluation.vehicle)
 
 
 def known_limits(worlds: Worlds, scenario: Scenario, vehicle: int) -> Limits | None:
@@ -142,6 +152,8 @@ def known_limits(worlds: Worlds, scenario: Scenario, vehicle: int) -> Limits | N
 
 def assess(evaluation: Evaluation) -> Regrets | None:
     """Best known harm of every world, the agents of this evaluation included; None where nothing is proven."""
+    if len(evaluation.vehicles) != 1:
+        return None
     limits = known_limits(evaluation.worlds, evaluation.scenario, evaluation.vehicle)
     if limits is None:
         return None

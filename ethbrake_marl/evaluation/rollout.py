@@ -5,7 +5,6 @@ Counting "the first episodes that finish" instead would over-count short ones, a
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount, Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate
@@ -32,7 +32,7 @@ class Outcome:
     ledger: Ledger
     final: Worlds  # each world as its episode left it
     at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
-    predicted_harm: Floats | None  # [n] what the agent expected at the alert, if it predicts
+    predicted_harm: Floats | None  # [n] what the agent expected at the alert, if it predicts and drives alone
     chosen_policy: Bools | None  # [n] a hybrid drove by its policy; else by its backup
 
     @property
@@ -42,9 +42,8 @@ class Outcome:
 
     @property
     def impacts(self) -> Ints:
-        """Number of impacts of all pairs, [n]."""
-        impacts: Ints = self.ledger.count.sum(axis=1)
-        return impacts
+        """Number of impacts of all pairs, and with an obstacle ahead, [n]."""
+        return self.ledger.impacts
 
     @property
     def first_impact_harm(self) -> Floats:
@@ -68,14 +67,22 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Outcomes of agents that drove the same vehicle in the same worlds, row k of every array being world k."""
+    """Outcomes of agents that drove the same vehicles in the same worlds, row k of every array being world k."""
 
     scenario: Scenario
-    vehicle: int  # index (0 = front) of the vehicle that the agents drove
+    vehicles: tuple[int, ...]  # indices (0 = front) of the vehicles that were driven; the others followed scripts
     worlds: Worlds  # at the alert
     index: Ints  # [n] number of each world in its list
     seed: int | None  # of the list; None for worlds that were given
     outcomes: dict[str, Outcome]
+
+    @property
+    def vehicle(self) -> int:
+        """The vehicle that was driven; raises ``InvalidInput`` if it is not exactly one."""
+        if len(self.vehicles) != 1:
+            driven = ", ".join(self.scenario.vehicle_names[i] for i in self.vehicles) or "none"
+            raise InvalidInput(f"scenario {self.scenario.name!r}: needs one driven vehicle; driven are: {driven}")
+        return self.vehicles[0]
 
     def outcome(self, agent: str) -> Outcome:
         """The outcome of one agent; raises ``InvalidInput`` naming those that were evaluated."""
@@ -86,7 +93,7 @@ class Evaluation:
 
 def evaluate(
     worlds: Worlds | Sample,
-    agents: Mapping[str, Agent],
+    agents: Mapping[str, Driver],
     *,
     scenario: Scenario,
     vehicle: int | str | None = None,
@@ -94,23 +101,24 @@ def evaluate(
     chunk: int = CHUNK,
     on_progress: Progress | None = None,
 ) -> Evaluation:
-    """Let each agent drive ``vehicle`` through every world once, from the alert to the episode's end.
+    """Let each agent drive every world once, from the alert to the episode's end.
 
-    ``vehicle`` is a name (``vehicle_2``) or an index (0 = front), by default the scenario's only learner; all others
-    follow the scenario's scripts (see ``agents.driving``). A world's outcome depends neither on ``chunk`` nor on the
-    other worlds, and the given agents are left as they are. ``seed`` is noted, not used. Raises ``InvalidInput`` for
-    worlds that do not fit the scenario or are not at the alert, no agents, or a second learner that nobody drives.
+    The scenario's learners are driven, each by its own copy of the agent, or by its driver in a ``Team``; or just
+    ``vehicle``, a name (``vehicle_2``) or an index (0 = front). All others follow the scenario's scripts (see
+    ``agents.driving``). A world's outcome depends neither on ``chunk`` nor on the other worlds, and the given agents
+    are left as they are. ``seed`` is noted, not used. Raises ``InvalidInput`` for worlds that do not fit the scenario
+    or are not at the alert, no agents, no vehicle to drive, a team of other vehicles, or a learner that nobody drives.
     """
     _check_request(worlds, agents, scenario, chunk)
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
-    driven = controlled_vehicle(scenario, vehicle)
+    driven = driven_vehicles(scenario, vehicle, agents)
     outcomes = {}
     for name, agent in agents.items():
         parts = []
         for first in range(0, sample.worlds.n, chunk):
             rows = np.arange(first, min(first + chunk, sample.worlds.n))
-            parts.append(_roll_out(sample.worlds.take(rows), agent, scenario, driven))
+            parts.append(_roll_out(sample.worlds.take(rows), team_of(agent, driven), scenario))
             if on_progress is not None:
                 on_progress(name, int(rows[-1]) + 1)
         outcomes[name] = _joined(parts)
@@ -132,10 +140,17 @@ def _check_request(worlds: object, agents: object, scenario: object, chunk: obje
     if not agents:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
     for name, agent in agents.items():
-        if not isinstance(agent, Agent):
+        if not isinstance(agent, Agent | Team):
             raise InvalidInput(f"evaluate: agent {name!r} = {agent!r}: must be an agent, as make_agent(name) gives")
     if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or not chunk >= 1:
         raise InvalidInput(f"evaluate: chunk = {chunk!r}; a whole number of worlds, at least 1 at a time, is needed")
+
+
+def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
+    """Indices of the vehicles to drive: the given one, or all learners; nobody, if the agents are teams of nobody."""
+    if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
+        return (controlled_vehicle(scenario, vehicle),)
+    return scenario.learners
 
 
 def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
@@ -163,11 +178,11 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
     return int(vehicle)
 
 
-def _roll_out(worlds: Worlds, agent: Agent, scenario: Scenario, vehicle: int) -> Outcome:
-    """Outcome of a copy of the agent: what the given one remembers is neither used nor changed."""
-    driver = copy.deepcopy(agent)
-    episodes = drive(worlds, driver, scenario, vehicle)
-    predicted, chosen = _said(driver, "predicted_harm", worlds.n), _said(driver, "chosen_policy", worlds.n)
+def _roll_out(worlds: Worlds, team: Team, scenario: Scenario) -> Outcome:
+    """Outcome of a fresh team; what an agent says about a world counts where it drives alone."""
+    episodes = drive(worlds, team, scenario)
+    alone = next(iter(team.drivers.values())) if len(team.drivers) == 1 else None
+    predicted, chosen = (_said(alone, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
     return Outcome(
         episodes.ledger,
         episodes.final,
@@ -177,10 +192,10 @@ def _roll_out(worlds: Worlds, agent: Agent, scenario: Scenario, vehicle: int) ->
     )
 
 
-def _said(agent: Agent, attribute: str, n: int) -> NDArray[np.generic] | None:
+def _said(agent: Agent | None, attribute: str, n: int) -> NDArray[np.generic] | None:
     """What the agent says about each world of the batch, or None when it says nothing."""
     value = getattr(agent, attribute, None)
-    if value is None:
+    if agent is None or value is None:
         return None
     column = np.asarray(value)
     if column.shape != (n,):

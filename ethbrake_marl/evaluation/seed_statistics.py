@@ -64,25 +64,75 @@ def paired_over_seeds(
     that leaves out 0 holds for other seeds *and* other worlds. None with a single world. Raises ``InvalidInput`` for
     arrays that cannot be paired or are not finite.
     """
-    first, second = (np.atleast_2d(np.asarray(given, np.float64)) for given in (values, baseline))
-    if first.ndim != 2 or second.ndim != 2 or first.shape[1] != second.shape[1] or not first.size or not second.size:
-        raise InvalidInput(
-            f"paired_over_seeds: shapes {first.shape} and {second.shape}: must be [seeds, worlds] with the same worlds"
-        )
-    if not (np.isfinite(first).all() and np.isfinite(second).all()):
-        raise InvalidInput("paired_over_seeds: every harm must be finite")
+    first, second = _paired("paired_over_seeds", values, baseline)
     value = float((first.mean(axis=0) - second.mean(axis=0)).mean())
-    worlds = first.shape[1]
-    if worlds < 2:
+    if first.shape[1] < 2:
         return Estimate(value, None)
+    means = _resampled_means((first, second), resamples, seed)
+    return _with_percentiles(value, means[:, 0] - means[:, 1], confidence)
+
+
+def mean_over_seeds(
+    values: ArrayLike, *, confidence: float = CONFIDENCE, resamples: int = 2000, seed: int = 0
+) -> Estimate:
+    """Mean of ``values`` [seeds, worlds], with the interval that holds for other seeds and other worlds."""
+    given = np.atleast_2d(np.asarray(values, np.float64))
+    return paired_over_seeds(
+        given, np.zeros((1, given.shape[-1])), confidence=confidence, resamples=resamples, seed=seed
+    )
+
+
+def share_over_seeds(
+    values: ArrayLike,
+    worst: ArrayLike,
+    best: ArrayLike,
+    *,
+    confidence: float = CONFIDENCE,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Estimate | None:
+    """``(mean(worst) - mean(values)) / (mean(worst) - mean(best))`` on the same worlds, [seeds, worlds] each.
+
+    Which part of the way from ``worst`` to ``best`` the values are; the interval is as in ``paired_over_seeds``. None
+    where ``best`` is not below ``worst``.
+    """
+    sides = _paired("share_over_seeds", values, worst, best)
+    reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
+    if not high > low:
+        return None
+    share = (high - reached) / (high - low)
+    if sides[0].shape[1] < 2:
+        return Estimate(share, None)
+    means = _resampled_means(sides, resamples, seed)
+    means = means[means[:, 1] > means[:, 2]]
+    return _with_percentiles(share, (means[:, 1] - means[:, 0]) / (means[:, 1] - means[:, 2]), confidence)
+
+
+def _paired(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
+    """The sides as [seeds, worlds], all with the same worlds; raises ``InvalidInput``."""
+    arrays = tuple(np.atleast_2d(np.asarray(given, np.float64)) for given in sides)
+    if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
+        shapes = " and ".join(str(side.shape) for side in arrays)
+        raise InvalidInput(f"{who}: shapes {shapes}: must be [seeds, worlds] with the same worlds")
+    if not all(np.isfinite(side).all() for side in arrays):
+        raise InvalidInput(f"{who}: every harm must be finite")
+    return arrays
+
+
+def _resampled_means(sides: Sequence[Floats], resamples: int, seed: int) -> Floats:
+    """Means [resamples, sides] over seeds of each side and over worlds, which all sides share, drawn anew."""
+    worlds = sides[0].shape[1]
     rng = np.random.default_rng(seed)
-    differences = np.empty(resamples)
+    means = np.empty((resamples, len(sides)))
     for k in range(resamples):
         weight = np.bincount(rng.integers(worlds, size=worlds), minlength=worlds) / worlds
-        means = [side[rng.integers(len(side), size=len(side))] @ weight for side in (first, second)]
-        differences[k] = means[0].mean() - means[1].mean()
+        means[k] = [(side[rng.integers(len(side), size=len(side))] @ weight).mean() for side in sides]
+    return means
+
+
+def _with_percentiles(value: float, resampled: Floats, confidence: float) -> Estimate:
     tail = 50.0 * (1.0 - confidence)
-    low, high = np.percentile(differences, [tail, 100.0 - tail])
+    low, high = np.percentile(resampled, [tail, 100.0 - tail])
     return Estimate(value, (float(low), float(high)))
 
 

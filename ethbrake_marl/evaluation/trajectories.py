@@ -67,6 +67,8 @@ def _positions(axes: Axes, record: EpisodeRecord) -> None:
             linewidth=1.6,
             label=f"Vehicle {i + 1}",
         )
+    if np.isfinite(record.initial.hazard_gap_m[0]):
+        axes.axhline(float(record.initial.hazard_gap_m[0]), color="black", linewidth=2.5, label="obstacle")
     rows = record.impacts
     at = _at(record, rows.time_s, rows.pair)
     for first, fill, size, label in ((True, "black", 60.0, "first impact"), (False, "white", 26.0, "later impact")):
@@ -121,8 +123,9 @@ def _vehicle_style(i: int) -> tuple[str, str | tuple[int, tuple[int, ...]]]:
 
 
 def _at(record: EpisodeRecord, time_s: Floats, pair: np.ndarray) -> Floats:
-    """Position at which the front vehicle of each impact's pair was at that time."""
-    return np.array([np.interp(t, record.time_s, record.positions_m[:, p]) for t, p in zip(time_s, pair, strict=True)])
+    """Position at which the front vehicle of each impact's pair was at that time; at the obstacle, Vehicle 1."""
+    front = np.maximum(pair, 0)
+    return np.array([np.interp(t, record.time_s, record.positions_m[:, i]) for t, i in zip(time_s, front, strict=True)])
 
 
 def _speed(speed_mps: float) -> str:

@@ -6,16 +6,22 @@ from ethbrake_marl.shield.guard import StepShield
 from ethbrake_marl.shield.parallel import HybridShield, shielded_aec
 from ethbrake_marl.shield.single import ShieldedEnv
 from ethbrake_marl.shield.step import StepShieldAgent
+from ethbrake_marl.shield.uncertainty import Interval, Uncertainty, parse_uncertainty
+from ethbrake_marl.shield.vector import ShieldedVectorEnv
 
 __all__ = [
     "Backup",
     "Decision",
     "HybridAgent",
     "HybridShield",
+    "Interval",
     "Running",
     "ShieldedEnv",
+    "ShieldedVectorEnv",
     "StepShield",
     "StepShieldAgent",
+    "Uncertainty",
     "certify",
+    "parse_uncertainty",
     "shielded_aec",
 ]

@@ -19,11 +19,18 @@ operations of the engine's step in their order, and adds harm in its order. So:
 
 The budget is ``c`` (or anything between ``c`` and ``B``), so ``c <= B`` always. ∎ No tolerance enters: where the engine
 does what it is said to do, realised harm and the last bound are the same double.
+
+**Several members.** Where a world has more than one (``shield.uncertainty``), each is advanced by the same actions, and
+every harm above is the largest over them. Then the harm realised in *any* member is at most ``B``.
+
+**Several members.** Where a world has more than one (``shield.uncertainty``), every harm above is the largest over
+them, each member being advanced by the same actions: then the realised harm of *every* member is at most ``B``.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,31 +49,71 @@ REASONS = (
     "not a number",  # nothing usable was proposed: the plan's action was applied
     "ended",  # the episode is over
     "assumption broken",  # the world did not do what was predicted: the fallback was applied
+    "policy rollout",  # nothing else kept the budget, but the policy itself does, rolled out after the proposal
 )
+PER_ROW = ("start", "clock", "bounds", "command", "latency", "mass", "limit", "identity")  # arrays of a problem
 CONSTANTS = tuple(-k / 10 for k in range(11))  # actions that are tried as constants: coasting to full braking
 
 
 class Running(NamedTuple):
-    """Running episodes at a decision, as the shield knows them."""
+    """Running episodes at a decision, as the shield knows them: n worlds with M members each (``shield.uncertainty``).
 
-    problem: ProfileProblem  # parameters, commands of the others, grid of decisions; one vehicle
-    states: Floats  # [n, S] of agents.profile_motion: speeds, gaps, hit flags, both harms so far
+    World k's members are the rows k * M to k * M + M - 1, the nominal one first; without uncertainty M is 1.
+    """
+
+    problem: ProfileProblem  # parameters, commands of the others, grid of decisions; one vehicle; n * M rows
+    states: Floats  # [n * M, S] of agents.profile_motion: speeds, gaps, hit flags, both harms so far
     steps: Ints  # [n] number of the decision
-    ended: Bools  # [n]
+    ended: Bools  # [n * M]
+
+    @property
+    def n(self) -> int:
+        """Number of worlds."""
+        return len(self.steps)
+
+    @property
+    def members(self) -> int:
+        """Number of members of each world (M)."""
+        return len(self.ended) // max(self.n, 1)
+
+    @property
+    def finished(self) -> Bools:
+        """Worlds in which every member's episode is over, [n]."""
+        return np.asarray(self.ended.reshape(self.n, -1).all(axis=1), np.bool_)
 
     @property
     def time_s(self) -> Floats:
-        """Time of the decision, [n] s."""
-        clock = self.problem.clock
+        """Time of the decision in the nominal member, [n] s."""
+        clock = self.problem.clock[:: self.members]
         time: Floats = clock[:, START] + self.steps * clock[:, TIME_STEP]
         return time
+
+    def rows_of(self, worlds: Ints) -> Ints:
+        """The rows of the members of some worlds."""
+        rows: Ints = (worlds[:, np.newaxis] * self.members + np.arange(self.members)).ravel()
+        return rows
+
+    def take(self, worlds: Ints) -> Running:
+        """Some of the worlds, with all their members."""
+        return self._select(self.rows_of(worlds), worlds)
+
+    def nominal(self) -> Running:
+        """Every world with its nominal member alone."""
+        if self.members == 1:
+            return self
+        return self._select(np.arange(self.n) * self.members, np.arange(self.n))
+
+    def _select(self, rows: Ints, worlds: Ints) -> Running:
+        problem = self.problem
+        arrays: dict[str, Any] = {name: getattr(problem, name)[rows] for name in PER_ROW}
+        return Running(replace(problem, **arrays), self.states[rows], self.steps[worlds], self.ended[rows])
 
 
 class Backup(NamedTuple):
     """What is executed if nothing else is certified."""
 
     plan: Floats  # [n, L] actions, column j for decision j
-    harm: Floats  # [n] of the episode if it is executed from now on (m2/s2)
+    harm: Floats  # [n] of the episode if it is executed from now on, in the worst member (m2/s2)
     constants: Floats = np.array(CONSTANTS)  # [K] actions that may replace the rest of a plan
 
 
@@ -82,24 +129,34 @@ class Decision(NamedTuple):
     backup: Backup  # the plan that goes with the bound
 
 
-def begin_running(problem: ProfileProblem) -> Running:
-    """The episodes of a problem at their first decision."""
+def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
+    """The episodes of a problem at their first decision; its rows are worlds with ``members`` each."""
     if len(problem.vehicles) != 1:
         raise InvalidInput(f"shield: {len(problem.vehicles)} controlled vehicles; exactly one is needed")
-    return Running(problem, problem.start, np.zeros(problem.n, np.int64), np.zeros(problem.n, np.bool_))
+    steps, ended = np.zeros(problem.n // members, np.int64), np.zeros(problem.n, np.bool_)
+    return Running(problem, problem.start, steps, ended)
 
 
 def plan_harm(running: Running, plan: Floats) -> Floats:
-    """Harm of the episodes if the plans [n, L] are executed from here, [n] m2/s2, to the engine's bits."""
-    problem, value = running.problem, np.empty(running.problem.n)
+    """Harm of the episodes, in the worst member, if the plans [n, L] are executed from here, [n] m2/s2.
+
+    It is to the engine's bits.
+    """
+    return bettered_plan(running, plan, np.zeros(0))[1]
+
+
+def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
+    """The plans [n, L], or where it harms less in the worst member the best of the constant actions; and that harm."""
+    problem, value = running.problem, np.empty(running.n)
     _check_plan(running, plan)
+    plans = np.array(plan, np.float64, order="C")
     harm_of_plans(
-        running.states, running.steps, problem.clock, _bounds(problem), problem.command, problem.latency, problem.mass,
-        problem.limit, int(problem.vehicles[0]), np.ascontiguousarray(plan, np.float64), value,
+        running.states, running.steps, running.ended, problem.clock, _bounds(problem), problem.command,
+        problem.latency, problem.mass, problem.limit, int(problem.vehicles[0]), constants, plans, value,
     )  # fmt: skip
     if not np.isfinite(value).all():
         raise PhysicsError(f"shield: world {int(np.argmin(np.isfinite(value)))} could not be advanced")
-    return value
+    return plans, value
 
 
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
@@ -109,7 +166,7 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
     one that is no number is replaced. Nothing given is changed. Raises ``InvalidInput`` for shapes that do not fit or a
     budget below the backup's harm, ``PhysicsError`` if a world cannot be advanced.
     """
-    n, problem = running.problem.n, running.problem
+    n, problem = running.n, running.problem
     _check_plan(running, backup.plan)
     given = np.ascontiguousarray(proposed, np.float64)
     if not given.shape == backup.harm.shape == budget.shape == (n,):
@@ -119,7 +176,7 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
     if not (budget >= backup.harm).all():
         raise InvalidInput("certify: a budget is below the backup's harm; nothing could be guaranteed")
     plans, after, out = backup.plan.copy(), np.empty_like(running.states), np.empty((n, 4))
-    over = np.zeros(n, np.bool_)
+    over = np.zeros(problem.n, np.bool_)
     failed = certify_worlds(
         running.states, running.steps, running.ended, problem.clock, _bounds(problem), problem.command,
         problem.latency, problem.mass, problem.limit, int(problem.vehicles[0]), given, budget, backup.harm,
@@ -130,7 +187,7 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
     applied, bound, margin = out[:, 0].copy(), out[:, 2].copy(), out[:, 3].copy()
     reason = out[:, 1].astype(np.int64)
     intervened = (reason == NO_CERTIFICATE) | (reason == NOT_A_NUMBER)
-    later = running._replace(states=after, steps=running.steps + ~running.ended, ended=over)
+    later = running._replace(states=after, steps=running.steps + ~running.finished, ended=over)
     return Decision(applied, intervened, reason, bound, margin, later, backup._replace(plan=plans, harm=bound))
 
 
@@ -140,5 +197,5 @@ def _bounds(problem: ProfileProblem) -> Floats:
 
 def _check_plan(running: Running, plan: Floats) -> None:
     most = int(running.problem.last_step.max(initial=0))
-    if plan.ndim != 2 or plan.shape[0] != running.problem.n or plan.shape[1] < most:
-        raise InvalidInput(f"shield: plan {plan.shape}; ({running.problem.n}, at least {most}) is needed")
+    if plan.ndim != 2 or plan.shape[0] != running.n or plan.shape[1] < most:
+        raise InvalidInput(f"shield: plan {plan.shape}; ({running.n}, at least {most}) is needed")

@@ -15,9 +15,8 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import drive, introduce, scripted
 from ethbrake_marl.agents.e_v2x_bm import EV2XBM
-from ethbrake_marl.agents.protocol import Agent, place
+from ethbrake_marl.agents.protocol import Agent, check_agent, place
 from ethbrake_marl.agents.rehearsed import Rehearsed
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
@@ -36,8 +35,7 @@ class HybridAgent:
     def __init__(
         self, policy: Agent, scenario: Scenario, *, bound: Bound = "coupled", count: HarmCount = "first"
     ) -> None:
-        if not isinstance(policy, Agent):
-            raise InvalidInput(f"hybrid: {policy!r} is not an agent; load_policy(path) or make_agent(name) makes one")
+        check_agent(policy, "hybrid")
         self.policy = policy
         self.backup = EV2XBM(bound, count=count, horizon_s=scenario.horizon_s)
         self.scenario = scenario

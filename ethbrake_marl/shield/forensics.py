@@ -52,7 +52,7 @@ def review(driver: StepShieldAgent, worlds: Worlds, vehicle: int) -> Review:
     realised = shield.bound[world]
     without = np.zeros(0)
     if world.size:
-        clock = shield.running.problem.clock[world]
+        clock = shield.running.nominal().problem.clock[world]
         again = _Released(copy.deepcopy(driver.policy), shield.backup.plan[world], step, clock)
         without = drive(worlds.take(world), again, driver.scenario, vehicle).ledger.world_harm(shield.count)
     verdict = np.where(without > realised + SAME_HARM, "needed", "harmless")

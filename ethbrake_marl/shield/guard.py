@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
@@ -10,24 +9,35 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.actions import action_to_command, command_to_action
+from ethbrake_marl.actions import command_to_action
 from ethbrake_marl.agents.coupled import optimise_coupled
-from ethbrake_marl.agents.driving import drive, introduce, scripted
+from ethbrake_marl.agents.driving import scripted
 from ethbrake_marl.agents.others import fixed_commands
-from ethbrake_marl.agents.profile_motion import START, TIME_STEP
-from ethbrake_marl.agents.profile_problem import ProfileProblem, profile_problem
+from ethbrake_marl.agents.profile_problem import profile_problem
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.shield.certify import Backup, Decision, Running, begin_running, certify, plan_harm
-from ethbrake_marl.shield.certify_kernel import ENDED
+from ethbrake_marl.shield.certify import (
+    PER_ROW,
+    Backup,
+    Decision,
+    Running,
+    begin_running,
+    bettered_plan,
+    certify,
+    plan_harm,
+)
+from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE
+from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, rolled_out
+from ethbrake_marl.shield.uncertainty import Uncertainty
 from ethbrake_marl.starts import Script
 
-BROKEN = ENDED + 1  # the last of REASONS
+BROKEN, ROLLOUT = ENDED + 1, ENDED + 2  # the reasons that the kernel does not know
 Number = TypeVar("Number", bound=np.generic)
-_PER_WORLD = ("start", "clock", "bounds", "command", "latency", "mass", "limit", "identity")
+SLACK = 1e-9  # by more than this (m, m/s) a world lies outside what several members predict; one member is exact
+LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions, for the bound at the alert where there are several members
 
 
 class Intervention(NamedTuple):
@@ -54,8 +64,9 @@ class StepShield:
     fixed at the alert. What happens is compared with what was predicted, bit by bit: where it differs (a vehicle that
     brakes beyond its capacity, a number that is none, a message that never came) ``distrusted`` [n] is set, nothing is
     guaranteed any more, and for the rest of the episode the fallback ``best constant`` drives: the better one of the
-    plan's rest and the constants, chosen again after every surprise. Raises ``InvalidInput`` for an unknown count, a
-    negative allowance, or others whose commands are not fixed.
+    plan's rest and the constants, chosen again after every surprise. With an ``uncertainty`` (robust mode) all of this
+    holds for the worst member of each world, and what is seen must lie within the range of their predictions. Raises
+    ``InvalidInput`` for an unknown count, a negative allowance, or others whose commands are not fixed.
     """
 
     fallback = "best constant"
@@ -68,12 +79,14 @@ class StepShield:
         count: HarmCount = "first",
         allowance: float = 0.0,
         others: Mapping[int, Script] | None = None,
+        uncertainty: Uncertainty | None = None,
         logging: bool = False,
     ) -> None:
         check_count(count)
         if not 0.0 <= allowance < np.inf:
             raise InvalidInput(f"shield: allowance = {allowance!r}: must be at least 0 m2/s2")
         self.scenario, self.vehicle, self.count, self.allowance = scenario, vehicle, count, allowance
+        self.uncertainty = uncertainty
         self.log: list[Intervention] | None = [] if logging else None
         self.running: Running | None = None
         self.backup = Backup(np.zeros((0, 0)), np.zeros(0))
@@ -96,45 +109,62 @@ class StepShield:
         return np.maximum(self.backup.harm, np.minimum(self._budget, self.first_bound + self.allowance))
 
     def begin(self, worlds: Worlds, rows: Ints, policy: Agent | None = None) -> None:
-        """New episodes start in these rows; ``worlds`` holds those rows only, at the alert."""
+        """New episodes start in these rows; ``worlds`` holds those rows only, at the alert, as they are believed."""
         scenario, vehicle = self.scenario, self.vehicle
-        others = fixed_commands(self._others, worlds, "shield", vehicle=vehicle)
+        possible = worlds if self.uncertainty is None else self.uncertainty.members(worlds)
+        members = possible.n // worlds.n
+        others = fixed_commands(self._others, possible, "shield", vehicle=vehicle)
         best = optimise_coupled(
-            worlds, vehicle, count=self.count, horizon_s=scenario.horizon_s, others_mps2=others
+            worlds, vehicle, count=self.count, horizon_s=scenario.horizon_s, others_mps2=others[::members]
         ).deceleration_mps2
         problem = profile_problem(
-            worlds, [vehicle], count=self.count, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s,
+            possible, [vehicle], count=self.count, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s,
             others_mps2=others,
         )  # fmt: skip
-        running = begin_running(problem)
+        running = begin_running(problem, members)
         plan = np.repeat(command_to_action(-best, worlds.vehicles, vehicle)[:, np.newaxis], self._width, axis=1)
+        if members > 1:
+            plan = bettered_plan(running, plan, LOOKED_AT)[0]
         harm, alone = plan_harm(running, plan), np.full(worlds.n, np.inf)
         if policy is not None:
-            actions = rolled_out(worlds, policy, scenario, vehicle, problem, self._width)
+            actions = rolled_out(worlds, policy, scenario, vehicle, running.nominal().problem, self._width)
             alone = plan_harm(running, actions)
             plan[alone <= harm] = actions[alone <= harm]
             harm = np.minimum(alone, harm)
         self._place(rows, running, Backup(plan, harm), alone)
 
-    def decide(self, proposed: Floats, *, seen: Floats | None = None, only: Bools | None = None) -> Decision:
+    def decide(
+        self,
+        proposed: Floats,
+        *,
+        seen: Floats | None = None,
+        only: Bools | None = None,
+        proposer: Proposer | None = None,
+    ) -> Decision:
         """Decide in every running episode, or ``only`` in some; the others stay as they are.
 
-        ``seen`` [n, columns]: the worlds as they are now, in the first columns of ``Running.states``.
+        ``seen`` [n, columns]: the worlds as they are now, in the first columns of ``Running.states``. Where nothing
+        else certifies a proposal, the ``proposer`` (if given) is rolled out from the state after it.
         """
         assert self.running is not None
-        before = self.running
-        asked = ~before.ended if only is None else only & ~before.ended
+        asked = ~self.running.finished if only is None else only
         if seen is not None:
             self._compare(seen, asked)
-        now = self.running._replace(ended=~asked)
+        before = self.running
+        asked = asked & ~before.finished
+        each = np.repeat(asked, before.members)
+        now = before._replace(ended=before.ended | ~each)
         given = np.where(self.distrusted, np.nan, np.asarray(proposed, np.float64))
         held, budget = self.backup, self.budget
         decision = certify(now, given, held, budget)
+        if proposer is not None and (rows := np.flatnonzero(decision.reason == NO_CERTIFICATE)).size:
+            width = held.plan.shape[1]
+            decision = _merged(decision, rows, certify_rollouts(now, given, rows, budget, width, proposer))
         decision.reason[asked & self.distrusted] = BROKEN
         self.interventions = self.interventions + (decision.intervened & asked)
         if self.log is not None:
             self._write(now, proposed, decision, held)
-        self.running = decision.after._replace(ended=before.ended | (decision.after.ended & asked))
+        self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
         self.backup = decision.backup
         self._budget = np.where(asked & (self.allowance == 0.0), decision.bound, self._budget)
         return decision
@@ -142,21 +172,23 @@ class StepShield:
     def commands(self, actions: Floats) -> Floats:
         """Wanted signed accelerations of actions, to the bits of the engine, [n] m/s2."""
         assert self.running is not None
-        braking, driving = -self.running.problem.bounds[:, 0, 0], self.running.problem.bounds[:, 0, 1]
+        bounds = self.running.nominal().problem.bounds
+        braking, driving = -bounds[:, 0, 0], bounds[:, 0, 1]
         return np.where(actions < 0.0, actions * braking, actions * driving)
 
     def _compare(self, seen: Floats, asked: Bools) -> None:
         """Find the worlds that did not do what was predicted, and choose anew there from what is seen."""
         assert self.running is not None
-        columns = seen.shape[1]
-        surprising = asked & ~(seen == self.running.states[:, :columns]).all(axis=1)
+        running, columns = self.running, seen.shape[1]
+        surprising = asked & ~as_predicted(running, seen)
         if not surprising.any():
             return
         self.distrusted = self.distrusted | surprising
         rows = np.flatnonzero(surprising & np.isfinite(seen).all(axis=1))  # others: what was predicted goes on
-        states = self.running.states.copy()
-        states[rows, :columns] = seen[rows]
-        self.running = self.running._replace(states=states)
+        states, ended, at = running.states.copy(), running.ended.copy(), running.rows_of(rows)
+        states[at, :columns] = np.repeat(seen[rows], running.members, axis=0)
+        ended[at] = np.repeat(running.steps[rows], running.members) >= running.problem.last_step[at]
+        self.running = running._replace(states=states, ended=ended)
         plan, harm = self.backup.plan.copy(), self.backup.harm.copy()
         harm[rows] = np.inf
         for constant in (None, *self.backup.constants):
@@ -171,20 +203,20 @@ class StepShield:
         """Keep new episodes in these rows."""
         if self.running is None or len(rows) == len(self.first_bound):
             order = np.argsort(rows)
-            self.running, self.backup = _taken(running, order), Backup(backup.plan[order], backup.harm[order])
+            self.running, self.backup = running.take(order), Backup(backup.plan[order], backup.harm[order])
             self.first_bound, self.alone_harm = backup.harm[order], alone[order]
             self._budget = self.first_bound + self.allowance
             self.interventions, self.distrusted = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.bool_)
             return
-        old = self.running
+        old, at = self.running, self.running.rows_of(rows)
         arrays: dict[str, Any] = {
-            name: _put(getattr(old.problem, name), rows, getattr(running.problem, name)) for name in _PER_WORLD
+            name: _put(getattr(old.problem, name), at, getattr(running.problem, name)) for name in PER_ROW
         }
         self.running = Running(
             replace(old.problem, **arrays),
-            _put(old.states, rows, running.states),
+            _put(old.states, at, running.states),
             _put(old.steps, rows, running.steps),
-            _put(old.ended, rows, running.ended),
+            _put(old.ended, at, running.ended),
         )
         self.backup = Backup(_put(self.backup.plan, rows, backup.plan), _put(self.backup.harm, rows, backup.harm))
         self.first_bound = _put(self.first_bound, rows, backup.harm)
@@ -195,45 +227,32 @@ class StepShield:
 
     def _write(self, now: Running, proposed: Floats, decision: Decision, held: Backup) -> None:
         assert self.log is not None
-        times = now.time_s
+        times, states = now.time_s, now.nominal().states
         for k in np.flatnonzero(decision.intervened).tolist():
             row = Intervention(
                 k, int(now.steps[k]), float(times[k]), float(proposed[k]), float(decision.applied[k]),
-                int(decision.reason[k]), float(decision.bound[k]), float(decision.margin[k]), now.states[k].copy(),
+                int(decision.reason[k]), float(decision.bound[k]), float(decision.margin[k]), states[k].copy(),
                 held.plan[k].copy(),
             )  # fmt: skip
             self.log.append(row)
 
 
-def rolled_out(
-    worlds: Worlds, policy: Agent, scenario: Scenario, vehicle: int, problem: ProfileProblem, width: int
-) -> Floats:
-    """The actions [n, width] of a policy that drives alone from the alert; full braking beyond its episode's end."""
-    recorder = _Recorder(copy.deepcopy(policy), problem, width)
-    introduce(recorder.policy, vehicle, scripted(scenario, but=vehicle))
-    drive(worlds, recorder, scenario, vehicle)
-    return recorder.actions
+def as_predicted(running: Running, seen: Floats) -> Bools:
+    """Where what is seen [n, columns] does not contradict the prediction, [n].
 
-
-class _Recorder:
-    """A policy whose actions are written down, and applied as they are written."""
-
-    name = "recorder"
-
-    def __init__(self, policy: Agent, problem: ProfileProblem, width: int) -> None:
-        self.policy = policy
-        self.actions = np.full((problem.n, width), -1.0)
-        self._clock = problem.clock
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        self.policy.begin(worlds, vehicle, rows)
-
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        action = command_to_action(self.policy.act(worlds, vehicle), worlds.vehicles, vehicle)
-        step = np.rint((worlds.time_s - self._clock[:, START]) / self._clock[:, TIME_STEP]).astype(np.int64)
-        rows = np.flatnonzero((step >= 0) & (step < self.actions.shape[1]))
-        self.actions[rows, step[rows]] = action[rows]
-        return action_to_command(action, worlds.vehicles, vehicle)
+    One member: where it is what was predicted, to the bit. Several: where it lies within the range of their
+    predictions, by column; once one of them has had an impact, worlds between the corners may leave that range, and any
+    finite numbers will do.
+    """
+    columns, N = seen.shape[1], (running.states.shape[1] + 4) // 5
+    predicted = running.states.reshape(running.n, running.members, -1)
+    slack = 0.0 if running.members == 1 else SLACK
+    low, high = predicted[:, :, :columns].min(axis=1) - slack, predicted[:, :, :columns].max(axis=1) + slack
+    within: Bools = ((seen >= low) & (seen <= high)).all(axis=1)
+    if running.members > 1:
+        had_impact = (predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2))
+        within |= had_impact & np.isfinite(seen).all(axis=1)
+    return within
 
 
 def _put(old: NDArray[Number], rows: Ints, new: NDArray[Number]) -> NDArray[Number]:
@@ -242,12 +261,28 @@ def _put(old: NDArray[Number], rows: Ints, new: NDArray[Number]) -> NDArray[Numb
     return placed
 
 
-def _taken(running: Running, rows: Ints) -> Running:
-    problem = running.problem
-    arrays: dict[str, Any] = {name: getattr(problem, name)[rows] for name in _PER_WORLD}
-    return Running(replace(problem, **arrays), running.states[rows], running.steps[rows], running.ended[rows])
+def _merged(decision: Decision, rows: Ints, found: Decision) -> Decision:
+    """A batch's decision with that of ``rows`` replaced where the policy's rollout kept the budget."""
+    margin = decision.margin.copy()
+    margin[rows] = np.maximum(margin[rows], found.margin)
+    kept = np.flatnonzero(~found.intervened)
+    at, after, plan = rows[kept], found.after, found.backup.plan
+    return Decision(
+        _put(decision.applied, at, found.applied[kept]),
+        _put(decision.intervened, at, found.intervened[kept]),
+        _put(decision.reason, at, np.full(len(at), ROLLOUT)),
+        _put(decision.bound, at, found.bound[kept]),
+        margin,
+        decision.after._replace(
+            states=_put(decision.after.states, decision.after.rows_of(at), after.states[after.rows_of(kept)]),
+            ended=_put(decision.after.ended, decision.after.rows_of(at), after.ended[after.rows_of(kept)]),
+        ),
+        decision.backup._replace(
+            plan=_put(decision.backup.plan, at, plan[kept]), harm=_put(decision.backup.harm, at, found.bound[kept])
+        ),
+    )
 
 
 def _harm_of(running: Running, plan: Floats, rows: Ints) -> Floats:
     """Harm of the plans in some of the worlds."""
-    return plan_harm(_taken(running, rows), plan[rows])
+    return plan_harm(running.take(rows), plan[rows])

@@ -20,8 +20,9 @@ from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Ints, Worlds
 from ethbrake_marl.shield.attached import AttachedShield, engine_of, only_shielded
 from ethbrake_marl.shield.episode import Bound, HybridAgent
+from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
 
-MODES = ("episode", "step")
+MODES = ("episode", "step", "robust")
 
 
 class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
@@ -32,8 +33,10 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
     policy, not single actions: while it drives, its own deterministic action is applied, whatever is proposed.
     ``infos[agent]["shield"]`` holds proposed and applied action, who drives, and both harms. Mode ``step`` certifies
     every action that is proposed (by the caller, or by ``policy`` where none is passed), and replaces those that cannot
-    keep the bound: see ``StepShield``; its infos say why. ``bound`` is the episode mode's, ``allowance`` (m2/s2 above
-    the bound) the step mode's. The claim of a bound holds for one shielded vehicle, the others following their scripts.
+    keep the bound: see ``StepShield``; its infos say why. Mode ``robust`` is step mode with an ``uncertainty``
+    (``"latency_s=0.1"``): what is certified must hold in every member. ``bound`` is the episode mode's, ``allowance``
+    (m2/s2 above the bound) that of the others. The claim of a bound holds for one shielded vehicle, the others
+    following their scripts.
     """
 
     def __init__(
@@ -45,10 +48,12 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         bound: Bound = "coupled",
         count: HarmCount = "first",
         allowance: float = 0.0,
+        uncertainty: Uncertainty | str | None = None,
         agents: Sequence[str] | None = None,
     ) -> None:
         if mode not in MODES:
             raise unknown_name("shield mode", mode, MODES)
+        intervals = mode_uncertainty(mode, uncertainty, "HybridShield")
         engine = engine_of(env)
         super().__init__(env)
         self._engine = engine
@@ -61,8 +66,8 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         self.shielded = shielded[0]
         self._vehicle = names.index(self.shielded)
         self.attached: AttachedShield | None = None
-        if mode == "step":
-            self.attached = AttachedShield(env, policy, count=count, allowance=allowance)
+        if mode != "episode":
+            self.attached = AttachedShield(env, policy, count=count, allowance=allowance, uncertainty=intervals)
             return
         if not (isinstance(policy, Agent) or callable(policy)):
             raise InvalidInput(f"HybridShield: policy = {policy!r}: must be an agent or a policy (eb.load_policy)")
@@ -76,6 +81,8 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         proposed = actions.get(agent)
         if proposed is not None:
             checked_action(proposed, (1,), agent)
+        if not self.env.agents:
+            self.env.step(actions)  # says that no episode is running
         if self.attached is not None:
             return self._certified(self.attached, actions, proposed)
         command = self.hybrid.act(engine.worlds, self._vehicle)
@@ -97,8 +104,6 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
     ) -> tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]:
         """Advance by one step in mode ``step``."""
         agent = self.shielded
-        if not self.env.agents:
-            self.env.step(actions)  # says that no episode is running
         given = attached.proposal() if proposed is None else checked_action(proposed, (1,), agent)
         applied = attached.decide(given)
         decision = attached.decision

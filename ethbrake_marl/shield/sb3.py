@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
 from ethbrake_marl.shield.attached import AttachedShield
+from ethbrake_marl.shield.uncertainty import Uncertainty
 
 
 class ShieldedVecEnv(VecEnvWrapper):
@@ -34,12 +36,15 @@ class ShieldedVecEnv(VecEnvWrapper):
         *,
         count: HarmCount = "first",
         allowance: float = 0.0,
+        uncertainty: Uncertainty | str | None = None,
         intervention_penalty: float = 0.0,
         logging: bool = False,
     ) -> None:
         if not isinstance(venv, EthBrakeVecEnv):
             raise InvalidInput(f"ShieldedVecEnv: {venv!r} is not an environment of make_sb3_vec_env")
-        self.attached = AttachedShield(venv, policy, count=count, allowance=allowance, logging=logging)
+        self.attached = AttachedShield(
+            venv, policy, count=count, allowance=allowance, uncertainty=uncertainty, logging=logging
+        )
         super().__init__(venv)
         self.intervention_penalty = intervention_penalty
         self._proposed: NDArray[np.float64] = np.zeros(0)
@@ -63,10 +68,20 @@ class ShieldedVecEnv(VecEnvWrapper):
         trusted = ~shield.shield.distrusted
         observation, reward, done, infos = self.venv.step_wait()
         assert decision is not None
+        shield.check_applied(only=~done)
         for k, info in enumerate(infos):
             info["shield"] = shield.info(k, float(self._proposed[k]), decision) | {"trusted": bool(trusted[k])}
         paid = reward - np.float32(self.intervention_penalty) * decision.intervened.astype(np.float32)
         return observation, paid, done, infos  # type: ignore[return-value]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for a copy, without the table of the class that SB3 keeps in every wrapper and nobody can pickle."""
+        return {name: value for name, value in self.__dict__.items() if name != "class_attributes"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Become that copy."""
+        self.__dict__.update(state)
+        self.class_attributes = dict(inspect.getmembers(self.__class__))
 
     def close(self) -> None:
         """Let go of the environment, and close it."""

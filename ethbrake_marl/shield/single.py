@@ -14,6 +14,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.shield.attached import AttachedShield
+from ethbrake_marl.shield.uncertainty import Uncertainty
 
 
 class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]], RecordConstructorArgs):
@@ -31,6 +32,7 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
         *,
         count: HarmCount = "first",
         allowance: float = 0.0,
+        uncertainty: Uncertainty | str | None = None,
         intervention_penalty: float = 0.0,
         logging: bool = False,
     ) -> None:
@@ -39,10 +41,13 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
             policy=policy,
             count=count,
             allowance=allowance,
+            uncertainty=uncertainty,
             intervention_penalty=intervention_penalty,
             logging=logging,
         )
-        self.attached = AttachedShield(env, policy, count=count, allowance=allowance, logging=logging)
+        self.attached = AttachedShield(
+            env, policy, count=count, allowance=allowance, uncertainty=uncertainty, logging=logging
+        )
         super().__init__(env)
         self.intervention_penalty = intervention_penalty
 

@@ -4,23 +4,31 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.actions import action_to_command, command_to_action
 from ethbrake_marl.agents.driving import introduce, scripted
-from ethbrake_marl.agents.protocol import Agent, place
+from ethbrake_marl.agents.profile_problem import state_columns
+from ethbrake_marl.agents.protocol import Agent, check_agent, place
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.guard import StepShield
+from ethbrake_marl.shield.rollouts import Proposer
+from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
 
 
 class StepShieldAgent:
     """Drives by ``policy`` as far as ``StepShield`` certifies it.
 
     At the alert the policy is rolled out once: where it harms no more than the coupled optimum, it drives unhindered,
-    and its harm is the bound. Elsewhere each of its actions must be certified. After ``begin``, ``predicted_harm``
-    [n] is the bound: realised harm (``count``) is at most that. ``chosen_policy`` [n]: no intervention so far;
-    ``shield`` holds the rest. Raises ``InvalidInput`` for what is not an agent, and what ``StepShield`` raises.
+    and its harm is the bound. Elsewhere each of its actions must be certified: by the rest of the plan, by a constant,
+    or (``later_rollouts``) by the policy itself, rolled out from the state after the action. After ``begin``,
+    ``predicted_harm`` [n] is the bound: realised harm (``count``) is at most that. ``chosen_policy`` [n]: no
+    intervention so far; ``shield`` holds the rest. Raises ``InvalidInput`` for what is not an agent, and what
+    ``StepShield`` raises.
+
+    With an ``uncertainty`` this is robust mode: what is certified must hold in every member. ``believed`` (row k for
+    row k of the batch) is what the shield takes for the worlds at the alert; the policy sees the worlds themselves.
     """
 
     def __init__(
@@ -31,16 +39,22 @@ class StepShieldAgent:
         count: HarmCount = "first",
         allowance: float = 0.0,
         logging: bool = False,
+        later_rollouts: bool = True,
+        uncertainty: Uncertainty | str | None = None,
+        believed: Worlds | None = None,
     ) -> None:
-        if not isinstance(policy, Agent):
-            raise InvalidInput(f"step: {policy!r} is not an agent; load_policy(path) or make_agent(name) makes one")
-        self.name = f"step({policy.name})"
+        check_agent(policy, "step")
+        uncertainty = checked_uncertainty(uncertainty)
+        self.name = f"{'step' if uncertainty is None else 'robust'}({policy.name})"
         self.policy = policy
         self.scenario = scenario
         self.shield: StepShield | None = None
         self.predicted_harm: Floats = np.zeros(0)
-        self._settings = {"count": count, "allowance": allowance, "logging": logging}
+        self._believed = believed
+        self._settings = {"count": count, "allowance": allowance, "logging": logging, "uncertainty": uncertainty}
+        self._later_rollouts = later_rollouts
         self._wanted: Floats = np.zeros(0)
+        self._first_s: Floats = np.zeros(0)  # [n] time of the first decision
         self._make(0)  # refuses bad settings at once
 
     @property
@@ -56,10 +70,11 @@ class StepShieldAgent:
             self.shield = self._make(vehicle)
         introduce(self.policy, vehicle, scripted(self.scenario, but=vehicle))
         self.policy.begin(worlds, vehicle, rows)
-        self.shield.begin(worlds, rows, self.policy)
+        self.shield.begin(worlds if self._believed is None else self._believed.take(rows), rows, self.policy)
         bound = self.shield.first_bound[rows] + self.shield.allowance
         self.predicted_harm = place(self.predicted_harm, rows, bound)
         self._wanted = place(self._wanted, rows, np.zeros(worlds.n))
+        self._first_s = place(self._first_s, rows, np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s))
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The certified command, [n] m/s2. Asked twice at the same moment, it says the same."""
@@ -67,10 +82,11 @@ class StepShieldAgent:
         if shield is None or shield.running is None or len(self._wanted) != worlds.n:
             raise InvalidInput(f"agent {self.name!r}: act on {worlds.n} worlds, but begin was not called for each")
         proposed = command_to_action(self.policy.act(worlds, vehicle), worlds.vehicles, vehicle)
-        due = worlds.time_s == shield.running.time_s
-        seen = np.concatenate([worlds.speeds_mps, worlds.gaps_m, worlds.pair_hit], axis=1)
-        decision = shield.decide(proposed, seen=seen, only=due)
-        self._wanted = np.where(due, shield.commands(decision.applied), self._wanted)
+        due = worlds.time_s == self._first_s + shield.running.steps * self.scenario.time_step_s
+        seen = state_columns(worlds)
+        proposer = Proposer(self.policy, worlds) if self._later_rollouts else None
+        decision = shield.decide(proposed, seen=seen, only=due, proposer=proposer)
+        self._wanted = np.where(due, action_to_command(decision.applied, worlds.vehicles, vehicle), self._wanted)
         return self._wanted.copy()
 
     def _make(self, vehicle: int) -> StepShield:

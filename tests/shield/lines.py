@@ -12,6 +12,7 @@ from ethbrake_marl.engine import Engine
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.attached import AttachedShield
 from ethbrake_marl.shield.certify import certify
+from tests.shield.trained import trained
 
 _ROLES = {
     3: {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "constant:5"},
@@ -52,37 +53,40 @@ class Attack(NamedTuple):
     decisions: int
 
 
-def random_actions(rng, shield, k):
-    return rng.uniform(-1.0, 1.0, len(shield.first_bound))
+def random_actions(rng, attached, k):
+    return rng.uniform(-1.0, 1.0, attached.engine.n)
 
 
-def extremes(rng, shield, k):
-    return np.where((k + np.arange(len(shield.first_bound))) % 2, 1.0, -1.0)
+def extremes(rng, attached, k):
+    return np.where((k + np.arange(attached.engine.n)) % 2, 1.0, -1.0)
 
 
-def full_drive(rng, shield, k):
-    return np.ones(len(shield.first_bound))
+def full_drive(rng, attached, k):
+    return np.ones(attached.engine.n)
 
 
-def slow_drift(rng, shield, k):
+def slow_drift(rng, attached, k):
     """Random, held for several steps: whole profiles that differ from the plan."""
-    return np.random.default_rng(1_000 + k // 6).uniform(-1.0, 0.5, len(shield.first_bound))
+    return np.random.default_rng(1_000 + k // 6).uniform(-1.0, 0.5, attached.engine.n)
 
 
-def worst_case(rng, shield, k):
+def worst_case(rng, attached, k):
     """Of eight candidates the accepted one that leaves the most harm: a search against the shield itself."""
+    return most_harmful(rng, attached.shield)
+
+
+def most_harmful(rng, shield, candidates=8):
     n = len(shield.first_bound)
     best, action = np.full(n, -1.0), np.full(n, 1.0)
-    for candidate in np.linspace(-1.0, 1.0, 8) + rng.uniform(-0.1, 0.1, 8):
-        proposed = np.full(n, candidate)
-        decision = certify(shield.running, proposed, shield.backup, shield.budget)
+    for candidate in np.linspace(-1.0, 1.0, candidates) + rng.uniform(-0.1, 0.1, candidates):
+        decision = certify(shield.running, np.full(n, candidate), shield.backup, shield.budget)
         free = ~decision.intervened & (decision.reason != 0)
         better = free & (decision.bound > best)
         best[better], action[better] = decision.bound[better], np.clip(candidate, -1.0, 1.0)
     return action
 
 
-ADVERSARIES = {f.__name__: f for f in (random_actions, extremes, full_drive, slow_drift, worst_case)}
+ADVERSARIES = {f.__name__: f for f in (random_actions, extremes, full_drive, slow_drift, worst_case, trained)}
 
 
 def attack(scenario: Scenario, worlds, adversary, *, count="first", allowance=0.0, seed=0) -> Attack:
@@ -96,7 +100,7 @@ def attack(scenario: Scenario, worlds, adversary, *, count="first", allowance=0.
     accepted, decisions, k = np.zeros(worlds.n, np.int64), 0, 0
     while not engine.ended.all():
         decisions += int((~engine.ended).sum())
-        actions = attached.decide(adversary(rng, attached.shield, k))
+        actions = attached.decide(adversary(rng, attached, k))
         reason = attached.decision.reason
         accepted += (reason == 1) | (reason == 2)
         engine.step(actions[:, np.newaxis])

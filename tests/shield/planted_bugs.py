@@ -1,8 +1,8 @@
-"""Ten bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
+"""Thirteen bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
-applied to a temporary copy. There ``test_certify`` and ``test_guard`` run with compilation switched off, and where they
-stay green, the other tests of the shield, compiled. Those two must be green without any bug.
+applied to a temporary copy. There ``test_certify``, ``test_guard`` and one test of ``test_robust`` run with compilation
+switched off, and where they stay green, the other tests of the shield, compiled. Those must be green without any bug.
 """
 
 from __future__ import annotations
@@ -13,9 +13,12 @@ import sys
 from tests.physics.programme.mutation import ROOT
 from tests.physics.programme.planted_bugs import Patch, red_with
 
-QUICK = ("tests/shield/test_certify.py", "tests/shield/test_guard.py")
-WHOLE = ("tests/shield/test_step.py", "tests/shield/test_faces.py")
-KERNEL, CERTIFY, GUARD = (f"ethbrake_marl/shield/{name}.py" for name in ("certify_kernel", "certify", "guard"))
+BY_HAND = "test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner"
+QUICK = ("tests/shield/test_certify.py", "tests/shield/test_guard.py", f"tests/shield/test_robust.py::{BY_HAND}")
+WHOLE = ("tests/shield/test_step.py", "tests/shield/test_rollouts.py", "tests/shield/test_faces.py")
+KERNEL, CERTIFY, GUARD, ROLLOUTS = (
+    f"ethbrake_marl/shield/{name}.py" for name in ("certify_kernel", "certify", "guard", "rollouts")
+)
 
 BUGS: dict[str, tuple[Patch, ...]] = {
     "pairwise bound used as if it were coupled": (
@@ -44,21 +47,21 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "latency ignored": (
         Patch(
             GUARD,
-            "problem = profile_problem(\n            worlds,",
-            "problem = profile_problem(\n            _at_once(worlds),",
+            "problem = profile_problem(\n            possible,",
+            "problem = profile_problem(\n            _at_once(possible),",
         ),
         Patch(
             GUARD,
-            "def rolled_out(",
+            "def as_predicted(",
             "def _at_once(worlds: Worlds) -> Worlds:\n    v = worlds.vehicles\n"
-            "    return replace(worlds, vehicles=replace(v, latency_s=0.0 * v.latency_s))\n\n\ndef rolled_out(",
+            "    return replace(worlds, vehicles=replace(v, latency_s=0.0 * v.latency_s))\n\n\ndef as_predicted(",
         ),
     ),
     "the rest of the plan begins one decision late": (
         Patch(
             KERNEL,
-            "value = follow_plan(table, harm, latency, clock, vehicle, bounds, after, step + 1, plan, budget)",
-            "value = follow_plan(table, harm, latency, clock, vehicle, bounds, after, step + 2, plan, budget)",
+            "value = worst_of_plan(world, after, over, step + 1, plan, budget)",
+            "value = worst_of_plan(world, after, over, step + 2, plan, budget)",
         ),
     ),
     "the plan of a rejected proposal is kept": (
@@ -73,8 +76,21 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "a constant counts without being certified step by step": (
         Patch(
             KERNEL,
-            "certified = follow_plan(table, harm, latency, clock, vehicle, bounds, state, step, trial, most)",
+            "certified = worst_of_plan(world, states, ended, step, trial, most)",
             "certified = least",
+        ),
+    ),
+    "a policy's rollout counts without being followed step by step": (
+        Patch(ROLLOUTS, "    harm = plan_harm(part, plan)\n", "    harm = 0.0 * plan_harm(part, plan)\n"),
+    ),
+    "a rollout disturbs the policy's memory": (
+        Patch(ROLLOUTS, "return copy.deepcopy(policy), np.arange(n)", "return policy, np.arange(n)"),
+    ),
+    "only the world as told is certified, not its corners": (
+        Patch(
+            KERNEL,
+            "m = (first + j) % ended.shape[0]\n        worst = max(worst, follow_plan",
+            "m = 0\n        worst = max(worst, follow_plan",
         ),
     ),
     "a surprise is not flagged": (Patch(GUARD, "if not surprising.any():", "if surprising.any() or True:"),),

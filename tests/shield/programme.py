@@ -1,97 +1,254 @@
-"""Trying to break the step shield: ``make test-shield`` (``python -m tests.shield.programme --worlds 2000``).
+"""Trying to break the step shield: ``make test-shield`` (``python -m tests.shield.programme``).
 
-Adversaries of ``tests.shield.lines`` propose in every step; harm is read from the engine's ledger. One line per gate:
-no realised harm above the bound at the alert (tolerance 1e-9), for both counts, N = 3 and 5, e from 0 to 0.3; the
-search is not too weak (restarts whose accepted actions bring at least 99 % of the bound); the speed of a decision.
+Four gates, one line each, exit status 1 if one fails:
+
+bound   random worlds against every adversary of ``tests.shield.lines``, both counts, N = 3 and 5, e from 0 to 0.3
+faces   worlds through every wrapped face (``tests.shield.face_attack``)
+search  restarts of a search against the shield, and against twelve leaks of it (``tests.shield.search``)
+speed   decisions per second in a batch, and the latency of one decision
+
+No realised harm may be above the bound at the alert (tolerance 1e-9). Bound and faces run in chunks; each finished
+chunk is a file in ``--results``, so what was stopped goes on, and several processes (``--part 1/2``, ``--part 2/2``)
+share the work. ``--results`` of other code, or of another seed, are refused.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import sys
 import time
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.agents.driving import episode_engine
+from ethbrake_marl.durable_files import write_file
+from ethbrake_marl.lineup import make_agents
 from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield import StepShieldAgent
 from ethbrake_marl.shield.certify import certify
 from ethbrake_marl.shield.guard import StepShield
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from tests.shield.face_attack import FACES
 from tests.shield.lines import ADVERSARIES, attack, line
+from tests.shield.sabotage import LEAKS
+from tests.shield.search import search
 
+ROOT = Path(__file__).resolve().parents[2]
 TOLERANCE = 1e-9  # m2/s2
-CLOSE = 0.99
+CHUNK = 2_000  # worlds
+CHUNKS = {3: 36, 5: 12}  # of each cell, for a million worlds: lines of five take five times as long
+SLOW_CHUNKS = {"worst_case": 5}  # of a search in every step
 RATE, P50_S, P99_S = 100_000, 100e-6, 300e-6
 
 
-def falsify(worlds: int, seed: int) -> bool:
-    """Every adversary, count and length of line."""
-    total, decisions, above, close, restarts = 0, 0, 0, 0, 0
-    for N in (3, 5):
-        scenario = line(N)
-        sample = scenario.sample(worlds, seed).worlds
-        for count in ("first", "total"):
-            for name, adversary in ADVERSARIES.items():
-                found = attack(scenario, sample, adversary, count=count, seed=seed)
-                excess = found.realised - found.bound
-                near = (found.realised >= CLOSE * found.bound) & (found.accepted > 0) & (found.bound > 0.0)
-                print(
-                    f"N={N} {count:5s} {name:15s} {worlds} worlds, {found.decisions:9,} decisions,"
-                    f" {found.accepted.sum():9,} deviations accepted, largest excess {excess.max():.1e},"
-                    f" within 1 %: {near.sum()}",
-                    flush=True,
-                )
-                total += worlds
-                decisions += found.decisions
-                above += int((excess > TOLERANCE).sum())
-                close += int(near.sum())
-                restarts += int((found.bound > 0.0).sum())
-    verdict = "PASS" if above == 0 else "FAIL"
-    print(f"bound: {total:,} episodes, {decisions:,} decisions, {above} above the bound: {verdict}")
-    print(f"search: {close:,} of {restarts:,} come within 1 % of the bound: {'PASS' if close else 'FAIL'}")
-    return above == 0 and close > 0
+def bound_chunks(worlds: int) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Name and arguments of each chunk of the first gate; no two share a world. 1,000,000 worlds are 500 chunks."""
+    first = 0
+    cells = [(N, count, name) for N in (3, 5) for count in ("first", "total") for name in ADVERSARIES]
+    for N, count, name in cells:
+        chunks = max(1, round(SLOW_CHUNKS.get(name, CHUNKS[N]) * worlds / 1_000_000))
+        for k in range(chunks):
+            given = {"N": N, "count": count, "who": name, "first": first, "worlds": min(CHUNK, worlds)}
+            yield f"bound-{N}-{count}-{name}-{k:03d}", given
+            first += CHUNK
+
+
+def attack_chunk(seed: int, *, N: int, count: Any, who: str, first: int, worlds: int) -> dict[str, Any]:
+    """One adversary in some worlds."""
+    scenario = line(N)
+    found = attack(
+        scenario, scenario.sample(worlds, seed, first=first).worlds, ADVERSARIES[who], count=count, seed=seed
+    )
+    return _outcome(found.realised, found.bound, found.decisions) | {"accepted": int(found.accepted.sum())}
+
+
+def face_chunks(worlds: int) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Likewise for the faces."""
+    for who in FACES:
+        for k, first in enumerate(range(0, worlds, CHUNK)):
+            yield f"face-{who}-{k:03d}", {"who": who, "first": first, "worlds": min(CHUNK, worlds - first)}
+
+
+def face_chunk(seed: int, *, who: str, first: int, worlds: int) -> dict[str, Any]:
+    """One face."""
+    realised, bound, decisions = FACES[who](worlds, seed * 1_000_000 + first)
+    return _outcome(np.array(realised), np.array(bound), decisions)
+
+
+def _outcome(realised: np.ndarray, bound: np.ndarray, decisions: int) -> dict[str, Any]:
+    excess = realised - bound
+    return {
+        "worlds": len(realised), "decisions": decisions, "above": int((excess > TOLERANCE).sum()),
+        "excess": float(excess.max()), "exact": int((realised == bound).sum()),
+    }  # fmt: skip
+
+
+def run_chunks(chunks: list[tuple[str, dict[str, Any]]], run: Any, given: argparse.Namespace, code: str) -> bool:
+    """Run what is missing of this part's chunks; print a table of all that is there."""
+    part, parts = (int(word) for word in given.part.split("/"))
+    given.results.mkdir(parents=True, exist_ok=True)
+    in_turn = sorted(
+        chunks, key=lambda chunk: (chunk[0].split("-")[1], chunk[0][-3:])
+    )  # short lines, then cells in turn
+    for k, (name, arguments) in enumerate(in_turn):
+        file = given.results / f"{name}.json"
+        if k % parts == part - 1 and not file.exists():
+            begun = time.process_time()
+            outcome = run(given.seed, **arguments)
+            kept = {"code": code, "seed": given.seed} | arguments | outcome | {"cpu_s": time.process_time() - begun}
+            write_file(file, json.dumps(kept).encode() + b"\n")
+    rows = [json.loads((given.results / f"{name}.json").read_text()) for name, _ in chunks if _there(given, name)]
+    if any((row["code"], row["seed"]) != (code, given.seed) for row in rows):
+        print(f"{given.results}: results of other code or another seed; give another folder")
+        return False
+    return _tell(rows, len(chunks))
+
+
+def _there(given: argparse.Namespace, name: str) -> bool:
+    return (given.results / f"{name}.json").exists()
+
+
+def _tell(rows: list[dict[str, Any]], wanted: int) -> bool:
+    groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        groups[" ".join(str(row[key]) for key in ("N", "count", "who") if key in row)].append(row)
+    for name, members in groups.items():
+        total = {key: sum(m[key] for m in members) for key in ("worlds", "decisions", "above", "cpu_s")}
+        print(
+            f"  {name:22s} {total['worlds']:9,} worlds {total['decisions']:11,} decisions"
+            f"{_accepted(members)}  above: {total['above']}  largest excess {max(m['excess'] for m in members):.1e}"
+            f"  {total['cpu_s']:6.0f} s"
+        )
+    worlds, decisions, above = (sum(row[key] for row in rows) for key in ("worlds", "decisions", "above"))
+    left = f"; {wanted - len(rows)} of {wanted} chunks are missing" if len(rows) < wanted else ""
+    print(f"  {worlds:,} worlds, {decisions:,} decisions, {above} above the bound{left}", flush=True)
+    return above == 0 and not left
+
+
+def _accepted(rows: list[dict[str, Any]]) -> str:
+    """How many deviations from the plan were let through, where that was counted."""
+    return f" {sum(row['accepted'] for row in rows):11,} deviations accepted" if "accepted" in rows[0] else ""
+
+
+def search_gate(restarts: int, seed: int) -> bool:
+    """The search against the shield, and against each leak."""
+    good = True
+    for count in ("first", "total"):
+        whole = search(restarts, seed, count=count)
+        good = good and whole.above == 0
+        print(
+            f"  the shield as it is, {count}: {whole.restarts:,} restarts, {whole.above} above the bound, largest"
+            f" excess {whole.excess:.1e}; the same proposals without it: {whole.loose:.0%} above",
+            flush=True,
+        )
+    for name, leak in LEAKS.items():
+        found = search(restarts, seed, leak, until_found=True)
+        good = good and found.first is not None
+        told = "NOT FOUND" if found.first is None else f"found in restart {found.first}"
+        print(f"  {name:52s} {told}, largest excess {found.excess:.2g} m2/s2", flush=True)
+    return good
 
 
 def speed(decisions: int) -> bool:
     """Batched decisions per second and the latency of one, N = 3."""
     scenario = load_scenario("paper-random")
-    shield = StepShield(scenario, 1)
-    n = 4096
-    shield.begin(scenario.sample(n, 3).worlds, np.arange(n))
-    rng = np.random.default_rng(0)
-    shield.decide(rng.uniform(-1.0, 1.0, n))
-    done, begun = 0, time.process_time()
-    while not shield.running.ended.all():
-        done += int((~shield.running.ended).sum())
-        shield.decide(rng.uniform(-1.0, 1.0, n))
-    rate = done / (time.process_time() - begun)
-    took = []
+    rate, _ = batch_rate(None, 4096)
+    rng, took = np.random.default_rng(0), []
     while len(took) < decisions:
         shield = StepShield(scenario, 1)
         shield.begin(scenario.sample(1, 3, first=len(took)).worlds, np.arange(1))
-        while not shield.running.ended.all():
+        while not shield.running.finished.all():
             proposed = rng.uniform(-1.0, 1.0, 1)
             begun = time.perf_counter()
             decision = certify(shield.running, proposed, shield.backup, shield.budget)
             took.append(time.perf_counter() - begun)
             shield.running, shield.backup = decision.after, decision.backup
     p50, p99 = np.quantile(took, [0.5, 0.99])
-    good = rate >= RATE and p50 <= P50_S and p99 <= P99_S
-    print(
-        f"speed: {rate:,.0f} decisions/s batched; one decision p50 {p50 * 1e6:.0f} us, p99 {p99 * 1e6:.0f} us:"
-        f" {'PASS' if good else 'FAIL'}"
-    )
-    return bool(good)
+    print(f"  {rate:,.0f} decisions/s batched; one decision p50 {p50 * 1e6:.0f} us, p99 {p99 * 1e6:.0f} us")
+    for intervals in ("gaps_m=0.5", "braking_capacity_mps2=10%,gaps_m=0.5"):
+        robust, members = batch_rate(intervals, 1000)
+        print(f"  robust mode, {members} members ({intervals}): {robust:,.0f} decisions/s batched")
+    for later in (False, True):
+        mid, slow = np.quantile(_agent_times(decisions, later), [0.5, 0.99]) * 1e6
+        told = f"ppo@shipped behind it, {'with' if later else 'without'} later rollouts, inference included"
+        print(f"  {told}: p50 {mid:.0f} us, p99 {slow:.0f} us of processor time")
+    return bool(rate >= RATE and p50 <= P50_S and p99 <= P99_S)
+
+
+def batch_rate(intervals: str | None, n: int) -> tuple[float, int]:
+    """Decisions per second of a batch under random proposals, and the members of each world."""
+    scenario = load_scenario("paper-random")
+    shield = StepShield(scenario, 1, uncertainty=None if intervals is None else parse_uncertainty(intervals))
+    shield.begin(scenario.sample(n, 3).worlds, np.arange(n))
+    rng = np.random.default_rng(0)
+    shield.decide(rng.uniform(-1.0, 1.0, n))
+    done, begun = 0, time.process_time()
+    while not shield.running.finished.all():
+        done += int((~shield.running.finished).sum())
+        shield.decide(rng.uniform(-1.0, 1.0, n))
+    return done / (time.process_time() - begun), shield.running.members
+
+
+def _agent_times(decisions: int, later: bool) -> list[float]:
+    """Processor time (s) per decision of a learned policy behind the shield, one world at a time."""
+    scenario = load_scenario("paper-random")
+    (policy,) = make_agents(["ppo@shipped"], scenario).values()
+    took: list[float] = []
+    world = 0
+    while len(took) < decisions:
+        agent = StepShieldAgent(policy, scenario, later_rollouts=later)
+        engine = episode_engine(scenario.sample(1, 3, first=world).worlds, agent, scenario, 1)
+        while not engine.ended.all():
+            begun = time.process_time()
+            agent.act(engine.worlds, 1)  # asked again by the engine, it says the same
+            took.append(time.process_time() - begun)
+            engine.step({})
+        world += 1
+    return took
+
+
+def code_digest() -> str:
+    """What the outcomes depend on: the shield, the physics, and these tests."""
+    digest = hashlib.sha256()
+    for folder in ("ethbrake_marl/shield", "ethbrake_marl/physics", "tests/shield"):
+        for file in sorted((ROOT / folder).glob("*.py")):
+            if file.name not in ("programme.py", "planted_bugs.py") and not file.name.startswith("test_"):
+                digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def main() -> int:
-    """All gates; exit status 1 if one fails."""
+    """All gates."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--worlds", type=int, default=2_000, help="for each adversary, count and length of line")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--worlds", type=int, default=1_000_000, help="of the gate 'bound', all cells together")
+    parser.add_argument("--face-worlds", type=int, default=10_000, help="through each face")
+    parser.add_argument("--restarts", type=int, default=1_000, help="of the search")
     parser.add_argument("--decisions", type=int, default=5_000, help="timed one by one")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="speed,search,faces,bound", help="gates, with commas between them")
+    parser.add_argument("--results", type=Path, default=ROOT / "runs" / "test-shield", help="folder of finished chunks")
+    parser.add_argument("--part", default="1/1", help="this process's share of the chunks, for instance 1/2")
     given = parser.parse_args()
-    good = falsify(given.worlds, given.seed)
-    return 0 if speed(given.decisions) and good else 1
+    code = code_digest()
+    gates = {
+        "speed": lambda: speed(given.decisions),
+        "search": lambda: search_gate(given.restarts, given.seed),
+        "faces": lambda: run_chunks(list(face_chunks(given.face_worlds)), face_chunk, given, code),
+        "bound": lambda: run_chunks(list(bound_chunks(given.worlds)), attack_chunk, given, code),
+    }
+    verdicts = {}
+    for name in given.only.split(","):
+        print(name, flush=True)
+        verdicts[name] = gates[name]()
+    for name, good in verdicts.items():
+        print(f"{name}: {'PASS' if good else 'FAIL'}")
+    return 0 if all(verdicts.values()) else 1
 
 
 if __name__ == "__main__":

@@ -1,0 +1,152 @@
+"""What each mode of the shield makes of an agent, on the same worlds: harm, and what each intervention was good for."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.table import Table
+
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.shield import HybridAgent, StepShieldAgent
+from ethbrake_marl.shield.forensics import VERDICTS, review
+
+NONE, EPISODE, STEP, STEP_ALERT = "none", "episode", "step", "step-alert"  # the last: rollout at the alert only
+CHUNK = 500  # worlds advanced together: bounds memory, changes no result
+
+Progress = Callable[[str, int], None]  # agent, worlds done so far
+
+
+@dataclass(frozen=True, slots=True)
+class ModeRow:
+    """One agent behind one mode of the shield."""
+
+    agent: str
+    mode: str
+    harm: Estimate  # mean over worlds (m2/s2)
+    against_episode: Estimate | None  # minus that of episode mode, paired by world; None: of episode mode itself
+    replaced: float | None = None  # share of the decisions; of step mode alone, as all that follows
+    verdicts: tuple[float, ...] | None = None  # shares of the replaced decisions, in the order of VERDICTS
+    above_bound: int | None = None  # worlds whose realised harm is above the bound told at the alert
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
+        against = self.against_episode
+        told: dict[str, Any] = {
+            "agent": self.agent,
+            "mode": self.mode,
+            "harm": self.harm.value,
+            "harm_interval": _interval(self.harm),
+            "against_episode": None if against is None else against.value,
+            "against_episode_interval": _interval(against),
+            "decisions_replaced": self.replaced,
+        }
+        shares = (None,) * len(VERDICTS) if self.verdicts is None else self.verdicts
+        return {**told, **dict(zip(VERDICTS, shares, strict=True)), "above_bound": self.above_bound}
+
+
+def compare_modes(
+    agents: Mapping[str, Agent],
+    worlds: Worlds,
+    scenario: Scenario,
+    vehicle: int,
+    *,
+    count: HarmCount = "first",
+    on_progress: Progress | None = None,
+) -> list[ModeRow]:
+    """Let every agent drive ``vehicle`` alone, in episode mode and in step mode, through every world; see ``ModeRow``.
+
+    Each replaced decision of step mode is simulated again without the shield (``shield.forensics.review``). The given
+    agents are left as they are. Raises ``InvalidInput`` where a shield refuses the scenario.
+    """
+    rows = []
+    for name, agent in agents.items():
+        parts = []
+        for first in range(0, worlds.n, CHUNK):
+            part = worlds.take(np.arange(first, min(first + CHUNK, worlds.n)))
+            parts.append(_measured(part, agent, scenario, vehicle, count))
+            if on_progress is not None:
+                on_progress(name, min(first + CHUNK, worlds.n))
+        rows += _rows(name, parts)
+    return rows
+
+
+def modes_table(rows: list[ModeRow]) -> Table:
+    """The rows for a terminal, below the name of each agent."""
+    title = "Mean harm per world (m²/s²), difference with 95 % interval"
+    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("agent, mode", overflow="fold")
+    for heading in ("harm", "minus episode mode", "replaced", *VERDICTS, "above"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        if row.mode == NONE:
+            table.add_row(row.agent)
+        shares = (None,) * len(VERDICTS) if row.verdicts is None else row.verdicts
+        table.add_row(
+            f"  {row.mode}",
+            f"{row.harm.value:.2f}",
+            _shown(row.against_episode),
+            *(_percent(share) for share in (row.replaced, *shares)),
+            "–" if row.above_bound is None else str(row.above_bound),
+        )
+    return table
+
+
+def _measured(worlds: Worlds, agent: Agent, scenario: Scenario, vehicle: int, count: HarmCount) -> dict[str, Any]:
+    """Of one chunk: harm per world under each mode, and what step mode replaced."""
+    found: dict[str, Any] = {}
+    drivers: dict[str, Agent] = {NONE: copy.deepcopy(agent), EPISODE: HybridAgent(agent, scenario, count=count)}
+    for name, later in ((STEP, True), (STEP_ALERT, False)):
+        drivers[name] = StepShieldAgent(copy.deepcopy(agent), scenario, count=count, logging=True, later_rollouts=later)
+    for name, driver in drivers.items():
+        harm = drive(worlds, driver, scenario, vehicle).ledger.world_harm(count)
+        found[name] = harm
+        if isinstance(driver, StepShieldAgent):
+            shield = driver.shield
+            assert shield is not None and shield.running is not None
+            verdict = review(driver, worlds, vehicle).verdict
+            above = int((harm > shield.first_bound).sum())
+            counted = [int((verdict == each).sum()) for each in VERDICTS]
+            found[f"{name} counts"] = np.array([int(shield.running.steps.sum()), above, *counted])
+    return found
+
+
+def _rows(name: str, parts: list[dict[str, Any]]) -> list[ModeRow]:
+    harm: dict[str, Floats] = {
+        mode: np.concatenate([part[mode] for part in parts]) for mode in (NONE, EPISODE, STEP, STEP_ALERT)
+    }
+    rows = [
+        ModeRow(name, NONE, mean(harm[NONE]), paired_difference(harm[NONE], harm[EPISODE])),
+        ModeRow(name, EPISODE, mean(harm[EPISODE]), None),
+    ]
+    for mode in (STEP, STEP_ALERT):
+        decisions, above, *counted = np.sum([part[f"{mode} counts"] for part in parts], axis=0).tolist()
+        replaced = sum(counted)
+        shares = tuple(each / replaced for each in counted) if replaced else None
+        difference = paired_difference(harm[mode], harm[EPISODE])
+        rows.append(ModeRow(name, mode, mean(harm[mode]), difference, replaced / decisions, shares, above))
+    return rows
+
+
+def _interval(estimate: Estimate | None) -> list[float] | None:
+    return None if estimate is None or estimate.interval is None else list(estimate.interval)
+
+
+def _shown(estimate: Estimate | None) -> str:
+    if estimate is None:
+        return "–"
+    interval = "" if estimate.interval is None else f" [{estimate.interval[0]:+.2f}, {estimate.interval[1]:+.2f}]"
+    return f"{estimate.value:+.2f}{interval}"
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{100.0 * share:.1f} %"

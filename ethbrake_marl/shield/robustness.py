@@ -1,0 +1,80 @@
+"""What not knowing costs: robust mode's price, and what happens where the truth is not what the shield believes."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.shield.step import StepShieldAgent
+from ethbrake_marl.shield.uncertainty import Uncertainty
+
+WIDTHS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of a curve, in units of the intervals that are given
+TRUTHS = ("as told", "inside", "corner")  # the world that was told; one evenly out of its box; one of the box's corners
+MODES = ("step", "robust")
+
+Progress = Callable[[str, int], None]  # what is driven, worlds done so far
+
+
+class RobustnessPoint(NamedTuple):
+    """How one shield did at one width of the intervals, in one kind of truth; means are over all worlds."""
+
+    mode: str  # one of MODES; step mode believes what it is told
+    truth: str  # one of TRUTHS
+    width: float  # in units of the intervals that were given
+    harm: float  # mean realised (m2/s2)
+    bound: float  # mean stated at the alert (m2/s2)
+    above: float  # share of worlds that realise more than the bound stated at the alert
+    excess: float  # mean of how much more, 0 where it is not (m2/s2)
+    distrusted: float  # share of worlds in which the shield noticed
+
+
+def robustness(
+    worlds: Worlds,
+    policy: Agent,
+    scenario: Scenario,
+    vehicle: int,
+    uncertainty: Uncertainty,
+    *,
+    widths: Sequence[float] = WIDTHS,
+    count: HarmCount = "first",
+    seed: int = 0,
+    on_progress: Progress | None = None,
+) -> list[RobustnessPoint]:
+    """Both shields around ``policy`` in every kind of truth at each width; ``worlds`` is what the shields are told.
+
+    The engine runs the truth, and the policy sees it; the shields begin with what they are told and see what happens.
+    The numbers that place a truth in its box are those of ``seed``, the same for all widths. Raises ``InvalidInput``
+    for no width or a negative one, and what ``StepShieldAgent`` raises.
+    """
+    if not widths or not all(0.0 <= width < np.inf for width in widths):
+        raise InvalidInput(f"robustness: widths {tuple(widths)}: at least one is needed, each at least 0")
+    points = []
+    for width in widths:
+        intervals = uncertainty.scaled(width)
+        for truth in TRUTHS:
+            driven = worlds
+            if truth != "as told":
+                driven = intervals.draw(worlds, np.random.default_rng(seed), corners=truth == "corner")
+            for mode in MODES:
+                shielded = StepShieldAgent(
+                    copy.deepcopy(policy), scenario, count=count, believed=worlds,
+                    uncertainty=intervals if mode == "robust" else None,
+                )  # fmt: skip
+                harm = drive(driven, shielded, scenario, vehicle).ledger.world_harm(count)
+                bound, shield = shielded.predicted_harm, shielded.shield
+                assert shield is not None
+                above, noticed = np.maximum(harm - bound, 0.0), shield.distrusted
+                means = (harm.mean(), bound.mean(), (above > 0.0).mean(), above.mean(), noticed.mean())
+                points.append(RobustnessPoint(mode, truth, float(width), *map(float, means)))
+                if on_progress is not None:
+                    on_progress(f"{mode}, {truth}, width {width:g}", worlds.n)
+    return points

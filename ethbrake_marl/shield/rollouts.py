@@ -1,0 +1,135 @@
+"""Rollouts of the policy that proposes: its actions from the alert, and from any later decision, as plans.
+
+What a rollout does is written down as a plan and certified like any other (``shield.certify.plan_harm``): a policy that
+would drive differently the second time costs interventions, never the bound.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.actions import action_to_command, command_to_action
+from ethbrake_marl.agents.driving import drive, introduce, scripted
+from ethbrake_marl.agents.profile_motion import HARM_IS_TOTAL, START, TIME_STEP
+from ethbrake_marl.agents.profile_problem import ProfileProblem, worlds_at
+from ethbrake_marl.agents.protocol import Agent, Divisible
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.shield.certify import Backup, Decision, Running, certify, plan_harm
+
+
+class Proposer(NamedTuple):
+    """Who proposes, and what it sees now: enough to try, on copies, what it would do later."""
+
+    policy: Agent  # its memory is that of the running episodes, this decision's action included; never changed
+    worlds: Worlds  # [n] now
+
+
+def rolled_out(
+    worlds: Worlds, policy: Agent, scenario: Scenario, vehicle: int, problem: ProfileProblem, width: int
+) -> Floats:
+    """The actions [n, width] of a policy that drives alone from the alert; full braking beyond its episode's end."""
+    recorder = _Recorder(copy.deepcopy(policy), problem, width)
+    introduce(recorder.policy, vehicle, scripted(scenario, but=vehicle))
+    drive(worlds, recorder, scenario, vehicle)
+    return recorder.actions
+
+
+def certify_rollouts(
+    running: Running, proposed: Floats, rows: Ints, budget: Floats, width: int, proposer: Proposer
+) -> Decision:
+    """Decide again in ``rows``, where the proposals found no certificate, with the policy itself as the later plan.
+
+    The plan that is tried is the proposal (clipped, a number), then what the policy does from the state after it. Where
+    it keeps the budget it becomes the backup, and the proposal is "what the plan says"; elsewhere the reason says that
+    something else must be applied. ``running``, ``proposed`` and ``budget`` are those of the whole batch, plans
+    are ``width`` decisions long. Returns the decision of those rows alone.
+    """
+    part, first, least = running.take(rows), np.clip(proposed[rows], -1.0, 1.0), budget[rows]
+    plan = _later_plan(running.nominal(), first, rows, budget, width, proposer)
+    harm = plan_harm(part, plan)
+    kept = harm <= least
+    decision = certify(part, first, Backup(plan, harm), np.maximum(least, harm))
+    return decision._replace(intervened=~kept, margin=least - harm)
+
+
+def _later_plan(running: Running, first: Floats, rows: Ints, budget: Floats, width: int, proposer: Proposer) -> Floats:
+    """The plans [m, L] of ``rows``: the ``first`` action [m], then the policy's; given up once above the budget."""
+    policy, worlds = proposer
+    driver, batch = _apart(policy, rows, worlds.n)
+    seen, wanted = worlds.take(batch), np.isin(batch, rows)
+    episodes, most = running.take(batch), budget[batch]
+    episodes = episodes._replace(ended=episodes.ended | ~wanted)
+    added = episodes.problem.command.shape[1] - worlds.N  # an obstacle ahead is vehicle 0 of the problem
+    vehicle, action = int(episodes.problem.vehicles[0]) - added, np.zeros(len(batch))
+    action[wanted] = first
+    plan, nothing = np.full((len(batch), width), -1.0), np.zeros(len(batch))
+    no_constants = np.zeros(0)
+    while True:
+        going = np.flatnonzero(~episodes.ended)
+        plan[going, episodes.steps[going]] = action[going]
+        episodes = certify(episodes, action, Backup(plan, nothing, no_constants), nothing).after
+        episodes = episodes._replace(ended=episodes.ended | (harm_so_far(episodes) > most))
+        if episodes.ended.all():
+            return plan[wanted]
+        seen = _seen(seen, episodes, action_to_command(action, seen.vehicles, vehicle))
+        action = command_to_action(driver.act(seen, vehicle), seen.vehicles, vehicle)
+
+
+def _apart(policy: Agent, rows: Ints, n: int) -> tuple[Agent, Ints]:
+    """A policy that goes on without changing this one, and the rows of the batch that it drives: all, if it must."""
+    if isinstance(policy, Divisible):
+        try:
+            return policy.take(rows), rows
+        except InvalidInput:  # what it wraps cannot be divided
+            pass
+    return copy.deepcopy(policy), np.arange(n)
+
+
+def harm_so_far(running: Running) -> Floats:
+    """Harm of the episodes up to now under the count that is guaranteed, [n] m2/s2."""
+    pairs = (running.states.shape[1] - 1) // 5  # the width is N + 4 (N - 1)
+    group = 1 if running.problem.clock[0, HARM_IS_TOTAL] == 1.0 else 0
+    last = running.states.shape[1] - (1 - group) * pairs
+    harm: Floats = running.states[:, last - pairs : last].sum(axis=1)
+    return harm
+
+
+def _seen(worlds: Worlds, running: Running, command_mps2: Floats) -> Worlds:
+    """The worlds as a driver sees them at the decisions of ``running``, its last commands [n] in force."""
+    N, problem = worlds.N, running.problem
+    commands = problem.command.copy()
+    commands[:, problem.vehicles[0]] = command_mps2
+    commands = commands[:, -N:]  # without an obstacle ahead
+    time = running.time_s
+    return replace(
+        worlds_at(worlds, running.states),
+        time_s=time,
+        command_mps2=np.where(worlds.vehicles.latency_s <= time[:, np.newaxis], commands, 0.0),
+    )
+
+
+class _Recorder:
+    """A policy whose actions are written down, and applied as they are written."""
+
+    name = "recorder"
+
+    def __init__(self, policy: Agent, problem: ProfileProblem, width: int) -> None:
+        self.policy = policy
+        self.actions = np.full((problem.n, width), -1.0)
+        self._clock = problem.clock
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        self.policy.begin(worlds, vehicle, rows)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        action = command_to_action(self.policy.act(worlds, vehicle), worlds.vehicles, vehicle)
+        step = np.rint((worlds.time_s - self._clock[:, START]) / self._clock[:, TIME_STEP]).astype(np.int64)
+        rows = np.flatnonzero((step >= 0) & (step < self.actions.shape[1]))
+        self.actions[rows, step[rows]] = action[rows]
+        return action_to_command(action, worlds.vehicles, vehicle)

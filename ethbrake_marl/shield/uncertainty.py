@@ -1,0 +1,198 @@
+"""What is not known exactly: intervals around the quantities of a world, and the members that stand for them.
+
+A quantity of one vehicle (or pair) that was told as x lies in [x - h, x + h], h being a number in its unit or a share
+of x, cut to what is possible (no latency, speed or gap below 0, no speed above the vehicle's limit). The *members* of
+a world are the world as it was told, and every corner of the box of all these intervals: 2^d of them, for d uncertain
+numbers. What robust mode proves, it proves for the members (``docs/shield.md``).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.physics import Floats, Worlds, concatenate
+
+OF_VEHICLES = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t")  # fields of ``Vehicles``
+QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m")
+POSITIVE = ("braking_capacity_mps2", "mass_t")  # must stay above 0
+MOST_CORNERS = 1024  # of one world: each costs as much as the world itself
+EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
+
+_ENTRY = re.compile(r"(?P<name>\w+)(?:\.(?P<what>vehicle|pair)_(?P<number>[1-9]\d*))?=(?P<width>[^=%]+)(?P<share>%?)")
+_NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """How far one quantity may be from what was told, of one vehicle or pair, or (``place`` None) of each."""
+
+    quantity: str  # one of QUANTITIES
+    half_width: float  # in the quantity's unit, or a share of its value below 1
+    relative: bool = False
+    place: int | None = None  # index from 0
+
+    def __post_init__(self) -> None:
+        if self.quantity not in QUANTITIES:
+            raise unknown_name("uncertain quantity", self.quantity, QUANTITIES)
+        most, told = (1.0, "a share from 0 to below 100 %") if self.relative else (np.inf, "a number, at least 0")
+        if not 0.0 <= self.half_width < most:
+            raise InvalidInput(f"uncertainty: {self.quantity}: half-width {self.half_width!r}: must be {told}")
+        if self.place is not None and not self.place >= 0:
+            raise InvalidInput(f"uncertainty: {self.quantity}: place {self.place!r}: must be an index from 0")
+
+    def __str__(self) -> str:
+        kind = "pair" if self.quantity == "gaps_m" else "vehicle"
+        where = "" if self.place is None else f".{kind}_{self.place + 1}"
+        width = f"{100.0 * self.half_width:g}%" if self.relative else f"{self.half_width:g}"
+        return f"{self.quantity}{where}={width}"
+
+
+class Side(NamedTuple):
+    """One uncertain number of every world: which it is, its least and its largest value."""
+
+    quantity: str
+    place: int
+    low: Floats  # [n]
+    high: Floats  # [n]
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """Intervals around what was told about a world; see the module. ``parse_uncertainty`` reads the written form.
+
+    Raises ``InvalidInput`` without an interval, or for a quantity of one vehicle or pair that is given twice.
+    """
+
+    intervals: tuple[Interval, ...]
+
+    def __post_init__(self) -> None:
+        if not self.intervals:
+            raise InvalidInput(f"uncertainty: no interval; one is needed, for instance {EXAMPLE}")
+        for k, one in enumerate(self.intervals):
+            for other in self.intervals[:k]:
+                same = None in (one.place, other.place) or one.place == other.place
+                if one.quantity == other.quantity and same:
+                    raise InvalidInput(f"uncertainty: {other} and {one} speak of the same quantity; give each once")
+
+    def __str__(self) -> str:
+        return ",".join(str(interval) for interval in self.intervals)
+
+    def scaled(self, factor: float) -> Uncertainty:
+        """The same intervals, ``factor`` times as wide."""
+        return Uncertainty(tuple(replace(each, half_width=each.half_width * factor) for each in self.intervals))
+
+    def members(self, worlds: Worlds) -> Worlds:
+        """The members [n * M] of worlds at the alert: for each world itself, then its corners, the next world's after.
+
+        Corners come in the order of binary numbers, the first interval's bit being the lowest; intervals of no
+        width make none. Raises ``InvalidInput`` for a vehicle that is not there, a capacity or mass that may be 0, or
+        more than ``MOST_CORNERS`` corners.
+        """
+        sides = self._sides(worlds)
+        corners = 2 ** len(sides) if sides else 0
+        if corners > MOST_CORNERS:
+            raise InvalidInput(
+                f"uncertainty: {len(sides)} uncertain numbers in each world make {corners} corners; at most"
+                f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {EXAMPLE}"
+            )
+        parts = [worlds] + [_placed(worlds, sides, lambda k, c=c: c >> k & 1) for c in range(corners)]  # type: ignore[misc]
+        order = np.arange(worlds.n * len(parts)).reshape(len(parts), worlds.n).T.ravel()
+        return concatenate(parts).take(order)
+
+    def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:
+        """One world [n] out of each box: evenly from its inside, or one of its ``corners``."""
+        sides = self._sides(worlds)
+        shares = rng.random((len(sides), worlds.n))
+        if corners:
+            shares = np.round(shares)
+        return _placed(worlds, sides, lambda k: shares[k])
+
+    def _sides(self, worlds: Worlds) -> list[Side]:
+        """The uncertain numbers of these worlds."""
+        sides = []
+        for interval in self.intervals:
+            told = _values(worlds, interval.quantity)
+            if interval.half_width == 0.0:
+                continue
+            if interval.place is not None and interval.place >= told.shape[1]:
+                raise InvalidInput(f"uncertainty: {interval}: the line has only {told.shape[1]} of these")
+            for place in range(told.shape[1]) if interval.place is None else (interval.place,):
+                sides.append(_side(worlds, interval, place))
+        return sides
+
+
+def parse_uncertainty(text: str) -> Uncertainty:
+    """Read ``quantity=half-width`` entries with commas between them, for instance ``EXAMPLE``.
+
+    A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
+    the quantity limits it to that one. Raises ``InvalidInput`` for anything else.
+    """
+    return Uncertainty(tuple(_interval(entry.strip()) for entry in text.split(",")))
+
+
+def checked_uncertainty(given: object) -> Uncertainty | None:
+    """An ``Uncertainty``, given as such or in its written form; None stays None. Raises ``InvalidInput`` otherwise."""
+    if given is None or isinstance(given, Uncertainty):
+        return given
+    if isinstance(given, str):
+        return parse_uncertainty(given)
+    raise InvalidInput(f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {EXAMPLE!r}")
+
+
+def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
+    """The uncertainty that goes with a mode: needed by ``robust``, refused by every other one with ``InvalidInput``."""
+    uncertainty = checked_uncertainty(given)
+    if (mode == "robust") != (uncertainty is not None):
+        what = "needs an uncertainty" if uncertainty is None else "takes no uncertainty; robust does"
+        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {EXAMPLE}")
+    return uncertainty
+
+
+def _interval(entry: str) -> Interval:
+    found = _ENTRY.fullmatch(entry)
+    if found is None or _NUMBER.fullmatch(found["width"]) is None:
+        raise InvalidInput(f"uncertainty: {entry!r}: must be quantity=half-width, for instance {EXAMPLE}")
+    name, width = found["name"], float(found["width"])
+    if name in QUANTITIES and found["what"] not in (None, "pair" if name == "gaps_m" else "vehicle"):
+        raise InvalidInput(f"uncertainty: {entry!r}: gaps_m is of pairs (.pair_1), all else of vehicles (.vehicle_1)")
+    place = None if found["number"] is None else int(found["number"]) - 1
+    return Interval(name, width / 100.0 if found["share"] else width, bool(found["share"]), place)
+
+
+def _values(worlds: Worlds, quantity: str) -> Floats:
+    """What was told, [n, N] or [n, P]."""
+    values: Floats = getattr(worlds.vehicles if quantity in OF_VEHICLES else worlds, quantity)
+    return values
+
+
+def _side(worlds: Worlds, interval: Interval, place: int) -> Side:
+    """Least and largest value of one uncertain number."""
+    told = _values(worlds, interval.quantity)[:, place]
+    half = interval.half_width * told if interval.relative else np.full(worlds.n, interval.half_width)
+    low, high = told - half, told + half
+    if interval.quantity in POSITIVE and not (low > 0.0).all():
+        k = int(np.argmin(low))
+        raise InvalidInput(
+            f"uncertainty: {interval}: {told[k]:g} of vehicle_{place + 1} in world {k} may be as low as {low[k]:g}; it"
+            " must stay above 0"
+        )
+    most = worlds.vehicles.speed_limit_mps[:, place] if interval.quantity == "speeds_mps" else np.inf
+    return Side(interval.quantity, place, np.maximum(low, 0.0), np.minimum(high, most))
+
+
+def _placed(worlds: Worlds, sides: list[Side], share: Callable[[int], Floats | int]) -> Worlds:
+    """The worlds with each uncertain number at ``share(k)`` of its interval: 0 its least value, 1 its largest."""
+    changed: dict[str, Any] = {}
+    for k, side in enumerate(sides):
+        values = changed.setdefault(side.quantity, _values(worlds, side.quantity).copy())
+        at = np.broadcast_to(np.asarray(share(k), np.float64), side.low.shape)
+        inside = side.low + at * (side.high - side.low)
+        values[:, side.place] = np.where(at == 0.0, side.low, np.where(at == 1.0, side.high, inside))
+    vehicles = replace(worlds.vehicles, **{name: v for name, v in changed.items() if name in OF_VEHICLES})
+    return replace(worlds, vehicles=vehicles, **{name: v for name, v in changed.items() if name not in OF_VEHICLES})

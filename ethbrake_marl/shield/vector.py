@@ -1,0 +1,73 @@
+"""Step mode as a Gymnasium vector wrapper."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import VectorWrapper
+from numpy.typing import NDArray
+
+from ethbrake_marl.actions import checked_action
+from ethbrake_marl.agents.learned import LearnedPolicy
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.envs.vector import EthBrakeVectorEnv
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.observations import Observations
+from ethbrake_marl.physics import Bools, Floats
+from ethbrake_marl.shield.attached import AttachedShield
+from ethbrake_marl.shield.uncertainty import Uncertainty
+
+
+class ShieldedVectorEnv(VectorWrapper):
+    """``EthBrakeVectorEnv`` behind the step shield: each row's action is certified, or replaced; see ``StepShield``.
+
+    ``infos["shield"]`` tells the step that was made, also of rows whose episode ended with it: one array per key,
+    marked by ``infos["_shield"]`` (rows that the autoreset mode spends on a reset are not). ``intervention_penalty`` is
+    taken off a step's reward where something else than the proposal was applied. Raises ``InvalidInput`` for another
+    environment.
+    """
+
+    def __init__(
+        self,
+        env: EthBrakeVectorEnv,
+        policy: Agent | LearnedPolicy | None = None,
+        *,
+        count: HarmCount = "first",
+        allowance: float = 0.0,
+        uncertainty: Uncertainty | str | None = None,
+        intervention_penalty: float = 0.0,
+        logging: bool = False,
+    ) -> None:
+        if not isinstance(env, EthBrakeVectorEnv):
+            raise InvalidInput(f"ShieldedVectorEnv: {env!r} is not an EthBrakeVectorEnv")
+        self.attached = AttachedShield(
+            env, policy, count=count, allowance=allowance, uncertainty=uncertainty, logging=logging
+        )
+        super().__init__(env)
+        self.intervention_penalty = intervention_penalty
+
+    def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
+        """Advance every world by one time step with the actions [rows, 1] certified or replaced."""
+        attached = self.attached
+        if attached.shield.running is None:
+            return self.env.step(actions)  # says that no episode is running
+        before = attached.engine.ended
+        given = np.array(actions)
+        if before.any() and given.shape[:1] == before.shape:
+            given[before] = 0.0  # whatever stands there, the autoreset mode ignores it
+        proposed = checked_action(given, (self.num_envs, 1), "the learners")[:, 0]
+        applied = attached.decide(proposed)
+        decision, told = attached.decision, attached.infos(proposed)
+        assert decision is not None
+        observation, reward, terminated, truncated, infos = self.env.step(applied[:, np.newaxis])
+        attached.check_applied(only=~(before | terminated | truncated))
+        infos |= {"shield": told, "_shield": ~before}
+        paid = reward - self.intervention_penalty * (decision.intervened & ~before)
+        return observation, paid, terminated, truncated, infos
+
+    def close(self, **kwargs: Any) -> None:
+        """Let go of the environment, and close it."""
+        self.attached.detach()
+        super().close(**kwargs)

@@ -1,0 +1,144 @@
+"""The same attack through every face of the shield: what was realised against the bound at the alert."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.sb3 import make_sb3_vec_env
+from ethbrake_marl.envs.vector import EthBrakeVectorEnv
+from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, StepShieldAgent, shielded_aec
+from ethbrake_marl.shield.sb3 import ShieldedVecEnv
+from tests.shield.lines import line
+
+ROWS = 250  # worlds that batched faces advance together
+Harms = tuple[list[float], list[float], int]  # realised, bound at the alert, decisions
+
+
+class Proposals:
+    """What is proposed, in every row its own way: at random, at the extremes, or one value held for some steps."""
+
+    def __init__(self, seed: int, rows: int) -> None:
+        self.rng, self.rows, self.held = np.random.default_rng(seed), rows, np.zeros(rows)
+
+    def next(self) -> np.ndarray:
+        drawn = self.rng.uniform(-1.0, 1.0, (3, self.rows))
+        self.held = np.where(self.rng.random(self.rows) < 0.2, drawn[1], self.held)
+        return np.choose(np.arange(self.rows) % 3, [drawn[0], np.sign(drawn[2]), self.held])
+
+
+def parallel(worlds: int, seed: int) -> Harms:
+    env = HybridShield(parallel_env(line(3)), mode="step")
+    told: Harms = ([], [], 0)
+    for k in range(worlds):
+        env.reset(seed=seed + k)
+        bound, proposals, steps = env.attached.shield.first_bound[0], Proposals(seed + k, 3), 0
+        while env.agents:
+            env.step({"vehicle_2": proposals.next()[[k % 3]]})
+            steps += 1
+        told = _with(told, env.unwrapped.engine, bound, steps)
+    return told
+
+
+def aec(worlds: int, seed: int) -> Harms:
+    env = shielded_aec(parallel_env(line(3)), mode="step")
+    shielded: Any = env
+    while not isinstance(shielded, HybridShield):
+        shielded = shielded.env
+    told: Harms = ([], [], 0)
+    for k in range(worlds):
+        env.reset(seed=seed + k)
+        bound, proposals, steps = shielded.attached.shield.first_bound[0], Proposals(seed + k, 3), 0
+        for agent in env.agent_iter():
+            *_, terminated, truncated, _ = env.last()
+            env.step(None if terminated or truncated else proposals.next()[[k % 3]].astype(np.float32))
+            steps += agent == "vehicle_2" and not (terminated or truncated)
+        told = _with(told, shielded.unwrapped.engine, bound, steps)
+    return told
+
+
+def single(worlds: int, seed: int) -> Harms:
+    env = ShieldedEnv(gymnasium.make("EthBrake-v0", scenario=line(3)).unwrapped)
+    told: Harms = ([], [], 0)
+    for k in range(worlds):
+        env.reset(seed=seed + k)
+        bound, proposals, steps, over = env.attached.shield.first_bound[0], Proposals(seed + k, 3), 0, False
+        while not over:
+            *_, terminated, truncated, _ = env.step(proposals.next()[[k % 3]])
+            over, steps = terminated or truncated, steps + 1
+        told = _with(told, env.attached.engine, bound, steps)
+    return told
+
+
+def vector(worlds: int, seed: int) -> Harms:
+    env = ShieldedVectorEnv(EthBrakeVectorEnv(ROWS, line(3)))
+    env.reset(seed=seed)
+
+    def step(actions: np.ndarray) -> tuple[np.ndarray, Any]:
+        _, _, terminated, truncated, infos = env.step(actions)
+        over = terminated | truncated
+        return over, infos["final_info"]["world_first_impact_harm"][over] if over.any() else []
+
+    return _batched(env.attached.shield, step, worlds, seed)
+
+
+def sb3(worlds: int, seed: int) -> Harms:
+    env = ShieldedVecEnv(make_sb3_vec_env(line(3), ROWS, seed=seed))
+    env.reset()
+
+    def step(actions: np.ndarray) -> tuple[np.ndarray, Any]:
+        _, _, over, infos = env.step(actions)
+        return over, [infos[k]["world_first_impact_harm"] for k in np.flatnonzero(over)]
+
+    return _batched(env.attached.shield, step, worlds, seed)
+
+
+class Proposing:
+    """An agent of a batched evaluation; it drives by chance, so its rollouts say little about what it will do."""
+
+    name = "proposing"
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+
+    def begin(self, worlds: Any, vehicle: int, rows: Any) -> None:
+        self.proposals = Proposals(self.seed, worlds.n)
+
+    def act(self, worlds: Any, vehicle: int) -> np.ndarray:
+        return self.proposals.next() * worlds.vehicles.braking_capacity_mps2[:, vehicle]
+
+
+def evaluation(worlds: int, seed: int) -> Harms:
+    told: Harms = ([], [], 0)
+    scenario = line(3)
+    for first in range(0, worlds, ROWS):
+        agent = StepShieldAgent(Proposing(seed + first), scenario)
+        harm = drive(scenario.sample(min(ROWS, worlds - first), seed, first=first).worlds, agent, scenario, 1)
+        realised, steps = harm.ledger.world_harm("first").tolist(), int(agent.shield.running.steps.sum())
+        told = told[0] + realised, told[1] + agent.shield.first_bound.tolist(), told[2] + steps
+    return told
+
+
+def _with(told: Harms, engine: Any, bound: float, steps: int) -> Harms:
+    return [*told[0], float(engine.ledger.world_harm("first")[0])], [*told[1], float(bound)], told[2] + steps
+
+
+def _batched(shield: Any, step: Any, worlds: int, seed: int) -> Harms:
+    """A face that renews its rows by itself: until so many episodes have ended."""
+    realised: list[float] = []
+    bounds: list[float] = []
+    proposals, decisions = Proposals(seed, ROWS), 0
+    while len(realised) < worlds:
+        before = shield.first_bound.copy()
+        over, harm = step(proposals.next()[:, np.newaxis].astype(np.float32))
+        decisions += ROWS
+        realised += [float(h) for h in harm]
+        bounds += before[over].tolist()
+    return realised, bounds, decisions
+
+
+FACES = {f.__name__: f for f in (parallel, aec, single, vector, sb3, evaluation)}

@@ -1,0 +1,182 @@
+"""The policy itself as a later certificate: accepted only if its rollout, followed step by step, keeps the budget."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rehearsed import Rehearsed
+from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.observations import ObservationSpec
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.shield import HybridShield, StepShield, StepShieldAgent
+from ethbrake_marl.shield.certify import REASONS, Backup
+from ethbrake_marl.shield.rollouts import Proposer
+
+PAPER = load_scenario("paper-random")
+WORLDS = PAPER.sample(120, 3).worlds
+TWO = Scenario(
+    name="two", vehicles=2, gaps_m=15, speeds_mps=[0, 10], braking_capacity_mps2=5, driving_capacity_mps2=5,
+    mass_t=1, latency_s=0, roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
+)  # fmt: skip
+
+
+class Weights:
+    """A policy of fixed random weights on everything that is observed: it reacts to all, and drives badly."""
+
+    observation = ObservationSpec()
+
+    def __call__(self, observation):
+        weights = np.random.default_rng(4).normal(0.0, 1.0, (observation.shape[1], 1))
+        return np.tanh(observation @ weights - 1.0).astype(np.float32)
+
+
+class Remembering:
+    """A policy whose action depends on how often it was asked in each row; it cannot be divided."""
+
+    name = "remembering"
+
+    def __init__(self):
+        self.asked = np.zeros(0)
+
+    def begin(self, worlds, vehicle, rows):
+        self.asked = np.zeros(rows.max() + 1)
+
+    def act(self, worlds, vehicle):
+        self.asked = self.asked + 1.0
+        wave = np.sin(3.0 * self.asked + np.arange(worlds.n))
+        return np.where(wave > 0.0, 0.0, wave * worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+
+class TwoFaced:
+    """Coasts in person, while every copy of it does otherwise."""
+
+    name = "two-faced"
+
+    def __deepcopy__(self, memo):
+        return LearnedAgent(Weights())
+
+    def begin(self, worlds, vehicle, rows):
+        pass
+
+    def act(self, worlds, vehicle):
+        return np.zeros(worlds.n)
+
+
+def tight():
+    """10 m/s, 15 m to a vehicle at rest, and a plan (3.5 m/s2: 14.3 m) that coasting would make useless."""
+    shield, worlds = StepShield(TWO, 1), TWO.sample(1, 0).worlds
+    shield.begin(worlds, np.arange(1))
+    shield.backup = Backup(np.full_like(shield.backup.plan, -0.7), np.zeros(1), np.zeros(0))
+    return shield, worlds
+
+
+def test_by_hand__the_policy_certifies_what_plan_and_constants_do_not():
+    shield, worlds = tight()
+    assert REASONS[shield.decide(np.zeros(1)).reason[0]] == "no certificate"
+    shield, worlds = tight()
+    decision = shield.decide(np.zeros(1), proposer=Proposer(make_agent("full_brake"), worlds))
+    assert REASONS[decision.reason[0]] == "policy rollout" and not decision.intervened[0]
+    assert decision.applied.tolist() == [0.0] and decision.bound.tolist() == [0.0]
+    assert (shield.backup.plan[0, 0], shield.backup.plan[0, 1]) == (0.0, -1.0)
+    assert shield.running.steps.tolist() == [1] and shield.running.states[0, 2] == pytest.approx(14.0)
+
+
+def test_by_hand__a_policy_that_would_collide_certifies_nothing():
+    shield, worlds = tight()
+    decision = shield.decide(np.zeros(1), proposer=Proposer(make_agent("constant:3.5"), worlds))
+    assert REASONS[decision.reason[0]] == "no certificate" and decision.applied.tolist() == [-0.7]
+    # 14 m are left, 10^2 / (2 * 3.5) = 14.29 m are needed: 2 * 3.5 * 0.2857 = 2 m2/s2
+    assert decision.margin[0] == pytest.approx(-2.0)
+
+
+def driven(policy, **settings):
+    """The agent, each world's harm, and the reasons [decisions, n]."""
+    agent, reasons = StepShieldAgent(policy, PAPER, **settings), []
+    decide = StepShield.decide
+
+    def noted(shield, *arguments, **given):
+        decision = decide(shield, *arguments, **given)
+        reasons.append(np.where(given["only"], decision.reason, -1))
+        return decision
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StepShield, "decide", noted)
+        harm = drive(WORLDS, agent, PAPER, 1).ledger.world_harm("first")
+    return agent, harm, np.array(reasons)
+
+
+@pytest.mark.parametrize("policy", [LearnedAgent(Weights()), Remembering()], ids=["divisible", "remembering"])
+def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_exact(policy):
+    agent, harm, reasons = driven(policy)
+    accepted = reasons == REASONS.index("policy rollout")
+    assert accepted.sum() > 3
+    later = np.cumsum(accepted, axis=0) - accepted > 0  # after the first accepted rollout of that world
+    allowed = [-1, REASONS.index("same as plan"), REASONS.index("ended")]
+    assert np.isin(reasons[later], allowed).all()
+    assert harm.tolist() == agent.shield.bound.tolist()
+    assert (harm <= agent.predicted_harm).all() and not agent.shield.distrusted.any()
+
+
+def test_rollout__leaves_the_policys_memory_alone():
+    policy = Remembering()
+    _, _, reasons = driven(policy)
+    assert (reasons == REASONS.index("no certificate")).any()
+    assert set(policy.asked) == {float(len(reasons))}
+
+
+def test_rollout__a_policy_that_does_otherwise_than_its_copies_gets_no_further_than_the_bound():
+    agent, harm, reasons = driven(TwoFaced())
+    assert (reasons == REASONS.index("policy rollout")).any()
+    assert harm.tolist() == agent.shield.bound.tolist() and (harm <= agent.predicted_harm).all()
+
+
+def test_rollout__of_some_worlds_alone_is_that_of_the_whole_batch():
+    class Whole:
+        name = "whole"
+
+        def __init__(self):
+            self.policy = LearnedAgent(Weights())
+
+        def begin(self, worlds, vehicle, rows):
+            pass
+
+        def act(self, worlds, vehicle):
+            return self.policy.act(worlds, vehicle)
+
+    assert driven(Whole())[1].tolist() == driven(LearnedAgent(Weights()))[1].tolist()
+
+
+def test_later_rollouts__may_be_switched_off():
+    _, _, reasons = driven(LearnedAgent(Weights()), later_rollouts=False)
+    assert not (reasons == REASONS.index("policy rollout")).any()
+
+
+def test_wrapper__tries_its_policy_where_the_proposal_is_rejected_and_keeps_the_bound():
+    env, reasons = HybridShield(parallel_env(), LearnedAgent(Weights()), mode="step"), set()
+    for seed in range(40):
+        if reasons >= {"policy rollout", "no certificate"}:
+            break
+        env.reset(seed=seed)
+        first = env.attached.shield.first_bound[0]
+        while env.agents:
+            *_, infos = env.step({})
+            reasons.add(infos["vehicle_2"]["shield"]["reason"])
+        assert env.unwrapped.engine.ledger.world_harm("first")[0] == infos["vehicle_2"]["shield"]["bound_harm"] <= first
+    assert {"policy rollout", "no certificate"} <= reasons
+
+
+def test_rehearsed__also_where_its_policy_cannot_be_divided():
+    agent = StepShieldAgent(Rehearsed(Remembering(), PAPER, rehearsals=2), PAPER)
+    harm = drive(WORLDS.take(np.arange(20)), agent, PAPER, 1).ledger.world_harm("first")
+    assert harm.tolist() == agent.shield.bound.tolist()
+
+
+def test_take__of_a_rehearsed_policy_drives_on_in_those_rows():
+    worlds, rows = WORLDS.take(np.arange(6)), np.array([4, 1])
+    agent = Rehearsed(LearnedAgent(Weights()), PAPER, rehearsals=4)
+    agent.begin(worlds, 1, np.arange(6))
+    assert agent.take(rows).act(worlds.take(rows), 1).tolist() == agent.act(worlds, 1)[rows].tolist()
