@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from ethbrake_marl.learning.schemes import SCHEMES
 from ethbrake_marl.objectives import KINDS, scored
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario, parse_yaml
 from ethbrake_marl.v2x import CHANNELS, PRESETS, V2X
@@ -32,6 +33,10 @@ def test_page__its_presets_are_those_of_the_code():
         assert float(burst.split()[0]) == pytest.approx(1 / channel.loss_ends, abs=0.05)
 
 
+def test_page__names_every_training_scheme():
+    assert {re.findall("`(.*?)`", cell)[0] for cell in rows("| scheme | networks |")} == set(SCHEMES)
+
+
 def test_page__names_every_key_objective_and_level():
     keys = {key for cell in rows("| key | range |") for key in re.findall("`(.*?)`", cell)}
     assert keys == set(V2X.model_fields)
@@ -41,9 +46,21 @@ def test_page__names_every_key_objective_and_level():
     assert set(rows("| scenario | learns |")) == {f"`{name}`" for name in levels}
 
 
+def test_page__its_example_of_a_training_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (block,) = (b for b in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "train_team(" in b)
+    names: dict[str, object] = {}
+    exec(
+        block.replace('("cooperation")', '("cooperation").replace(total_steps=1, n_envs=8)').replace("1000", "20"),
+        names,
+    )
+    assert names["harm"].shape == (20,)
+    assert (tmp_path / "runs" / "pair" / "team.json").is_file()
+
+
 def test_page__its_examples_run():
     names: dict[str, object] = {}
-    blocks = re.findall("```python\n(.*?)```", PAGE, re.DOTALL)
+    blocks = [b for b in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "train_team(" not in b]
     assert len(blocks) == 3
     exec(blocks[0], names)
     exec(blocks[2].replace("1000", "20"), names)

@@ -35,9 +35,19 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("lineup", "results_folder"),
     ("experiment",),
     ("learning_curves",),
+    ("ablation",),
     ("__init__",),
     ("doctor", "terminal", "command_options", "machine", "benchmark", "scaling"),
-    ("picture_commands", "search_commands", "bench_commands", "training_commands", "policy_commands"),
+    (
+        "evaluate_command",
+        "picture_commands",
+        "search_commands",
+        "bench_commands",
+        "training_commands",
+        "policy_commands",
+        "ablation_commands",
+        "shield_commands",
+    ),
     ("cli", "__main__"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}

@@ -12,7 +12,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics import advance, forecast, make_worlds
-from ethbrake_marl.rewards import RewardParams, StepOutcome, reward_params, reward_terms, weighted_sum
+from ethbrake_marl.rewards import RewardParams, StepOutcome, potential, reward_params, reward_terms, weighted_sum
 from ethbrake_marl.scenario import load_scenario
 
 
@@ -105,6 +105,21 @@ def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(discount):
         assert (result.reward[:, [0, 2]] == 0.0).all()
     assert (least > 0).sum() > 20
     assert total == pytest.approx(least, abs=1e-9)
+
+
+def test_potential__of_two_learners_lets_each_choose_given_the_other():
+    worlds = load_scenario("cooperation-3-pair").sample(30, seed=3).worlds
+    braking = worlds.vehicles.braking_capacity_mps2
+    shares = np.linspace(0.0, 1.0, 9)
+    alone, pair = (-potential(RewardParams(), worlds, learners, 8.0) for learners in ((1,), (0, 1)))
+    every = np.empty((worlds.n, 9))  # least harm by Vehicle 2, for each choice of Vehicle 1
+    for c, share in enumerate(shares):
+        command = -braking.copy()
+        command[:, 0] *= share
+        every[:, c] = forecast(worlds, command, 1, -braking[:, 1:2] * shares, 8.0)[0].min(axis=1)
+    assert (every.min(axis=1) <= pair).all() and (pair <= alone).all()
+    assert (alone > 1.0).sum() > 10
+    assert pair.mean() < 0.1 * alone.mean()  # Vehicle 1 simply does not brake
 
 
 def test_bad_input__is_refused():

@@ -44,6 +44,7 @@ def _with_script(script: str) -> Scenario:
         (SCENARIO, SHAPED),
         (SCENARIO, "paper"),
         (SCENARIO.with_learners(["vehicle_2", "vehicle_3"]), SHAPED),
+        (load_scenario("cooperation-4-congested"), SHAPED),
         (load_scenario("stress-wide"), "total-harm"),
         (_with_script("gentlest_front"), "harm"),
         (_with_script("e_v2x_bm:pairwise"), "harm"),

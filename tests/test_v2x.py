@@ -13,7 +13,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import ObservationSpec, observe
+from ethbrake_marl.observations import observation_for, observe
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
 from ethbrake_marl.snapshots import engine_snapshot, restore_engine
@@ -150,13 +150,16 @@ def shuffled(worlds, vehicle):
         speeds_mps=np.where(unknown, worlds.speeds_mps[lines] * 0.5, worlds.speeds_mps),
         command_mps2=np.where(unknown, -1.0, worlds.command_mps2),
         pair_hit=np.where(unknown[:, [0, 2]], True, worlds.pair_hit),
+        hazard_gap_m=np.where(unknown[:, 0], worlds.hazard_gap_m[lines] + 5.0, worlds.hazard_gap_m),
+        hazard_hit=unknown[:, 0] | worlds.hazard_hit,
     )
 
 
+@pytest.mark.parametrize("hazard", [False, True])
 @pytest.mark.parametrize("name", ["blocked", "congested", "sensors-only"])
-def test_observe__what_is_not_known_changes_no_bit(name):
-    start = channel_of(name).sample(400, 5).worlds
-    spec = ObservationSpec()
+def test_observe__what_is_not_known_changes_no_bit(name, hazard):
+    scenario = channel_of(name).replace(hazard_gap_m={"uniform": [30, 50]}) if hazard else channel_of(name)
+    start, spec = scenario.sample(400, 5).worlds, observation_for(scenario)
     seen = 0
     for time in (0.0, 0.5, 0.8, 1.0, 1.5):
         worlds, _ = advance(start, -3.0, until_s=time)
@@ -165,6 +168,9 @@ def test_observe__what_is_not_known_changes_no_bit(name):
         assert observe(worlds, 1, spec).tobytes() == observe(other, 1, spec).tobytes()
         flags = observe(worlds, 1, spec)[:, [7, 17]]
         assert (flags == ~unknown).all()
+        if hazard:
+            at = [f.name for f in spec.features].index("hazard.known")
+            assert (observe(worlds, 1, spec)[:, at] == ~unknown[:, 0]).all()
         seen += int(unknown.sum())
     assert seen > 400
 

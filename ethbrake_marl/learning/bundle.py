@@ -38,7 +38,7 @@ class Policy:
     """A policy in memory: its manifest, its tensors, and ``policy(observation)`` for the deterministic action."""
 
     manifest: Manifest
-    tensors: Mapping[str, Float32s]
+    tensors: Mapping[str, Float32s] = field(repr=False)
     _actor: Actor = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -120,6 +120,9 @@ def _bundle_folder(path: Path) -> Path:
             if folder.is_symlink():
                 raise CorruptBundle(f"{folder}: is a symbolic link; give the folder it points to")
             return folder
+    members = sorted((path / "policy").glob("vehicle_*"))
+    if members:
+        raise InvalidInput(f"{path}: each of its learners has a policy of its own; name one, for instance {members[0]}")
     reason = "holds no policy" if path.is_dir() else "is not a folder"
     raise InvalidInput(f"{path}: {reason}; give a policy bundle ({MANIFEST}, {WEIGHTS}) or a run that finished")
 

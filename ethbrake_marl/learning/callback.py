@@ -10,10 +10,10 @@ import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
-from ethbrake_marl.learning.bundle import Policy
 from ethbrake_marl.learning.course import RETURN, Course
 from ethbrake_marl.learning.divergence import check_losses, check_rollout, check_step, check_weights
 from ethbrake_marl.learning.model_state import Model
+from ethbrake_marl.learning.policy_team import Trained
 from ethbrake_marl.learning.recipe import TrainingRecipe
 
 # Column of the log -> info of an episode's end; means over the episodes since the last row, exploration included.
@@ -23,7 +23,7 @@ EPISODE_COLUMNS = {
     "rollout/collision_rate": "collided",
 }
 
-Evaluate = Callable[[Policy], Mapping[str, float]]
+Evaluate = Callable[[Any], Mapping[str, float]]  # of what is trained: a ``Policy``, or a ``PolicyTeam``
 
 
 class StopRequested(Exception):
@@ -60,7 +60,7 @@ class BetweenUpdates(BaseCallback):
     def __init__(
         self,
         recipe: TrainingRecipe,
-        policy_now: Callable[[Model], Policy],
+        policy_now: Callable[[Model], Trained],
         *,
         save: Save,
         stop: Callable[[], bool],
@@ -80,7 +80,7 @@ class BetweenUpdates(BaseCallback):
         """What a checkpoint must hold of this object."""
         return {"updates": self.updates, "ended": self._ended, "course": self.course.to_json()}
 
-    def restore(self, content: Mapping[str, Any], steps: int, policy: Policy, best: Policy | None) -> None:
+    def restore(self, content: Mapping[str, Any], steps: int, policy: Trained, best: Trained | None) -> None:
         """Go on from a checkpoint."""
         self.updates = self.course.updates = int(content["updates"])
         self._ended = {column: list(content["ended"][column]) for column in EPISODE_COLUMNS}

@@ -21,7 +21,7 @@ from safetensors import SafetensorError
 
 from ethbrake_marl.durable_files import new_folder, remove_folder, write_file
 from ethbrake_marl.errors import CorruptBundle
-from ethbrake_marl.learning.bundle import Policy, load_policy, save_policy
+from ethbrake_marl.learning.policy_team import Trained, read_trained, save_trained
 from ethbrake_marl.learning.strict_json import parse_strict_json
 from ethbrake_marl.snapshots import Arrays
 
@@ -49,8 +49,8 @@ class TrainingState:
     numbers: dict[str, Any]  # plain JSON
     arrays: Arrays
     replay: Arrays  # memory-mapped when read
-    policy: Policy  # as it was checked last
-    best: Policy | None  # of least harm so far
+    policy: Trained  # as it was checked last
+    best: Trained | None  # of least harm so far
     table: bytes  # progress.csv
     versions: Mapping[str, str]
 
@@ -61,9 +61,9 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
         write_file(partial / _NUMBERS, json.dumps(state.numbers, allow_nan=False).encode())
         write_file(partial / _ARRAYS, safetensors.numpy.save(_contiguous(state.arrays)))
         write_file(partial / _TABLE, state.table)
-        save_policy(state.policy, partial / _POLICY)
+        save_trained(state.policy, partial / _POLICY)
         if state.best is not None:
-            save_policy(state.best, partial / _BEST)
+            save_trained(state.best, partial / _BEST)
         for name, array in state.replay.items():
             _write_array(partial / f"{_MEMORY}-{name}.npy", array)
         files = sorted(path for path in partial.rglob("*") if path.is_file())
@@ -94,8 +94,8 @@ def read_checkpoint(folder: Path) -> TrainingState:
                 file.stem.removeprefix(f"{_MEMORY}-"): np.load(file, mmap_mode="r", allow_pickle=False)
                 for file in sorted(folder.glob(f"{_MEMORY}-*.npy"))
             },
-            policy=load_policy(folder / _POLICY),
-            best=load_policy(folder / _BEST) if (folder / _BEST).is_dir() else None,
+            policy=read_trained(folder / _POLICY),
+            best=read_trained(folder / _BEST) if (folder / _BEST).is_dir() else None,
             table=(folder / _TABLE).read_bytes(),
             versions=listing["versions"],
         )

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.bundle import Policy
+from ethbrake_marl.learning.policy_team import Trained
 
 HARM_METRIC: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
 RETURN = "episode_return"
@@ -27,8 +27,8 @@ class Course:
     """
 
     count: HarmCount = "first"
-    policy: Policy | None = None  # none until the first weights were checked
-    best: Policy | None = None
+    policy: Trained | None = None  # none until the first weights were checked
+    best: Trained | None = None
     best_harm: float = math.inf
     steps: int = 0
     updates: int = 0
@@ -43,11 +43,11 @@ class Course:
         return self.wall_before_s + time.monotonic() - self.started
 
     @property
-    def kept(self) -> Policy | None:
+    def kept(self) -> Trained | None:
         """The policy to use: the best, or the last where nothing was measured."""
         return self.best or self.policy
 
-    def measured(self, policy: Policy, metrics: Mapping[str, float], episode_return: float | None) -> str | None:
+    def measured(self, policy: Trained, metrics: Mapping[str, float], episode_return: float | None) -> str | None:
         """Take in an evaluation of ``policy``; gives the alarm, if this one raises it."""
         extra = {} if episode_return is None else {RETURN: episode_return}
         self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **extra})

@@ -12,12 +12,12 @@ from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.learning.model_state import Model, optimizers_of
 
 _LOSSES = (
-    "train/loss",
-    "train/value_loss",
-    "train/policy_gradient_loss",
-    "train/actor_loss",
-    "train/critic_loss",
-    "train/ent_coef_loss",
+    "loss",
+    "value_loss",
+    "policy_gradient_loss",
+    "actor_loss",
+    "critic_loss",
+    "ent_coef_loss",
 )
 
 
@@ -42,11 +42,12 @@ def watch_gradients(model: Model) -> None:
 
 def check_losses(model: Model) -> None:
     """Refuse an update whose losses are not finite; an infinite loss may well leave finite weights."""
-    logged = model.logger.name_to_value
-    for name in _LOSSES:
-        if name in logged and not np.isfinite(float(logged[name])):
+    logged = model.logger.name_to_value  # train/loss, or vehicle_2/loss where learners are independent
+    found = ((name, float(logged[name])) for loss in _LOSSES for name in logged if name.rpartition("/")[2] == loss)
+    for name, value in found:
+        if not np.isfinite(value):
             raise TrainingDiverged(
-                f"training: {name} = {float(logged[name])} after step {model.num_timesteps}: must be finite;"
+                f"training: {name} = {value} after step {model.num_timesteps}: must be finite;"
                 " try a smaller learning_rate, or smaller weights of the reward"
             )
 

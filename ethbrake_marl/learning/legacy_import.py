@@ -19,7 +19,7 @@ from ethbrake_marl.learning.networks import Activation, NetworkSpec, tensor_tabl
 from ethbrake_marl.learning.recipe import Algorithm
 from ethbrake_marl.learning.sb3_policy import tensors_of
 from ethbrake_marl.learning.versions import installed_versions
-from ethbrake_marl.observations import ObservationSpec
+from ethbrake_marl.observations import observation_for
 from ethbrake_marl.scenario import Scenario
 
 _CLASSES: dict[Algorithm, Any] = {"ppo": PPO, "sac": SAC}
@@ -44,13 +44,14 @@ def import_legacy(file: Path, scenario: Scenario, *, algorithm: Algorithm = "ppo
         model = _CLASSES[algorithm].load(file, device="cpu")
     except Exception as error:  # whatever its unpickling raises
         raise InvalidInput(f"{file}: cannot be read as {algorithm.upper()} ({type(error).__name__}: {error})") from None
-    _check_spaces(file, model)
-    network = _network(file, model, algorithm)
+    observation = observation_for(scenario)
+    _check_spaces(file, model, observation.size)
+    network = _network(file, model, algorithm, observation.size)
     return make_policy(
         tensors_of(model.policy, network),
         algorithm=algorithm,
         network=network,
-        observation=observation_schema(ObservationSpec()),
+        observation=observation_schema(observation),
         learners=tuple(scenario.vehicle_names[vehicle] for vehicle in scenario.learners),
         scenario=scenario.model_dump(mode="json"),
         reward={"imported_from_sha256": hashlib.sha256(file.read_bytes()).hexdigest()},
@@ -60,16 +61,15 @@ def import_legacy(file: Path, scenario: Scenario, *, algorithm: Algorithm = "ppo
     )
 
 
-def _check_spaces(file: Path, model: Any) -> None:
+def _check_spaces(file: Path, model: Any, size: int) -> None:
     seen, acting = model.observation_space, model.action_space
-    size = ObservationSpec().size
     if getattr(seen, "shape", None) != (size,):
         raise InvalidInput(f"{file}: takes observations of shape {getattr(seen, 'shape', None)}; ours are ({size},)")
     if getattr(acting, "shape", None) != (1,) or not (np.all(acting.low == -1.0) and np.all(acting.high == 1.0)):
         raise InvalidInput(f"{file}: its actions are {acting}; ours are one number in [-1, 1]")
 
 
-def _network(file: Path, model: Any, algorithm: Algorithm) -> NetworkSpec:
+def _network(file: Path, model: Any, algorithm: Algorithm, observation_size: int) -> NetworkSpec:
     """Our description of its network, read off its tensors."""
     state: dict[str, torch.Tensor] = model.policy.state_dict()
     actor = "mlp_extractor.policy_net" if algorithm == "ppo" else "actor.latent_pi"
@@ -80,7 +80,7 @@ def _network(file: Path, model: Any, algorithm: Algorithm) -> NetworkSpec:
     if not hidden:
         raise InvalidInput(f"{file}: its policy has no hidden layers of its own ({actor}.*)")
     spec = NetworkSpec(
-        observation_size=ObservationSpec().size,
+        observation_size=observation_size,
         action_size=1,
         policy_hidden=hidden,
         value_hidden=value,

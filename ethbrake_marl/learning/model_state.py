@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import PPO, SAC
 
+from ethbrake_marl.learning.independent import IndependentPPO
 from ethbrake_marl.learning.random_state import capture_random, restore_random
 from ethbrake_marl.snapshots import Arrays
 
@@ -93,6 +94,8 @@ def restore_replay(model: Model, arrays: Mapping[str, NDArray[Any]], plain: Mapp
 
 def optimizers_of(model: Model) -> dict[str, torch.optim.Optimizer]:
     """The model's optimisers by name."""
+    if isinstance(model, IndependentPPO):
+        return dict(zip(model.names, (member.optimizer for member in model.policy.policies), strict=True))
     if isinstance(model, PPO):
         return {"policy": model.policy.optimizer}
     found: dict[str, Any] = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}

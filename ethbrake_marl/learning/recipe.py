@@ -20,7 +20,10 @@ from ethbrake_marl.scenario.yaml_loading import Document, YamlPath, read_yaml
 
 ROLLOUT_LIMIT = 2**24  # decisions held in memory between two updates
 
+WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
+
 Algorithm = Literal["ppo", "sac"]
+Scheme = Literal["single", "shared", "independent", "centralised"]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -103,6 +106,7 @@ class TrainingRecipe(_Part):
     description: str = ""
     source: str = ""
     algorithm: Algorithm
+    scheme: Scheme | None = None  # None: single for one learner, shared for several
     total_steps: Annotated[int, Field(ge=1)]
     n_envs: Annotated[int, Field(ge=1)]
     batch_size: Annotated[int, Field(ge=2)]
@@ -155,7 +159,14 @@ class PpoRecipe(TrainingRecipe):
     vf_coef: NonNegative
     max_grad_norm: Positive
     target_kl: Positive | None = None
+    turns: Annotated[int, Field(ge=1, le=1000)] | None = None  # of independent learners; None: all learn at once
     network: NetworkShape
+
+    @model_validator(mode="after")
+    def _turns_are_for_independent_learners(self) -> PpoRecipe:
+        if self.turns is not None and self.scheme != "independent":
+            refuse(("turns",), self.turns, "is for scheme: independent only; leave it out")
+        return self
 
     @model_validator(mode="after")
     def _whole_batches(self) -> PpoRecipe:

@@ -55,6 +55,11 @@ class RunDirectory:
         return self.path / "policy-last"
 
     @property
+    def team(self) -> Path:
+        """Which bundle drives which vehicle."""
+        return self.path / "team.json"
+
+    @property
     def checkpoints(self) -> Path:
         """Where the training can go on; empty once it has finished."""
         return self.path / "checkpoints"
@@ -102,11 +107,13 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def create_run(path: Path, config: Mapping[str, Any], *, force: bool = False) -> RunDirectory:
-    """Make the folder of a run with its ``config.json`` and ``run.json``, in one step: it can be resumed from then on.
+def create_run(
+    path: Path, config: Mapping[str, Any], *, team: Mapping[str, Any] | None = None, force: bool = False
+) -> RunDirectory:
+    """Make the folder of a run with its configuration and its record, in one step: it can be resumed from then on.
 
-    Raises ``AlreadyExists`` when there is something; with ``force`` an earlier run (a folder with a ``run.json``) or an
-    empty folder is replaced, and anything else is still refused.
+    ``team`` is the content of ``team.json``. Raises ``AlreadyExists`` when there is something; with ``force`` an
+    earlier run (a folder with a ``run.json``) or an empty folder is replaced, and anything else is still refused.
     """
     run = RunDirectory(path)
     replace = force and path.is_dir() and not path.is_symlink() and (run.status.is_file() or not any(path.iterdir()))
@@ -120,6 +127,8 @@ def create_run(path: Path, config: Mapping[str, Any], *, force: bool = False) ->
     with new_folder(path, replace=replace) as partial:
         new = RunDirectory(partial)
         new.write_json(new.config, config)
+        if team is not None:
+            new.write_json(new.team, team)
         write_status(new, "running", {"started_utc": _now()})
     return run
 

@@ -7,7 +7,6 @@ from typing import Any, Literal
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
 from ethbrake_marl.durable_files import remove_folder
-from ethbrake_marl.learning.bundle import Policy, save_policy
 from ethbrake_marl.learning.callback import BetweenUpdates, StopRequested
 from ethbrake_marl.learning.checkpoint import TrainingState, prune, write_checkpoint
 from ethbrake_marl.learning.divergence import TrainingDiverged, weights_are_finite
@@ -20,6 +19,7 @@ from ethbrake_marl.learning.model_state import (
     restore_model,
     restore_replay,
 )
+from ethbrake_marl.learning.policy_team import Trained, save_trained, steps_of
 from ethbrake_marl.learning.progress_table import ProgressTable
 from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.learning.run_directory import RunDirectory, RunRecord, RunStatus
@@ -114,16 +114,16 @@ class Session:
             "wall_s": round(course.wall_s, 3),
             "steps": course.steps,
             "updates": course.updates,
-            "policy_steps": None if course.kept is None else course.kept.manifest.steps,
+            "policy_steps": None if course.kept is None else steps_of(course.kept),
             "alarms": course.alarms,
         }
         self._record.end(status, reason, left)
         if status == "finished" and self._run.checkpoints.is_dir():
             remove_folder(self._run.checkpoints)
 
-    def _save_policy(self, policy: Policy | None, name: str) -> None:
+    def _save_policy(self, policy: Trained | None, name: str) -> None:
         if policy is not None:
-            save_policy(policy, self._run.path / name, replace=True)
+            save_trained(policy, self._run.path / name, replace=True)
 
     def _diverged(self, error: BaseException) -> BaseException:
         """The error to report: torch's own when a distribution gets a NaN says little about a training."""

@@ -7,32 +7,41 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import ValidationError
-from stable_baselines3.common.vec_env import VecEnv
 
 from ethbrake_marl.durable_files import remove_unfinished
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
+from ethbrake_marl.envs.sb3 import Appended, EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.bundle import Policy, make_policy
+from ethbrake_marl.learning.bundle import Policy
 from ethbrake_marl.learning.callback import BetweenUpdates, Evaluate, Progress
 from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
 from ethbrake_marl.learning.course import Course
-from ethbrake_marl.learning.manifest import observation_schema
-from ethbrake_marl.learning.model_state import Model
-from ethbrake_marl.learning.models import make_model
+from ethbrake_marl.learning.models import make_model, policy_maker
 from ethbrake_marl.learning.random_state import own_random_state
-from ethbrake_marl.learning.recipe import SacRecipe, TrainingRecipe, recipe_of
+from ethbrake_marl.learning.recipe import SacRecipe, Scheme, TrainingRecipe, recipe_of
 from ethbrake_marl.learning.run_directory import RunDirectory, create_run, only_process, open_run
-from ethbrake_marl.learning.sb3_policy import tensors_of
-from ethbrake_marl.learning.session import Session
+from ethbrake_marl.learning.schemes import scheme_of
+from ethbrake_marl.learning.session import Ended, Session
 from ethbrake_marl.learning.stop_signal import stop_on_signal
+from ethbrake_marl.learning.team_file import team_content
 from ethbrake_marl.learning.versions import installed_versions
-from ethbrake_marl.observations import ObservationSpec
+from ethbrake_marl.observations import observation_for
 from ethbrake_marl.scenario import Scenario
 
-OBSERVATION = ObservationSpec()  # what a learner sees: itself, and one neighbour on each side
+_APPENDED: dict[Scheme, Appended] = {"independent": "number", "centralised": "state"}
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """A training that has ended or was interrupted: its folder, and what it has reached."""
+
+    run: RunDirectory
+    course: Course
+    status: Ended
+    scheme: Scheme
+    scenario: Scenario
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +51,7 @@ class TrainResult:
     directory: Path
     policy: Policy  # of least harm on the fixed list, the last where none was measured; also saved as directory/policy
     last_policy: Policy  # also saved as directory/policy-last
-    status: Literal["finished", "interrupted"]
+    status: Ended
     steps: int  # decisions of learners, a multiple of rows x rounds
     updates: int
     wall_s: float
@@ -63,6 +72,7 @@ def train(
 ) -> TrainResult:
     """Train on ``scenario`` (its roles say who learns; several learners share one policy) into the new ``directory``.
 
+    A recipe whose scheme makes a policy for each learner is for ``learning.teams.train_team``.
     ``seed`` and ``steps`` override the recipe. Training ends after the first update at or beyond ``steps``.
     ``evaluate(policy)`` is called before the first update, then as the recipe says, and at the end. The same recipe,
     scenario, seed and machine give the same policy, bit for bit; global random states are left as they were.
@@ -72,13 +82,26 @@ def train(
     ``resume`` goes on. Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` for a
     scenario without learners, ``TrainingDiverged`` for numbers that are not finite.
     """
+    if scheme_of(recipe, scenario) == "independent":
+        raise InvalidInput(f"recipe {recipe.name!r}: scheme independent makes several policies; use train_team")
     changes = {"seed": seed, "total_steps": steps}
     recipe = recipe.replace(**{name: value for name, value in changes.items() if value is not None})
-    if not scenario.learners:
-        raise InvalidInput(f"scenario {scenario.name!r}: no vehicle learns; give at least one the role learner")
+    return _result(run_training(recipe, scenario, Path(directory), force, evaluate, on_progress))
+
+
+def run_training(
+    recipe: TrainingRecipe,
+    scenario: Scenario,
+    directory: Path,
+    force: bool,
+    evaluate: Evaluate | None,
+    on_progress: Callable[[Progress], None] | None,
+) -> Training:
+    """What ``train`` does, under whatever scheme; ``evaluate`` gets a ``Policy``, or a ``PolicyTeam``."""
+    team = team_content(scheme_of(recipe, scenario), scenario)
 
     def begin() -> tuple[RunDirectory, None]:
-        return create_run(Path(directory), _config(recipe, scenario), force=force), None
+        return create_run(directory, _config(recipe, scenario), team=team, force=force), None
 
     return _run(begin, recipe, scenario, evaluate, on_progress)
 
@@ -98,14 +121,32 @@ def resume(
     that has finished, one in which another process trains, and a checkpoint written by other versions, whose numbers
     may differ, unless ``other_versions``.
     """
-    run, config = open_run(Path(directory))
+    if scheme_of(*_asked_for(Path(directory))[1:]) == "independent":
+        raise InvalidInput(f"{directory}: its learners have a policy each; go on with resume_team")
+    return _result(resume_training(Path(directory), evaluate, on_progress, other_versions))
+
+
+def resume_training(
+    directory: Path,
+    evaluate: Callable[[TrainingRecipe, Scenario], Evaluate | None] | None,
+    on_progress: Callable[[Progress], None] | None,
+    other_versions: bool,
+) -> Training:
+    """What ``resume`` does, under whatever scheme."""
+    run, recipe, scenario = _asked_for(directory)
+    measure = None if evaluate is None else evaluate(recipe, scenario)
+    return _run(lambda: (run, other_versions), recipe, scenario, measure, on_progress)
+
+
+def _asked_for(directory: Path) -> tuple[RunDirectory, TrainingRecipe, Scenario]:
+    """The training that was begun in a folder."""
+    run, config = open_run(directory)
     try:
         recipe = recipe_of(json.dumps(config["recipe"]))
         scenario = Scenario.model_validate_json(json.dumps(config["scenario"]))
     except (KeyError, ValidationError) as error:
         raise InvalidInput(f"{run.config}: is not the configuration of a training ({error})") from None
-    measure = None if evaluate is None else evaluate(recipe, scenario)
-    return _run(lambda: (run, other_versions), recipe, scenario, measure, on_progress)
+    return run, recipe, scenario
 
 
 def _run(
@@ -114,7 +155,7 @@ def _run(
     scenario: Scenario,
     evaluate: Evaluate | None,
     on_progress: Callable[[Progress], None] | None,
-) -> TrainResult:
+) -> Training:
     """Train in the folder that ``begin`` makes or finds, once nothing can be wrong with environment and model.
 
     What else it gives is None for a new training, else whether other versions may go on with it.
@@ -127,7 +168,7 @@ def _run(
             session = Session(run, model, recipe)
             between = BetweenUpdates(
                 recipe,
-                _policy_maker(recipe, scenario),
+                policy_maker(recipe, scenario, observation_for(scenario)),
                 save=session.save,
                 stop=stop,
                 evaluate=evaluate,
@@ -137,16 +178,17 @@ def _run(
                 session.restore(between, found[0])
                 between.notes += [f"a damaged checkpoint was left aside: {reason}" for reason in found[1]]
             status = session.learn(between)
-    return _result(run, between.course, status)
+    return Training(run, between.course, status, scheme_of(recipe, scenario), scenario)
 
 
-def _result(run: RunDirectory, course: Course, status: Literal["finished", "interrupted"]) -> TrainResult:
-    assert course.policy is not None and course.kept is not None  # set before the first rollout
+def _result(training: Training) -> TrainResult:
+    course = training.course
+    assert isinstance(course.policy, Policy) and isinstance(course.kept, Policy)  # set before the first rollout
     return TrainResult(
-        run.path,
+        training.run.path,
         course.kept,
         course.policy,
-        status,
+        training.status,
         course.steps,
         course.updates,
         course.wall_s,
@@ -177,22 +219,6 @@ def _check_versions(run: RunDirectory, then: Mapping[str, str]) -> None:
             )
 
 
-def _policy_maker(recipe: TrainingRecipe, scenario: Scenario) -> Callable[[Model], Policy]:
-    """How to make a policy of the model's present weights."""
-    network = recipe.network_spec(OBSERVATION.size)
-    fixed = {
-        "algorithm": recipe.algorithm,
-        "network": network,
-        "observation": observation_schema(OBSERVATION),
-        "learners": tuple(scenario.vehicle_names[vehicle] for vehicle in scenario.learners),
-        "scenario": scenario.model_dump(mode="json"),
-        "reward": recipe.reward.model_dump(mode="json"),
-        "seeds": {"training": recipe.seed},
-        "versions": installed_versions(),
-    }
-    return lambda model: make_policy(tensors_of(model.policy, network), steps=model.num_timesteps, **fixed)
-
-
 def _config(recipe: TrainingRecipe, scenario: Scenario) -> dict[str, Any]:
     stated = {"update_ratio": recipe.update_ratio} if isinstance(recipe, SacRecipe) else {}
     return {
@@ -205,14 +231,15 @@ def _config(recipe: TrainingRecipe, scenario: Scenario) -> dict[str, Any]:
 
 
 @contextmanager
-def _environment(recipe: TrainingRecipe, scenario: Scenario) -> Iterator[VecEnv]:
+def _environment(recipe: TrainingRecipe, scenario: Scenario) -> Iterator[EthBrakeVecEnv]:
     environment = make_sb3_vec_env(
         scenario,
         recipe.n_envs,
         recipe.seed,
         reward=recipe.reward,
-        observation=OBSERVATION,
+        observation=observation_for(scenario),
         horizon_is_end=recipe.horizon_is_end,
+        appended=_APPENDED.get(scheme_of(recipe, scenario)),
     )
     try:
         yield environment

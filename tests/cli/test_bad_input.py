@@ -152,10 +152,10 @@ def test_recipe__an_unknown_key_is_named_with_a_suggestion(ethbrake, tiny_recipe
     refused(ethbrake("train", "--recipe", path, "--output", tmp_path / "new"), str(path), "gama", "gamma")
 
 
-def test_scenario_with_two_learners__evaluate_and_run_ask_who_is_driven(ethbrake, scenario_file, tmp_path):
+def test_scenario_with_two_learners__run_asks_who_is_driven(ethbrake, scenario_file, tmp_path):
     path = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: learner\n")
-    for command in (["evaluate", "--episodes", "5"], ["run", "--output", tmp_path / "new"]):
-        refused(ethbrake(*command, "--scenario", path), "2 learners (vehicle_2, vehicle_3)", "--vehicle vehicle_2")
+    answer = ethbrake("run", "--output", tmp_path / "new", "--scenario", path)
+    refused(answer, "2 learners (vehicle_2, vehicle_3)", "--vehicle vehicle_2")
     assert not (tmp_path / "new").exists()
 
 
@@ -217,7 +217,7 @@ def test_existing_folder__that_is_no_run_is_kept_even_with_force(ethbrake, tiny_
 
 
 def test_agents__one_that_cannot_drive_is_refused_before_another_works(ethbrake, monkeypatch):
-    monkeypatch.setattr("ethbrake_marl.cli.evaluate", lambda *args, **kwargs: pytest.fail("worked"))
+    monkeypatch.setattr("ethbrake_marl.evaluate_command.evaluate", lambda *args, **kwargs: pytest.fail("worked"))
     refused(ethbrake("evaluate", "--agents", "e_v2x_bm,constant:99", "--episodes", "5"), "constant:99", "7 m/s2")
 
 
@@ -231,14 +231,14 @@ def test_memory__that_is_not_there_is_said_in_one_line(ethbrake, monkeypatch):
     def short(*args: object, **kwargs: object) -> None:
         raise MemoryError("Unable to allocate 9 TiB")
 
-    monkeypatch.setattr("ethbrake_marl.cli.choose_worlds", short)
+    monkeypatch.setattr("ethbrake_marl.evaluate_command.choose_worlds", short)
     refused(ethbrake("evaluate"), "not enough memory (Unable to allocate 9 TiB)", "fewer worlds")
 
 
 def test_per_world__an_existing_file_is_refused_before_the_work(ethbrake, tmp_path, monkeypatch):
     path = tmp_path / "out.csv"
     path.write_text("precious")
-    monkeypatch.setattr("ethbrake_marl.cli.evaluate", lambda *args, **kwargs: pytest.fail("worked"))
+    monkeypatch.setattr("ethbrake_marl.evaluate_command.evaluate", lambda *args, **kwargs: pytest.fail("worked"))
     refused(ethbrake("evaluate", "--episodes", "5", "--per-world", path), str(path), "force")
     assert path.read_text() == "precious"
 

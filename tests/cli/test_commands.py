@@ -16,6 +16,8 @@ COMMANDS = [
     "train",
     "resume",
     "learning-curves",
+    "ablate",
+    "generalise",
     "export",
     "import-legacy",
     "evaluate",
@@ -168,3 +170,24 @@ def test_scenario_schema__is_a_json_schema(ethbrake):
 def test_scenario__folder_and_short_name_of_a_shipped_one(ethbrake):
     assert ethbrake("scenario", "show", "stress/wide").out == ethbrake("scenario", "show", "stress-wide").out
     assert ethbrake("scenario", "validate", "stress/wide").out.startswith("OK  stress-wide: 3 vehicles")
+
+
+def test_evaluate__several_learners_and_objectives(ethbrake, tmp_path):
+    worlds = tmp_path / "worlds.csv"
+    words = ["evaluate", "--scenario", "cooperation-3-pair", "--episodes", "20", "--agents", "full_brake,e_v2x_bm"]
+    words += ["--objective", "own", "--objective", "weighted:1,4,1"]
+    rows = json.loads(ethbrake(*words, "--per-world", worlds, "--json").out)
+    assert rows[0]["parameters"]["controlled_vehicles"] == ["vehicle_2", "vehicle_3"]
+    told = [(one["objective"], one["count"]) for one in rows[1]["objectives"]]
+    assert told == [("own", "first"), ("weighted:1,4,1", "first"), ("own", "total"), ("weighted:1,4,1", "total")]
+    own = rows[0]["objectives"][2]
+    assert sum(own[f"vehicle_{i}"] for i in (1, 2, 3)) == pytest.approx(rows[0]["total_harm"])
+    table = list(csv.DictReader(worlds.read_text().splitlines()))
+    assert float(table[0]["own_total_3"]) == float(table[0]["total_harm_3"])
+    answer = ethbrake(*words)
+    assert "Objectives, first-impact harm" in answer.out and "weighted:1,4,1" in answer.out
+
+
+def test_evaluate__what_drives_one_vehicle_only_is_refused_for_several(ethbrake, finished_run):
+    answer = ethbrake("evaluate", "--scenario", "cooperation-3-pair", "--agents", f"hybrid@{finished_run}")
+    assert answer.status == 2 and "vehicle_3 of scenario 'cooperation-3-pair' must be driven too" in answer.err

@@ -24,8 +24,8 @@ def names(typer_app) -> set[str]:
 
 
 def test_cli_page__has_every_command_and_agent():
-    training = {"run", "train", "resume", "learning-curves", "export", "import-legacy"}
-    assert names(app) == training | {"evaluate", "doctor", "bench", "best-harm"}
+    training = {"run", "train", "resume", "learning-curves", "ablate", "generalise", "export", "import-legacy"}
+    assert names(app) == training | {"evaluate", "shield", "doctor", "bench", "best-harm"}
     for command in names(app) | {"scenario"}:
         assert f"\n## {command}\n" in CLI
     about_scenarios = CLI.partition("\n## scenario\n")[2].partition("\n## ")[0]

@@ -150,7 +150,9 @@ def test_train__several_learners_share_a_policy(ethbrake, tiny_recipe, scenario_
     folder = tmp_path / "two"
     answer = ethbrake("train", "--scenario", scenario, "--recipe", tiny_recipe, "--output", folder, "--json")
     assert answer.status == 0
-    assert json.loads(answer.out)["evaluation"] is None
+    told = json.loads(answer.out)
+    assert told["scheme"] == "shared" and told["evaluation"]["first_impact_harm"] > 0.0
+    assert "scheme shared: policy drives vehicle_2, vehicle_3" in answer.err
     manifest = json.loads((folder / "policy" / "manifest.json").read_text())
     assert manifest["learners"] == ["vehicle_2", "vehicle_3"]
 

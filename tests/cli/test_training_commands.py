@@ -60,6 +60,20 @@ def test_resume__goes_on_and_ends_as_if_nothing_had_happened(ethbrake, tiny_reci
     refused(ethbrake("resume", tmp_path), "holds no training")
 
 
+def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_recipe, tmp_path):
+    scenario, folder = ("--scenario", "cooperation-3-pair"), tmp_path / "run"
+    told = "policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
+    answer = ethbrake("train", *scenario, "--recipe", tiny_recipe, "--scheme", "independent", "--output", folder)
+    assert answer.status == 0 and f"scheme independent: {told}" in answer.err
+    answer = ethbrake("evaluate", *scenario, "--episodes", "20", "--agents", f"ppo@{folder},team@{folder}", "--json")
+    assert answer.status == 0
+    alone, team = json.loads(answer.out)
+    assert alone["first_impact_harm"] == team["first_impact_harm"]
+    refused(ethbrake("train", *scenario, "--scheme", "single", "--output", tmp_path / "no"), "has 2 learners")
+    refused(ethbrake("train", *scenario, "--scheme", "centralized", "--output", tmp_path / "no"), "centralised")
+    refused(ethbrake("evaluate", "--agents", f"team@{tmp_path}"), "holds no team")
+
+
 def test_resume__an_interrupted_run_goes_on_as_a_training(ethbrake, tiny_recipe, tmp_path, monkeypatch):
     folder = tmp_path / "stopped"
     with monkeypatch.context() as patch:

@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.envs.single import EthBrakeEnv
+from ethbrake_marl.envs.state import full_state
 from ethbrake_marl.errors import InvalidInput
 from tests.contract.faces import FIVE, PAPER, actions, initial_state
 from tests.envs.lines import CRASH, REST
@@ -134,7 +135,7 @@ def test_seed__anything_but_a_whole_number_from_0_is_refused(seed: Any) -> None:
 
 
 def test_set_options__gives_each_world_its_own_start_once() -> None:
-    env = make_sb3_vec_env(CRASH, 2, learners=["vehicle_1", "vehicle_2"])
+    env = make_sb3_vec_env(CRASH.replace(hazard_gap_m=30), 2, learners=["vehicle_1", "vehicle_2"])
     far, near_ = ({"initial_state": {"gaps_m": gap, "speeds_mps": 10}} for gap in (40, 4))
     env.set_options([far, far, near_, near_])
     env.reset()
@@ -146,7 +147,7 @@ def test_set_options__gives_each_world_its_own_start_once() -> None:
 
 @pytest.mark.parametrize("order", [(0, 1, 1, 1), (0, None, 1, 1), (None, None, 1, 1), (0, 0)])
 def test_set_options__rows_that_do_not_fit_together_are_refused(order: tuple[int | None, ...]) -> None:
-    env = make_sb3_vec_env(CRASH, 2, learners=["vehicle_1", "vehicle_2"])
+    env = make_sb3_vec_env(CRASH.replace(hazard_gap_m=30), 2, learners=["vehicle_1", "vehicle_2"])
     starts = [{"initial_state": {"gaps_m": np.array([gap])}} for gap in (40.0, 4.0)]
     env.set_options([{} if k is None else starts[k] for k in order])
     with pytest.raises(InvalidInput, match="set_options: "):
@@ -241,3 +242,28 @@ def test_horizon_is_end__hides_the_truncation_and_nothing_else(horizon_is_end: b
         cut += [info["TimeLimit.truncated"] for info in infos if info]
     assert done.all() and cut == [not horizon_is_end] * 3
     assert all(info["terminal_observation"].shape == (27,) for info in infos)
+
+
+@pytest.mark.parametrize("appended", ["number", "state"])
+def test_appended__stands_behind_the_own_observation_in_every_row(appended: Any) -> None:
+    plain = make_sb3_vec_env(FIVE, 3, seed=2, learners=PAIR)
+    more = make_sb3_vec_env(FIVE, 3, seed=2, learners=PAIR, appended=appended)
+    own = plain.observation_space.shape[0]
+    rows, seen = plain.reset(), more.reset()
+    ended = 0
+    for _ in range(90):
+        expected = np.tile([[0.0], [1.0]], (3, 1))
+        if appended == "state":
+            expected = full_state(more.engine.worlds, more.engine.scenario).repeat(2, axis=0)
+        np.testing.assert_array_equal(seen[:, :own], rows)
+        np.testing.assert_array_equal(seen[:, own:], expected.astype(np.float32))
+        assert more.observation_space.contains(seen[0])
+        actions = np.full((6, 1), -0.8, np.float32)
+        (rows, _, _, plainly), (seen, _, dones, infos) = plain.step(actions), more.step(actions)
+        for row in np.flatnonzero(dones):
+            last = infos[row]["terminal_observation"]
+            np.testing.assert_array_equal(last[:own], plainly[row]["terminal_observation"])
+            assert last.shape == more.observation_space.shape
+            assert appended == "state" or last[own] == row % 2
+            ended += 1
+    assert ended > 0

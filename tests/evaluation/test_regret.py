@@ -21,6 +21,7 @@ from ethbrake_marl.evaluation import (
 from ethbrake_marl.evaluation import regret as regret_module
 from ethbrake_marl.evaluation.regret import assess, distance, known_limits, limits_do_not_apply
 from ethbrake_marl.harm import Ledger
+from ethbrake_marl.physics.advance import no_hazard_harm
 from ethbrake_marl.scenario import Scenario, load_scenario
 
 # Four worlds by hand: the first is avoidable, the second is in the table, in the third the agent is below the table,
@@ -44,7 +45,7 @@ def outcome(evaluation: Evaluation, harms: tuple[list[float], list[float]]) -> O
     first, total = (np.column_stack([harm, np.zeros(len(harm))]) for harm in harms)
     count = (total > 0.0).astype(np.int64)
     final = evaluation.worlds.take(np.arange(len(first)))
-    ledger = Ledger(first, total, count, final.vehicles.mass_t)
+    ledger = Ledger(first, total, count, *no_hazard_harm(final.n), final.vehicles.mass_t)
     return Outcome(ledger, final, np.ones(len(first), np.bool_), None, None)
 
 
@@ -68,7 +69,7 @@ def first_worlds(evaluation: Evaluation, n: int) -> Evaluation:
         name: outcome(evaluation, (harms[0][:n], harms[1][:n])) for name, harms in (("full_brake", FULL), ("a", AGENT))
     }
     rows = np.arange(n)
-    return Evaluation(evaluation.scenario, 1, evaluation.worlds.take(rows), rows, 7, outcomes)
+    return Evaluation(evaluation.scenario, (1,), evaluation.worlds.take(rows), rows, 7, outcomes)
 
 
 def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation) -> None:
@@ -85,7 +86,7 @@ def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation) -> N
 
 def test_best_known__rounding_below_the_table_is_not_below_it(four: Evaluation) -> None:
     close = outcome(four, ([1.0, 2.0 - 9e-7, 4.0 - 2e-6, 6.0], [1.0, 4.0, 6.0, 7.0]))
-    found = assess(Evaluation(four.scenario, 1, four.worlds, four.index, 7, {"a": close}))
+    found = assess(Evaluation(four.scenario, (1,), four.worlds, four.index, 7, {"a": close}))
     assert found is not None
     assert found.below(close).tolist() == [False, False, True, False]
     assert found.source.tolist() == ["witness", "table", "below_table", "agents"]
@@ -126,7 +127,7 @@ def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Ev
 
 def test_distance__without_full_braking_nothing_is_realised(four: Evaluation, evaluation: Evaluation) -> None:
     three = first_worlds(evaluation, 3)
-    alone = Evaluation(three.scenario, 1, three.worlds, three.index, 7, {"a": three.outcome("a")})
+    alone = Evaluation(three.scenario, (1,), three.worlds, three.index, 7, {"a": three.outcome("a")})
     (row,) = (row.to_json() for row in summarise(alone))
     assert row["realised_share"] is row["realised_share_first"] is row["realised_share_total"] is None
     assert row["mean_regret"] == 1.0

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.seed_statistics import interquartile_mean, paired_over_seeds
+from ethbrake_marl.evaluation.seed_statistics import (
+    interquartile_mean,
+    mean_over_seeds,
+    paired_over_seeds,
+    share_over_seeds,
+)
 
 
 @pytest.mark.parametrize(
@@ -76,3 +81,22 @@ def test_interquartile_mean__refuses_what_is_no_figure_per_seed(tasks: list[list
 def test_paired_over_seeds__refuses_what_cannot_be_paired(values: list[list[float]]) -> None:
     with pytest.raises(InvalidInput, match="paired_over_seeds: "):
         paired_over_seeds(values, [[1.0, 2.0, 3.0]])
+
+
+def test_share_over_seeds__by_hand_and_wider_with_fewer_seeds() -> None:
+    rng = np.random.default_rng(3)
+    worst = 10.0 + rng.normal(size=200)
+    best = np.full(200, 2.0)
+    seeds = np.array([[4.0], [6.0]]) + 0.1 * rng.normal(size=(2, 200))
+    found = share_over_seeds(seeds, worst, best)
+    assert found is not None and found.interval is not None
+    assert found.value == pytest.approx((worst.mean() - seeds.mean()) / (worst.mean() - 2.0), rel=1e-12)
+    assert found.interval[0] == pytest.approx(0.5, abs=0.02) and found.interval[1] == pytest.approx(0.75, abs=0.02)
+    assert share_over_seeds(seeds, worst, worst) is None
+    with pytest.raises(InvalidInput, match="same worlds"):
+        share_over_seeds(seeds, worst, best[:5])
+
+
+def test_mean_over_seeds__is_the_mean_with_the_spread_between_seeds() -> None:
+    found = mean_over_seeds(np.array([[1.0] * 50, [3.0] * 50]))
+    assert (found.value, found.interval) == (2.0, pytest.approx((1.0, 3.0)))

@@ -18,9 +18,9 @@ import time
 from multiprocessing.context import ForkProcess
 from pathlib import Path
 
-from ethbrake_marl.experiment import resume_measured, train_measured
 from ethbrake_marl.learning.checkpoint import newest_usable
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.learning.teams import resume_team, train_team
 from ethbrake_marl.scenario import load_scenario
 
 SOON_S = 300.0
@@ -46,7 +46,8 @@ SAC = load_recipe("sac").replace(
     log_every_updates=20,
 )
 WRITING = SAC.replace(checkpoint_every_updates=5, total_steps=4000 * 16, evaluation=PPO.evaluation.model_dump())
-RECIPES: dict[str, TrainingRecipe] = {"ppo": PPO, "sac": SAC, "writing": WRITING}
+INDEPENDENT = PPO.replace(scheme="independent", n_envs=16)
+RECIPES: dict[str, TrainingRecipe] = {"ppo": PPO, "sac": SAC, "independent": INDEPENDENT, "writing": WRITING}
 
 FORK = multiprocessing.get_context("fork")  # a fresh interpreter needs seconds; test_resume.py kills some of those
 
@@ -54,9 +55,10 @@ FORK = multiprocessing.get_context("fork")  # a fresh interpreter needs seconds;
 def work(what: str, run: Path) -> None:
     """Train from the beginning (``what`` names the recipe), or resume what is there."""
     if run.exists():
-        resume_measured(run)
+        resume_team(run)
     else:
-        train_measured(load_scenario("paper-random"), run, recipe=RECIPES[what])
+        level = "cooperation-3-pair" if what == "independent" else "paper-random"
+        train_team(RECIPES[what], load_scenario(level), run)
 
 
 def start(what: str, run: Path) -> ForkProcess:
@@ -67,9 +69,9 @@ def start(what: str, run: Path) -> ForkProcess:
 
 
 def digest(run: Path) -> str:
-    """What a finished run says and holds: the weights of both policies."""
-    both = [(run / name / "weights.safetensors").read_bytes() for name in ("policy", "policy-last")]
-    return hashlib.sha256(b"".join(both)).hexdigest()
+    """What a finished run says and holds: the weights of its policies, the best and the last."""
+    weights = [file.read_bytes() for file in sorted(run.glob("policy*/**/weights.safetensors"))]
+    return hashlib.sha256(b"".join(weights)).hexdigest()
 
 
 def finish(what: str, run: Path) -> str:
@@ -153,7 +155,7 @@ def main() -> int:
     rng = random.Random(options.seed)
     good = True
     with tempfile.TemporaryDirectory() as scratch:
-        for what in ("ppo", "sac"):
+        for what in ("ppo", "sac", "independent"):
             folder = Path(scratch) / what
             folder.mkdir()
             same = random_kills(what, options.kills, folder, rng)

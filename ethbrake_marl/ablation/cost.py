@@ -1,0 +1,136 @@
+"""What an ablation will take, measured on this machine before it starts."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ethbrake_marl.ablation.levels import common_worlds
+from ethbrake_marl.ablation.plan import OPTIMUM, Plan, Training
+from ethbrake_marl.analysis.best_harm import CHUNK, best_harm
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.learning.callback import Progress
+from ethbrake_marl.learning.teams import load_team, train_team
+from ethbrake_marl.scenario import Sample, Scenario
+
+_UPDATES = 4  # of the training that is timed; the first one, which compiles and warms up, does not count
+_TIMED_WORLDS = 4  # of the search that is timed
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Seconds of one core for what is left to do."""
+
+    trainings: int
+    decisions: int
+    training_s: float
+    driving_s: float
+    search_s: float
+
+    @property
+    def whole_s(self) -> float:
+        """Everything."""
+        return self.training_s + self.driving_s + self.search_s
+
+    def __str__(self) -> str:
+        """The cost in one line."""
+        speed = f" at {self.decisions / self.training_s:,.0f}/s" if self.training_s > 0.0 else ""
+        return (
+            f"to do: {self.trainings} trainings, {self.decisions:,} decisions{speed}: {_minutes(self.training_s)};"
+            f" joint optima {_minutes(self.search_s)}; driving the common worlds {_minutes(self.driving_s)};"
+            f" together about {_minutes(self.whole_s)} of one core"
+        )
+
+
+def cost_of(plan: Plan) -> Cost:
+    """Time a short training of each level and recipe, an evaluation and a search, and reckon up what is left.
+
+    Other work on the machine counts as well: seconds are of the clock. Raises as ``Training.steps_left``.
+    """
+    left = [(training, training.steps_left()) for training in plan.trainings()]
+    samples = {
+        level.name: sample
+        for level, sample in zip(plan.levels, common_worlds(plan.levels, 50, plan.list_seed), strict=True)
+    }
+    training_s, worlds_s = 0.0, []
+    for kind in {training.folder.name.rpartition("-seed")[0]: training for training, _ in left}.values():
+        same = (kind.level.name, kind.algorithm)
+        steps = sum(number for training, number in left if (training.level.name, training.algorithm) == same)
+        if not steps:
+            continue
+        per_step_s, world_s = _timed(kind, samples[kind.level.name])
+        worlds_s.append(world_s)
+        runs = steps / kind.recipe.total_steps
+        training_s += steps * per_step_s + runs * _measurements(kind) * kind.recipe.evaluation.worlds * world_s
+    if not worlds_s:
+        worlds_s.append(_driving_s(left[0][0].folder, left[0][0].level.scenario, samples[left[0][0].level.name]))
+    driving_s = sum(worlds_s) / len(worlds_s) * plan.episodes * (len(left) + len(plan.levels))
+    trainings, decisions = sum(1 for _, steps in left if steps), sum(steps for _, steps in left)
+    return Cost(trainings, decisions, training_s, driving_s, _search_s(plan, samples))
+
+
+def _timed(training: Training, sample: Sample) -> tuple[float, float]:
+    """Seconds per decision, and per world that the policy drives."""
+    told: list[Progress] = []
+    recipe, scenario = training.recipe, training.level.scenario
+    short = recipe.replace(evaluation={**recipe.evaluation.model_dump(), "worlds": 10, "every_updates": 1000})
+    with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
+        path = Path(folder) / "timed"
+        train_team(short, scenario, path, steps=1, on_progress=told.append)
+        once = told[-1].steps  # decisions of one update
+        told.clear()
+        train_team(short, scenario, path, steps=_UPDATES * once, force=True, on_progress=told.append)
+        return _per_step(told), _driving_s(path, scenario, sample)
+
+
+def _driving_s(folder: Path, scenario: Scenario, sample: Sample) -> float:
+    """Seconds per world that a trained team drives."""
+    team = load_team(folder, scenario)
+    evaluate(sample.worlds.take(np.arange(5)), {"warm": team}, scenario=scenario)
+    started = time.monotonic()
+    evaluate(sample, {"team": team}, scenario=scenario)
+    return (time.monotonic() - started) / sample.worlds.n
+
+
+def _per_step(told: Sequence[Progress]) -> float:
+    """Seconds per decision between the first and the last update that was told."""
+    updates = [one for one in told if one.updates >= 1]
+    first, last = updates[0], updates[-1]
+    if last.steps == first.steps:
+        return last.wall_s / last.steps
+    return (last.wall_s - first.wall_s) / (last.steps - first.steps)
+
+
+def _measurements(training: Training) -> int:
+    """How often a training measures its policies on the fixed list: at first, now and then, and at the end."""
+    recipe = training.recipe
+    learners = len(training.level.scenario.learners)
+    per_update = recipe.n_envs * learners * recipe.rounds
+    return recipe.total_steps // per_update // recipe.evaluation.every_updates + 2
+
+
+def _search_s(plan: Plan, samples: dict[str, Sample]) -> float:
+    """Seconds for the searches whose parts are not all there."""
+    seconds = 0.0
+    for level in plan.levels:
+        folder = plan.folder / OPTIMUM / level.name
+        parts = math.ceil(plan.search_episodes / CHUNK)
+        missing = parts - (len(list(folder.glob("*.npz"))) if folder.is_dir() else 0)
+        if level.trained and missing > 0:
+            worlds = samples[level.name].worlds.take(np.arange(_TIMED_WORLDS))
+            best_harm(level.scenario, worlds.take(np.arange(1)), budget=100, threads=1)
+            started = time.monotonic()
+            best_harm(level.scenario, worlds, budget=plan.budget, threads=1)
+            per_world_s = (time.monotonic() - started) / _TIMED_WORLDS
+            seconds += per_world_s * plan.search_episodes * missing / parts
+    return seconds
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} min"

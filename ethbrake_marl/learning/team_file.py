@@ -1,0 +1,108 @@
+"""``team.json`` in a run's folder: which bundle drives which vehicle. Reading a team needs no torch."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.team import Team
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.learning.bundle import Policy, load_policy
+from ethbrake_marl.learning.recipe import Scheme
+from ethbrake_marl.learning.schemes import drivers
+from ethbrake_marl.learning.strict_json import parse_strict_json
+from ethbrake_marl.scenario import Scenario
+
+TEAM = "team.json"
+_LIMIT_BYTES = 1 << 20
+
+Name = Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")]
+BundleFolder = Annotated[str, Field(pattern=r"^policy(/vehicle_[1-9][0-9]?)?$")]
+
+
+class _TeamFile(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    format: Literal["ethbrake-team"] = "ethbrake-team"
+    format_version: Literal[1] = 1
+    scheme: Scheme
+    vehicles: Annotated[int, Field(ge=2)]
+    drivers: Annotated[dict[Name, BundleFolder], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _drivers_of_the_line(self) -> _TeamFile:
+        for name in self.drivers:
+            if int(name.removeprefix("vehicle_")) > self.vehicles:
+                raise ValueError(f"drivers: {name} in a line of {self.vehicles}")
+        return self
+
+
+def team_content(scheme: Scheme, scenario: Scenario) -> dict[str, Any]:
+    """What ``team.json`` says of a training."""
+    file = _TeamFile(scheme=scheme, vehicles=scenario.vehicles, drivers=drivers(scheme, scenario))
+    return file.model_dump(mode="json")
+
+
+def is_team(path: str | os.PathLike[str]) -> bool:
+    """Whether ``path`` is a run whose learners have a policy each, so that no policy alone drives all of them."""
+    file = Path(path) / TEAM
+    return file.is_file() and len(set(_read(file).drivers.values())) > 1
+
+
+def load_team(path: str | os.PathLike[str], scenario: Scenario, name: str = "team") -> Team:
+    """The learners of ``scenario`` driven as they were trained together in the run at ``path``.
+
+    A learner that the scenario gives a script is left out. Raises ``InvalidInput`` where there is no team, for one of
+    another line length, or for a learner that it does not drive; ``CorruptBundle`` (file, what is wrong) for a damaged
+    one.
+    """
+    file = Path(path) / TEAM
+    if not file.is_file():
+        raise InvalidInput(f"{path}: holds no team ({TEAM}); give the folder of a run, or a bundle as ppo@{path}")
+    team = _read(file)
+    if team.vehicles != scenario.vehicles:
+        shared = len(set(team.drivers.values())) == 1
+        raise InvalidInput(
+            f"{path}: is a team for a line of {team.vehicles} vehicles, scenario {scenario.name!r} has"
+            f" {scenario.vehicles}; "
+            + (
+                f"its one policy can drive other lines: ppo@{path}"
+                if shared
+                else "only a shared policy can drive others"
+            )
+        )
+    wanted = {scenario.vehicle_names[i]: i for i in scenario.learners}
+    missing = [each for each in wanted if each not in team.drivers]
+    if missing or not wanted:
+        who = ", ".join(missing) or "nobody"
+        raise InvalidInput(f"{path}: drives {', '.join(team.drivers)}; scenario {scenario.name!r} has {who} to drive")
+    return Team({i: LearnedAgent(load_driver(path, each), name) for each, i in wanted.items()}, name)
+
+
+def load_driver(path: str | os.PathLike[str], vehicle: str) -> Policy:
+    """The policy that drives ``vehicle`` in the run at ``path``; raises as ``load_team``."""
+    given: Mapping[str, str] = _read(Path(path) / TEAM).drivers
+    if vehicle not in given:
+        raise InvalidInput(f"{path}: drives {', '.join(given)}, not {vehicle}")
+    return load_policy(Path(path) / given[vehicle])
+
+
+def _read(file: Path) -> _TeamFile:
+    try:
+        with file.open("rb") as opened:
+            data = opened.read(_LIMIT_BYTES)
+        parse_strict_json(data)
+        return _TeamFile.model_validate_json(data)
+    except OSError as error:
+        raise InvalidInput(f"{file}: cannot be read ({error.strerror})") from None
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise CorruptBundle(f"{file}: {where}: {first['msg']}") from None
+    except ValueError as error:
+        raise CorruptBundle(f"{file}: {error}") from None

@@ -1,0 +1,95 @@
+"""What the comparison says, by hand."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.ablation.comparison import compare
+from ethbrake_marl.ablation.figures import change_figure, harm_curve, who_pays
+from ethbrake_marl.ablation.levels import Level
+from ethbrake_marl.ablation.measurement import Harms, Measured
+from ethbrake_marl.ablation.tables import levels_csv, markdown
+from ethbrake_marl.scenario import load_scenario
+
+WORLDS = 40
+
+
+def harms(*seeds: tuple[float, float, float]) -> Harms:
+    """The same harm of each vehicle in every world, one triple per seed; total harm is twice the first."""
+    first = np.repeat(np.array(seeds)[:, np.newaxis, :], WORLDS, axis=1)
+    vehicle = {"first": first, "total": 2.0 * first}
+    world = {count: each.sum(axis=2) for count, each in vehicle.items()}
+    return Harms(world, vehicle, first.sum(axis=2) > 0.0)
+
+
+def measured(
+    name: str, algorithm: str | None, reached: Harms, best: float | None, clear: str | None = None
+) -> Measured:
+    braking = harms((4.0, 8.0, 8.0))
+    limit = None if best is None else {"first": np.full((1, 10), best), "total": np.full((1, 10), 2.0 * best)}
+    return Measured(Level(load_scenario(name), clear), algorithm, reached, braking, limit)
+
+
+@pytest.fixture(scope="module")
+def ablation() -> list[Measured]:
+    return [
+        measured("cooperation-0-sensors", None, harms((4.0, 8.0, 8.0)), None),
+        measured("cooperation-2-paper", "ppo", harms((5.0, 3.0, 2.0), (5.0, 5.0, 2.0)), 6.0),
+        measured("cooperation-3-pair", "ppo", harms((1.0, 1.0, 3.0), (1.0, 1.0, 3.0)), 5.0),
+        measured("cooperation-2-blocked", "ppo", harms((5.0, 4.0, 2.0)), 6.0, "cooperation-2-paper"),
+    ]
+
+
+def test_compare__each_level(ablation):
+    sensors, paper, pair, _ = compare(ablation)["levels"]
+    assert paper["first"]["harm"]["value"] == pytest.approx(11.0)
+    assert paper["first"]["harm"]["interval"] == pytest.approx([10.0, 12.0])
+    assert paper["first"]["each_seed"] == pytest.approx([10.0, 12.0])
+    assert paper["first"]["realised_share"]["value"] == pytest.approx((20.0 - 11.0) / (20.0 - 6.0))
+    assert paper["total"]["best_known"]["value"] == pytest.approx(12.0)
+    assert [one["value"] for one in paper["total"]["vehicles"]] == pytest.approx([10.0, 8.0, 4.0])
+    assert sensors["first"]["realised_share"] is None and sensors["algorithm"] is None
+    assert pair["first"]["realised_share"]["value"] == pytest.approx(1.0)
+    assert pair["learners"] == ["vehicle_2", "vehicle_3"]
+
+
+def test_compare__steps_of_the_ladder_and_lost_messages(ablation):
+    found = compare(ablation)
+    first, second = found["steps"]
+    assert (first["from"], first["to"]) == ("cooperation-0-sensors", "cooperation-2-paper")
+    assert first["first"]["difference"]["value"] == pytest.approx(-9.0)
+    assert first["first"]["worse_off"]["value"] == 1.0  # Vehicle 1, always
+    assert first["first"]["worse_off_vehicles"] == [1.0, 0.0, 0.0]
+    assert [one["value"] for one in second["first"]["vehicles"]] == pytest.approx([-4.0, -3.0, 1.0])
+    assert second["total"]["difference"]["interval"][1] < 0.0
+    (lost,) = found["channels"]
+    assert (lost["from"], lost["to"]) == ("cooperation-2-paper", "cooperation-2-blocked")
+    assert lost["first"]["difference"]["value"] == pytest.approx(0.0)
+    assert lost["first"]["worse_off"]["value"] == 0.5  # Vehicle 2 against the first of two seeds
+
+
+def test_tables__hold_the_same_figures(ablation):
+    page = markdown(compare(ablation), "40 worlds.")
+    assert "| `cooperation-2-paper` | ppo |" in page and "11.00 [10.00, 12.00]" in page
+    assert "| `cooperation-2-paper` | `cooperation-3-pair` | ppo | -6.00" in page
+    assert "Price of lost messages" in page and page.rstrip().endswith("40 worlds.")
+    rows = list(csv.DictReader(levels_csv(ablation).splitlines()))
+    assert [(row["level"], row["seed"]) for row in rows[:3]] == [
+        ("cooperation-0-sensors", ""), ("cooperation-2-paper", "0"), ("cooperation-2-paper", "1")
+    ]  # fmt: skip
+    assert float(rows[2]["first_impact_harm"]) == 12.0 and float(rows[2]["total_harm_2"]) == 10.0
+    assert float(rows[1]["best_known_total_harm"]) == 12.0 and rows[0]["best_known_total_harm"] == ""
+
+
+def test_figures__show_what_was_found(ablation):
+    found = compare(ablation)
+    curve, changes, pays = (draw(found, "40 worlds") for draw in (harm_curve, change_figure, who_pays))
+    ticks = [label.get_text() for label in curve.axes[0].get_xticklabels()]
+    assert ticks == ["0\nsensors", "2\npaper", "3\npair"]
+    assert [text.get_text() for text in curve.axes[0].texts] == ["blocked"]
+    rows = [label.get_text() for label in changes.axes[0].get_yticklabels()]
+    assert rows == ["0 sensors → 2 paper", "2 paper → 3 pair", "2 paper → 2 blocked"]
+    assert "+1.00" in [text.get_text() for text in pays.axes[0].texts]

@@ -1,0 +1,63 @@
+"""What each mode of the shield makes of an agent: the same figures as driving it by hand, in one table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.shield_modes import ModeRow, compare_modes, modes_table
+from ethbrake_marl.evaluation.shield_modes_figure import shield_modes_figure
+from ethbrake_marl.evaluation.statistics import paired_difference
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield import HybridAgent, StepShieldAgent
+
+PAPER = load_scenario("paper-random")
+WORLDS = PAPER.sample(60, 3).worlds
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[ModeRow]:
+    return compare_modes({"full_brake": make_agent("full_brake")}, WORLDS, PAPER, 1)
+
+
+def test_rows__are_what_driving_each_mode_gives(rows: list[ModeRow]) -> None:
+    step = StepShieldAgent(make_agent("full_brake"), PAPER)
+    drivers = [make_agent("full_brake"), HybridAgent(make_agent("full_brake"), PAPER), step]
+    harms = [drive(WORLDS, driver, PAPER, 1).ledger.world_harm("first") for driver in drivers]
+    assert [row.mode for row in rows] == ["none", "episode", "step", "step-alert"]
+    assert [row.harm.value for row in rows[:3]] == [harm.mean() for harm in harms]
+    assert rows[0].against_episode == paired_difference(harms[0], harms[1])
+    assert rows[1].against_episode is None and rows[1].replaced is None
+    assert step.shield is not None and step.shield.running is not None
+    assert rows[2].replaced == step.shield.interventions.sum() / step.shield.running.steps.sum() > 0.1
+
+
+def test_rows__tell_what_the_interventions_were_good_for(rows: list[ModeRow]) -> None:
+    for row in rows[2:]:
+        assert row.verdicts is not None and sum(row.verdicts) == pytest.approx(1.0)
+        assert row.verdicts[0] > 0.9 and row.above_bound == 0
+        told = row.to_json()
+        assert told["needed"] == row.verdicts[0] and told["against_episode_interval"][1] < 0.0
+
+
+def test_rows__do_not_depend_on_the_size_of_a_chunk(rows: list[ModeRow], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ethbrake_marl.evaluation.shield_modes.CHUNK", 25)
+    done: list[tuple[str, int]] = []
+    again = compare_modes(
+        {"full_brake": make_agent("full_brake")}, WORLDS, PAPER, 1, on_progress=lambda *a: done.append(a)
+    )
+    assert again == rows
+    assert done == [("full_brake", 25), ("full_brake", 50), ("full_brake", 60)]
+
+
+def test_table_and_figure__show_every_row(rows: list[ModeRow]) -> None:
+    assert modes_table(rows).row_count == 5
+    axes = shield_modes_figure(rows).axes[0]
+    drawn = [float(container.lines[0].get_xdata()[0]) for container in axes.containers]
+    expected = [row.against_episode.value for row in rows if row.against_episode is not None]
+    assert np.allclose(sorted(drawn), sorted(expected))
+    with pytest.raises(InvalidInput, match="at least one agent"):
+        shield_modes_figure([])

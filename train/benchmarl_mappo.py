@@ -1,0 +1,30 @@
+"""BenchMARL's MAPPO on a level of cooperation. Needs `pip install 'ethbrake-marl[marl]'`.
+
+    python train/benchmarl_mappo.py --scenario cooperation-3-pair --steps 200000 --output runs/mappo
+    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@runs/mappo
+
+`ethbrake train --scheme centralised` trains the same kind of team (one actor for all, a critic on the state of the
+line) without the extra, with checkpoints and measuring on the way; this file is for those who use BenchMARL.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import ethbrake_marl as eb
+from ethbrake_marl.learning.benchmarl_task import train_mappo
+from ethbrake_marl.learning.recipe import PpoRecipe, load_recipe
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", default="cooperation-3-pair", help="a shipped scenario, or a YAML file")
+    parser.add_argument("--recipe", default="cooperation", help="a shipped PPO recipe, or a YAML file")
+    parser.add_argument("--steps", type=int, default=200_000, help="decisions of learners")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, default=Path("runs/mappo"), help="new folder")
+    given = parser.parse_args()
+    recipe = load_recipe(given.recipe).replace(total_steps=given.steps, seed=given.seed)
+    assert isinstance(recipe, PpoRecipe), "give a recipe for PPO"
+    train_mappo(recipe, eb.load_scenario(given.scenario), given.output)
+    print(f"trained: ethbrake evaluate --scenario {given.scenario} --agents full_brake,team@{given.output}")
