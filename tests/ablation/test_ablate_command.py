@@ -163,7 +163,7 @@ def test_ablate__an_interruption_reaches_the_trainings_of_other_processes(tmp_pa
     try:
         _wait_for(lambda: len(list(folder.glob("trainings/*/checkpoints"))) == 2, process)
         process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=300)
     finally:
         process.kill()
         process.stderr.close()

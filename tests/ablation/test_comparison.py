@@ -43,8 +43,13 @@ def ablation() -> list[Measured]:
     ]
 
 
-def test_compare__each_level(ablation):
-    sensors, paper, pair, _ = compare(ablation)["levels"]
+@pytest.fixture(scope="module")
+def found(ablation) -> dict:
+    return compare(ablation)
+
+
+def test_compare__each_level(found):
+    sensors, paper, pair, _ = found["levels"]
     assert paper["first"]["harm"]["value"] == pytest.approx(11.0)
     assert paper["first"]["harm"]["interval"] == pytest.approx([10.0, 12.0])
     assert paper["first"]["each_seed"] == pytest.approx([10.0, 12.0])
@@ -56,8 +61,7 @@ def test_compare__each_level(ablation):
     assert pair["learners"] == ["vehicle_2", "vehicle_3"]
 
 
-def test_compare__steps_of_the_ladder_and_lost_messages(ablation):
-    found = compare(ablation)
+def test_compare__steps_of_the_ladder_and_lost_messages(found):
     first, second = found["steps"]
     assert (first["from"], first["to"]) == ("cooperation-0-sensors", "cooperation-2-paper")
     assert first["first"]["difference"]["value"] == pytest.approx(-9.0)
@@ -71,8 +75,8 @@ def test_compare__steps_of_the_ladder_and_lost_messages(ablation):
     assert lost["first"]["worse_off"]["value"] == 0.5  # Vehicle 2 against the first of two seeds
 
 
-def test_tables__hold_the_same_figures(ablation):
-    page = markdown(compare(ablation), "40 worlds.")
+def test_tables__hold_the_same_figures(ablation, found):
+    page = markdown(found, "40 worlds.")
     assert "| `cooperation-2-paper` | ppo |" in page and "11.00 [10.00, 12.00]" in page
     assert "| `cooperation-2-paper` | `cooperation-3-pair` | ppo | -6.00" in page
     assert "Price of lost messages" in page and page.rstrip().endswith("40 worlds.")
@@ -84,8 +88,7 @@ def test_tables__hold_the_same_figures(ablation):
     assert float(rows[1]["best_known_total_harm"]) == 12.0 and rows[0]["best_known_total_harm"] == ""
 
 
-def test_figures__show_what_was_found(ablation):
-    found = compare(ablation)
+def test_figures__show_what_was_found(found):
     curve, changes, pays = (draw(found, "40 worlds") for draw in (harm_curve, change_figure, who_pays))
     ticks = [label.get_text() for label in curve.axes[0].get_xticklabels()]
     assert ticks == ["0\nsensors", "2\npaper", "3\npair"]
