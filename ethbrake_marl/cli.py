@@ -88,7 +88,8 @@ app.command(
 )(learning_curves_command)
 app.command("ablate", epilog="Example: ethbrake ablate --quick --output runs/ablation-quick")(ablate_command)
 app.command(
-    "generalise", epilog="Example: ethbrake generalise --runs runs/cooperation-4-all-cooperation-seed0 --vehicles 3,5,10"
+    "generalise",
+    epilog="Example: ethbrake generalise --runs runs/cooperation-4-all-seed0 --vehicles 3,5,10",
 )(generalise_command)
 app.command("export", epilog="Example: ethbrake export runs/early --onnx early.onnx")(export_command)
 app.command(

@@ -13,6 +13,7 @@ from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.harm import COUNTS, HarmCount
 
 NONE = "–"
+_ALGORITHM = "Algorithm"
 _HARM = {"first": "first-impact harm", "total": "total harm"}
 
 Json = dict[str, Any]
@@ -79,7 +80,7 @@ def _of(estimate: Estimate | None, scale: float = 1.0, digits: int = 2, unit: st
 
 
 def _levels(levels: Sequence[Json], count: HarmCount) -> str:
-    head = ["Level", "Algorithm", "Collisions", "All brake fully", f"Reached, {_HARM[count]}"]
+    head = ["Level", _ALGORITHM, "Collisions", "All brake fully", f"Reached, {_HARM[count]}"]
     head += ["Joint optimum", "Share of its reduction"]
     rows = []
     for level in levels:
@@ -91,7 +92,7 @@ def _levels(levels: Sequence[Json], count: HarmCount) -> str:
 
 
 def _changes(changes: Sequence[Json]) -> str:
-    head = ["From", "To", "Algorithm"]
+    head = ["From", "To", _ALGORITHM]
     for count in COUNTS:
         head += [f"Change of {_HARM[count]}", f"Somebody worse off, {_HARM[count]}"]
     rows = []
@@ -105,7 +106,7 @@ def _changes(changes: Sequence[Json]) -> str:
 
 def _who_pays(changes: Sequence[Json], count: HarmCount) -> str:
     vehicles = len(changes[0][count]["vehicles"])
-    head = [f"Change of {_HARM[count]}", "Algorithm", *(f"Vehicle {i + 1}" for i in range(vehicles))]
+    head = [f"Change of {_HARM[count]}", _ALGORITHM, *(f"Vehicle {i + 1}" for i in range(vehicles))]
     head += [f"Vehicle {i + 1} worse off" for i in range(vehicles)]
     rows = []
     for change in changes:
@@ -117,6 +118,12 @@ def _who_pays(changes: Sequence[Json], count: HarmCount) -> str:
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
+    """A table whose first ``left`` columns are texts; without the algorithm's where there is only one."""
+    if _ALGORITHM in head:
+        column = head.index(_ALGORITHM)
+        if len({row[column] for row in rows} - {NONE}) == 1:
+            head, *rows = ([*row[:column], *row[column + 1 :]] for row in (head, *rows))
+            left -= 1
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * left + " ---: |" * (len(head) - left)]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 

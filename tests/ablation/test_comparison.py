@@ -77,8 +77,8 @@ def test_compare__steps_of_the_ladder_and_lost_messages(found):
 
 def test_tables__hold_the_same_figures(ablation, found):
     page = markdown(found, "40 worlds.")
-    assert "| `cooperation-2-paper` | ppo |" in page and "11.00 [10.00, 12.00]" in page
-    assert "| `cooperation-2-paper` | `cooperation-3-pair` | ppo | -6.00" in page
+    assert "| `cooperation-2-paper` | 100.0 % [100.0, 100.0] | 20.00 | 11.00 [10.00, 12.00] | 6.00 | 64.3 % [" in page
+    assert "| `cooperation-2-paper` | `cooperation-3-pair` | -6.00" in page and "Algorithm" not in page
     assert "Price of lost messages" in page and page.rstrip().endswith("40 worlds.")
     rows = list(csv.DictReader(levels_csv(ablation).splitlines()))
     assert [(row["level"], row["seed"]) for row in rows[:3]] == [
@@ -86,6 +86,13 @@ def test_tables__hold_the_same_figures(ablation, found):
     ]  # fmt: skip
     assert float(rows[2]["first_impact_harm"]) == 12.0 and float(rows[2]["total_harm_2"]) == 10.0
     assert float(rows[1]["best_known_total_harm"]) == 12.0 and rows[0]["best_known_total_harm"] == ""
+
+
+def test_tables__name_the_algorithm_where_there_are_two(ablation):
+    other = measured("cooperation-2-paper", "sac", harms((5.0, 3.0, 2.0)), 6.0)
+    page = markdown(compare([*ablation[:2], other]), "")
+    assert "| `cooperation-2-paper` | sac | 100.0 %" in page and "| `cooperation-0-sensors` | – |" in page
+    assert "| `cooperation-0-sensors` | `cooperation-2-paper` | sac | -10.00" in page
 
 
 def test_figures__show_what_was_found(found):
