@@ -64,6 +64,7 @@ from ethbrake_marl.training_commands import (
 
 BAD_INPUT = 2
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
+GENERALISE = "Example: ethbrake generalise --runs runs/cooperation-4-all-cooperation-seed0 --vehicles 3,5,10"
 
 app = typer.Typer(
     add_completion=False,
@@ -87,10 +88,7 @@ app.command(
     "learning-curves", epilog="Example: ethbrake learning-curves --scenario paper-delay-low --output runs/low-delay"
 )(learning_curves_command)
 app.command("ablate", epilog="Example: ethbrake ablate --quick --output runs/ablation-quick")(ablate_command)
-app.command(
-    "generalise",
-    epilog="Example: ethbrake generalise --runs runs/cooperation-4-all-seed0 --vehicles 3,5,10",
-)(generalise_command)
+app.command("generalise", epilog=GENERALISE)(generalise_command)
 app.command("export", epilog="Example: ethbrake export runs/early --onnx early.onnx")(export_command)
 app.command(
     "import-legacy", epilog="Example: ethbrake import-legacy old.zip --output old --algorithm sac --i-trust-this-file"

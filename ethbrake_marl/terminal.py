@@ -65,18 +65,23 @@ class Bars:
         """The part ``name`` has come to ``done`` of ``total``; ``note`` is said once, above the bars."""
         harm = (metrics or {}).get("first_impact_harm")
         label = name if harm is None else f"{name}, first-impact harm {harm:.2f}"
+        if note:
+            self.tell(note)
         if self._bars is None:
-            if note:
-                say(note)
             if label != self._last_line:
                 say(f"{label}: {done:,} of {total:,}")
             self._last_line = label
             return
-        if note:
-            self._bars.console.print(note, highlight=False)
         if name not in self._tasks:
             self._tasks[name] = self._bars.add_task(label, total=total)
         self._bars.update(self._tasks[name], completed=min(done, total), total=total, description=label)
+
+    def tell(self, text: str) -> None:
+        """One line above the bars."""
+        if self._bars is None:
+            say(text)
+        else:
+            self._bars.console.print(text, highlight=False)
 
 
 @contextmanager

@@ -57,11 +57,15 @@ def train_command(
             plan = plan.replace(scheme=check_scheme(scheme))
         used = scheme_of(plan, chosen)
         folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
-        say(f"scheme {used}: {who_drives_what(drivers(used, chosen))}")
+        begun = [f"scheme {used}: {who_drives_what(drivers(used, chosen))}"]  # said once all input is known to be good
         with progress_bars() as bars:
-            result = train_team(
-                plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=lambda p: show_progress(bars, p)
-            )
+
+            def tell(progress: Progress) -> None:
+                if begun:
+                    bars.tell(begun.pop())
+                show_progress(bars, progress)
+
+            result = train_team(plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell)
     _show_result(result, as_json)
 
 

@@ -51,7 +51,7 @@ def team_content(scheme: Scheme, scenario: Scenario) -> dict[str, Any]:
 def is_team(path: str | os.PathLike[str]) -> bool:
     """Whether ``path`` is a run whose learners have a policy each, so that no policy alone drives all of them."""
     file = Path(path) / TEAM
-    return file.is_file() and len(set(_read(file).drivers.values())) > 1
+    return os.path.isfile(file) and len(set(_read(file).drivers.values())) > 1
 
 
 def load_team(path: str | os.PathLike[str], scenario: Scenario, name: str = "team") -> Team:
