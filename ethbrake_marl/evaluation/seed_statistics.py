@@ -19,6 +19,7 @@ from ethbrake_marl.physics import Floats
 
 RESAMPLES = 10_000
 _CUT = 0.25
+_AT_ONCE = 1 << 20  # drawn worlds in memory: 8 MB
 
 
 def interquartile_mean(
@@ -123,11 +124,17 @@ def _resampled_means(sides: Sequence[Floats], resamples: int, seed: int) -> Floa
     """Means [resamples, sides] over seeds of each side and over worlds, which all sides share, drawn anew."""
     worlds = sides[0].shape[1]
     rng = np.random.default_rng(seed)
-    means = np.empty((resamples, len(sides)))
-    for k in range(resamples):
-        weight = np.bincount(rng.integers(worlds, size=worlds), minlength=worlds) / worlds
-        means[k] = [(side[rng.integers(len(side), size=len(side))] @ weight).mean() for side in sides]
-    return means
+    parts: list[Floats] = []
+    chunk = max(1, _AT_ONCE // worlds)
+    for size in (min(chunk, resamples - begin) for begin in range(0, resamples, chunk)):
+        drawn = rng.integers(worlds, size=(size, worlds)) + worlds * np.arange(size)[:, np.newaxis]
+        weights = np.bincount(drawn.ravel(), minlength=size * worlds).reshape(size, worlds) / worlds
+        means = np.empty((size, len(sides)))
+        for column, side in enumerate(sides):
+            seeds = rng.integers(len(side), size=(size, len(side)))
+            means[:, column] = np.take_along_axis(weights @ side.T, seeds, axis=1).mean(axis=1)
+        parts.append(means)
+    return np.concatenate(parts)
 
 
 def _with_percentiles(value: float, resampled: Floats, confidence: float) -> Estimate:
