@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.ablation.comparison import TOLERANCE
 from ethbrake_marl.ablation.measurement import Harms, harms_of
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
@@ -108,7 +109,7 @@ def _of_length(question: Question, vehicles: int, agents: Sequence[Agent], tell:
     reached = _driven(agents, scenario, sample, tell)
     worst, own = braking.world[count], reached.world[count]
     none = np.zeros_like(worst)
-    worse = (reached.vehicle[count] > braking.vehicle[count] + 1e-6).any(axis=2)
+    worse = (reached.vehicle[count] > braking.vehicle[count] + TOLERANCE).any(axis=2)
     best = _searched(question, scenario, sample, own, tell)
     known = slice(0, question.search_episodes)
     return LineResult(
