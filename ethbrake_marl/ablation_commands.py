@@ -28,7 +28,12 @@ def ablate_command(
         str | None, typer.Option(metavar="A,B,...", help="Scenarios in this order.", show_default="the shipped ladder")
     ] = None,
     recipes: Annotated[str, typer.Option(metavar="A,B,...", help="Training recipes.")] = "cooperation",
-    scheme: Annotated[str, typer.Option(metavar="NAME", help="How several learners are trained.")] = "independent",
+    scheme: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="How several learners are trained.", show_default="the recipe's; else independent"
+        ),
+    ] = None,
     seeds: Annotated[int | None, typer.Option(help="Trainings of each, seeds 0, 1, ...", show_default="5")] = None,
     steps: Annotated[
         int | None, typer.Option(help="Decisions per training, for each of its learners.", show_default="400000")
@@ -55,6 +60,8 @@ def ablate_command(
         # torch takes seconds to load, and no other command needs it
         from ethbrake_marl.ablation.cost import cost_of
         from ethbrake_marl.ablation.levels import LADDER, STANDARD
+        from ethbrake_marl.ablation.plan import check_settings, keep_settings
+        from ethbrake_marl.ablation.trainings import check_finished
 
         chosen = dict(QUICK if quick else FULL)
         given = {"seeds": seeds, "steps_per_learner": steps, "episodes": episodes, "search_episodes": search_episodes}
@@ -63,16 +70,19 @@ def ablate_command(
         if not 1 <= jobs <= 64:
             raise InvalidInput(f"jobs {jobs}: must be from 1 to 64")
         plan = _plan(names, recipes, scheme, list_seed, output, chosen)
-        output.mkdir(parents=True, exist_ok=True)
+        if not cost:
+            check_settings(plan)
+        check_finished(plan.trainings())
         say(str(cost_of(plan)))
         if not cost:
+            keep_settings(plan)
             _run(plan, jobs, as_json)
 
 
 def generalise_command(
     runs: Annotated[
         str,
-        typer.Option(metavar="RUN,RUN,...", help="Runs or bundles, seeds of one training; they drive all followers."),
+        typer.Option(metavar="RUN,RUN,...", help="Runs or bundles, seeds of one training."),
     ],
     scenario: ScenarioOption = "cooperation-4-all",
     vehicles: Annotated[
@@ -85,8 +95,12 @@ def generalise_command(
     budget: Annotated[int, typer.Option(help="Candidates per world of that search.")] = 20_000,
     as_json: JsonOption = False,
 ) -> None:
-    """Let trained policies drive longer lines with the same weights."""
-    from ethbrake_marl.ablation.longer_lines import Question, drive_longer, load_runs  # loads scipy's statistics
+    """Let trained policies drive longer lines with the same weights.
+
+    They drive every follower, and Vehicle 1 where it learns in the scenario.
+    """
+    # scipy's statistics take a second to load
+    from ethbrake_marl.ablation.longer_lines import Question, drive_longer, load_runs
     from ethbrake_marl.ablation.tables import lines_markdown
 
     lengths = _lengths(vehicles)
@@ -95,8 +109,9 @@ def generalise_command(
             f"episodes {episodes}, search-episodes {search_episodes}, budget {budget}: must be at least 1, from 0 to"
             " the episodes, and at least 1"
         )
-    agents = load_runs([each.strip() for each in runs.split(",")])
-    question = Question(load_runnable(scenario), lengths, episodes, seed, count, search_episodes, budget)
+    line = load_runnable(scenario)
+    agents = load_runs([each.strip() for each in runs.split(",")], line)
+    question = Question(line, lengths, episodes, seed, count, search_episodes, budget)
     with interruptible("nothing was written"), progress_bars() as bars:
         found = drive_longer(question, agents, bars.show)
     if as_json:
@@ -115,21 +130,24 @@ def _lengths(text: str) -> tuple[int, ...]:
     return lengths
 
 
-def _plan(names: list[str], recipes: str, scheme: str, list_seed: int, output: Path, numbers: dict[str, int]) -> Plan:
+def _plan(
+    names: list[str], recipes: str, scheme: str | None, list_seed: int, output: Path, numbers: dict[str, int]
+) -> Plan:
     from ethbrake_marl.ablation.levels import common_worlds, read_levels
-    from ethbrake_marl.ablation.plan import Plan, check_plan
+    from ethbrake_marl.ablation.plan import Plan, check_folder, check_plan, with_scheme
     from ethbrake_marl.learning.recipe import load_recipe
     from ethbrake_marl.learning.schemes import check_scheme, scheme_of
 
+    chosen = None if scheme is None else check_scheme(scheme)
     plan = Plan(
         levels=tuple(read_levels(names)),
-        recipes=tuple(load_recipe(each.strip()) for each in recipes.split(",")),
-        scheme=check_scheme(scheme),
+        recipes=tuple(with_scheme(load_recipe(each.strip()), chosen) for each in recipes.split(",")),
         list_seed=list_seed,
         folder=output,
         **numbers,
     )
     check_plan(plan)
+    check_folder(output)
     common_worlds(plan.levels, 5, list_seed)
     for training in plan.trainings():
         scheme_of(training.recipe, training.level.scenario)

@@ -19,8 +19,9 @@ from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.analysis.best_harm_shipped import make_best_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.learning.bundle import Policy
 from ethbrake_marl.learning.shipped import SHIPPED, PolicyKind, load_named_policy
-from ethbrake_marl.learning.team_file import is_team, load_team
+from ethbrake_marl.learning.team_file import is_team, load_driver, load_team
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
 from ethbrake_marl.shield.episode import HybridAgent
@@ -101,9 +102,14 @@ def load_evaluated(name_or_path: str, vehicle: str | None) -> Scenario:
     Raises ``InvalidInput`` when there is no such vehicle, or no learner.
     """
     scenario = load_runnable(name_or_path)
-    if vehicle is None and len(scenario.learners) > 1:
-        return scenario
-    return load_driven(name_or_path, vehicle)
+    if vehicle is not None:
+        return scenario.with_learners([vehicle])
+    if not scenario.learners:
+        raise InvalidInput(
+            f"scenario {scenario.name!r} has no learner to drive; give the scenario that the agents were trained for"
+            " (--scenario), or say which vehicle is driven, for instance --vehicle vehicle_2"
+        )
+    return scenario
 
 
 def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario) -> None:
@@ -137,10 +143,10 @@ def make_lineup(
     ``shipped``, the policy that comes with the package for this scenario and count (PPO's for all but sac@shipped), or
     ``shipped/NAME``; ``universal@shipped`` is for all scenarios. ``ladder`` stands for every agent of ``LADDER`` that
     there is. ``count`` is the harm that optimising and choosing agents minimise.
-    ``shield`` (one of ``SHIELDS``) is put around every learned agent that has none. ``robust@PATH``,
-    ``robust:rehearsed@PATH`` and the shield ``robust`` certify against an ``uncertainty``. Raises ``InvalidInput`` for
-    a spec given twice, or an uncertainty that is missing or that nobody uses, ``UnknownName`` with a suggestion, and
-    whatever loading a policy raises.
+    ``shield`` (one of ``SHIELDS``) is put around every learned agent that has none, which is named ``SPEC+shield``.
+    ``robust@PATH``, ``robust:rehearsed@PATH`` and the shield ``robust`` certify against an ``uncertainty``. Raises
+    ``InvalidInput`` for a spec given twice, a team that is to be shielded, a shield that nobody gets, or an uncertainty
+    that is missing or that nobody uses, ``UnknownName`` with a suggestion, and whatever loading a policy raises.
     """
     specs = [each for spec in specs for each in (_ladder() if spec == _LADDER_SPEC else [spec])]
     for k, spec in enumerate(specs):
@@ -149,10 +155,13 @@ def make_lineup(
     if uncertainty is not None and shield != "robust" and not any(spec.startswith("robust") for spec in specs):
         raise InvalidInput(f"uncertainty {uncertainty}: nobody uses it; shield robust or an agent robust@PATH does")
     agents = {spec: _driver(spec, scenario, count, uncertainty) for spec in specs}
-    return {
-        _shielded_name(spec, shield): _shielded(agent, scenario, count, shield, uncertainty)
-        for spec, agent in agents.items()
-    }
+    drivers = {spec: _shielded(spec, agent, scenario, count, shield, uncertainty) for spec, agent in agents.items()}
+    if shield != "none" and all(drivers[spec] is agent for spec, agent in agents.items()):
+        raise InvalidInput(
+            f"shield {shield}: nobody of {', '.join(specs)} gets it; it is put around what learned and has no shield"
+            " yet, for instance ppo@shipped"
+        )
+    return {spec if driver is agents[spec] else f"{spec}+{shield}": driver for spec, driver in drivers.items()}
 
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, count: HarmCount = "first") -> dict[str, Agent]:
@@ -163,6 +172,17 @@ def make_agents(specs: Sequence[str], scenario: Scenario, *, count: HarmCount = 
             raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
         alone[spec] = agent
     return alone
+
+
+def make_proposers(specs: Sequence[str], scenario: Scenario, *, count: HarmCount = "first") -> dict[str, Agent]:
+    """``make_agents`` for what goes behind a shield; raises ``InvalidInput`` for a spec that has one already."""
+    for spec in specs:
+        kind = re.split("[:@]", spec, maxsplit=1)[0]
+        if kind in ("hybrid", "step", "robust"):
+            raise InvalidInput(
+                f"agent {spec!r}: has a shield already; here the shields are put around what proposes: ppo@PATH"
+            )
+    return make_agents(specs, scenario, count=count)
 
 
 def choose_worlds(
@@ -205,8 +225,18 @@ def _ladder() -> list[str]:
 def _driver(spec: str, scenario: Scenario, count: HarmCount, uncertainty: Uncertainty | None) -> Driver:
     kind, at, path = spec.partition("@")
     if at and (kind == _TEAM or (kind in ("ppo", "sac") and is_team(path))):
-        return load_team(path, scenario, spec)
+        team = load_team(path, scenario, spec)
+        _check_algorithm(spec, load_driver(path, scenario.vehicle_names[min(team.drivers)]))
+        return team
     return _agent(spec, scenario, count, uncertainty)
+
+
+def _check_algorithm(spec: str, policy: Policy) -> None:
+    """``ppo@PATH`` and ``sac@PATH`` are for policies of that algorithm."""
+    kind, _, path = spec.partition("@")
+    trained_by = policy.manifest.algorithm
+    if kind in ("ppo", "sac") and kind != trained_by:
+        raise InvalidInput(f"agent {spec!r}: that policy was trained by {trained_by.upper()}: {trained_by}@{path}")
 
 
 def _agent(spec: str, scenario: Scenario, count: HarmCount, uncertainty: Uncertainty | None) -> Agent:
@@ -233,10 +263,8 @@ def _agent_of_a_policy(
     if kind == "universal" and path != SHIPPED:
         raise InvalidInput(f"agent {spec!r}: must be universal@{SHIPPED}; for another policy: ppo@PATH or sac@PATH")
     loaded = load_named_policy(path, wanted, scenario, count)
-    trained_by = loaded.manifest.algorithm
-    if kind in ("ppo", "sac") and kind != trained_by:
-        raise InvalidInput(f"agent {spec!r}: that policy was trained by {trained_by.upper()}: {trained_by}@{path}")
-    policy = LearnedAgent(loaded, name=spec if kind in POLICY_KINDS else f"{trained_by}@{path}")
+    _check_algorithm(spec, loaded)
+    policy = LearnedAgent(loaded, name=spec if kind in POLICY_KINDS else f"{loaded.manifest.algorithm}@{path}")
     if kind in POLICY_KINDS:
         return policy
     assert scenario is not None
@@ -250,21 +278,21 @@ def _agent_of_a_policy(
     return HybridAgent(driver, scenario, bound="pairwise" if kind == "hybrid:pairwise" else "coupled", count=count)
 
 
-def _shielded_name(spec: str, shield: str) -> str:
-    return f"{spec}+{shield}" if shield != "none" and _is_learned(spec) else spec
-
-
-def _is_learned(spec: str) -> bool:
-    return re.split("[:@]", spec, maxsplit=1)[0] in (*POLICY_KINDS, "rehearsed")
-
-
 def _shielded(
-    agent: Driver, scenario: Scenario, count: HarmCount, shield: str, uncertainty: Uncertainty | None
+    spec: str, agent: Driver, scenario: Scenario, count: HarmCount, shield: str, uncertainty: Uncertainty | None
 ) -> Driver:
-    """A learned agent behind the shield; any other agent as it is. Raises ``UnknownName`` for another shield."""
+    """A learned agent behind the shield; any other agent as it is. Raises ``UnknownName`` for another shield.
+
+    Raises ``InvalidInput`` for a team.
+    """
     if shield not in SHIELDS:
         raise unknown_name("shield", shield, SHIELDS)
     intervals = mode_uncertainty(shield, uncertainty, "shield") if shield == "robust" else None
+    if shield != "none" and isinstance(agent, Team):
+        raise InvalidInput(
+            f"agent {spec!r}: is a team, and shield {shield} is for one driven vehicle, the others following scripts;"
+            " name that vehicle (--vehicle vehicle_2) and one policy of the team (ppo@RUN/policy/vehicle_2)"
+        )
     if shield == "none" or not isinstance(agent, LearnedAgent | Rehearsed):
         return agent
     if shield == "episode":

@@ -9,7 +9,7 @@ social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``, social value orientat
                     (prosocial) to 90 degrees (the others' only)
 maximin             ``max_j H_j``: the harm of whoever bears most
 mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: harm in a heavy vehicle counts for more
-weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight for each vehicle, for instance its occupants
+weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (1e-6 to 1e6) for each vehicle, as for its occupants
 ==================  ================================================================================================
 """
 
@@ -24,6 +24,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount, Ledger
+from ethbrake_marl.numerals import parse_numeral
 from ethbrake_marl.physics.worlds import Floats
 
 KINDS = ("total", "own", "social", "maximin", "mass-weighted", "weighted")
@@ -44,7 +45,7 @@ class Objective(NamedTuple):
 def parse_objective(text: str) -> Objective:
     """Read ``total``, ``own``, ``social:45``, ``maximin``, ``mass-weighted`` or ``weighted:1,4,1``.
 
-    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, or a weight that is not above 0.
+    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, or a weight outside [1e-6, 1e6].
     """
     kind, colon, argument = text.partition(":")
     if kind not in KINDS:
@@ -53,23 +54,31 @@ def parse_objective(text: str) -> Objective:
         if colon:
             raise InvalidInput(f"objective {text!r}: {kind} takes no argument")
         return Objective(kind)
-    try:
-        numbers = tuple(float(part) for part in argument.split(","))
-    except ValueError:
-        numbers = ()
+    written = [parse_numeral(part.strip()) for part in argument.split(",")]
+    numbers = tuple(number for number in written if number is not None) if None not in written else ()
     if kind == "social":
         if len(numbers) != 1 or not 0.0 <= numbers[0] <= 90.0:
             raise InvalidInput(f"objective {text!r}: social needs an angle from 0 to 90 degrees, as in social:45")
         return Objective(kind, angle_deg=numbers[0])
-    if not numbers or not all(0.0 < weight < math.inf for weight in numbers):
+    if not numbers or not all(1e-6 <= weight <= 1e6 for weight in numbers):
         raise InvalidInput(
-            f"objective {text!r}: weighted needs a weight above 0 for each vehicle, for instance weighted:1,4,1"
+            f"objective {text!r}: weighted needs a weight from 1e-6 to 1e6 for each vehicle, as in weighted:1,4,1"
         )
     return Objective(kind, weights=numbers)
 
 
+def check_declared(declared: object) -> None:
+    """Refuse, with ``InvalidInput``, what is not an objective or a list of some, however many vehicles there are."""
+    each = [declared] if isinstance(declared, str) else declared
+    if not isinstance(each, list | tuple) or not all(isinstance(text, str) for text in each):
+        raise InvalidInput("objective: must be a name, for instance own or social:45, or a list with one per vehicle")
+    for text in each:
+        parse_objective(text)
+
+
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
     """The objective of each of ``vehicles`` vehicles; ``InvalidInput`` if there are too many or too few."""
+    check_declared(declared)
     each = (declared,) * vehicles if isinstance(declared, str) else tuple(declared)
     if len(each) != vehicles:
         raise InvalidInput(
@@ -93,8 +102,10 @@ def objective_harm(ledger: Ledger, count: HarmCount, objectives: Sequence[Object
 def scored(ledger: Ledger, count: HarmCount, declared: Sequence[Declared] = STANDARD) -> dict[str, Floats]:
     """The same ledger under several objectives: objective -> what it is for each vehicle, [n, N] (m2/s2).
 
-    So one policy, whatever it was trained for, is told under all of them.
+    So one policy, whatever it was trained for, is told under all of them. ``InvalidInput`` for a name without its list.
     """
+    if isinstance(declared, str):
+        raise InvalidInput(f"scored: {declared!r}: must be a list of objectives, for instance [{declared!r}]")
     vehicles = ledger.mass_t.shape[1]
     return {
         each if isinstance(each, str) else ", ".join(each): objective_harm(ledger, count, objectives_of(each, vehicles))

@@ -2,7 +2,9 @@
 
 An observation is the vehicle's own features followed by those of its nearest neighbours, front ones first. Each
 feature is ``clip(value / scale, low, high)``. What this vehicle does not know, or a neighbour that is absent, reads 0
-with its ``known`` flag 0. There are no running statistics: an observation means the same in every run.
+with its ``known`` flag 0. There are no running statistics: an observation means the same in every run. Over a channel
+(``v2x``), ``latency_left`` and what follows from it count the own part of a latency only: nobody knows beforehand when
+news that has not arrived will.
 
 Where an obstacle stands ahead of Vehicle 1 (``observation_for``), the vehicle's place in the line and what it knows of
 the obstacle follow. Vehicle 1 sees it; any other vehicle knows of it as soon as it has Vehicle 1's news.
@@ -197,12 +199,13 @@ def _observe_rows(  # noqa: C901
     braking, driving, latency, mass = params_at(0, N), params_at(1, N), params_at(2, N), params_at(3, N)
     news, obstacle = params_at(5, N), state_width(N)
     by_link, some_obstacle = params.shape[1] > news, state.shape[1] > obstacle
+    own_part, to_next = (news, N + 1) if by_link else (latency, 1)  # of vehicle j's latency: own_part + j * to_next
     value = np.zeros(out.shape[2])
     for k in range(out.shape[0]):
         time = state[k, TIME]
         for o in range(observers.shape[0]):
             i = observers[o]
-            own_speed, own_latency = state[k, speed + i], max(params[k, latency + i] - time, 0.0)
+            own_speed, own_latency = state[k, speed + i], max(params[k, own_part + i * to_next] - time, 0.0)
             own_stop = _stopping_distance(own_speed, own_latency, params[k, braking + i])
             value[0] = own_speed
             value[1] = state[k, command + i]
@@ -223,7 +226,8 @@ def _observe_rows(  # noqa: C901
                 for p in range(min(i, j), max(i, j)):
                     gap += state[k, gap_column + p]
                 in_front = j < i
-                other_speed, other_latency = state[k, speed + j], max(params[k, latency + j] - time, 0.0)
+                other_speed = state[k, speed + j]
+                other_latency = max(params[k, own_part + j * to_next] - time, 0.0)
                 other_stop = _stopping_distance(other_speed, other_latency, params[k, braking + j])
                 room = gap + other_stop if in_front else other_stop - gap
                 value[c] = 1.0

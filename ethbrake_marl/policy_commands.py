@@ -9,7 +9,7 @@ import typer
 
 from ethbrake_marl.command_options import ForceOption, ScenarioOption
 from ethbrake_marl.errors import AlreadyExists
-from ethbrake_marl.evaluation.output_files import write_output
+from ethbrake_marl.evaluation.output_files import check_target, write_output
 from ethbrake_marl.learning.bundle import save_policy
 from ethbrake_marl.learning.onnx_export import onnx_model
 from ethbrake_marl.learning.shipped import load_named_policy
@@ -24,8 +24,9 @@ def export_command(
 ) -> None:
     """Write a policy as an ONNX model: observation in, acceleration out.
 
-    Needs the extra `export`: pip install 'ethbrake-marl[export]'.
+    Needs the package onnx, which the extra `export` brings.
     """
+    check_target(onnx, force=force)
     write_output(onnx, onnx_model(load_named_policy(policy)), force=force)
     say(f"written: {onnx}")
 

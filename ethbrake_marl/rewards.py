@@ -26,9 +26,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from scipy.special import expit
 
-from ethbrake_marl.errors import InvalidInput, UnknownName, unknown_name
+from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.objectives import Declared, Objective, objectives_of, parse_objective
+from ethbrake_marl.objectives import Declared, Objective, check_declared, objectives_of
 from ethbrake_marl.physics import Bools, Floats, Worlds, forecast
 
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -56,14 +56,14 @@ class RewardParams(BaseModel):
     target_gap_m: NonNegative = 3.0
     distance_slope_per_m: Positive = 1.0
 
-    @field_validator("objective")
+    @field_validator("objective", mode="before")
     @classmethod
-    def _objective(cls, value: Declared | None) -> Declared | None:
-        for each in (value,) if isinstance(value, str) else value or ():
+    def _objective(cls, value: Any) -> Any:
+        if value is not None:
             try:
-                parse_objective(each)
-            except (InvalidInput, UnknownName) as error:
-                raise ValueError(str(error)) from None
+                check_declared(value)
+            except InvalidInput as error:
+                raise ValueError(str(error).removeprefix("objective: ")) from None
         return value
 
 
@@ -108,7 +108,10 @@ def resolved_objective(
     Raises ``InvalidInput`` for an objective that does not fit the number of vehicles.
     """
     declared = of_scenario if params.objective is None else params.objective
-    objectives = objectives_of(declared, vehicles)
+    try:
+        objectives = objectives_of(declared, vehicles)
+    except InvalidInput as error:  # the scenario's was found to fit when it was made
+        raise InvalidInput(f"reward: {error}") from None
     if all(objective.kind == "total" for objective in objectives):
         return params.model_copy(update={"objective": None}), ()
     return params.model_copy(update={"objective": declared}), objectives

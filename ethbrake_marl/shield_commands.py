@@ -10,7 +10,7 @@ from ethbrake_marl.command_options import ForceOption, JsonOption, ScenarioOptio
 from ethbrake_marl.evaluation.output_files import write_output
 from ethbrake_marl.evaluation.shield_modes import ModeRow, compare_modes, modes_table
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.lineup import LIST_SEED, load_driven, make_agents
+from ethbrake_marl.lineup import LIST_SEED, load_driven, make_proposers
 from ethbrake_marl.picture_commands import PictureOption, picture_app, picture_target
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.terminal import interruptible, progress_bars, result_console, say, write_json
@@ -18,7 +18,8 @@ from ethbrake_marl.terminal import interruptible, progress_bars, result_console,
 EPISODES = 2_000
 
 ProposersOption = Annotated[
-    str, typer.Option("--agents", metavar="A,B,...", help="Who proposes; any agent of `ethbrake evaluate`.")
+    str,
+    typer.Option("--agents", metavar="A,B,...", help="Who proposes; agents of `ethbrake evaluate` without a shield."),
 ]
 EpisodesOption = Annotated[int, typer.Option("--episodes", help="Worlds of the list.", min=1)]
 CountOption = Annotated[HarmCount, typer.Option("--count", help="Harm that is guaranteed.")]
@@ -73,7 +74,7 @@ def picture_shield_modes(
 def measured_modes(agents: str, scenario: Scenario, episodes: int, count: HarmCount) -> list[ModeRow]:
     """The rows of these agents, with progress on stderr."""
     worlds = scenario.sample(episodes, LIST_SEED).worlds
-    lineup = make_agents(agents.split(","), scenario, count=count)
+    lineup = make_proposers(agents.split(","), scenario, count=count)
     with interruptible("nothing was written"), progress_bars() as bars:
         return compare_modes(
             lineup,

@@ -12,11 +12,13 @@ the direct neighbours: they add a hop of ``sensing_s``. Vehicle i reacts from
 
 on (nobody reacts to an emergency before its news: Vehicle 1's own message, or the sight of the vehicle ahead that
 brakes), and knows of vehicle j from ``max(latency_i, tau_ij)``, or ``max(latency_i, hop_ij)`` for a direct neighbour
-in sight if that is sooner. The rule of the paper, preset ``paper``: everything, from the own latency on.
+in sight if that is sooner. Of latencies themselves only the own parts are observed: what a channel has drawn shows when
+it happens. The rule of the paper, preset ``paper``: everything, from the own latency on.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -63,6 +65,7 @@ CHANNELS = {
     "blocked": Channel("messages", loss_begins=0.20, loss_ends=0.20, lost=0.20),
     "sensors-only": Channel("messages", hears="none"),
 }
+_LATEST = np.array([[1.0, 0.0, 1.0, 1.0]])  # uniform numbers of one link: a whole period, the longest burst, not lost
 _OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
 
 
@@ -87,22 +90,37 @@ class V2X(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _by_name(cls, value: Any) -> Any:
+        if not isinstance(value, str | dict | V2X):
+            right = f"must be a preset ({', '.join(PRESETS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
+            raise PydanticCustomError("scenario", "{right}", {"right": right})
         return {"preset": value} if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _possible(self) -> V2X:
-        channel, fixed = self.channel, self.link_latency_s is not None
-        if fixed or channel.timing == "latency" or channel.hears == "none":
-            for name in _OF_MESSAGES:
-                why = "a fixed link_latency_s" if fixed else f"preset {self.preset}"
-                _require(getattr(self, name) is None, name, self, f"{why} has no generated messages; leave it out")
+        channel = self.channel
+        if channel.hears == "none":
+            self._leave_out(("link_latency_s", "lost", *_OF_MESSAGES), "hears none has no messages")
+        elif self.link_latency_s is not None:
+            self._leave_out(_OF_MESSAGES, "a fixed link_latency_s has no generated messages")
+        elif channel.timing == "latency":
+            self._leave_out(_OF_MESSAGES, f"preset {self.preset} has no generated messages")
+        if channel.senses == "none":
+            self._leave_out(("sensing_s",), "senses none has nobody in sight")
         low, high = channel.sensing_s
         _require(low <= high, "sensing_s", self, "low must not be above high")
         silent = channel.timing == "messages" or channel.hears == "none" or channel.lost > 0.0
         needs_sight = silent and (channel.timing != "latency")
-        right = "without sight of the vehicle ahead, one that hears nothing would never react; use both or front"
-        _require(channel.senses != "none" or not needs_sight, "senses", self, right)
+        right = (
+            "without sight of the vehicle ahead, one that hears nothing would never react; use senses: both or front"
+        )
+        at = "senses" if self.senses is not None else "lost"  # one that is given: only preset paper itself sees nobody
+        _require(channel.senses != "none" or not needs_sight, at, self, right)
         return self
+
+    def _leave_out(self, names: tuple[str, ...], why: str) -> None:
+        """Refuse the first of these keys that is given: it would do nothing."""
+        for name in names:
+            _require(getattr(self, name) is None, name, self, f"{why}; leave it out")
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -136,10 +154,11 @@ class V2X(BaseModel):
         channel, latest = self.channel, own_latency_s.copy()
         if channel.timing == "latency":
             return latest
-        sure = channel.timing == "fixed" and channel.hears != "none" and channel.lost == 0.0
+        sure = channel.hears != "none" and channel.lost == 0.0
+        heard = float(link_delays(channel, _LATEST)[0]) if sure else np.inf
         for i in range(1, len(latest)):
             seen = latest[i - 1] + channel.sensing_s[1] if channel.senses != "none" else np.inf
-            latest[i] = max(latest[i], min(seen, channel.link_latency_s if sure else np.inf))
+            latest[i] = max(latest[i], min(seen, heard))
         return latest
 
 
@@ -147,7 +166,7 @@ def _require(holds: bool, name: str, v2x: V2X, right: str) -> None:
     """Refuse the value of ``name`` unless ``holds``; ``right`` says what would do."""
     if not holds:
         value = getattr(v2x, name)
-        shown = v2x.channel._asdict()[name] if value is None else value
+        shown = v2x.channel._asdict()[name] if value is None else list(value) if isinstance(value, tuple) else value
         raise PydanticCustomError("scenario", "{right}", {"right": right, "value": str(shown), "at": (name,)})
 
 
@@ -198,26 +217,37 @@ def with_news(v2x: V2X, vehicles: Vehicles, u: Floats) -> Vehicles:
             told = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
             latency[:, i] = np.maximum(latency[:, i], told)
     known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
-    known[:, np.arange(N), np.arange(N)] = 0.0
-    return replace(vehicles, latency_s=latency, known_from_s=known.reshape(n, N * N))
+    return replace(vehicles, latency_s=latency, known_from_s=_by_link(known, vehicles.latency_s))
+
+
+def _by_link(known: Floats, own_latency_s: Floats) -> Floats:
+    """The columns of ``Vehicles.known_from_s`` [n, N * N]: the news [n, N, N], on the diagonal the own parts [n, N]."""
+    n, N = own_latency_s.shape
+    columns = known.reshape(n, N * N).copy()
+    columns[:, :: N + 1] = own_latency_s
+    return columns
 
 
 def known_from(vehicles: Vehicles) -> Floats:
     """When vehicle i has the news of vehicle j (s since the alert), [n, N, N]; infinite: never; of itself: 0."""
-    n, N = vehicles.latency_s.shape
-    if vehicles.known_from_s.shape[1]:
-        return vehicles.known_from_s.reshape(n, N, N).copy()
-    known = vehicles.latency_s.repeat(N, axis=1).reshape(n, N, N)
-    known[:, np.arange(N), np.arange(N)] = 0.0
-    return known
+    columns = vehicles.known_from_s
+    return news_of(columns if columns.shape[1] else vehicles.latency_s.repeat(vehicles.latency_s.shape[1], axis=1))
+
+
+def news_of(columns: Floats) -> Floats:
+    """The columns of ``Vehicles.known_from_s`` [n, N * N] as [n, N, N], in their own memory; of itself: 0."""
+    N = math.isqrt(columns.shape[1])
+    known = columns.copy()
+    known[:, :: N + 1] = 0.0
+    return known.reshape(-1, N, N)
 
 
 def told_by_link(worlds: Worlds) -> Worlds:
     """The same worlds with their news written out link by link."""
     if worlds.vehicles.known_from_s.shape[1]:
         return worlds
-    known = known_from(worlds.vehicles).reshape(worlds.n, worlds.N * worlds.N)
-    return replace(worlds, vehicles=replace(worlds.vehicles, known_from_s=known))
+    columns = _by_link(known_from(worlds.vehicles), worlds.vehicles.latency_s)
+    return replace(worlds, vehicles=replace(worlds.vehicles, known_from_s=columns))
 
 
 def fixed_news(v2x: V2X, vehicles: Vehicles, where: str) -> Vehicles:

@@ -17,7 +17,7 @@ PACKAGE = "ethbrake_marl"
 
 # From the bottom up. A room imports lower levels; inside a level one room may import another, but not both ways.
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("errors",),
+    ("errors", "numerals"),
     ("durable_files",),
     ("physics",),
     ("harm",),

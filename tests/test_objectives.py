@@ -126,18 +126,35 @@ def test_infos__tell_the_harm_term_of_each_vehicle():
         ("social:91", "objective 'social:91': social needs an angle from 0 to 90 degrees"),
         ("social:nan", "social needs an angle"),
         ("social:-1", "social needs an angle"),
-        ("weighted:1,0,1", "weighted needs a weight above 0"),
-        ("weighted:1,inf,1", "weighted needs a weight above 0"),
-        ("weighted", "weighted needs a weight above 0"),
+        ("social:4_5", "social needs an angle"),
+        ("weighted:1,0,1", "weighted needs a weight from 1e-6 to 1e6"),
+        ("weighted:1,inf,1", "weighted needs a weight from 1e-6 to 1e6"),
+        ("weighted:1,1e308,1", "weighted needs a weight from 1e-6 to 1e6"),
+        ("weighted:1,1e-7,1", "weighted needs a weight from 1e-6 to 1e6"),
+        ("weighted:1,1_0,1", "weighted needs a weight from 1e-6 to 1e6"),
+        ("weighted", "weighted needs a weight from 1e-6 to 1e6"),
         ("weighted:1,2", "2 weights; 3 vehicles need 3"),
         (["own", "own"], "2 entries; 3 vehicles need 3"),
+        (5, "objective = 5: must be a name, for instance own or social:45, or a list with one per vehicle$"),
+        (["own", 5, "own"], r"objective = \['?own'?, 5, '?own'?\]: must be a name"),
     ],
 )
 def test_objective__that_cannot_be_is_refused_wherever_it_is_given(objective, message):
     with pytest.raises(InvalidInput, match=message):
         PAPER.replace(objective=objective)
-    with pytest.raises(InvalidInput, match=message):
+    with pytest.raises(InvalidInput, match=message) as refused:
         played({"objective": objective})
+    assert str(refused.value).startswith("reward: ")
+
+
+def test_objective_harm__with_the_largest_and_smallest_weights_is_finite():
+    weighted = objective_harm(ledger(), "first", objectives_of("weighted:1e6, 1e-6,1e6", 3))[0]
+    assert weighted == pytest.approx([3 * (8 + 6) / 2] * 3)
+
+
+def test_scored__refuses_a_name_without_its_list():
+    with pytest.raises(InvalidInput, match=r"scored: 'own': must be a list of objectives, for instance \['own'\]"):
+        scored(ledger(), "first", "own")
 
 
 def test_objective__round_trips_with_its_scenario():

@@ -12,6 +12,7 @@ from ethbrake_marl.agents.profile_problem import identities
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import observation_for, observe
 from ethbrake_marl.physics import advance, make_worlds
@@ -134,14 +135,27 @@ def test_sample__a_world_alone_has_the_same_news_and_the_line_of_the_paper(name)
     assert (many.vehicles.known_from_s[:, 1] != other.vehicles.known_from_s[:, 1]).all()
 
 
+def exchanged(of, values, rng):
+    """``values`` [n, ...] with the entries ``of`` exchanged between the worlds, and made 0.7 later."""
+    other = values.copy()
+    for at in np.ndindex(values.shape[1:]):
+        rows = np.flatnonzero(of[(slice(None), *at)])
+        other[(rows, *at)] = values[(rng.permutation(rows), *at)] + 0.7
+    return other
+
+
 def shuffled(worlds, vehicle):
-    """The worlds with everything exchanged between them that ``vehicle`` does not know yet."""
+    """The worlds with everything exchanged between them that ``vehicle`` does not know yet.
+
+    So also all that the channel has in store: news to come, and latencies of those who have not reacted.
+    """
     unknown = known_from(worlds.vehicles)[:, vehicle] > worlds.time_s[:, np.newaxis]
     lines = np.random.default_rng(1).permutation(worlds.n)
     changed = {}
     for name in ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps"):
         column = getattr(worlds.vehicles, name)
         changed[name] = np.where(unknown, column[lines] * 1.5, column)
+    changed["latency_s"], changed["known_from_s"] = other_future(worlds, unknown)
     gaps = np.where(unknown[:, [0, 2]], worlds.gaps_m[lines] + 3.0, worlds.gaps_m)
     return replace(
         worlds,
@@ -155,10 +169,53 @@ def shuffled(worlds, vehicle):
     )
 
 
+def other_future(worlds, unknown):
+    """Latencies and news by link with all that is still to come exchanged, and the own parts of the ``unknown``."""
+    rng, now, N = np.random.default_rng(2), worlds.time_s[:, np.newaxis], worlds.N
+    latency, news = worlds.vehicles.latency_s, worlds.vehicles.known_from_s
+    own_parts = np.arange(0, N * N, N + 1)
+    to_come = news > now
+    to_come[:, own_parts] = unknown
+    return exchanged(latency > now, latency, rng), exchanged(to_come, news, rng)
+
+
+def test_observe__tells_own_parts_of_latencies_and_nothing_that_the_channel_has_drawn():
+    # Vehicle 2 knows Vehicle 3 from 0.4 s on; Vehicle 3's own part is 0.5 s, Vehicle 1's message reaches it at 0.9 s.
+    scenario = PAPER.replace(v2x="congested", latency_s=[0, 0.1, 0.5], early_impacts="keep")
+    worlds = scenario.sample(1, 7).worlds
+    worlds.vehicles.latency_s[0] = [0.0, 0.4, 0.9]
+    worlds.vehicles.known_from_s[0] = [0.0, 0.8, 0.8, 0.4, 0.1, 0.4, 0.9, 0.9, 0.5]
+    assert known_from(worlds.vehicles)[0].tolist() == [[0.0, 0.8, 0.8], [0.4, 0.0, 0.4], [0.9, 0.9, 0.0]]
+    spec = observation_for(scenario)
+    at = [f.name for f in spec.features].index("rear_1.latency_left")
+    for time, own_left, rear_left in ((0.0, 0.1, 0.0), (0.4, 0.0, 0.1), (0.6, 0.0, 0.0), (0.95, 0.0, 0.0)):
+        seen = observe(replace(worlds, time_s=np.full(1, time)), 1, spec)[0]
+        assert (seen[5], seen[at]) == (pytest.approx(own_left), pytest.approx(rear_left))
+
+
+def test_full_state__has_the_latency_that_the_channel_has_drawn():
+    scenario = channel_of("blocked")
+    worlds = scenario.sample(50, 7).worlds
+    at = [f.name for f in state_features(scenario)].index("vehicle_3.latency_left")
+    assert (full_state(worlds, scenario)[:, at] == worlds.vehicles.latency_s[:, 2].astype(np.float32)).all()
+
+
+def test_observe__writing_the_papers_news_out_by_link_changes_no_bit():
+    plain = PAPER.sample(50, 7).worlds
+    told = told_by_link(plain)
+    for time in (0.0, 0.3, 0.6, 1.0):
+        for i in range(3):
+            now = (replace(w, time_s=np.full(50, time)) for w in (plain, told))
+            one, other = (observe(w, i, observation_for(PAPER)) for w in now)
+            assert one.tobytes() == other.tobytes()
+
+
+@pytest.mark.parametrize("latency", [0, [0, {"uniform": [0.3, 0.7]}, {"uniform": [0.5, 1.0]}]])
 @pytest.mark.parametrize("hazard", [False, True])
 @pytest.mark.parametrize("name", ["blocked", "congested", "sensors-only"])
-def test_observe__what_is_not_known_changes_no_bit(name, hazard):
-    scenario = channel_of(name).replace(hazard_gap_m={"uniform": [30, 50]}) if hazard else channel_of(name)
+def test_observe__what_is_not_known_changes_no_bit(name, hazard, latency):
+    scenario = channel_of(name).replace(latency_s=latency)
+    scenario = scenario.replace(hazard_gap_m={"uniform": [30, 50]}) if hazard else scenario
     start, spec = scenario.sample(400, 5).worlds, observation_for(scenario)
     seen = 0
     for time in (0.0, 0.5, 0.8, 1.0, 1.5):
@@ -166,6 +223,10 @@ def test_observe__what_is_not_known_changes_no_bit(name, hazard):
         other = shuffled(worlds, 1)
         unknown = known_from(worlds.vehicles)[:, 1][:, [0, 2]] > time
         assert observe(worlds, 1, spec).tobytes() == observe(other, 1, spec).tobytes()
+        for i in range(3):
+            latency, news = other_future(worlds, known_from(worlds.vehicles)[:, i] > time)
+            later = replace(worlds, vehicles=replace(worlds.vehicles, latency_s=latency, known_from_s=news))
+            assert observe(worlds, i, spec).tobytes() == observe(later, i, spec).tobytes()
         flags = observe(worlds, 1, spec)[:, [7, 17]]
         assert (flags == ~unknown).all()
         if hazard:
@@ -241,6 +302,13 @@ def test_initial_state__needs_a_channel_without_chance():
         ({"preset": "clear", "lost": float("nan")}, r"v2x.lost = .nan: must be a finite number"),
         ({"preset": "clear", "sensing_s": [2, 1]}, r"v2x.sensing_s = .*: low must not be above high"),
         ({"preset": "clear", "link_latency_s": 0.1, "radio_s": 0.1}, r"v2x.radio_s = 0.1: a fixed link_latency_s"),
+        ({"preset": "clear", "hears": "none", "radio_s": 0.1}, r"v2x.radio_s = 0.1: hears none has no messages"),
+        ({"preset": "sensors-only", "lost": 0.5}, r"v2x.lost = 0.5: hears none has no messages; leave it out"),
+        ({"preset": "sensors-only", "link_latency_s": 0.2}, r"v2x.link_latency_s = 0.2: hears none has no messages"),
+        ({"link_latency_s": 0.1, "hears": "none"}, r"v2x.link_latency_s = 0.1: hears none has no messages"),
+        ({"sensing_s": [0.8, 1]}, r"v2x.sensing_s = \[0.8, 1.0\]: senses none has nobody in sight; leave it out"),
+        ({"link_latency_s": 0.1, "lost": 0.1}, r"v2x.lost = 0.1: without sight .* use senses: both or front"),
+        (5, r"v2x = 5: must be a preset \(paper, .*\), or a mapping such as"),
     ],
 )
 def test_v2x__that_cannot_be_is_refused_with_its_place(v2x, message):
@@ -249,8 +317,21 @@ def test_v2x__that_cannot_be_is_refused_with_its_place(v2x, message):
 
 
 def test_v2x__everybody_may_act_before_the_horizon():
-    with pytest.raises(InvalidInput, match=r"vehicle_3 may have no news until 2.2 s; .* below horizon_s \(2 s\)"):
+    with pytest.raises(
+        InvalidInput, match=r"vehicle_3 may have no news until 2.2 s; .* below horizon_s \(2 s\), which may be raised"
+    ):
         PAPER.replace(v2x="blocked", horizon_s=2)
+
+
+@pytest.mark.parametrize(("name", "latest"), [("clear", 5.22), ("nominal", 5.42)])
+def test_v2x__where_nothing_is_lost_the_longest_burst_bounds_the_news(name, latest):
+    # 48 and 50 periods, in which the share of a burst falls below 2^-53; one of waiting; 20 + 100 + 200 ms.
+    v2x = V2X(preset=name)
+    assert v2x.latest_reaction_s(np.zeros(12)).tolist()[5:] == pytest.approx([latest] * 7)
+    u = np.random.default_rng(3).random((2_000, 144 * PER_LINK))
+    u.reshape(2_000, 144, PER_LINK)[:1_000, :, 1] = 0.0  # the longest bursts everywhere
+    drawn = with_news(v2x, vehicles([0.0] * 12, 2_000), u).latency_s
+    assert (drawn <= v2x.latest_reaction_s(np.zeros(12))).all() and drawn.max() > latest - 0.1
 
 
 @pytest.mark.parametrize("name", PRESETS)

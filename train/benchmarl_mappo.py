@@ -13,8 +13,21 @@ import argparse
 from pathlib import Path
 
 import ethbrake_marl as eb
-from ethbrake_marl.learning.benchmarl_task import train_mappo
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.learning.recipe import PpoRecipe, load_recipe
+
+
+def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:
+    """Train with the numbers of a recipe, into the new folder `output`."""
+    line, plan = eb.load_scenario(scenario), load_recipe(recipe).replace(total_steps=steps, seed=seed)
+    if not isinstance(plan, PpoRecipe):
+        raise InvalidInput(f"recipe {plan.name!r}: is for {plan.algorithm.upper()}; MAPPO needs one for PPO")
+    try:
+        from ethbrake_marl.learning.benchmarl_task import train_mappo  # only here: an extra
+    except ModuleNotFoundError as error:
+        raise InvalidInput(f"needs BenchMARL: pip install 'ethbrake-marl[marl]' ({error})") from None
+    train_mappo(plan, line, output)
+
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -24,7 +37,8 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/mappo"), help="new folder")
     given = parser.parse_args()
-    recipe = load_recipe(given.recipe).replace(total_steps=given.steps, seed=given.seed)
-    assert isinstance(recipe, PpoRecipe), "give a recipe for PPO"
-    train_mappo(recipe, eb.load_scenario(given.scenario), given.output)
+    try:
+        train(given.scenario, given.recipe, given.steps, given.seed, given.output)
+    except (EthBrakeError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
     print(f"trained: ethbrake evaluate --scenario {given.scenario} --agents full_brake,team@{given.output}")

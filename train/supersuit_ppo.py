@@ -21,10 +21,14 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
 import ethbrake_marl as eb
-from ethbrake_marl.learning.bundle import make_policy, save_policy
+from ethbrake_marl.durable_files import new_folder
+from ethbrake_marl.errors import EthBrakeError
+from ethbrake_marl.learning.bundle import Policy, make_policy, save_policy
 from ethbrake_marl.learning.manifest import observation_schema
 from ethbrake_marl.learning.networks import NetworkSpec
+from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.sb3_policy import tensors_of
+from ethbrake_marl.learning.schemes import scheme_of
 from ethbrake_marl.learning.versions import installed_versions
 from ethbrake_marl.rewards import reward_params
 
@@ -125,7 +129,17 @@ def make_worlds(scenario: eb.Scenario) -> SeededAndTruncated:
 
 
 def train(scenario: eb.Scenario, steps: int, seed: int, output: Path) -> None:
-    """Train PPO for `steps` decisions of learners, and save its policy as `output`/policy."""
+    """Train PPO for `steps` decisions of learners, and save its policy as `output`/policy.
+
+    Refuses at once what cannot be: steps, a seed, a scenario in which nobody learns, an `output` that is there.
+    """
+    scheme_of(load_recipe("ppo").replace(total_steps=steps, seed=seed), scenario)
+    with new_folder(output) as folder:
+        save_policy(learn(scenario, steps, seed), folder / "policy")
+
+
+def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
+    """The policy that PPO comes to."""
     torch.set_num_threads(1)
     worlds = VecMonitor(make_worlds(scenario))
     model = PPO(
@@ -155,7 +169,7 @@ def train(scenario: eb.Scenario, steps: int, seed: int, output: Path) -> None:
         activation="relu",
         output="clip",
     )
-    policy = make_policy(
+    return make_policy(
         tensors_of(model.policy, network),
         algorithm="ppo",
         network=network,
@@ -167,7 +181,6 @@ def train(scenario: eb.Scenario, steps: int, seed: int, output: Path) -> None:
         steps=model.num_timesteps,
         versions=installed_versions(),
     )
-    save_policy(policy, output / "policy")
 
 
 if __name__ == "__main__":
@@ -177,7 +190,10 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/supersuit"), help="new folder")
     given = parser.parse_args()
-    train(eb.load_scenario(given.scenario), given.steps, given.seed, given.output)
+    try:
+        train(eb.load_scenario(given.scenario), given.steps, given.seed, given.output)
+    except (EthBrakeError, OSError) as error:
+        parser.exit(2, f"{parser.prog}: error: {error}\n")
     print(
         f"trained: {given.output}; ethbrake evaluate --scenario {given.scenario} --agents full_brake,ppo@{given.output}"
     )

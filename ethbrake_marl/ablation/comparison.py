@@ -27,10 +27,11 @@ TOLERANCE = 1e-6  # m2/s2; a vehicle whose harm rose by more is worse off
 Json = dict[str, Any]
 
 
-def compare(measured: Sequence[Measured]) -> Json:
-    """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels`` (lost messages); see docs/cooperation.md.
+def compare(measured: Sequence[Measured], searched: int) -> Json:
+    """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels`` (lost messages); see docs/cli.md.
 
-    Each algorithm has a ladder of its own; levels in which nobody learns are in all of them.
+    The joint optimum is known in the first ``searched`` worlds; what stands beside it is of these worlds too. Each
+    algorithm has a ladder of its own; levels in which nobody learns are in all of them.
     """
     algorithms = [m.algorithm for m in measured if m.algorithm is not None]
     steps, channels = [], []
@@ -40,10 +41,10 @@ def compare(measured: Sequence[Measured]) -> Json:
         steps += [_change(before, after, algorithm) for before, after in pairwise(ladder)]
         by_name = {m.level.name: m for m in own}
         channels += [_change(by_name[m.level.clear], m, algorithm) for m in own if m.level.clear is not None]
-    return {"levels": [_level(one) for one in measured], "steps": steps, "channels": channels}
+    return {"levels": [_level(one, searched) for one in measured], "steps": steps, "channels": channels}
 
 
-def _level(one: Measured) -> Json:
+def _level(one: Measured, searched: int) -> Json:
     """What one level reached under one algorithm."""
     scenario = one.level.scenario
     return {
@@ -55,29 +56,39 @@ def _level(one: Measured) -> Json:
         "seeds": len(one.reached.collided),
         "worlds": one.reached.collided.shape[1],
         "collision_rate": _plain(mean_over_seeds(one.reached.collided.astype(np.float64))),
-        **{count: _under_count(one, count) for count in COUNTS},
+        **{count: _under_count(one, count, searched) for count in COUNTS},
     }
 
 
-def _under_count(one: Measured, count: HarmCount) -> Json:
-    """Harm (m2/s2) under one count, what full braking does in the same level, and the joint optimum."""
+def _under_count(one: Measured, count: HarmCount, searched: int) -> Json:
+    """Harm (m2/s2) under one count and what it is if all brake fully, in all worlds and in the ``searched`` ones.
+
+    There also the joint optimum, and the share of its reduction that is realised.
+    """
     reached, braking = one.reached.world[count], one.full_brake.world[count]
     each = reached.mean(axis=1)
-    found: Json = {
+    return {
+        "full_brake": _plain(mean_over_seeds(braking)),
         "harm": _plain(mean_over_seeds(reached)),
         "each_seed": each.tolist(),
         "interquartile_mean": _plain(interquartile_mean([each], resamples=2000)),
         "vehicles": [_plain(mean_over_seeds(column)) for column in _columns(one.reached, count)],
-        "full_brake": _plain(mean_over_seeds(braking)),
-        "best_known": None,
-        "realised_share": None,
+        "searched": _searched(
+            reached[:, :searched], braking[:, :searched], None if one.best is None else one.best[count]
+        ),
     }
-    if one.best is not None:
-        searched = one.best[count].shape[1]
-        found["best_known"] = _plain(mean_over_seeds(one.best[count]))
-        share = share_over_seeds(reached[:, :searched], braking[:, :searched], one.best[count])
-        found["realised_share"] = _plain(share)
-    return found
+
+
+def _searched(reached: Floats, braking: Floats, best: Floats | None) -> Json:
+    """Everything in the worlds in which the joint optimum was searched."""
+    return {
+        "worlds": reached.shape[1],
+        "full_brake": _plain(mean_over_seeds(braking)),
+        "harm": _plain(mean_over_seeds(reached)),
+        "each_seed": reached.mean(axis=1).tolist(),
+        "best_known": None if best is None else _plain(mean_over_seeds(best)),
+        "realised_share": None if best is None else _plain(share_over_seeds(reached, braking, best)),
+    }
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:

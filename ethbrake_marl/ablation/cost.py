@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 import time
 from collections.abc import Sequence
@@ -11,16 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
+from ethbrake_marl.ablation.joint_optimum import parts_left, questions
 from ethbrake_marl.ablation.levels import common_worlds
-from ethbrake_marl.ablation.plan import OPTIMUM, Plan, Training
-from ethbrake_marl.analysis.best_harm import CHUNK, best_harm
+from ethbrake_marl.ablation.plan import Plan, Training
+from ethbrake_marl.analysis.best_harm import best_harm
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.learning.callback import Progress
 from ethbrake_marl.learning.teams import load_team, train_team
 from ethbrake_marl.scenario import Sample, Scenario
 
 _UPDATES = 4  # of the training that is timed; the first one, which compiles and warms up, does not count
-_TIMED_WORLDS = 4  # of the search that is timed
+_TIMED_DRIVES, _TIMED_WORLDS = 50, 4  # worlds of the evaluation and of the search that are timed
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +32,7 @@ class Cost:
     training_s: float
     driving_s: float
     search_s: float
+    damaged: tuple[Path, ...]  # kept parts of a search that will be searched again
 
     @property
     def whole_s(self) -> float:
@@ -39,13 +40,14 @@ class Cost:
         return self.training_s + self.driving_s + self.search_s
 
     def __str__(self) -> str:
-        """The cost in one line."""
+        """The cost in one line, and a line for each damaged part."""
         speed = f" at {self.decisions / self.training_s:,.0f}/s" if self.training_s > 0.0 else ""
-        return (
+        line = (
             f"to do: {self.trainings} trainings, {self.decisions:,} decisions{speed}: {_minutes(self.training_s)};"
             f" joint optima {_minutes(self.search_s)}; driving the common worlds {_minutes(self.driving_s)};"
             f" together about {_minutes(self.whole_s)} of one core"
         )
+        return "\n".join([line, *(f"{file}: is damaged; its worlds are searched again" for file in self.damaged)])
 
 
 def cost_of(plan: Plan) -> Cost:
@@ -54,10 +56,8 @@ def cost_of(plan: Plan) -> Cost:
     Other work on the machine counts as well: seconds are of the clock. Raises as ``Training.steps_left``.
     """
     left = [(training, training.steps_left()) for training in plan.trainings()]
-    samples = {
-        level.name: sample
-        for level, sample in zip(plan.levels, common_worlds(plan.levels, 50, plan.list_seed), strict=True)
-    }
+    lists = common_worlds(plan.levels, plan.episodes, plan.list_seed)
+    samples = {level.name: _first(sample) for level, sample in zip(plan.levels, lists, strict=True)}
     training_s, worlds_s = 0.0, []
     for kind in {training.folder.name.rpartition("-seed")[0]: training for training, _ in left}.values():
         same = (kind.level.name, kind.algorithm)
@@ -72,7 +72,13 @@ def cost_of(plan: Plan) -> Cost:
         worlds_s.append(_driving_s(left[0][0].folder, left[0][0].level.scenario, samples[left[0][0].level.name]))
     driving_s = sum(worlds_s) / len(worlds_s) * plan.episodes * (len(left) + len(plan.levels))
     trainings, decisions = sum(1 for _, steps in left if steps), sum(steps for _, steps in left)
-    return Cost(trainings, decisions, training_s, driving_s, _search_s(plan, samples))
+    return Cost(trainings, decisions, training_s, driving_s, *_search(plan, lists))
+
+
+def _first(sample: Sample) -> Sample:
+    """The worlds that are timed."""
+    rows = np.arange(min(_TIMED_DRIVES, sample.worlds.n))
+    return Sample(sample.worlds.take(rows), sample.index[rows], 0)
 
 
 def _timed(training: Training, sample: Sample) -> tuple[float, float]:
@@ -92,7 +98,7 @@ def _timed(training: Training, sample: Sample) -> tuple[float, float]:
 def _driving_s(folder: Path, scenario: Scenario, sample: Sample) -> float:
     """Seconds per world that a trained team drives."""
     team = load_team(folder, scenario)
-    evaluate(sample.worlds.take(np.arange(5)), {"warm": team}, scenario=scenario)
+    evaluate(sample.worlds.take(np.arange(min(5, sample.worlds.n))), {"warm": team}, scenario=scenario)
     started = time.monotonic()
     evaluate(sample, {"team": team}, scenario=scenario)
     return (time.monotonic() - started) / sample.worlds.n
@@ -115,21 +121,19 @@ def _measurements(training: Training) -> int:
     return recipe.total_steps // per_update // recipe.evaluation.every_updates + 2
 
 
-def _search_s(plan: Plan, samples: dict[str, Sample]) -> float:
-    """Seconds for the searches whose parts are not all there."""
-    seconds = 0.0
-    for level in plan.levels:
-        folder = plan.folder / OPTIMUM / level.name
-        parts = math.ceil(plan.search_episodes / CHUNK)
-        missing = parts - (len(list(folder.glob("*.npz"))) if folder.is_dir() else 0)
-        if level.trained and missing > 0:
-            worlds = samples[level.name].worlds.take(np.arange(_TIMED_WORLDS))
+def _search(plan: Plan, samples: Sequence[Sample]) -> tuple[float, tuple[Path, ...]]:
+    """Seconds for the worlds that are still to be searched, and the kept parts that are damaged."""
+    seconds, damaged = 0.0, []
+    for level, part, _ in questions(plan, samples):
+        left, broken = parts_left(plan, level, part)
+        damaged += broken
+        if left:
+            worlds = part.worlds.take(np.arange(min(_TIMED_WORLDS, part.worlds.n)))
             best_harm(level.scenario, worlds.take(np.arange(1)), budget=100, threads=1)
             started = time.monotonic()
             best_harm(level.scenario, worlds, budget=plan.budget, threads=1)
-            per_world_s = (time.monotonic() - started) / _TIMED_WORLDS
-            seconds += per_world_s * plan.search_episodes * missing / parts
-    return seconds
+            seconds += (time.monotonic() - started) / worlds.n * left
+    return seconds, tuple(damaged)
 
 
 def _minutes(seconds: float) -> str:

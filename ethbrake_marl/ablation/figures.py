@@ -16,6 +16,7 @@ from ethbrake_marl.harm import COUNTS, HarmCount
 
 LINEAR = 0.1  # m2/s2; axes are linear up to there and logarithmic beyond: harm falls to a hundredth
 
+_LEAST_IN = 2.6  # height of a figure with few rows: titles and caption need it
 _BESIDE = 0.42  # of a worse channel, right of its clear one
 _TITLES = {"first": "First-impact harm (m²/s²)", "total": "Total harm (m²/s²)"}
 
@@ -23,7 +24,10 @@ Json = dict[str, Any]
 
 
 def harm_curve(found: Json, caption: str) -> Figure:
-    """Harm level by level under both counts, with full braking above and the joint optimum, its limit, below."""
+    """Harm level by level under both counts, with full braking above and the joint optimum, its limit, below.
+
+    All of it in the worlds in which the joint optimum was searched.
+    """
     figure = new_figure(10.5, 4.8)
     ladder = list(dict.fromkeys(level["level"] for level in found["levels"] if level["clear"] is None))
     for axes, count in zip(figure.subplots(1, 2), COUNTS, strict=True):
@@ -38,14 +42,15 @@ def harm_curve(found: Json, caption: str) -> Figure:
         axes.set_title(_TITLES[count], loc="left", fontsize=10)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=4, frameon=False, fontsize=8.5)
-    add_caption(figure, caption)
+    worlds = found["levels"][0]["first"]["searched"]["worlds"]
+    add_caption(figure, f"{caption} All of this figure: the first {worlds:,} worlds.")
     return figure
 
 
 def change_figure(found: Json, caption: str) -> Figure:
     """What each step and each worse channel changes, with its interval: left of the line is less harm."""
     changes = found["steps"] + found["channels"]
-    figure = new_figure(10.5, 1.6 + 0.42 * len(changes))
+    figure = new_figure(10.5, max(_LEAST_IN, 1.6 + 0.42 * len(changes)))
     for axes, count in zip(figure.subplots(1, 2, sharey=True), COUNTS, strict=True):
         style_axes(axes)
         axes.axvline(0.0, color=GREY, linewidth=0.9)
@@ -62,9 +67,9 @@ def change_figure(found: Json, caption: str) -> Figure:
         axes.set_title(f"Change of {_TITLES[count][0].lower()}{_TITLES[count][1:]}", loc="left", fontsize=10)
         axes.set_xscale("symlog", linthresh=LINEAR)
         axes.xaxis.set_major_formatter(FuncFormatter(_plain))
-        axes.margins(x=0.1, y=0.15)
+        axes.margins(x=0.1)
     figure.axes[0].set_yticks(range(len(changes)), [_of_change(change, found) for change in changes], fontsize=8)
-    figure.axes[0].invert_yaxis()
+    figure.axes[0].set_ylim(len(changes) - 0.5, -0.6)  # from top to bottom
     add_caption(figure, caption)
     return figure
 
@@ -72,7 +77,7 @@ def change_figure(found: Json, caption: str) -> Figure:
 def who_pays(found: Json, caption: str) -> Figure:
     """How harm moved between the vehicles from level to level: a matrix of changes, blue is less."""
     changes = found["steps"] + found["channels"]
-    figure = new_figure(10.5, 1.8 + 0.42 * len(changes))
+    figure = new_figure(10.5, max(_LEAST_IN, 1.8 + 0.42 * len(changes)))
     grids = {count: _matrix(changes, count) for count in COUNTS}
     largest = max(float(np.abs(grid).max()) for grid in grids.values()) or 1.0
     every = figure.subplots(1, 2, sharey=True)
@@ -99,10 +104,10 @@ def _plain(value: float, _: int) -> str:
 def _limits(axes: Axes, levels: Sequence[Json], ladder: Sequence[str], count: HarmCount) -> None:
     """Full braking and the joint optimum of every level, as short lines; shorter ones beside for worse channels."""
     for key, label, colour in (("full_brake", "all brake fully", GREY), ("best_known", "joint optimum", COLOURS[3])):
-        shown = [level for level in levels if level[count][key] is not None]
+        shown = [level for level in levels if level[count]["searched"][key] is not None]
         for number, level in enumerate(shown):
             x, half = _place(level, ladder), 0.3 if level["clear"] is None else 0.07
-            value, name = level[count][key]["value"], "" if number else label
+            value, name = level[count]["searched"][key]["value"], "" if number else label
             axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=name)
 
 
@@ -127,17 +132,17 @@ def _reached(
         _with_intervals(axes, beside, worse, count, label=f"{algorithm}, worse channel", **hollow)
         for place, level in zip(beside, worse, strict=True):
             channel = level["level"].rpartition("-")[2]
-            spot = (place, level[count]["full_brake"]["value"])
+            spot = (place, level[count]["searched"]["full_brake"]["value"])
             axes.annotate(channel, spot, xytext=(0, 4), textcoords="offset points", ha="center", fontsize=8)
     for place, level in zip([*x, *beside], [*steps, *worse], strict=True):
-        dots = level[count]["each_seed"]
+        dots = level[count]["searched"]["each_seed"]
         if len(dots) > 1:
             axes.scatter([place + 0.05] * len(dots), dots, s=6, color=str(style["color"]), alpha=0.5, linewidths=0)
 
 
 def _with_intervals(axes: Axes, x: Sequence[float], levels: Sequence[Json], count: HarmCount, **style: Any) -> None:
-    values = np.array([level[count]["harm"]["value"] for level in levels])
-    ends = np.array([_interval(level[count]["harm"]) for level in levels]).T
+    harms = [level[count]["searched"]["harm"] for level in levels]
+    values, ends = np.array([harm["value"] for harm in harms]), np.array([_interval(harm) for harm in harms]).T
     axes.errorbar(x, values, yerr=np.abs(ends - values), capsize=3, **style)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.lineup import load_runnable
+from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Sample, Scenario
 
 LADDER = (
@@ -20,6 +21,10 @@ LADDER = (
 )
 STANDARD = (*LADDER, "cooperation-2-blocked")
 
+_LINE = ("vehicles", "time_step_s", "horizon_s")
+_WORLD = ("gaps_m", "speeds_mps")
+_VEHICLE = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps", "restitution")
+_MAY_DIFFER = "roles, objective, hazard_gap_m, v2x and, where v2x differs, latency_s"
 _ABOUT = {"name", "title", "description", "source"}
 
 
@@ -61,20 +66,37 @@ def read_levels(names: Sequence[str]) -> list[Level]:
 
 
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sample]:
-    """The list of each level: world k has the same gaps and speeds in all of them.
+    """The list of each level: world k is the same line in all of them, and the same physics hold in it.
 
-    Raises ``InvalidInput`` naming the level whose line is another.
+    Latencies may differ where ``v2x`` does, and an obstacle ahead may be there or not. Raises ``InvalidInput`` naming
+    the level and what is another there.
     """
     samples = [level.scenario.sample(episodes, seed) for level in levels]
-    first = samples[0].worlds
-    for level, sample in zip(levels, samples, strict=True):
-        worlds = sample.worlds
-        if not (np.array_equal(worlds.gaps_m, first.gaps_m) and np.array_equal(worlds.speeds_mps, first.speeds_mps)):
-            raise InvalidInput(
-                f"level {level.name!r}: its worlds are not those of {levels[0].name!r} ({worlds.N} and {first.N}"
-                " vehicles); levels are compared on the same gaps and speeds, so leave one of them out"
-            )
+    for k, level in enumerate(levels):
+        _check_same(levels[0], samples[0], level, samples[k], (*_LINE, *_WORLD, *_VEHICLE))
+        clear = next(j for j in range(k + 1) if levels[j].scenario.v2x == level.scenario.v2x)
+        _check_same(levels[clear], samples[clear], level, samples[k], ("latency_s",))
     return samples
+
+
+def _check_same(one: Level, first: Sample, other: Level, sample: Sample, names: Sequence[str]) -> None:
+    for name in names:
+        values, others = (_values(name, *pair) for pair in ((one, first), (other, sample)))
+        rows = np.flatnonzero((values != others).reshape(len(values), -1).any(axis=1))
+        if rows.size:
+            here, there = (", ".join(f"{each:g}" for each in np.ravel(v[rows[0]])) for v in (others, values))
+            raise InvalidInput(
+                f"level {other.name!r}: its {name} differs from that of {one.name!r} ({here}; there {there}); levels"
+                f" are compared on the same lines and may differ in {_MAY_DIFFER}, so change or leave out one of them"
+            )
+
+
+def _values(name: str, level: Level, sample: Sample) -> Floats:
+    """One row per world of a quantity of the worlds; one row of a number of the scenario."""
+    if name in _LINE:
+        return np.array([getattr(level.scenario, name)], np.float64)
+    values: Floats = getattr(sample.worlds if name in _WORLD else sample.worlds.vehicles, name)
+    return values
 
 
 def _but_channel(one: Scenario, other: Scenario) -> bool:

@@ -1,4 +1,4 @@
-"""The same weights on longer lines: policies of one line length drive every follower of lines of other lengths."""
+"""The same weights on longer lines: policies of one line length drive every learner of lines of other lengths."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ethbrake_marl.ablation.comparison import TOLERANCE
 from ethbrake_marl.ablation.measurement import Harms, harms_of
+from ethbrake_marl.ablation.plan import read_object
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.analysis.best_harm import best_harm
@@ -19,7 +20,9 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.seed_statistics import mean_over_seeds, share_over_seeds
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.bundle import load_policy
+from ethbrake_marl.learning.bundle import Policy, load_policy
+from ethbrake_marl.learning.recipe import WORDS
+from ethbrake_marl.learning.run_directory import RunDirectory
 from ethbrake_marl.learning.teams import is_team
 from ethbrake_marl.lineup import PROGRESS_EVERY, make_agent
 from ethbrake_marl.physics import Floats
@@ -87,24 +90,75 @@ def lengthened(scenario: Scenario, vehicles: int) -> Scenario:
     return scenario.replace(**changes, roles=roles)
 
 
-def load_runs(paths: Sequence[str]) -> list[Agent]:
-    """One agent for each run or bundle; raises ``InvalidInput`` for a run whose learners have a policy each."""
+def load_runs(paths: Sequence[str], scenario: Scenario) -> list[Agent]:
+    """One agent for each run or bundle, the seeds of one training, to drive lines of ``scenario``.
+
+    Raises ``InvalidInput`` for no path, a run whose learners have a policy each, one policy twice, policies of
+    different trainings, or policies that never drove Vehicle 1 where it learns.
+    """
+    if not paths or not all(paths):
+        raise InvalidInput(f"runs {','.join(paths)!r}: must be runs or bundles, for instance runs/my-run")
     for path in paths:
         if is_team(path):
             raise InvalidInput(f"{path}: its learners have a policy each; only one that all share drives other lines")
-    if len(set(paths)) < len(paths):
-        raise InvalidInput(f"runs {', '.join(paths)}: one is given twice")
-    return [LearnedAgent(load_policy(Path(path)), path) for path in paths]
+    policies = [load_policy(Path(path)) for path in paths]
+    trained = [_training(path, policy) for path, policy in zip(paths, policies, strict=True)]
+    for k, policy in enumerate(policies):
+        _check_front(paths[k], policy, scenario)
+        same = [path for path, one in zip(paths, policies[:k], strict=False) if _weights(one) == _weights(policy)]
+        if same:
+            raise InvalidInput(f"runs {same[0]} and {paths[k]}: are one policy; give each once")
+        other = [name for name, value in trained[k].items() if trained[0].get(name, value) != value]
+        if other:
+            raise InvalidInput(
+                f"runs {paths[0]} and {paths[k]}: differ in {', '.join(other)}; give seeds of one training"
+            )
+    return [LearnedAgent(policy, path) for path, policy in zip(paths, policies, strict=True)]
+
+
+def _weights(policy: Policy) -> str:
+    return policy.manifest.weights_sha256
+
+
+def _training(path: str, policy: Policy) -> dict[str, Any]:
+    """What seeds of one training have in common; the recipe too where ``path`` is a run."""
+    manifest = policy.manifest.model_dump(mode="json")
+    found = {name: manifest[name] for name in ("algorithm", "network", "observation", "learners", "reward", "scenario")}
+    config = RunDirectory(Path(path)).config
+    if config.is_file():
+        recipe = dict(read_object(config, f"give the policy instead: {Path(path) / 'policy'}").get("recipe") or {})
+        found["recipe"] = {name: value for name, value in recipe.items() if name not in (*WORDS, "seed")}
+    return found
+
+
+def _check_front(path: str, policy: Policy, scenario: Scenario) -> None:
+    """Raise ``InvalidInput`` where Vehicle 1 learns, which the policy never drove."""
+    manifest = policy.manifest
+    if 0 in scenario.learners and "vehicle_1" not in manifest.learners:
+        raise InvalidInput(
+            f"scenario {scenario.name!r}: vehicle_1 learns there, and {path} was trained for"
+            f" {', '.join(manifest.learners)}; give one whose Vehicle 1 follows a script, for instance"
+            f" --scenario {manifest.scenario['name']}"
+        )
 
 
 def drive_longer(question: Question, agents: Sequence[Agent], tell: Tell | None = None) -> list[LineResult]:
-    """Let every agent drive all followers of lines of each length, on the same worlds as full braking."""
-    return [_of_length(question, vehicles, agents, tell) for vehicles in question.vehicles]
+    """Let every agent drive all learners of lines of each length, on the same worlds as full braking.
+
+    All lines are made before the first is driven. Raises ``InvalidInput`` for a length that is given twice or that the
+    scenario cannot have.
+    """
+    if len(set(question.vehicles)) < len(question.vehicles):
+        raise InvalidInput(f"vehicles {', '.join(map(str, question.vehicles))}: each length once")
+    lines = [lengthened(question.scenario, vehicles) for vehicles in question.vehicles]
+    lists = [line.sample(question.episodes, question.list_seed) for line in lines]
+    return [_of_length(question, *line, agents, tell) for line in zip(lines, lists, strict=True)]
 
 
-def _of_length(question: Question, vehicles: int, agents: Sequence[Agent], tell: Tell | None) -> LineResult:
-    scenario, count = lengthened(question.scenario, vehicles), question.count
-    sample = scenario.sample(question.episodes, question.list_seed)
+def _of_length(
+    question: Question, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: Tell | None
+) -> LineResult:
+    count = question.count
     braking = _driven([make_agent("full_brake")], scenario, sample, tell)
     reached = _driven(agents, scenario, sample, tell)
     worst, own = braking.world[count], reached.world[count]
@@ -113,7 +167,7 @@ def _of_length(question: Question, vehicles: int, agents: Sequence[Agent], tell:
     best = _searched(question, scenario, sample, own, tell)
     known = slice(0, question.search_episodes)
     return LineResult(
-        vehicles,
+        scenario.vehicles,
         mean_over_seeds(worst),
         mean_over_seeds(own),
         share_over_seeds(own, worst, none),

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.ablation.levels import Level
+from ethbrake_marl.durable_files import check_writable, write_file
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe
+from ethbrake_marl.learning.recipe import WORDS, PpoRecipe, Scheme, TrainingRecipe
 from ethbrake_marl.learning.run_directory import RunDirectory
 from ethbrake_marl.scenario import Scenario
 
-TRAININGS, OPTIMUM = "trainings", "optimum"  # folders inside the ablation's
+TRAININGS, OPTIMUM, SETTINGS = "trainings", "optimum", "settings.json"  # inside the ablation's folder
+_NUMBERS = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +35,7 @@ class Training:
             if self.folder.exists():
                 raise InvalidInput(f"{self.folder}: is no training; move it away, or give another --output")
             return self.recipe.total_steps
-        status, config = (_content(file) for file in (run.status, run.config))
+        status, config = (read_object(file, "delete its folder to train anew") for file in (run.status, run.config))
         if not same_training(config, self.recipe, self.level.scenario):
             raise InvalidInput(
                 f"{self.folder}: holds the training of another recipe or scenario; give another folder (--output)"
@@ -49,8 +51,7 @@ class Plan:
     """An ablation."""
 
     levels: tuple[Level, ...]
-    recipes: tuple[TrainingRecipe, ...]
-    scheme: Scheme  # of levels with several learners
+    recipes: tuple[TrainingRecipe, ...]  # with the scheme of levels with several learners, see ``with_scheme``
     seeds: int
     steps_per_learner: int  # decisions of each learner
     episodes: int  # worlds on which everything is measured
@@ -62,7 +63,7 @@ class Plan:
     @property
     def algorithms(self) -> tuple[str, ...]:
         """Names of what is compared: recipes with the scheme."""
-        return tuple(self._algorithm(recipe) for recipe in self.recipes)
+        return tuple(_algorithm(recipe) for recipe in self.recipes)
 
     def trainings(self) -> Iterator[Training]:
         """Seed by seed, so that a first result over all levels is there early."""
@@ -76,23 +77,39 @@ class Plan:
         """The training of one seed."""
         learners = len(level.scenario.learners)
         changes: dict[str, Any] = {"seed": seed, "total_steps": self.steps_per_learner * learners}
-        changes["scheme"] = None if learners == 1 else self.scheme
-        algorithm = self._algorithm(recipe)
-        folder = self.folder / TRAININGS / f"{level.name}-{algorithm}-seed{seed}"
-        return Training(level, algorithm, recipe.replace(**changes), folder)
+        if learners == 1:  # the same training whatever the scheme of several learners
+            changes |= dict.fromkeys(("scheme", "turns") if isinstance(recipe, PpoRecipe) else ("scheme",))
+        name = recipe.name if learners == 1 else _algorithm(recipe)
+        folder = self.folder / TRAININGS / f"{level.name}-{name}-seed{seed}"
+        return Training(level, _algorithm(recipe), recipe.replace(**changes), folder)
 
-    def _algorithm(self, recipe: TrainingRecipe) -> str:
-        return f"{recipe.name}-{self.scheme}"
+    def settings(self) -> dict[str, Any]:
+        """Everything that shapes the results, as plain data."""
+        scenarios = [level.scenario.model_dump(mode="json", exclude=set(WORDS)) for level in self.levels]
+        recipes = [recipe.model_dump(mode="json", exclude=set(WORDS)) for recipe in self.recipes]
+        return {"levels": scenarios, "recipes": recipes, **{name: getattr(self, name) for name in _NUMBERS}}
+
+    def optimum_folder(self, level: Level) -> Path:
+        """Where the parts of its search stand."""
+        return self.folder / OPTIMUM / level.name
+
+
+def with_scheme(recipe: TrainingRecipe, scheme: Scheme | None) -> TrainingRecipe:
+    """The recipe with this scheme for several learners; None: its own, else independent."""
+    return recipe.replace(scheme=scheme or recipe.scheme or "independent")
+
+
+def _algorithm(recipe: TrainingRecipe) -> str:
+    return f"{recipe.name}-{recipe.scheme}"
 
 
 def check_plan(plan: Plan) -> None:
     """Raise ``InvalidInput`` for recipes of one name, numbers below 1, or nothing to train."""
-    names = plan.algorithms
+    names = [recipe.name for recipe in plan.recipes]
     if not names or len(set(names)) < len(names):
         raise InvalidInput(f"recipes {', '.join(names) or 'none'}: give at least one, each with a name of its own")
-    numbers = ("seeds", "steps_per_learner", "episodes", "search_episodes", "budget")
-    for name in numbers:
-        if not getattr(plan, name) >= 1:
+    for name in _NUMBERS:
+        if name != "list_seed" and not getattr(plan, name) >= 1:
             raise InvalidInput(f"{name.replace('_', '-')} {getattr(plan, name)}: must be at least 1")
     if plan.search_episodes > plan.episodes:
         raise InvalidInput(
@@ -102,6 +119,41 @@ def check_plan(plan: Plan) -> None:
         raise InvalidInput("levels: nobody learns in any of them; give at least one with a learner")
 
 
+def check_folder(folder: Path) -> None:
+    """Raise ``InvalidInput`` for a folder that is none, or that cannot be made or written to; makes nothing."""
+    there = next(each for each in (folder, *folder.absolute().parents) if each.exists())
+    if not there.is_dir():
+        raise InvalidInput(f"{folder}: {there} is a file; give a folder of its own (--output)")
+    try:
+        check_writable(there)
+    except OSError as error:
+        raise InvalidInput(f"{folder}: cannot be written to ({error.strerror}); give another (--output)") from None
+
+
+def check_settings(plan: Plan) -> None:
+    """Raise ``InvalidInput`` where the folder holds an ablation with other settings, whose results would be lost."""
+    file = plan.folder / SETTINGS
+    if not file.exists():
+        return
+    kept, wanted = read_object(file, "delete it to compare anew"), plan.settings()
+    other = [name for name, value in wanted.items() if kept.get(name) != value]
+    if other:
+        told = "; ".join(
+            f"{name.replace('_', '-')} {kept.get(name)!s:.40}, here {wanted[name]}" if name in _NUMBERS else f"{name}"
+            for name in other
+        )
+        raise InvalidInput(
+            f"{plan.folder}: holds an ablation with other settings ({told}); give another folder (--output), or, to use"
+            f" its trainings, a copy of it without {SETTINGS}"
+        )
+
+
+def keep_settings(plan: Plan) -> None:
+    """Make the folder, and write the settings into it."""
+    plan.folder.mkdir(parents=True, exist_ok=True)
+    write_file(plan.folder / SETTINGS, (json.dumps(plan.settings(), indent=2) + "\n").encode())
+
+
 def same_training(config: dict[str, Any], recipe: TrainingRecipe, scenario: Scenario) -> bool:
     """Whether a run's configuration is that of this recipe and scenario."""
     given = {name: value for name, value in dict(config.get("recipe") or {}).items() if name not in WORDS}
@@ -109,11 +161,12 @@ def same_training(config: dict[str, Any], recipe: TrainingRecipe, scenario: Scen
     return (given, config.get("scenario")) == wanted
 
 
-def _content(file: Path) -> dict[str, Any]:
+def read_object(file: Path, advice: str) -> dict[str, Any]:
+    """What a JSON file holds; raises ``InvalidInput`` (file, reason, ``advice``) if that is no object."""
     try:
         content = json.loads(file.read_text("utf-8"))
     except (OSError, ValueError) as error:
-        raise InvalidInput(f"{file}: is damaged ({error}); delete its folder to train anew") from None
+        raise InvalidInput(f"{file}: is damaged ({error}); {advice}") from None
     if not isinstance(content, dict):
-        raise InvalidInput(f"{file}: is damaged (no JSON object); delete its folder to train anew")
+        raise InvalidInput(f"{file}: is damaged (no JSON object); {advice}")
     return content

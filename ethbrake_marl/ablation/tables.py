@@ -14,6 +14,7 @@ from ethbrake_marl.harm import COUNTS, HarmCount
 
 NONE = "–"
 _ALGORITHM = "Algorithm"
+_SUMS = ("", "full_brake_", "searched_", "searched_full_brake_", "searched_best_known_")  # columns of each count
 _HARM = {"first": "first-impact harm", "total": "total harm"}
 
 Json = dict[str, Any]
@@ -22,6 +23,9 @@ Json = dict[str, Any]
 def markdown(found: Json, conditions: str) -> str:
     """All tables, with their conditions below."""
     blocks = ["## Levels", *[_levels(found["levels"], count) for count in COUNTS]]
+    worlds = found["levels"][0]["first"]["searched"]["worlds"]
+    blocks += [f"## How near the joint optimum, in the first {worlds:,} worlds"]
+    blocks += [_optima(found["levels"], count) for count in COUNTS]
     for title, key in (("What each step is worth", "steps"), ("Price of lost messages", "channels")):
         if found[key]:
             blocks += [f"## {title}", _changes(found[key])]
@@ -30,13 +34,16 @@ def markdown(found: Json, conditions: str) -> str:
     return "\n\n".join([*blocks, conditions]) + "\n"
 
 
-def levels_csv(measured: Sequence[Measured]) -> str:
-    """One row per level, algorithm and seed: means over the worlds (m2/s2); best known over the searched ones."""
+def levels_csv(measured: Sequence[Measured], searched: int) -> str:
+    """One row per level, algorithm and seed: means over the worlds (m2/s2).
+
+    ``searched``: over the worlds in which the joint optimum was searched.
+    """
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     vehicles = measured[0].reached.vehicle["first"].shape[2]
     harms = [f"{_column(count)}_{i + 1}" for count in COUNTS for i in range(vehicles)]
-    sums = [f"{name}{_column(count)}" for count in COUNTS for name in ("", "full_brake_", "best_known_")]
+    sums = [f"{name}{_column(count)}" for count in COUNTS for name in _SUMS]
     writer.writerow(["level", "algorithm", "seed", "worlds", "collision_rate", *sums, *harms])
     for one in measured:
         for seed in range(len(one.reached.collided)):
@@ -45,11 +52,20 @@ def levels_csv(measured: Sequence[Measured]) -> str:
             for count in COUNTS:
                 best = "" if one.best is None else float(one.best[count].mean())
                 reached, braking = one.reached.world[count][seed], one.full_brake.world[count]
-                row += [float(reached.mean()), float(braking.mean()), best]
+                row += [float(reached.mean()), float(braking.mean())]
+                row += [float(reached[:searched].mean()), float(braking[:, :searched].mean()), best]
             for count in COUNTS:
                 row += [float(harm) for harm in one.reached.vehicle[count][seed].mean(axis=0)]
             writer.writerow(row)
     return text.getvalue()
+
+
+def interval_words(seeds: int) -> str:
+    """What the intervals of figures over so many seeds hold for."""
+    if seeds == 1:
+        return "95 % intervals for other worlds only: one seed says nothing about others"
+    rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""
+    return f"95 % intervals for other seeds and other worlds{rough}"
 
 
 def lines_markdown(found: Sequence[LineResult], question: Question, runs: int) -> str:
@@ -65,7 +81,7 @@ def lines_markdown(found: Sequence[LineResult], question: Question, runs: int) -
     conditions = (
         f"{_HARM[question.count].capitalize()} (m²/s², means per world) of the line of {name} made longer:"
         f" {runs} {'policies' if runs > 1 else 'policy'}, {question.episodes:,} worlds of seed {question.list_seed} for"
-        " each length; 95 % intervals for other seeds and other worlds."
+        f" each length; {interval_words(runs)}."
     )
     if question.search_episodes:
         conditions += (
@@ -81,13 +97,23 @@ def _of(estimate: Estimate | None, scale: float = 1.0, digits: int = 2, unit: st
 
 def _levels(levels: Sequence[Json], count: HarmCount) -> str:
     head = ["Level", _ALGORITHM, "Collisions", "All brake fully", f"Reached, {_HARM[count]}"]
-    head += ["Joint optimum", "Share of its reduction"]
     rows = []
     for level in levels:
         own = level[count]
         row = [f"`{level['level']}`", level["algorithm"] or NONE, _cell(level["collision_rate"], 100.0, 1, " %")]
-        row += [_value(own["full_brake"]), _cell(own["harm"]), _value(own["best_known"])]
-        rows.append([*row, _cell(own["realised_share"], 100.0, 1, " %")])
+        rows.append([*row, _value(own["full_brake"]), _cell(own["harm"])])
+    return _table(head, rows, left=2)
+
+
+def _optima(levels: Sequence[Json], count: HarmCount) -> str:
+    head = ["Level", _ALGORITHM, "All brake fully", f"Reached, {_HARM[count]}"]
+    head += ["Joint optimum", "Share of its reduction"]
+    rows = []
+    for level in levels:
+        own = level[count]["searched"]
+        if own["best_known"] is not None:
+            row = [f"`{level['level']}`", level["algorithm"], _value(own["full_brake"]), _cell(own["harm"])]
+            rows.append([*row, _value(own["best_known"]), _cell(own["realised_share"], 100.0, 1, " %")])
     return _table(head, rows, left=2)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from multiprocessing import active_children, get_context, parent_process
@@ -13,7 +13,7 @@ from multiprocessing.process import BaseProcess
 from ethbrake_marl.ablation.plan import Training
 from ethbrake_marl.learning.callback import Progress
 from ethbrake_marl.learning.run_directory import RunDirectory
-from ethbrake_marl.learning.teams import resume_team, train_team
+from ethbrake_marl.learning.teams import load_team, resume_team, train_team
 
 Tell = Callable[[str, int, int], None]  # what, how far, of how much
 
@@ -45,6 +45,13 @@ def train_all(trainings: Sequence[Training], jobs: int, tell: Tell | None = None
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return True
+
+
+def check_finished(trainings: Iterable[Training]) -> None:
+    """Raise what ``load_team`` raises for a finished training that cannot drive, before anything long is begun."""
+    for training in trainings:
+        if not training.steps_left():
+            load_team(training.folder, training.level.scenario)
 
 
 def _begin_worker() -> None:

@@ -21,6 +21,7 @@ from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.packed import TIME, command_at, harm_at, params_at, state_width
 from ethbrake_marl.stepping import Step
+from ethbrake_marl.v2x import news_of
 
 AT_ANY_TIME = (
     "time_s",
@@ -50,9 +51,8 @@ def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -
         state, params, wanted = (array.take(rows, axis=0) for array in (state, params, wanted))
     values = np.empty((*wanted.shape, len(AFTER_A_STEP)))
     _report_rows(state, params, wanted, values)
-    n, N = wanted.shape
-    news = params[:, params_at(5, N) :]
-    return Report(values, step, news.reshape(n, N, N).copy() if news.shape[1] else None)
+    news = params[:, params_at(5, wanted.shape[1]) :]
+    return Report(values, step, news_of(news) if news.shape[1] else None)
 
 
 @compiled

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
@@ -71,6 +71,8 @@ class EthBrakeVecEnv(VecEnv):
     def __init__(
         self, engine: Engine, seed: int, *, horizon_is_end: bool = False, appended: Appended | None = None
     ) -> None:
+        if appended not in (None, *get_args(Appended)):
+            raise InvalidInput(f"appended = {appended!r}: must be {' or '.join(get_args(Appended))}, or None")
         if not engine.learners:
             raise InvalidInput(f"scenario {engine.scenario.name!r} has no learner; pass learners=['vehicle_2']")
         self.engine = engine

@@ -46,7 +46,8 @@ def state_features(scenario: Scenario) -> tuple[Feature, ...]:
 
 def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
     """State of every world, [n, S] float32 in its own memory; S = 7 N + 2 P + 1, and 2 more with an obstacle ahead."""
-    vehicles = [observe(worlds, i, _OWN_ONLY) for i in range(worlds.N)]
+    whole_latency = replace(worlds.vehicles, known_from_s=np.empty((worlds.n, 0)))  # with what a channel has drawn
+    vehicles = [observe(replace(worlds, vehicles=whole_latency), i, _OWN_ONLY) for i in range(worlds.N)]
     pair_values = {"gap": worlds.gaps_m, "hit": worlds.pair_hit.astype(np.float64)}
     columns = [pair_values[f.name][:, p] for p in range(worlds.N - 1) for f in _PAIR_FEATURES]
     columns.append(worlds.time_s)

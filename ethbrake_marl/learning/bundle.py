@@ -67,7 +67,7 @@ def make_policy(tensors: Mapping[str, Float32s], **manifest: Any) -> Policy:
         checked = draft.model_copy(update={"manifest_sha256": own})
         return Policy(checked, _tensors(data, checked))
     except ValidationError as error:
-        raise InvalidInput(f"policy: {_first_line(error)}") from None
+        raise InvalidInput(f"policy: {first_line(error)}") from None
     except ValueError as error:
         raise InvalidInput(f"policy: {error}") from None
 
@@ -97,6 +97,8 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
     Raises ``InvalidInput`` when there is none, ``CorruptBundle`` (file, what is wrong) when it cannot be trusted.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise InvalidInput(f"policy {path!r:.60}: must be the path of a run or of a policy bundle")
     folder = _bundle_folder(Path(path))
     _check_files(folder)
     manifest = _manifest(folder / MANIFEST)
@@ -158,7 +160,7 @@ def _manifest(path: Path) -> Manifest:
         content = parse_strict_json(data)
         manifest = Manifest.model_validate_json(data)
     except ValidationError as error:
-        raise CorruptBundle(f"{path}: {_first_line(error)}") from None
+        raise CorruptBundle(f"{path}: {first_line(error)}") from None
     except ValueError as error:
         raise CorruptBundle(f"{path}: {error}") from None
     found = content_sha256(content)
@@ -175,7 +177,8 @@ def _manifest(path: Path) -> Manifest:
     return manifest
 
 
-def _first_line(error: ValidationError) -> str:
+def first_line(error: ValidationError) -> str:
+    """Where the first mistake is, and what: pydantic's own message has several lines."""
     first = error.errors(include_url=False)[0]
     where = ".".join(str(part) for part in first["loc"])
     reason = first["msg"].removeprefix("Value error, ")

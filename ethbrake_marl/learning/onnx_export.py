@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ def onnx_model(policy: Policy) -> bytes:
     try:
         import onnx  # only here: an extra
     except ImportError:
-        raise InvalidInput("ONNX export needs the package onnx: pip install 'ethbrake-marl[export]'") from None
+        raise InvalidInput(f"ONNX export needs the package onnx: {sys.executable} -m pip install onnx") from None
     writer = _Writer(onnx)
     action = writer.actor(policy)
     features = {f.name: (k, f.scale) for k, f in enumerate(policy.observation.features)}

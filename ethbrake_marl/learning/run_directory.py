@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from ethbrake_marl.durable_files import new_folder, write_file
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
@@ -78,7 +78,7 @@ class RunRecord:
 
     def __init__(self, run: RunDirectory) -> None:
         self._run = run
-        self._started = _read_status(run).get("started_utc") or _now()
+        self._started = _read_object(run.status).get("started_utc") or _now()
         write_status(run, "running", {"started_utc": self._started})
 
     def end(self, status: RunStatus, reason: str | None, left: Mapping[str, Any]) -> None:
@@ -95,12 +95,19 @@ def write_status(run: RunDirectory, status: RunStatus, more: Mapping[str, Any]) 
     run.write_json(run.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **more})
 
 
-def _read_status(run: RunDirectory) -> dict[str, Any]:
+def _read_object(file: Path) -> dict[str, Any]:
+    """The JSON object in a file of a run; raises ``InvalidInput`` naming the file and what is wrong with it."""
     try:
-        content = parse_strict_json(run.status.read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
+        content = parse_strict_json(file.read_bytes())
+    except FileNotFoundError:
+        raise InvalidInput(f"{file}: is missing; without it this training cannot go on") from None
+    except OSError as error:
+        raise InvalidInput(f"{file}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise InvalidInput(f"{file}: is damaged: {error}") from None
+    if not isinstance(content, dict):
+        raise InvalidInput(f"{file}: is damaged: holds no JSON object")
+    return content
 
 
 def _now() -> str:
@@ -134,21 +141,25 @@ def create_run(
 
 
 def open_run(path: Path) -> tuple[RunDirectory, dict[str, Any]]:
-    """The run in ``path`` and its configuration; raises ``InvalidInput`` when there is none, or it has finished."""
+    """The run in ``path`` and its configuration.
+
+    Raises ``InvalidInput`` when there is none, or naming the file of it that is damaged.
+    """
     run = RunDirectory(path)
-    status = _read_status(run)
-    if status.get("format") != "ethbrake-run" or not run.config.is_file():
+    if not (run.status.exists() or run.config.exists()):
         raise InvalidInput(f"{path}: holds no training; give the folder of a run, for instance runs/my-run")
-    resumable = any(run.checkpoints.glob("step_*"))
-    if status.get("status") == "finished" or (status.get("stage") is not None and not resumable):
-        raise InvalidInput(
-            f"{path}: this training has finished; measure its policy with: ethbrake evaluate --agents hybrid@{path}"
-        )
-    try:
-        config: dict[str, Any] = parse_strict_json(run.config.read_bytes())
-    except ValueError as error:
-        raise InvalidInput(f"{run.config}: {error}") from None
+    status, config = _read_object(run.status), _read_object(run.config)
+    for key, right in (("format", ("ethbrake-run",)), ("status", get_args(RunStatus))):
+        if status.get(key) not in right:
+            raise InvalidInput(f"{run.status}: {key} = {status.get(key)!r:.60}: must be {' or '.join(right)}")
     return run, config
+
+
+def has_finished(run: RunDirectory) -> bool:
+    """Whether the training in an open run has come to its end, though its report may not."""
+    status = _read_object(run.status)
+    resumable = any(run.checkpoints.glob("step_*"))
+    return status.get("status") == "finished" or (status.get("stage") is not None and not resumable)
 
 
 @contextmanager

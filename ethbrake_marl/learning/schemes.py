@@ -45,7 +45,12 @@ def check_scheme(name: str) -> Scheme:
 def drivers(scheme: Scheme, scenario: Scenario) -> dict[str, str]:
     """Learner -> where in the run's folder the bundle stands that drives it, front to rear."""
     names = [scenario.vehicle_names[vehicle] for vehicle in scenario.learners]
-    return {name: f"{POLICY}/{name}" if scheme == "independent" else POLICY for name in names}
+    return {name: driver(scheme, name) for name in names}
+
+
+def driver(scheme: Scheme, vehicle: str) -> str:
+    """Where in the run's folder the bundle stands that drives a learner."""
+    return f"{POLICY}/{vehicle}" if scheme == "independent" else POLICY
 
 
 def who_drives_what(given: dict[str, str]) -> str:

@@ -14,15 +14,19 @@ from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.learning.bundle import Policy, load_policy
 from ethbrake_marl.learning.recipe import Scheme
-from ethbrake_marl.learning.schemes import drivers
+from ethbrake_marl.learning.schemes import driver, drivers
 from ethbrake_marl.learning.strict_json import parse_strict_json
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario.consistency import refuse
+from ethbrake_marl.scenario.validation_messages import explain
+from ethbrake_marl.scenario.yaml_loading import Document, YamlPath
 
 TEAM = "team.json"
 _LIMIT_BYTES = 1 << 20
-
-Name = Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")]
-BundleFolder = Annotated[str, Field(pattern=r"^policy(/vehicle_[1-9][0-9]?)?$")]
+_RIGHT = (
+    'right is, for instance, {"scheme": "shared", "vehicles": 3, "drivers": {"vehicle_2": "policy", "vehicle_3":'
+    ' "policy"}}'
+)
 
 
 class _TeamFile(BaseModel):
@@ -31,15 +35,38 @@ class _TeamFile(BaseModel):
     format: Literal["ethbrake-team"] = "ethbrake-team"
     format_version: Literal[1] = 1
     scheme: Scheme
-    vehicles: Annotated[int, Field(ge=2)]
-    drivers: Annotated[dict[Name, BundleFolder], Field(min_length=1)]
+    vehicles: Annotated[int, Field(ge=2, le=64)]
+    drivers: Annotated[dict[str, str], Field(min_length=1)]
 
     @model_validator(mode="after")
-    def _drivers_of_the_line(self) -> _TeamFile:
-        for name in self.drivers:
-            if int(name.removeprefix("vehicle_")) > self.vehicles:
-                raise ValueError(f"drivers: {name} in a line of {self.vehicles}")
+    def _drivers_of_the_line_and_scheme(self) -> _TeamFile:
+        line = [f"vehicle_{i + 1}" for i in range(self.vehicles)]
+        for name, bundle in self.drivers.items():
+            if name not in line:
+                refuse(("drivers",), name, f"must be one of {line[0]} to {line[-1]}")
+            if bundle != driver(self.scheme, name):
+                refuse(("drivers", name), bundle, f"must be {driver(self.scheme, name)} under scheme {self.scheme}")
+        alone = len(self.drivers) == 1
+        if (self.scheme == "single" and not alone) or (self.scheme == "independent" and alone):
+            right = "two vehicles or more" if alone else "one vehicle"
+            refuse(("drivers",), self.drivers, f"must be {right} under scheme {self.scheme}")
         return self
+
+
+class _TeamWording:
+    """The ``Wording`` of messages about ``team.json``."""
+
+    def known(self, path: YamlPath) -> list[str]:
+        """The keys of the file."""
+        return list(_TeamFile.model_fields)
+
+    def needed(self, path: YamlPath) -> str:
+        """A whole file."""
+        return _RIGHT
+
+    def owner(self, path: YamlPath) -> str:
+        """Nobody's."""
+        return ""
 
 
 def team_content(scheme: Scheme, scenario: Scenario) -> dict[str, Any]:
@@ -54,13 +81,14 @@ def is_team(path: str | os.PathLike[str]) -> bool:
     return os.path.isfile(file) and len(set(_read(file).drivers.values())) > 1
 
 
-def load_team(path: str | os.PathLike[str], scenario: Scenario, name: str = "team") -> Team:
+def load_team(path: str | os.PathLike[str], scenario: str | Path | Scenario, name: str = "team") -> Team:
     """The learners of ``scenario`` driven as they were trained together in the run at ``path``.
 
     A learner that the scenario gives a script is left out. Raises ``InvalidInput`` where there is no team, for one of
     another line length, or for a learner that it does not drive; ``CorruptBundle`` (file, what is wrong) for a damaged
     one.
     """
+    scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     file = Path(path) / TEAM
     if not file.is_file():
         raise InvalidInput(f"{path}: holds no team ({TEAM}); give the folder of a run, or a bundle as ppo@{path}")
@@ -95,14 +123,11 @@ def load_driver(path: str | os.PathLike[str], vehicle: str) -> Policy:
 def _read(file: Path) -> _TeamFile:
     try:
         with file.open("rb") as opened:
-            data = opened.read(_LIMIT_BYTES)
-        parse_strict_json(data)
-        return _TeamFile.model_validate_json(data)
+            content = parse_strict_json(opened.read(_LIMIT_BYTES))
+        return _TeamFile.model_validate(content)
     except OSError as error:
         raise InvalidInput(f"{file}: cannot be read ({error.strerror})") from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise CorruptBundle(f"{file}: {where}: {first['msg']}") from None
+        raise CorruptBundle(str(explain(error, Document(str(file), content, {}), _TeamWording()))) from None
     except ValueError as error:
-        raise CorruptBundle(f"{file}: {error}") from None
+        raise CorruptBundle(f"{file}: is not JSON ({error}); {_RIGHT}") from None

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ethbrake_marl.learning.bundle import Policy
 from ethbrake_marl.learning.policy_team import drivers_of
-from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe
+from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.learning.schemes import drivers
 from ethbrake_marl.learning.team_file import is_team as is_team
 from ethbrake_marl.learning.team_file import load_driver as load_driver
 from ethbrake_marl.learning.team_file import load_team as load_team
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
     from ethbrake_marl.learning.callback import Progress
@@ -41,8 +41,8 @@ class TeamResult:
 
 
 def train_team(
-    recipe: TrainingRecipe,
-    scenario: Scenario,
+    recipe: TrainingRecipe | str | Path,
+    scenario: Scenario | str | Path,
     directory: str | Path,
     *,
     scheme: Scheme | None = None,
@@ -54,14 +54,16 @@ def train_team(
 ) -> TeamResult:
     """Train the learners of ``scenario`` into the new ``directory``, measuring the team on the recipe's fixed list.
 
-    ``scheme`` (see docs/cooperation.md), ``turns``, ``seed`` and ``steps`` override the recipe; without a scheme one
-    learner is ``single`` and several are ``shared``. Everything else is as for ``learning.train.train``: the same bits
-    from the same seed, Ctrl-C, checkpoints, resume, what it raises. Raises ``InvalidInput`` for a scheme that does not
-    fit the learners or the algorithm.
+    Recipe and scenario may be given by name or path, too. ``scheme`` (see docs/cooperation.md), ``turns``, ``seed`` and
+    ``steps`` override the recipe; without a scheme one learner is ``single`` and several are ``shared``. Everything
+    else is as for ``learning.train.train``: the same bits from the same seed, Ctrl-C, checkpoints, resume, what it
+    raises. Raises ``InvalidInput`` for a scheme that does not fit the learners or the algorithm.
     """
     from ethbrake_marl.learning.measure import measure_on_list  # these two import torch, a team that drives needs none
     from ethbrake_marl.learning.train import run_training
 
+    recipe = recipe if isinstance(recipe, TrainingRecipe) else load_recipe(recipe)
+    scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     changes = {"scheme": scheme, "turns": turns, "seed": seed, "total_steps": steps}
     recipe = recipe.replace(**{name: value for name, value in changes.items() if value is not None})
     measure = measure_on_list(recipe, scenario)

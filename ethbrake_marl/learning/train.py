@@ -14,21 +14,21 @@ from pydantic import ValidationError
 from ethbrake_marl.durable_files import remove_unfinished
 from ethbrake_marl.envs.sb3 import Appended, EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.bundle import Policy
+from ethbrake_marl.learning.bundle import Policy, first_line
 from ethbrake_marl.learning.callback import BetweenUpdates, Evaluate, Progress
 from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
 from ethbrake_marl.learning.course import Course
 from ethbrake_marl.learning.models import make_model, policy_maker
 from ethbrake_marl.learning.random_state import own_random_state
-from ethbrake_marl.learning.recipe import SacRecipe, Scheme, TrainingRecipe, recipe_of
-from ethbrake_marl.learning.run_directory import RunDirectory, create_run, only_process, open_run
+from ethbrake_marl.learning.recipe import SacRecipe, Scheme, TrainingRecipe, load_recipe, recipe_of
+from ethbrake_marl.learning.run_directory import RunDirectory, create_run, has_finished, only_process, open_run
 from ethbrake_marl.learning.schemes import scheme_of
 from ethbrake_marl.learning.session import Ended, Session
 from ethbrake_marl.learning.stop_signal import stop_on_signal
 from ethbrake_marl.learning.team_file import team_content
 from ethbrake_marl.learning.versions import installed_versions
 from ethbrake_marl.observations import observation_for
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, load_scenario
 
 _APPENDED: dict[Scheme, Appended] = {"independent": "number", "centralised": "state"}
 
@@ -60,8 +60,8 @@ class TrainResult:
 
 
 def train(
-    recipe: TrainingRecipe,
-    scenario: Scenario,
+    recipe: TrainingRecipe | str | Path,
+    scenario: Scenario | str | Path,
     directory: str | Path,
     *,
     seed: int | None = None,
@@ -72,7 +72,8 @@ def train(
 ) -> TrainResult:
     """Train on ``scenario`` (its roles say who learns; several learners share one policy) into the new ``directory``.
 
-    A recipe whose scheme makes a policy for each learner is for ``learning.teams.train_team``.
+    Recipe and scenario may be given by name or path, too. A recipe whose scheme makes a policy for each learner is for
+    ``learning.teams.train_team``.
     ``seed`` and ``steps`` override the recipe. Training ends after the first update at or beyond ``steps``.
     ``evaluate(policy)`` is called before the first update, then as the recipe says, and at the end. The same recipe,
     scenario, seed and machine give the same policy, bit for bit; global random states are left as they were.
@@ -82,6 +83,8 @@ def train(
     ``resume`` goes on. Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` for a
     scenario without learners, ``TrainingDiverged`` for numbers that are not finite.
     """
+    recipe = recipe if isinstance(recipe, TrainingRecipe) else load_recipe(recipe)
+    scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     if scheme_of(recipe, scenario) == "independent":
         raise InvalidInput(f"recipe {recipe.name!r}: scheme independent makes several policies; use train_team")
     changes = {"seed": seed, "total_steps": steps}
@@ -135,17 +138,37 @@ def resume_training(
     """What ``resume`` does, under whatever scheme."""
     run, recipe, scenario = _asked_for(directory)
     measure = None if evaluate is None else evaluate(recipe, scenario)
-    return _run(lambda: (run, other_versions), recipe, scenario, measure, on_progress)
+    team = team_content(scheme_of(recipe, scenario), scenario)
+
+    def begin() -> tuple[RunDirectory, bool]:
+        run.write_json(run.team, team)  # follows from what was asked for; a damaged one would stay
+        return run, other_versions
+
+    return _run(begin, recipe, scenario, measure, on_progress)
 
 
 def _asked_for(directory: Path) -> tuple[RunDirectory, TrainingRecipe, Scenario]:
     """The training that was begun in a folder."""
     run, config = open_run(directory)
+    if "library" in config:
+        raise InvalidInput(
+            f"{directory}: was trained by {config['library']}, which leaves nothing to go on from; train again"
+        )
     try:
         recipe = recipe_of(json.dumps(config["recipe"]))
         scenario = Scenario.model_validate_json(json.dumps(config["scenario"]))
-    except (KeyError, ValidationError) as error:
-        raise InvalidInput(f"{run.config}: is not the configuration of a training ({error})") from None
+    except KeyError as error:
+        raise InvalidInput(f"{run.config}: is not the configuration of a training: {error} is missing") from None
+    except ValidationError as error:
+        raise InvalidInput(f"{run.config}: scenario: {first_line(error)}") from None
+    except InvalidInput as error:
+        raise InvalidInput(f"{run.config}: {error}") from None
+    if has_finished(run):
+        agents = f"{'team' if len(scenario.learners) > 1 else 'hybrid'}@{directory}"
+        raise InvalidInput(
+            f"{directory}: this training has finished; measure what it has learned with: ethbrake evaluate --scenario"
+            f" {scenario.name} --agents {agents}"
+        )
     return run, recipe, scenario
 
 

@@ -9,7 +9,7 @@ state   time, speeds N, commands in force N, commands in force before N, gaps P,
         episode began: first-impact harm P, total harm P, impacts P; and, where worlds have an obstacle ahead: gap to it
         (infinite: none), hit flag, and since the episode began: first-impact harm, total harm, impacts
 params  restitution, braking N, driving N, latency N, mass N, speed limit N; and, where it is told, when vehicle i has
-        the news of vehicle j, N * N columns (``Vehicles.known_from_s``)
+        the news of vehicle j, and the own parts of latencies, N * N columns (``Vehicles.known_from_s``)
 """
 
 from __future__ import annotations

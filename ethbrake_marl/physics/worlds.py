@@ -39,7 +39,9 @@ class Vehicles:
     mass_t: Floats  # [n, N] > 0
     speed_limit_mps: Floats  # [n, N] driving stops here, > 0
     restitution: Floats  # [n] in [0, 1]
-    known_from_s: Floats  # [n, 0], or [n, N * N] when vehicle i has the news of vehicle j, in column i * N + j; ``v2x``
+    # [n, 0], or [n, N * N] (``v2x``), in column i * N + j: when vehicle i has the news of vehicle j; where i is j: the
+    # own part of its latency
+    known_from_s: Floats
 
     def take(self, rows: ArrayLike) -> Vehicles:
         """Select worlds by index or mask (always a copy)."""

@@ -93,7 +93,7 @@ def check_objective(declared: Declared, vehicles: int) -> None:
     try:
         objectives_of(declared, vehicles)
     except InvalidInput as error:
-        refuse((), declared, str(error))
+        refuse((), declared, str(error).removeprefix("objective: "))
 
 
 def check_alternatives(scenario: Scenario) -> None:
@@ -137,7 +137,7 @@ def _check_reactions(scenario: Scenario) -> None:
         i = int(np.argmin(latest < scenario.horizon_s))
         right = (
             f"vehicle_{i + 1} may have no news until {latest[i]:g} s; it must be below horizon_s"
-            f" ({scenario.horizon_s:g} s)"
+            f" ({scenario.horizon_s:g} s), which may be raised"
         )
         refuse(("v2x",), scenario.v2x, right)
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.numerals import parse_numeral
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds, make_worlds
 from ethbrake_marl.scenario.distributions import support
-from ethbrake_marl.scenario.numerals import parse_numeral
 from ethbrake_marl.scenario.quantities import DECLARED, OPTIONAL, QUANTITIES, QuantityRule, suggestion
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.v2x import fixed_news
@@ -124,10 +124,9 @@ def initial_state_worlds(initial_state: Mapping[str, Any], scenario: Scenario) -
         count = known[field].count(scenario.vehicles)
         numbers = _numbers(f"initial_state: {field}", value)
         if numbers.shape not in ((), (count,)):
-            raise InvalidInput(
-                f"initial_state: {field} has shape {list(numbers.shape)}; {scenario.vehicles} vehicles need {count}"
-                " numbers, or one for all"
-            )
+            several = f"{scenario.vehicles} vehicles need {count} numbers, or one for all"
+            right = "must be one number" if known[field].per == "world" else several
+            raise InvalidInput(f"initial_state: {field} has shape {list(numbers.shape)}; {right}")
         for index, number in enumerate(np.broadcast_to(numbers, (count,))):
             given[field, index] = np.array([number])
     return _worlds(given, scenario, _Naming("initial_state", "state"))

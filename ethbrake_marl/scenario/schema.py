@@ -127,7 +127,7 @@ class Scenario(BaseModel):
         check_roles(value, vehicles)
         return complete_roles(value, vehicles)
 
-    @field_validator("objective")
+    @field_validator("objective", mode="before")
     @classmethod
     def _objective(cls, value: Any, info: ValidationInfo) -> Any:
         if "vehicles" in info.data:

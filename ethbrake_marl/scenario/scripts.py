@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.numerals import parse_numeral
 from ethbrake_marl.physics.worlds import Floats
-from ethbrake_marl.scenario.numerals import parse_numeral
 
 LEARNER = "learner"
 STATE_FREE = ("full_brake", "coast", "constant")  # names of the scripts whose command never depends on the state

@@ -8,9 +8,9 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.numerals import parse_numeral
 from ethbrake_marl.scenario.distributions import DISTRIBUTIONS
 from ethbrake_marl.scenario.flow_text import flow_text
-from ethbrake_marl.scenario.numerals import parse_numeral
 from ethbrake_marl.scenario.quantities import suggestion
 from ethbrake_marl.scenario.yaml_loading import Document, YamlPath
 

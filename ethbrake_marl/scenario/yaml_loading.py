@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 import yaml
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario.numerals import parse_numeral
+from ethbrake_marl.numerals import parse_numeral
 
 SIZE_LIMIT = 64 * 1024  # bytes
 DEPTH_LIMIT = 16  # mappings and lists inside each other

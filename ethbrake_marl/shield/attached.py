@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.actions import command_to_action
-from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
+from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.profile_problem import state_columns
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.engine import Engine
@@ -18,7 +17,8 @@ from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.shield.certify import REASONS, Decision
 from ethbrake_marl.shield.guard import StepShield
-from ethbrake_marl.shield.rollouts import Proposer
+from ethbrake_marl.shield.rollouts import Proposer, proposed_action
+from ethbrake_marl.shield.settings import only_shielded, proposing_agent
 from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
 
 
@@ -26,24 +26,23 @@ class AttachedShield:
     """A ``StepShield`` that begins with the engine's episodes and sees the engine's worlds.
 
     ``policy`` (an agent, a loaded policy, or None) is rolled out at each alert, and proposes where nobody else does.
-    Raises ``InvalidInput`` for an environment without an engine, or with another number of learners than one.
+    ``where`` is who builds it, for messages. Raises ``InvalidInput`` for another number of learners than one.
     """
 
     def __init__(
         self,
-        env: object,
+        engine: Engine,
         policy: Agent | LearnedPolicy | None,
         *,
         count: HarmCount = "first",
         allowance: float = 0.0,
         uncertainty: Uncertainty | str | None = None,
         logging: bool = False,
+        where: str = "shield",
     ) -> None:
-        self.engine = engine_of(env)
-        self.vehicle = only_shielded(self.engine)
-        if not (policy is None or isinstance(policy, Agent) or callable(policy)):
-            raise InvalidInput(f"shield: policy = {policy!r}: must be an agent, a policy (eb.load_policy) or None")
-        self.policy = policy if policy is None or isinstance(policy, Agent) else LearnedAgent(policy)
+        self.engine = engine
+        self.vehicle = only_shielded(engine, where)
+        self.policy = None if policy is None else proposing_agent(policy, where)
         self.shield = StepShield(
             self.engine.scenario, self.vehicle, count=count, allowance=allowance, others=self.engine.scripts,
             uncertainty=checked_uncertainty(uncertainty), logging=logging,
@@ -55,8 +54,7 @@ class AttachedShield:
         """What the policy itself would do now, as actions [n]."""
         if self.policy is None:
             raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
-        worlds = self.engine.worlds
-        return command_to_action(self.policy.act(worlds, self.vehicle), worlds.vehicles, self.vehicle)
+        return proposed_action(self.policy, self.engine.worlds, self.vehicle)
 
     def decide(self, proposed: Floats) -> Floats:
         """The actions [n] to apply instead of those proposed."""
@@ -107,23 +105,3 @@ class AttachedShield:
         if self.policy is not None:
             self.policy.begin(worlds, self.vehicle, rows)
         self.shield.begin(worlds, rows, self.policy)
-
-
-def engine_of(env: object) -> Engine:
-    """The engine of one of this package's environments, whatever wraps it."""
-    engine = getattr(getattr(env, "unwrapped", env), "engine", None)
-    if not isinstance(engine, Engine):
-        raise InvalidInput(f"HybridShield: {env} is not one of this package's environments (eb.parallel_env)")
-    return engine
-
-
-def only_shielded(engine: Engine) -> int:
-    """Index of the one learner, which is shielded; ``InvalidInput`` when there is none or more than one."""
-    if len(engine.learners) != 1:
-        learners = ", ".join(engine.scenario.vehicle_names[i] for i in engine.learners) or "none"
-        raise InvalidInput(
-            f"HybridShield: the environment has {len(engine.learners)} learners ({learners}), a shield needs exactly"
-            " one learner: what is certified is known only if every other vehicle follows a script; pass"
-            " learners=['vehicle_2'] to the environment"
-        )
-    return engine.learners[0]

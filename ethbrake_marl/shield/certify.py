@@ -20,9 +20,6 @@ operations of the engine's step in their order, and adds harm in its order. So:
 The budget is ``c`` (or anything between ``c`` and ``B``), so ``c <= B`` always. ∎ No tolerance enters: where the engine
 does what it is said to do, realised harm and the last bound are the same double.
 
-**Several members.** Where a world has more than one (``shield.uncertainty``), each is advanced by the same actions, and
-every harm above is the largest over them. Then the harm realised in *any* member is at most ``B``.
-
 **Several members.** Where a world has more than one (``shield.uncertainty``), every harm above is the largest over
 them, each member being advanced by the same actions: then the realised harm of *every* member is at most ``B``.
 """
@@ -157,6 +154,11 @@ def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Fl
     if not np.isfinite(value).all():
         raise PhysicsError(f"shield: world {int(np.argmin(np.isfinite(value)))} could not be advanced")
     return plans, value
+
+
+def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
+    """The plans [n, L] that are ``past`` before the decisions ``steps`` [n], which was applied, and ``later`` after."""
+    return np.where(np.arange(past.shape[1]) < steps[:, np.newaxis], past, later)
 
 
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:

@@ -15,11 +15,12 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import drive, introduce, scripted
 from ethbrake_marl.agents.e_v2x_bm import EV2XBM
-from ethbrake_marl.agents.protocol import Agent, check_agent, place
+from ethbrake_marl.agents.protocol import Agent, check_agent, place, recall
 from ethbrake_marl.agents.rehearsed import Rehearsed
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.shield.settings import check_scenario
 
 Bound = Literal["coupled", "pairwise"]
 
@@ -36,6 +37,7 @@ class HybridAgent:
         self, policy: Agent, scenario: Scenario, *, bound: Bound = "coupled", count: HarmCount = "first"
     ) -> None:
         check_agent(policy, "hybrid")
+        check_scenario(scenario, "hybrid")
         self.policy = policy
         self.backup = EV2XBM(bound, count=count, horizon_s=scenario.horizon_s)
         self.scenario = scenario
@@ -75,6 +77,8 @@ class HybridAgent:
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """Wanted signed acceleration of the chosen strategy, [n] m/s2."""
+        self.policy_harm = recall(self.policy_harm, worlds.n, self.name)  # of this batch; an earlier one may be larger
+        self.bound_harm = recall(self.bound_harm, worlds.n, self.name)
         return np.where(self.chosen_policy, self.policy.act(worlds, vehicle), self.backup.act(worlds, vehicle))
 
     def _harm(self, worlds: Worlds, agent: Agent, vehicle: int) -> Floats:

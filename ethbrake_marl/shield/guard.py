@@ -27,10 +27,12 @@ from ethbrake_marl.shield.certify import (
     begin_running,
     bettered_plan,
     certify,
+    from_now,
     plan_harm,
 )
 from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE
 from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, rolled_out
+from ethbrake_marl.shield.settings import check_amount, check_scenario
 from ethbrake_marl.shield.uncertainty import Uncertainty
 from ethbrake_marl.starts import Script
 
@@ -44,6 +46,7 @@ class Intervention(NamedTuple):
     """One decision in which something else than the proposal was applied."""
 
     world: int  # row of the batch
+    episode: int  # of that row, from 0
     step: int  # number of the decision
     time_s: float
     proposed: float  # action, as it was given
@@ -52,7 +55,7 @@ class Intervention(NamedTuple):
     bound: float  # m2/s2, from now on
     margin: float  # m2/s2; negative: what the proposal would have cost beyond the budget at least
     state: Floats  # [S] at the decision
-    plan: Floats  # [L] that was held
+    plan: Floats  # [L] that was held; before ``step`` what was applied
 
 
 class StepShield:
@@ -60,13 +63,14 @@ class StepShield:
 
     The bound starts as the harm of the coupled optimum, realised decision by decision, or as that of a ``policy``
     rolled out from the alert where that is lower, and only ever falls; ``allowance`` (m2/s2) is what the budget grants
-    above it (0: none). The other vehicles follow ``others`` (default: the scenario's scripts), whose commands must be
-    fixed at the alert. What happens is compared with what was predicted, bit by bit: where it differs (a vehicle that
-    brakes beyond its capacity, a number that is none, a message that never came) ``distrusted`` [n] is set, nothing is
-    guaranteed any more, and for the rest of the episode the fallback ``best constant`` drives: the better one of the
-    plan's rest and the constants, chosen again after every surprise. With an ``uncertainty`` (robust mode) all of this
-    holds for the worst member of each world, and what is seen must lie within the range of their predictions. Raises
-    ``InvalidInput`` for an unknown count, a negative allowance, or others whose commands are not fixed.
+    above it (0: none), and the bound is then that budget until the episode ends. The other vehicles follow ``others``
+    (default: the scenario's scripts), whose commands must be fixed at the alert. What happens is compared with what was
+    predicted, bit by bit: where it differs (a vehicle that brakes beyond its capacity, a number that is none, a message
+    that never came) ``distrusted`` [n] is set, nothing is guaranteed any more, and for the rest of the episode the
+    fallback ``best constant`` drives: the better one of the plan's rest and the constants, chosen again after every
+    surprise. With an ``uncertainty`` (robust mode) all of this holds for the worst member of each world, and what is
+    seen must lie within the range of their predictions. Raises ``InvalidInput`` for an unknown count or vehicle, a
+    negative allowance, or others whose commands are not fixed.
     """
 
     fallback = "best constant"
@@ -83,36 +87,50 @@ class StepShield:
         logging: bool = False,
     ) -> None:
         check_count(count)
-        if not 0.0 <= allowance < np.inf:
-            raise InvalidInput(f"shield: allowance = {allowance!r}: must be at least 0 m2/s2")
+        check_scenario(scenario, "shield")
+        check_amount("allowance", allowance, "shield", " m2/s2")
+        if vehicle not in range(scenario.vehicles):
+            raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
         self.scenario, self.vehicle, self.count, self.allowance = scenario, vehicle, count, allowance
         self.uncertainty = uncertainty
         self.log: list[Intervention] | None = [] if logging else None
         self.running: Running | None = None
         self.backup = Backup(np.zeros((0, 0)), np.zeros(0))
-        self._budget: Floats = np.zeros(0)
         self.first_bound: Floats = np.zeros(0)  # [n] harm of the backup at the first decision
         self.alone_harm: Floats = np.zeros(0)  # [n] of the policy rolled out; infinity without one
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
+        self.episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode
         self.distrusted: Bools = np.zeros(0, np.bool_)
         self._others = scripted(scenario, but=vehicle) if others is None else others
         self._width = int(np.ceil(scenario.horizon_s / scenario.time_step_s)) + 1
 
     @property
     def bound(self) -> Floats:
-        """Harm of each running episode is at most this, [n] m2/s2 (beside an ``allowance``)."""
-        return self.backup.harm
-
-    @property
-    def budget(self) -> Floats:
-        """What certificates may reach, [n] m2/s2."""
-        return np.maximum(self.backup.harm, np.minimum(self._budget, self.first_bound + self.allowance))
+        """Harm of each running episode is at most this, [n] m2/s2: what certificates may reach."""
+        if self.running is None or self.allowance == 0.0:
+            return self.backup.harm
+        granted = np.where(self.running.finished, 0.0, self.first_bound + self.allowance)
+        return np.maximum(self.backup.harm, granted)
 
     def begin(self, worlds: Worlds, rows: Ints, policy: Agent | None = None) -> None:
-        """New episodes start in these rows; ``worlds`` holds those rows only, at the alert, as they are believed."""
-        scenario, vehicle = self.scenario, self.vehicle
+        """New episodes start in these rows; ``worlds`` holds those rows only, at the alert, as they are believed.
+
+        Rows 0 to k - 1 together may also begin a larger batch. Raises ``InvalidInput`` for rows that are not there.
+        """
+        scenario, vehicle, running_rows = self.scenario, self.vehicle, len(self.first_bound)
+        if not (rows < running_rows).all() and sorted(rows.tolist()) != list(range(len(rows))):
+            raise InvalidInput(
+                f"shield: begin in row {rows.max()} of a batch of {running_rows}: a larger batch begins with all of its"
+                " rows at once"
+            )
         possible = worlds if self.uncertainty is None else self.uncertainty.members(worlds)
         members = possible.n // worlds.n
+        latest = possible.vehicles.latency_s[:, vehicle].max()
+        if members > 1 and not latest < scenario.horizon_s:
+            raise InvalidInput(
+                f"uncertainty: {self.uncertainty}: vehicle_{vehicle + 1} may decide first at {latest:g} s; must be"
+                f" before the horizon, {scenario.horizon_s:g} s"
+            )
         others = fixed_commands(self._others, possible, "shield", vehicle=vehicle)
         best = optimise_coupled(
             worlds, vehicle, count=self.count, horizon_s=scenario.horizon_s, others_mps2=others[::members]
@@ -146,7 +164,10 @@ class StepShield:
         ``seen`` [n, columns]: the worlds as they are now, in the first columns of ``Running.states``. Where nothing
         else certifies a proposal, the ``proposer`` (if given) is rolled out from the state after it.
         """
-        assert self.running is not None
+        if self.running is None:
+            raise InvalidInput("shield: decide, but no episode has begun; call begin first")
+        if np.shape(proposed) != self.distrusted.shape:
+            raise InvalidInput(f"shield: proposed {np.shape(proposed)}; {self.distrusted.shape} is needed")
         asked = ~self.running.finished if only is None else only
         if seen is not None:
             self._compare(seen, asked)
@@ -155,19 +176,26 @@ class StepShield:
         each = np.repeat(asked, before.members)
         now = before._replace(ended=before.ended | ~each)
         given = np.where(self.distrusted, np.nan, np.asarray(proposed, np.float64))
-        held, budget = self.backup, self.budget
+        held, budget = self.backup, self.bound
         decision = certify(now, given, held, budget)
         if proposer is not None and (rows := np.flatnonzero(decision.reason == NO_CERTIFICATE)).size:
-            width = held.plan.shape[1]
-            decision = _merged(decision, rows, certify_rollouts(now, given, rows, budget, width, proposer))
+            decision = _merged(decision, rows, certify_rollouts(now, given, rows, budget, held.plan, proposer))
         decision.reason[asked & self.distrusted] = BROKEN
         self.interventions = self.interventions + (decision.intervened & asked)
-        if self.log is not None:
-            self._write(now, proposed, decision, held)
         self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
         self.backup = decision.backup
-        self._budget = np.where(asked & (self.allowance == 0.0), decision.bound, self._budget)
+        decision = decision._replace(bound=self.bound)
+        if self.log is not None:
+            self._write(now, proposed, decision, held)
         return decision
+
+    def keep(self, n: int) -> None:
+        """Keep the first ``n`` rows only: a smaller batch has begun."""
+        assert self.running is not None
+        self.running = self.running.take(np.arange(n))
+        self.backup = self.backup._replace(plan=self.backup.plan[:n], harm=self.backup.harm[:n])
+        for name in ("first_bound", "alone_harm", "interventions", "distrusted", "episode"):
+            setattr(self, name, getattr(self, name)[:n])
 
     def commands(self, actions: Floats) -> Floats:
         """Wanted signed accelerations of actions, to the bits of the engine, [n] m/s2."""
@@ -191,8 +219,9 @@ class StepShield:
         self.running = running._replace(states=states, ended=ended)
         plan, harm = self.backup.plan.copy(), self.backup.harm.copy()
         harm[rows] = np.inf
+        held = self.backup.plan
         for constant in (None, *self.backup.constants):
-            trial = self.backup.plan if constant is None else np.full_like(plan, constant)
+            trial = held if constant is None else from_now(held, constant, running.steps)
             found = _harm_of(self.running, trial, rows)
             better = rows[found < harm[rows]]
             harm[rows] = np.minimum(found, harm[rows])
@@ -201,14 +230,19 @@ class StepShield:
 
     def _place(self, rows: Ints, running: Running, backup: Backup, alone: Floats) -> None:
         """Keep new episodes in these rows."""
-        if self.running is None or len(rows) == len(self.first_bound):
+        count, old = len(rows), self.running
+        new: dict[str, NDArray[Any]] = {
+            "first_bound": backup.harm, "alone_harm": alone, "interventions": np.zeros(count, np.int64),
+            "distrusted": np.zeros(count, np.bool_),
+        }  # fmt: skip
+        if old is None or count >= old.n:
             order = np.argsort(rows)
             self.running, self.backup = running.take(order), Backup(backup.plan[order], backup.harm[order])
-            self.first_bound, self.alone_harm = backup.harm[order], alone[order]
-            self._budget = self.first_bound + self.allowance
-            self.interventions, self.distrusted = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.bool_)
+            self.episode = np.full(count, self.episode.max(initial=-1) + 1)
+            for name, values in new.items():
+                setattr(self, name, values[order])
             return
-        old, at = self.running, self.running.rows_of(rows)
+        at = old.rows_of(rows)
         arrays: dict[str, Any] = {
             name: _put(getattr(old.problem, name), at, getattr(running.problem, name)) for name in PER_ROW
         }
@@ -219,20 +253,17 @@ class StepShield:
             _put(old.ended, at, running.ended),
         )
         self.backup = Backup(_put(self.backup.plan, rows, backup.plan), _put(self.backup.harm, rows, backup.harm))
-        self.first_bound = _put(self.first_bound, rows, backup.harm)
-        self.alone_harm = _put(self.alone_harm, rows, alone)
-        self._budget = _put(self._budget, rows, backup.harm + self.allowance)
-        self.interventions = _put(self.interventions, rows, np.zeros(len(rows), np.int64))
-        self.distrusted = _put(self.distrusted, rows, np.zeros(len(rows), np.bool_))
+        for name, values in {**new, "episode": self.episode[rows] + 1}.items():
+            setattr(self, name, _put(getattr(self, name), rows, values))
 
     def _write(self, now: Running, proposed: Floats, decision: Decision, held: Backup) -> None:
         assert self.log is not None
         times, states = now.time_s, now.nominal().states
         for k in np.flatnonzero(decision.intervened).tolist():
             row = Intervention(
-                k, int(now.steps[k]), float(times[k]), float(proposed[k]), float(decision.applied[k]),
-                int(decision.reason[k]), float(decision.bound[k]), float(decision.margin[k]), states[k].copy(),
-                held.plan[k].copy(),
+                k, int(self.episode[k]), int(now.steps[k]), float(times[k]), float(proposed[k]),
+                float(decision.applied[k]), int(decision.reason[k]), float(decision.bound[k]),
+                float(decision.margin[k]), states[k].copy(), held.plan[k].copy(),
             )  # fmt: skip
             self.log.append(row)
 
@@ -267,6 +298,7 @@ def _merged(decision: Decision, rows: Ints, found: Decision) -> Decision:
     margin[rows] = np.maximum(margin[rows], found.margin)
     kept = np.flatnonzero(~found.intervened)
     at, after, plan = rows[kept], found.after, found.backup.plan
+    assert (plan == from_now(decision.backup.plan[rows], plan, found.after.steps - 1)).all()  # one past
     return Decision(
         _put(decision.applied, at, found.applied[kept]),
         _put(decision.intervened, at, found.intervened[kept]),

@@ -11,15 +11,16 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.conversions import parallel_to_aec
 
-from ethbrake_marl.actions import checked_action, command_to_action
-from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
+from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Ints, Worlds
-from ethbrake_marl.shield.attached import AttachedShield, engine_of, only_shielded
+from ethbrake_marl.shield.attached import AttachedShield
 from ethbrake_marl.shield.episode import Bound, HybridAgent
+from ethbrake_marl.shield.settings import checked_proposal, engine_of, only_shielded, proposing_agent
 from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
 
 MODES = ("episode", "step", "robust")
@@ -35,8 +36,8 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
     every action that is proposed (by the caller, or by ``policy`` where none is passed), and replaces those that cannot
     keep the bound: see ``StepShield``; its infos say why. Mode ``robust`` is step mode with an ``uncertainty``
     (``"latency_s=0.1"``): what is certified must hold in every member. ``bound`` is the episode mode's, ``allowance``
-    (m2/s2 above the bound) that of the others. The claim of a bound holds for one shielded vehicle, the others
-    following their scripts.
+    (m2/s2 above the bound) that of the others; where a mode has none, giving one is refused. The claim of a bound holds
+    for one shielded vehicle, the others following their scripts.
     """
 
     def __init__(
@@ -54,12 +55,16 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         if mode not in MODES:
             raise unknown_name("shield mode", mode, MODES)
         intervals = mode_uncertainty(mode, uncertainty, "HybridShield")
-        engine = engine_of(env)
+        if mode == "episode" and allowance != 0.0:
+            raise InvalidInput(f"HybridShield: allowance = {allowance!r}: mode episode takes none; step and robust do")
+        if mode != "episode" and bound != "coupled":
+            raise InvalidInput(f"HybridShield: bound = {bound!r}: mode {mode} takes none; episode does")
+        engine = engine_of(env, ParallelEnv, "HybridShield", "eb.parallel_env")
         super().__init__(env)
         self._engine = engine
         names = engine.scenario.vehicle_names
         shielded = tuple(names[i] for i in engine.learners) if agents is None else _names(agents)
-        only_shielded(engine)
+        only_shielded(engine, "HybridShield")
         if len(shielded) != 1 or shielded[0] not in names or names.index(shielded[0]) not in engine.learners:
             raise InvalidInput(f"HybridShield: shields exactly one learner in mode {mode!r}; got {shielded}")
         self.mode = mode
@@ -67,20 +72,24 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         self._vehicle = names.index(self.shielded)
         self.attached: AttachedShield | None = None
         if mode != "episode":
-            self.attached = AttachedShield(env, policy, count=count, allowance=allowance, uncertainty=intervals)
+            self.attached = AttachedShield(
+                engine, policy, count=count, allowance=allowance, uncertainty=intervals, where="HybridShield"
+            )
             return
-        if not (isinstance(policy, Agent) or callable(policy)):
-            raise InvalidInput(f"HybridShield: policy = {policy!r}: must be an agent or a policy (eb.load_policy)")
-        agent = policy if isinstance(policy, Agent) else LearnedAgent(policy)
+        agent = proposing_agent(policy, "HybridShield")
         self.hybrid = HybridAgent(agent, engine.scenario, bound=bound, count=count)
         engine.on_begin.append(self._begin)
 
     def step(self, actions: Mapping[str, Any]) -> tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]:
         """Advance by one step with the shielded agent's action replaced; it may also be left out."""
         engine, agent = self._engine, self.shielded
+        if not isinstance(actions, Mapping):
+            raise InvalidInput(
+                f"HybridShield: actions = {actions!r}: must be a dict, for instance {{{agent!r}: [0.0]}}"
+            )
         proposed = actions.get(agent)
         if proposed is not None:
-            checked_action(proposed, (1,), agent)
+            checked_proposal(proposed, (1,), agent)
         if not self.env.agents:
             self.env.step(actions)  # says that no episode is running
         if self.attached is not None:
@@ -104,7 +113,7 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
     ) -> tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]:
         """Advance by one step in mode ``step``."""
         agent = self.shielded
-        given = attached.proposal() if proposed is None else checked_action(proposed, (1,), agent)
+        given = attached.proposal() if proposed is None else checked_proposal(proposed, (1,), agent)
         applied = attached.decide(given)
         decision = attached.decision
         assert decision is not None

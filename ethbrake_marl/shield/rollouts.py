@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -17,10 +17,10 @@ from ethbrake_marl.agents.driving import drive, introduce, scripted
 from ethbrake_marl.agents.profile_motion import HARM_IS_TOTAL, START, TIME_STEP
 from ethbrake_marl.agents.profile_problem import ProfileProblem, worlds_at
 from ethbrake_marl.agents.protocol import Agent, Divisible
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.agents.rehearsed import Rehearsed
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.shield.certify import Backup, Decision, Running, certify, plan_harm
+from ethbrake_marl.shield.certify import Backup, Decision, Running, certify, from_now, plan_harm
 
 
 class Proposer(NamedTuple):
@@ -41,25 +41,30 @@ def rolled_out(
 
 
 def certify_rollouts(
-    running: Running, proposed: Floats, rows: Ints, budget: Floats, width: int, proposer: Proposer
+    running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
     """Decide again in ``rows``, where the proposals found no certificate, with the policy itself as the later plan.
 
     The plan that is tried is the proposal (clipped, a number), then what the policy does from the state after it. Where
     it keeps the budget it becomes the backup, and the proposal is "what the plan says"; elsewhere the reason says that
-    something else must be applied. ``running``, ``proposed`` and ``budget`` are those of the whole batch, plans
-    are ``width`` decisions long. Returns the decision of those rows alone.
+    something else must be applied. ``running``, ``proposed``, ``budget`` and the plans ``held`` [n, L] are those of the
+    whole batch. Returns the decision of those rows alone.
     """
     part, first, least = running.take(rows), np.clip(proposed[rows], -1.0, 1.0), budget[rows]
-    plan = _later_plan(running.nominal(), first, rows, budget, width, proposer)
+    plan = _later_plan(running.nominal(), first, rows, budget, held, proposer)
     harm = plan_harm(part, plan)
     kept = harm <= least
     decision = certify(part, first, Backup(plan, harm), np.maximum(least, harm))
     return decision._replace(intervened=~kept, margin=least - harm)
 
 
-def _later_plan(running: Running, first: Floats, rows: Ints, budget: Floats, width: int, proposer: Proposer) -> Floats:
-    """The plans [m, L] of ``rows``: the ``first`` action [m], then the policy's; given up once above the budget."""
+def _later_plan(
+    running: Running, first: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
+) -> Floats:
+    """The plans [m, L] of ``rows``: what was applied, the ``first`` action [m], then the policy's.
+
+    Given up once above the budget.
+    """
     policy, worlds = proposer
     driver, batch = _apart(policy, rows, worlds.n)
     seen, wanted = worlds.take(batch), np.isin(batch, rows)
@@ -68,8 +73,7 @@ def _later_plan(running: Running, first: Floats, rows: Ints, budget: Floats, wid
     added = episodes.problem.command.shape[1] - worlds.N  # an obstacle ahead is vehicle 0 of the problem
     vehicle, action = int(episodes.problem.vehicles[0]) - added, np.zeros(len(batch))
     action[wanted] = first
-    plan, nothing = np.full((len(batch), width), -1.0), np.zeros(len(batch))
-    no_constants = np.zeros(0)
+    plan, nothing, no_constants = from_now(held[batch], -1.0, episodes.steps), np.zeros(len(batch)), np.zeros(0)
     while True:
         going = np.flatnonzero(~episodes.ended)
         plan[going, episodes.steps[going]] = action[going]
@@ -78,16 +82,29 @@ def _later_plan(running: Running, first: Floats, rows: Ints, budget: Floats, wid
         if episodes.ended.all():
             return plan[wanted]
         seen = _seen(seen, episodes, action_to_command(action, seen.vehicles, vehicle))
-        action = command_to_action(driver.act(seen, vehicle), seen.vehicles, vehicle)
+        action = _or_braking(proposed_action(driver, seen, vehicle))
+
+
+def proposed_action(policy: Agent, worlds: Worlds, vehicle: int) -> Floats:
+    """What a policy proposes, as actions [n] in [-1, 1]; a command that is no number stays none."""
+    command = policy.act(worlds, vehicle)
+    return np.where(np.isnan(command), np.nan, command_to_action(command, worlds.vehicles, vehicle))
+
+
+def _or_braking(action: Floats) -> Floats:
+    """In a rollout full braking stands for what is no number: the shield would not apply that either."""
+    return np.where(np.isnan(action), -1.0, action)
+
+
+def _is_divisible(policy: Agent) -> TypeGuard[Divisible]:
+    """Whether a policy can go on in some worlds apart; a rehearsed one can where what it rehearses can."""
+    return _is_divisible(policy.policy) if isinstance(policy, Rehearsed) else isinstance(policy, Divisible)
 
 
 def _apart(policy: Agent, rows: Ints, n: int) -> tuple[Agent, Ints]:
     """A policy that goes on without changing this one, and the rows of the batch that it drives: all, if it must."""
-    if isinstance(policy, Divisible):
-        try:
-            return policy.take(rows), rows
-        except InvalidInput:  # what it wraps cannot be divided
-            pass
+    if _is_divisible(policy):
+        return policy.take(rows), rows
     return copy.deepcopy(policy), np.arange(n)
 
 
@@ -117,10 +134,8 @@ def _seen(worlds: Worlds, running: Running, command_mps2: Floats) -> Worlds:
 class _Recorder:
     """A policy whose actions are written down, and applied as they are written."""
 
-    name = "recorder"
-
     def __init__(self, policy: Agent, problem: ProfileProblem, width: int) -> None:
-        self.policy = policy
+        self.policy, self.name = policy, policy.name  # what is refused is the policy's
         self.actions = np.full((problem.n, width), -1.0)
         self._clock = problem.clock
 
@@ -128,7 +143,7 @@ class _Recorder:
         self.policy.begin(worlds, vehicle, rows)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        action = command_to_action(self.policy.act(worlds, vehicle), worlds.vehicles, vehicle)
+        action = _or_braking(proposed_action(self.policy, worlds, vehicle))
         step = np.rint((worlds.time_s - self._clock[:, START]) / self._clock[:, TIME_STEP]).astype(np.int64)
         rows = np.flatnonzero((step >= 0) & (step < self.actions.shape[1]))
         self.actions[rows, step[rows]] = action[rows]

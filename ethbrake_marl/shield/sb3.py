@@ -9,15 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, Rewards
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
 from ethbrake_marl.shield.attached import AttachedShield
+from ethbrake_marl.shield.settings import check_amount, checked_proposal, engine_of
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 
@@ -40,11 +39,12 @@ class ShieldedVecEnv(VecEnvWrapper):
         intervention_penalty: float = 0.0,
         logging: bool = False,
     ) -> None:
-        if not isinstance(venv, EthBrakeVecEnv):
-            raise InvalidInput(f"ShieldedVecEnv: {venv!r} is not an environment of make_sb3_vec_env")
+        check_amount("intervention_penalty", intervention_penalty, "ShieldedVecEnv")
+        engine = engine_of(venv, EthBrakeVecEnv, "ShieldedVecEnv", "make_sb3_vec_env")
         self.attached = AttachedShield(
-            venv, policy, count=count, allowance=allowance, uncertainty=uncertainty, logging=logging
-        )
+            engine, policy, count=count, allowance=allowance, uncertainty=uncertainty, logging=logging,
+            where="ShieldedVecEnv",
+        )  # fmt: skip
         super().__init__(venv)
         self.intervention_penalty = intervention_penalty
         self._proposed: NDArray[np.float64] = np.zeros(0)
@@ -59,7 +59,7 @@ class ShieldedVecEnv(VecEnvWrapper):
         if self.attached.shield.running is None:
             self.venv.step_async(actions)
             return
-        self._proposed = checked_action(actions, (self.num_envs, 1), "the learners")[:, 0]
+        self._proposed = checked_proposal(actions, (self.num_envs, 1), "the learners")[:, 0]
         self.venv.step_async(self.attached.decide(self._proposed)[:, np.newaxis])
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:

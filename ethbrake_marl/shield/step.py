@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.actions import action_to_command, command_to_action
+from ethbrake_marl.actions import action_to_command
 from ethbrake_marl.agents.driving import introduce, scripted
 from ethbrake_marl.agents.profile_problem import state_columns
 from ethbrake_marl.agents.protocol import Agent, check_agent, place
@@ -13,8 +13,13 @@ from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.guard import StepShield
-from ethbrake_marl.shield.rollouts import Proposer
+from ethbrake_marl.shield.rollouts import Proposer, proposed_action
 from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
+
+
+def first_decision_s(worlds: Worlds, vehicle: int) -> Floats:
+    """Time of a vehicle's first decision in worlds at the alert, [n] s."""
+    return np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
 
 
 class StepShieldAgent:
@@ -44,6 +49,8 @@ class StepShieldAgent:
         believed: Worlds | None = None,
     ) -> None:
         check_agent(policy, "step")
+        if not (believed is None or isinstance(believed, Worlds)):
+            raise InvalidInput(f"step: believed = {believed!r}: must be worlds at the alert, or None")
         uncertainty = checked_uncertainty(uncertainty)
         self.name = f"{'step' if uncertainty is None else 'robust'}({policy.name})"
         self.policy = policy
@@ -66,6 +73,8 @@ class StepShieldAgent:
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Find the bound of these rows; ``worlds`` holds those rows only, at the alert."""
+        if self._believed is not None and not (rows < self._believed.n).all():
+            raise InvalidInput(f"step: believed holds {self._believed.n} worlds, but row {rows.max()} begins")
         if self.shield is None or self.shield.vehicle != vehicle:
             self.shield = self._make(vehicle)
         introduce(self.policy, vehicle, scripted(self.scenario, but=vehicle))
@@ -74,14 +83,19 @@ class StepShieldAgent:
         bound = self.shield.first_bound[rows] + self.shield.allowance
         self.predicted_harm = place(self.predicted_harm, rows, bound)
         self._wanted = place(self._wanted, rows, np.zeros(worlds.n))
-        self._first_s = place(self._first_s, rows, np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s))
+        self._first_s = place(self._first_s, rows, first_decision_s(worlds, vehicle))
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The certified command, [n] m/s2. Asked twice at the same moment, it says the same."""
         shield = self.shield
-        if shield is None or shield.running is None or len(self._wanted) != worlds.n:
+        if shield is None or shield.running is None or len(self._wanted) < worlds.n:
             raise InvalidInput(f"agent {self.name!r}: act on {worlds.n} worlds, but begin was not called for each")
-        proposed = command_to_action(self.policy.act(worlds, vehicle), worlds.vehicles, vehicle)
+        if len(self._wanted) > worlds.n:  # a smaller batch has begun
+            shield.keep(worlds.n)
+            self.predicted_harm, self._wanted, self._first_s = (
+                values[: worlds.n] for values in (self.predicted_harm, self._wanted, self._first_s)
+            )
+        proposed = proposed_action(self.policy, worlds, vehicle)
         due = worlds.time_s == self._first_s + shield.running.steps * self.scenario.time_step_s
         seen = state_columns(worlds)
         proposer = Proposer(self.policy, worlds) if self._later_rollouts else None

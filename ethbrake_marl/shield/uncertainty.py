@@ -17,15 +17,21 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.physics import Floats, Worlds, concatenate
+from ethbrake_marl.scenario.quantities import DECLARED
+from ethbrake_marl.shield.settings import is_amount
 
 OF_VEHICLES = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t")  # fields of ``Vehicles``
 QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m")
 POSITIVE = ("braking_capacity_mps2", "mass_t")  # must stay above 0
 MOST_CORNERS = 1024  # of one world: each costs as much as the world itself
 EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
+_FORM = f"must be quantity=half-width, for instance {EXAMPLE}"
 
-_ENTRY = re.compile(r"(?P<name>\w+)(?:\.(?P<what>vehicle|pair)_(?P<number>[1-9]\d*))?=(?P<width>[^=%]+)(?P<share>%?)")
-_NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_ENTRY = re.compile(
+    r"(?P<name>\w+)(?:\.(?P<what>vehicle|pair)_(?P<number>[1-9]\d*))?\s*=\s*(?P<width>[^=%\s]+)(?P<share>%?)",
+    re.ASCII,
+)
+_NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +47,9 @@ class Interval:
         if self.quantity not in QUANTITIES:
             raise unknown_name("uncertain quantity", self.quantity, QUANTITIES)
         most, told = (1.0, "a share from 0 to below 100 %") if self.relative else (np.inf, "a number, at least 0")
-        if not 0.0 <= self.half_width < most:
+        if not is_amount(self.half_width, most):
             raise InvalidInput(f"uncertainty: {self.quantity}: half-width {self.half_width!r}: must be {told}")
-        if self.place is not None and not self.place >= 0:
+        if self.place is not None and not (isinstance(self.place, int | np.integer) and self.place >= 0):
             raise InvalidInput(f"uncertainty: {self.quantity}: place {self.place!r}: must be an index from 0")
 
     def __str__(self) -> str:
@@ -72,6 +78,10 @@ class Uncertainty:
     intervals: tuple[Interval, ...]
 
     def __post_init__(self) -> None:
+        if not isinstance(self.intervals, tuple) or not all(isinstance(each, Interval) for each in self.intervals):
+            raise InvalidInput(
+                f"uncertainty: intervals = {self.intervals!r}: must be a tuple of Interval; parse_uncertainty reads it"
+            )
         if not self.intervals:
             raise InvalidInput(f"uncertainty: no interval; one is needed, for instance {EXAMPLE}")
         for k, one in enumerate(self.intervals):
@@ -131,9 +141,13 @@ def parse_uncertainty(text: str) -> Uncertainty:
     """Read ``quantity=half-width`` entries with commas between them, for instance ``EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
-    the quantity limits it to that one. Raises ``InvalidInput`` for anything else.
+    the quantity limits it to that one. Blanks around entries and ``=`` change nothing. Raises ``InvalidInput`` for
+    anything else.
     """
-    return Uncertainty(tuple(_interval(entry.strip()) for entry in text.split(",")))
+    entries = [entry.strip() for entry in text.split(",")]
+    if "" in entries:
+        raise InvalidInput(f"uncertainty: {text!r}: entry {entries.index('') + 1} is empty; it {_FORM}")
+    return Uncertainty(tuple(_interval(entry) for entry in entries))
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
@@ -157,7 +171,7 @@ def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None
 def _interval(entry: str) -> Interval:
     found = _ENTRY.fullmatch(entry)
     if found is None or _NUMBER.fullmatch(found["width"]) is None:
-        raise InvalidInput(f"uncertainty: {entry!r}: must be quantity=half-width, for instance {EXAMPLE}")
+        raise InvalidInput(f"uncertainty: {entry!r}: {_FORM}")
     name, width = found["name"], float(found["width"])
     if name in QUANTITIES and found["what"] not in (None, "pair" if name == "gaps_m" else "vehicle"):
         raise InvalidInput(f"uncertainty: {entry!r}: gaps_m is of pairs (.pair_1), all else of vehicles (.vehicle_1)")
@@ -183,7 +197,14 @@ def _side(worlds: Worlds, interval: Interval, place: int) -> Side:
             " must stay above 0"
         )
     most = worlds.vehicles.speed_limit_mps[:, place] if interval.quantity == "speeds_mps" else np.inf
-    return Side(interval.quantity, place, np.maximum(low, 0.0), np.minimum(high, most))
+    high, rule = np.minimum(high, most), DECLARED[interval.quantity]
+    if not (high <= rule.high).all():
+        k = int(np.argmax(high))
+        raise InvalidInput(
+            f"uncertainty: {interval}: {told[k]:g} of {rule.owner(place)} in world {k} may be as high as {high[k]:g};"
+            f" must be {rule.interval}"
+        )
+    return Side(interval.quantity, place, np.maximum(low, 0.0), high)
 
 
 def _placed(worlds: Worlds, sides: list[Side], share: Callable[[int], Floats | int]) -> Worlds:

@@ -8,15 +8,14 @@ import numpy as np
 from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
 
-from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.envs.vector import EthBrakeVectorEnv
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.shield.attached import AttachedShield
+from ethbrake_marl.shield.settings import check_amount, checked_proposal, engine_of
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 
@@ -40,11 +39,12 @@ class ShieldedVectorEnv(VectorWrapper):
         intervention_penalty: float = 0.0,
         logging: bool = False,
     ) -> None:
-        if not isinstance(env, EthBrakeVectorEnv):
-            raise InvalidInput(f"ShieldedVectorEnv: {env!r} is not an EthBrakeVectorEnv")
+        check_amount("intervention_penalty", intervention_penalty, "ShieldedVectorEnv")
+        engine = engine_of(env, EthBrakeVectorEnv, "ShieldedVectorEnv", "gymnasium.make_vec('EthBrake-v0')")
         self.attached = AttachedShield(
-            env, policy, count=count, allowance=allowance, uncertainty=uncertainty, logging=logging
-        )
+            engine, policy, count=count, allowance=allowance, uncertainty=uncertainty, logging=logging,
+            where="ShieldedVectorEnv",
+        )  # fmt: skip
         super().__init__(env)
         self.intervention_penalty = intervention_penalty
 
@@ -57,7 +57,7 @@ class ShieldedVectorEnv(VectorWrapper):
         given = np.array(actions)
         if before.any() and given.shape[:1] == before.shape:
             given[before] = 0.0  # whatever stands there, the autoreset mode ignores it
-        proposed = checked_action(given, (self.num_envs, 1), "the learners")[:, 0]
+        proposed = checked_proposal(given, (self.num_envs, 1), "the learners")[:, 0]
         applied = attached.decide(proposed)
         decision, told = attached.decision, attached.infos(proposed)
         assert decision is not None

@@ -14,14 +14,15 @@ import pytest
 
 from ethbrake_marl.ablation import trainings
 from ethbrake_marl.ablation.levels import read_levels
-from ethbrake_marl.ablation.plan import Plan
+from ethbrake_marl.ablation.plan import Plan, Training, with_scheme
 from ethbrake_marl.cli import run_command
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning import train as learning_train
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe, load_recipe
 
-LEVELS = "cooperation-0-sensors,cooperation-2-paper,cooperation-3-pair,cooperation-3-congested"
+LEVELS = "cooperation-0-sensors,cooperation-3-pair,cooperation-3-congested"
 SMALL = ["--levels", LEVELS, "--seeds", "2", "--episodes", "20", "--search-episodes", "4", "--budget", "50"]
-SMALL += ["--steps", "256", "--scheme", "shared"]
+SMALL += ["--steps", "128", "--scheme", "shared"]
 
 
 @pytest.fixture(scope="module")
@@ -51,16 +52,16 @@ def test_ablate__writes_tables_and_figures(ablation):
     assert names <= {path.name for path in ablation.iterdir()}
     found = content(ablation)
     assert [level["level"] for level in found["levels"]] == LEVELS.split(",")
-    assert [level["seeds"] for level in found["levels"]] == [1, 2, 2, 2]
+    assert [level["seeds"] for level in found["levels"]] == [1, 2, 2]
     assert [(step["from"], step["to"]) for step in found["channels"]] == [
         ("cooperation-3-pair", "cooperation-3-congested")
     ]
-    pair = found["levels"][2]["total"]
-    assert pair["best_known"]["value"] <= pair["full_brake"]["value"]
+    pair = found["levels"][1]["total"]
+    assert pair["searched"]["best_known"]["value"] <= pair["searched"]["full_brake"]["value"]
 
 
 def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(ablation, tmp_path, tiny, monkeypatch, capsys):
-    """Stopped in the middle of the second training, then once more between two trainings."""
+    """Stopped in the middle of the second training; ended by two processes."""
     folder, trained = tmp_path / "stopped", []
 
     def stop_in_the_second(recipe, scenario, path, **options):
@@ -83,7 +84,7 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(ablation, tmp_p
     assert not (folder / "ablation.json").exists()
     capsys.readouterr()
     assert run_command(["ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL, "--jobs", "2"]) == 0
-    assert "to do: 5 trainings" in capsys.readouterr().err
+    assert "to do: 3 trainings" in capsys.readouterr().err
     assert content(folder) == content(ablation)
 
 
@@ -104,9 +105,9 @@ def test_ablate__states_the_cost_first(ablation, tiny, capsys):
     words = ["ablate", "--output", str(ablation), "--recipes", str(tiny), *SMALL, "--cost"]
     before = (ablation / "ablation.json").stat().st_mtime_ns
     assert run_command(words) == 0
-    assert "to do: 0 trainings, 0 decisions" in capsys.readouterr().err
+    assert "to do: 0 trainings, 0 decisions: 0 s; joint optima 0 s;" in capsys.readouterr().err
     assert run_command([*words, "--seeds", "3"]) == 0
-    assert "to do: 3 trainings, 1,280 decisions at" in capsys.readouterr().err
+    assert "to do: 2 trainings, 512 decisions at" in capsys.readouterr().err
     assert (ablation / "ablation.json").stat().st_mtime_ns == before
 
 
@@ -118,7 +119,10 @@ def test_ablate__bad_input_is_refused(tmp_path, tiny, capsys):
     assert "scheme" in refused(capsys, *start, "--scheme", "shard")
     assert "jobs 0" in refused(capsys, *start, "--jobs", "0")
     only = "cooperation-0-sensors,paper-distance"
-    assert "are not those of" in refused(capsys, *start, "--levels", only)
+    assert "is a file; give a folder" in refused(capsys, "--output", tiny, "--recipes", tiny)
+    assert "is a file; give a folder" in refused(capsys, "--output", tiny / "new", "--recipes", tiny)
+    assert "each with a name of its own" in refused(capsys, *start, "--recipes", f"{tiny},{tiny}")
+    assert "differs from that of" in refused(capsys, *start, "--levels", only)
     assert not (tmp_path / "new").exists()
 
 
@@ -139,18 +143,67 @@ def test_ablate__a_damaged_folder_is_named(ablation, tmp_path, tiny, capsys, dam
     assert what in refused(capsys, "--output", folder, "--recipes", tiny, *SMALL)
 
 
-def test_ablate__another_training_in_the_folder_is_refused(ablation, tiny, capsys):
-    err = refused(capsys, "--output", ablation, "--recipes", tiny, *SMALL, "--steps", "4096")
+def test_ablate__damage_is_told_before_anything_is_searched(ablation, tmp_path, tiny, capsys):
+    folder = tmp_path / "copy"
+    shutil.copytree(ablation, folder)
+    shutil.rmtree(folder / "optimum")
+    shutil.rmtree(folder / "trainings" / "cooperation-3-pair-tiny-shared-seed0")
+    (folder / "trainings" / "cooperation-3-congested-tiny-shared-seed1" / "team.json").write_text("{}")
+    assert "team.json" in refused(capsys, "--output", folder, "--recipes", tiny, *SMALL)
+    assert not (folder / "optimum").exists() and len(list((folder / "trainings").iterdir())) == 3
+
+
+def test_ablate__another_training_in_the_folder_is_refused(ablation, tmp_path, tiny, capsys):
+    shutil.copytree(ablation, tmp_path / "copy")
+    (tmp_path / "copy" / "settings.json").unlink()
+    err = refused(capsys, "--output", tmp_path / "copy", "--recipes", tiny, *SMALL, "--steps", "4096")
     assert "holds the training of another recipe or scenario" in err
 
 
-def test_plan__one_learner_is_trained_alone_whatever_the_scheme(tmp_path, tiny):
+def test_ablate__other_settings_in_the_folder_are_refused_and_nothing_is_lost(ablation, tmp_path, tiny, capsys):
+    before = {path: path.read_bytes() for path in ablation.rglob("*") if path.is_file()}
+    start = ["--output", ablation, "--recipes", tiny, *SMALL]
+    assert "(budget 50, here 60)" in refused(capsys, *start, "--budget", "60")
+    err = refused(capsys, *start, "--seeds", "3", "--levels", "cooperation-3-pair,cooperation-0-sensors")
+    assert "other settings (levels; seeds 2, here 3); give another folder" in err
+    assert {path: path.read_bytes() for path in ablation.rglob("*") if path.is_file()} == before
+    (tmp_path / "settings.json").write_text("[]")
+    assert "settings.json: is damaged" in refused(capsys, "--output", tmp_path, "--recipes", tiny, *SMALL)
+
+
+def test_ablate__the_cost_of_a_new_folder_makes_nothing(tmp_path, tiny, capsys):
+    words = ["--levels", "cooperation-0-sensors,cooperation-2-paper", "--episodes", "5", "--search-episodes", "1"]
+    words += ["--budget", "1", "--seeds", "1", "--steps", "64"]
+    assert run_command(["ablate", "--output", str(tmp_path / "new"), "--recipes", str(tiny), *words, "--cost"]) == 0
+    assert "to do: 1 trainings, 64 decisions" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def planned(recipe: TrainingRecipe, scheme: Scheme | None) -> list[Training]:
     levels = tuple(read_levels(["cooperation-2-paper", "cooperation-3-pair"]))
-    plan = Plan(levels, (load_recipe(str(tiny)),), "independent", 1, 300, 10, 7, 5, 10, tmp_path)
-    alone, pair = plan.trainings()
+    return list(Plan(levels, (with_scheme(recipe, scheme),), 1, 300, 10, 7, 5, 10, Path("any")).trainings())
+
+
+def test_plan__one_learner_is_trained_alone_whatever_the_scheme(tiny):
+    recipe = load_recipe(str(tiny))
+    alone, pair = planned(recipe, None)
     assert (alone.recipe.scheme, pair.recipe.scheme) == (None, "independent")
     assert (alone.recipe.total_steps, pair.recipe.total_steps) == (300, 600)
     assert pair.folder.name == "cooperation-3-pair-tiny-independent-seed0"
+    again, shared = planned(recipe, "shared")
+    assert (again.recipe, again.folder) == (alone.recipe, alone.folder)
+    assert (
+        again.folder.name == "cooperation-2-paper-tiny-seed0" and again.algorithm == shared.algorithm == "tiny-shared"
+    )
+
+
+def test_plan__the_recipes_own_scheme_holds_and_turns_are_for_several(tiny):
+    recipe = load_recipe(str(tiny))
+    assert [each.recipe.scheme for each in planned(recipe.replace(scheme="shared"), None)] == [None, "shared"]
+    alone, pair = planned(recipe.replace(scheme="independent", turns=5), None)
+    assert (alone.recipe.turns, pair.recipe.turns) == (None, 5)
+    with pytest.raises(InvalidInput, match="turns"):
+        planned(recipe.replace(scheme="independent", turns=5), "shared")
 
 
 def test_ablate__an_interruption_reaches_the_trainings_of_other_processes(tmp_path, tiny):

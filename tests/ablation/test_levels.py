@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.ablation.levels import LADDER, STANDARD, common_worlds, read_levels
+from ethbrake_marl.ablation.levels import LADDER, STANDARD, Level, common_worlds, read_levels
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.scenario import scenario_path
+from ethbrake_marl.scenario import load_scenario, scenario_path
 
 
 def test_read_levels__the_standard_set_is_a_ladder_and_its_worse_channels():
@@ -42,5 +42,40 @@ def test_levels__bad_ones_are_refused():
         read_levels(["cooperation-3-pair", "cooperation-3-pair"])
     with pytest.raises(InvalidInput, match="1 given; at least two"):
         read_levels(["cooperation-3-pair"])
-    with pytest.raises(InvalidInput, match=r"'cooperation-3-five': its worlds are not those .* \(5 and 3 vehicles\)"):
+    with pytest.raises(InvalidInput, match=r"'cooperation-3-five': its vehicles differs from .* \(5; there 3\)"):
         common_worlds(read_levels(["cooperation-3-pair", "cooperation-3-five"]), 3, 7)
+
+
+PAPER = load_scenario("cooperation-2-paper")
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"gaps_m": 7}, "gaps_m"),
+        (
+            {"mass_t": [4.5, 5.5, 6]},
+            r"mass_t differs from that of 'cooperation-2-paper' \(4.5, 5.5, 6; there 4.5, 5.5, 5.9\)",
+        ),
+        ({"braking_capacity_mps2": 6}, "braking_capacity_mps2"),
+        ({"driving_capacity_mps2": 6}, "driving_capacity_mps2"),
+        ({"restitution": 0.2}, "restitution"),
+        ({"speed_limit_mps": 30}, "speed_limit_mps"),
+        ({"time_step_s": 0.05}, "time_step_s"),
+        ({"horizon_s": 9}, r"horizon_s differs .* \(9; there 8\)"),
+        ({"latency_s": [0, 0.5, 0.9]}, "latency_s"),
+    ],
+)
+def test_common_worlds__other_physics_are_refused(changes, what):
+    other = PAPER.replace(name="mine", roles={"vehicle_3": "learner"}, **changes)
+    with pytest.raises(InvalidInput, match=f"level 'mine': its {what}"):
+        common_worlds([Level(PAPER), Level(other)], 5, 7)
+
+
+def test_common_worlds__news_roles_objectives_and_an_obstacle_may_differ():
+    roles = {"vehicle_1": "learner", "vehicle_3": "coast"}
+    free = PAPER.replace(name="mine", roles=roles, objective="own", hazard_gap_m=42, v2x="blocked")
+    late = PAPER.replace(name="late", v2x="blocked")
+    assert len(common_worlds([Level(PAPER), Level(free), Level(late)], 5, 7)) == 3
+    with pytest.raises(InvalidInput, match="level 'late': its latency_s differs from that of 'mine'"):
+        common_worlds([Level(PAPER), Level(free), Level(late.replace(latency_s=[0, 0.5, 0.9]))], 5, 7)

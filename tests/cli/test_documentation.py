@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
 from ethbrake_marl.agents.registry import agent_names
 from ethbrake_marl.cli import app, scenario_app
@@ -14,6 +15,8 @@ from ethbrake_marl.cli import app, scenario_app
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 CLI = (DOCS / "cli.md").read_text("utf-8")
 TUTORIAL = (DOCS / "tutorials" / "first-ten-minutes.md").read_text("utf-8")
+
+TABLE_OF_COMMANDS, _, GENERAL = CLI.partition("\n## run\n")[0].partition("\n## What holds for every command\n")
 
 WORLDS = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n10,8,20,18,20\n5,9,22,18,20\n7,7,20,18,20\n"
 
@@ -27,12 +30,22 @@ def test_cli_page__has_every_command_and_agent():
     training = {"run", "train", "resume", "learning-curves", "ablate", "generalise", "export", "import-legacy"}
     assert names(app) == training | {"evaluate", "shield", "doctor", "bench", "best-harm"}
     for command in names(app) | {"scenario"}:
-        assert f"\n## {command}\n" in CLI
+        assert f"\n## {command}\n" in CLI and f"`{command}" in TABLE_OF_COMMANDS
     about_scenarios = CLI.partition("\n## scenario\n")[2].partition("\n## ")[0]
     for command in names(scenario_app):
         assert f"ethbrake scenario {command}" in about_scenarios or f"`{command}" in about_scenarios
     for agent in agent_names():
         assert f"`{agent}" in CLI
+
+
+@pytest.mark.parametrize("command", ["", "scenario", "picture"])
+def test_cli_page__has_every_option(command):
+    group = get_command(app) if not command else get_command(app).commands[command]
+    for name in sorted(group.commands.keys() - {"generalise"}):  # whose section shows the usual ones only
+        section = CLI.partition(f"\n## {command or name}\n")[2].partition("\n## ")[0]
+        shown = set(re.findall(r"--[a-z-]+", GENERAL + section))
+        options = {option for each in group.commands[name].params for option in each.opts if option.startswith("--")}
+        assert options <= shown | {"--help"}, name
 
 
 @pytest.mark.parametrize("page", [CLI, TUTORIAL])

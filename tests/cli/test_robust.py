@@ -37,6 +37,11 @@ def test_lineup__robust_agents_certify_against_the_uncertainty():
         (("--agents", "coast", "--uncertainty", "gaps_m=1"), "nobody uses it"),
         (("--agents", "ppo@shipped", "--shield", "robust", "--uncertainty", "gap=1"), "unknown uncertain quantity"),
         (("--agents", "ppo@shipped", "--shield", "robust", "--uncertainty", "mass_t=9"), "it must stay above 0"),
+        (
+            ("--agents", "ppo@shipped", "--shield", "robust", "--uncertainty", "latency_s=1000"),
+            "uncertainty: latency_s=1000: vehicle_2 may decide first at 1000.5 s; must be before the horizon, 8 s",
+        ),
+        (("--agents", "full_brake", "--shield", "robust", "--uncertainty", "gaps_m=1"), "nobody of full_brake gets it"),
     ],
 )
 def test_evaluate__what_does_not_fit_is_one_line(ethbrake, options, message):

@@ -4,6 +4,14 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.team import Team
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.lineup import make_lineup
+from ethbrake_marl.scenario import load_scenario
+
 
 def test_shield__prints_its_rows_as_json_and_as_a_table(ethbrake):
     arguments = ("shield", "--agents", "full_brake", "--episodes", "30")
@@ -27,3 +35,30 @@ def test_picture__shows_the_modes(ethbrake, tmp_path):
     answer = ethbrake("picture", "shield-modes", "--agents", "full_brake", "--episodes", "20", "--output", out)
     assert (answer.status, answer.out) == (0, "")
     assert out.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("spec", ["hybrid@shipped", "step@shipped", "step:rehearsed@shipped", "robust@shipped"])
+@pytest.mark.parametrize("command", ["shield", "picture shield", "picture robustness"])
+def test_shield__what_has_a_shield_already_is_refused(ethbrake, tmp_path, command, spec):
+    option = "--agent" if command.endswith("robustness") else "--agents"
+    output = () if command == "shield" else ("--output", tmp_path / "shield.png")
+    answer = ethbrake(*command.split(), option, spec, "--episodes", "3", *output)
+    assert (answer.status, answer.out) == (2, "")
+    assert f"agent {spec!r}: has a shield already" in answer.err and len(answer.err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("shield", ["episode", "step"])
+def test_evaluate__a_shield_that_nobody_gets_is_refused(ethbrake, shield):
+    for agents in ("full_brake", "step@shipped", "full_brake,hybrid@shipped"):
+        answer = ethbrake("evaluate", "--agents", agents, "--shield", shield, "--episodes", "3")
+        assert answer.status == 2 and f"shield {shield}: nobody of " in answer.err
+    lineup = make_lineup(["full_brake", "ppo@shipped"], load_scenario("paper-random"), shield=shield)
+    assert list(lineup) == ["full_brake", f"ppo@shipped+{shield}"]
+
+
+def test_evaluate__a_team_behind_a_shield_is_refused(monkeypatch):
+    scenario = load_scenario("cooperation-3-pair")
+    monkeypatch.setattr("ethbrake_marl.lineup._driver", lambda *given: Team.copies(make_agent("coast"), [1, 2]))
+    assert list(make_lineup(["team@run"], scenario)) == ["team@run"]
+    with pytest.raises(InvalidInput, match="agent 'team@run': is a team, and shield step is for one driven vehicle"):
+        make_lineup(["team@run"], scenario, shield="step")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from pathlib import Path
 
+import onnx
 import pytest
 import yaml
 from stable_baselines3 import PPO
@@ -56,7 +58,7 @@ def test_resume__goes_on_and_ends_as_if_nothing_had_happened(ethbrake, tiny_reci
     for name in ("policy", "policy-last"):
         expected = load_policy(whole / name).manifest.weights_sha256
         assert load_policy(stopped / name).manifest.weights_sha256 == expected
-    refused(ethbrake("resume", stopped), "has finished", "ethbrake evaluate --agents hybrid@")
+    refused(ethbrake("resume", stopped), "has finished", "ethbrake evaluate --scenario paper-random --agents hybrid@")
     refused(ethbrake("resume", tmp_path), "holds no training")
 
 
@@ -72,6 +74,10 @@ def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_rec
     refused(ethbrake("train", *scenario, "--scheme", "single", "--output", tmp_path / "no"), "has 2 learners")
     refused(ethbrake("train", *scenario, "--scheme", "centralized", "--output", tmp_path / "no"), "centralised")
     refused(ethbrake("evaluate", "--agents", f"team@{tmp_path}"), "holds no team")
+    refused(ethbrake("evaluate", *scenario, "--agents", f"sac@{folder}"), "was trained by PPO", f"ppo@{folder}")
+    nobody = ethbrake("evaluate", "--scenario", "cooperation-0-sensors", "--agents", f"team@{folder}")
+    refused(nobody, "has no learner to drive; give the scenario that the agents were trained for")
+    refused(ethbrake("resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
 
 
 def test_resume__an_interrupted_run_goes_on_as_a_training(ethbrake, tiny_recipe, tmp_path, monkeypatch):
@@ -127,12 +133,14 @@ def test_learning_curves__refuses_a_plan_that_is_none(ethbrake, recipes, tmp_pat
     assert not (tmp_path / "new").exists()
 
 
-def test_export__writes_onnx(ethbrake, finished_run, tmp_path):
-    onnx = pytest.importorskip("onnx")
+def test_export__writes_onnx(ethbrake, finished_run, tmp_path, monkeypatch):
     assert ethbrake("export", finished_run, "--onnx", tmp_path / "policy.onnx").status == 0
     model = onnx.load(str(tmp_path / "policy.onnx"))
     assert [output.name for output in model.graph.output] == ["action", "acceleration_mps2"]
+    monkeypatch.setitem(sys.modules, "onnx", None)  # not installed: the output is looked at before that is
     refused(ethbrake("export", finished_run, "--onnx", tmp_path / "policy.onnx"), "is there already")
+    refused(ethbrake("export", finished_run, "--onnx", tmp_path / "none" / "policy.onnx"), "there is no folder")
+    refused(ethbrake("export", finished_run, "--onnx", tmp_path / "new.onnx"), "needs the package onnx")
 
 
 def test_import_legacy__needs_trust_and_makes_a_bundle(ethbrake, tmp_path):

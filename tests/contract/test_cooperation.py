@@ -20,12 +20,12 @@ LEVELS = [entry.name for entry in list_scenarios() if entry.path.parent.name == 
 ONE_LEARNS = [name for name in LEVELS if len(load_scenario(name).learners) == 1]
 
 
-def line(vehicles: int) -> Scenario:
-    """All learn, an obstacle ahead, over a crowded channel; each for itself and a little for the others."""
+def line(vehicles: int, v2x: str = "congested", horizon_s: int = 12) -> Scenario:
+    """All learn, an obstacle ahead, over a channel; each for itself and a little for the others."""
     return Scenario(
-        name=f"line-{vehicles}", vehicles=vehicles, gaps_m={"uniform": [5, 10]}, speeds_mps={"uniform": [18, 22]},
+        name=f"line-{vehicles}-{v2x}", vehicles=vehicles, gaps_m={"uniform": [5, 10]}, speeds_mps={"uniform": [18, 22]},
         braking_capacity_mps2={"uniform": [5, 9]}, driving_capacity_mps2=3, mass_t={"uniform": [1, 8]},
-        latency_s=[0] + [0.3] * (vehicles - 1), horizon_s=12, v2x="congested", objective="social:30",
+        latency_s=[0] + [0.3] * (vehicles - 1), horizon_s=horizon_s, v2x=v2x, objective="social:30",
         roles={f"vehicle_{i}": "learner" for i in range(1, vehicles + 1)}, hazard_gap_m={"uniform": [35, 45]},
     )  # fmt: skip
 
@@ -58,7 +58,9 @@ def test_levels__of_three_vehicles_have_the_lines_of_the_random_test(name: str) 
     assert (worlds.vehicles.latency_s >= paper.vehicles.latency_s).all()
 
 
-@pytest.mark.parametrize("scenario", [*LEVELS, *(line(vehicles) for vehicles in range(2, 11))], ids=named)
+@pytest.mark.parametrize(
+    "scenario", [*LEVELS, *(line(vehicles) for vehicles in range(2, 11)), line(10, "nominal", 8)], ids=named
+)
 @pytest.mark.filterwarnings("ignore:reset. unknown option")
 def test_pettingzoo__holds(scenario: Any) -> None:
     parallel_api_test(ethbrake_v0.parallel_env(scenario=scenario), num_cycles=150)

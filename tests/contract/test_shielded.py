@@ -135,7 +135,7 @@ def test_vector__keeps_each_rows_bound_whatever_the_autoreset_mode(mode: Autores
 
 
 def test_vector__refuses_what_is_no_vector_environment_of_ours() -> None:
-    with pytest.raises(InvalidInput, match="is not an EthBrakeVectorEnv"):
+    with pytest.raises(InvalidInput, match="is not one of this package's environments"):
         ShieldedVectorEnv(parallel_env())
 
 

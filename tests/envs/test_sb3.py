@@ -244,6 +244,11 @@ def test_horizon_is_end__hides_the_truncation_and_nothing_else(horizon_is_end: b
     assert all(info["terminal_observation"].shape == (27,) for info in infos)
 
 
+def test_appended__that_is_unknown_is_refused_at_construction() -> None:
+    with pytest.raises(InvalidInput, match="appended = 'x': must be number or state, or None"):
+        make_sb3_vec_env(FIVE, 3, appended="x")  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("appended", ["number", "state"])
 def test_appended__stands_behind_the_own_observation_in_every_row(appended: Any) -> None:
     plain = make_sb3_vec_env(FIVE, 3, seed=2, learners=PAIR)

@@ -388,8 +388,15 @@ def test_load_policy__a_hard_link_is_the_file_itself(policy: Policy, tmp_path: P
     assert load_policy(tmp_path / "policy").manifest == policy.manifest
 
 
-def test_damaged_bundles__are_many() -> None:
-    assert len(SPOILED) >= 80
+@pytest.mark.parametrize("path", [None, 3, b"policy"])
+def test_load_policy__refuses_what_is_no_path(path: object) -> None:
+    with pytest.raises(InvalidInput, match=r"^policy .*: must be the path of a run or of a policy bundle"):
+        load_policy(path)
+
+
+def test_damaged_bundles__are_as_many_as_the_page_says() -> None:
+    page = Path(__file__).resolve().parents[2] / "docs" / "learning.md"
+    assert f"{len(SPOILED)} damaged and malicious\nbundles" in page.read_text("utf-8")
 
 
 def test_save_policy__does_not_replace(policy: Policy, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning import train as train_module
 from ethbrake_marl.learning.bundle import Policy, load_policy
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.learning.run_directory import create_run
 from ethbrake_marl.learning.train import TrainResult, resume, train
 from ethbrake_marl.scenario import Scenario, load_scenario
 
@@ -267,7 +269,7 @@ def test_resume__refuses_what_it_cannot_go_on_with(
 ) -> None:
     with pytest.raises(InvalidInput, match="holds no training; give the folder of a run"):
         resume(tmp_path)
-    with pytest.raises(InvalidInput, match="this training has finished; measure its policy with"):
+    with pytest.raises(InvalidInput, match="this training has finished; measure what it has learned with"):
         resume(whole("ppo")[0])
     _stopped(tmp_path / "run", monkeypatch)
     monkeypatch.setattr(train_module, "installed_versions", lambda: {"torch": "99.0"})
@@ -275,6 +277,32 @@ def test_resume__refuses_what_it_cannot_go_on_with(
         resume(tmp_path / "run")
     assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"
     assert resume(tmp_path / "run", other_versions=True).status == "finished"
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("run.json", None, "is missing"),
+        ("run.json", '{"format": "ethbrake', "is damaged: Unterminated string"),
+        ("run.json", "[]", "is damaged: holds no JSON object"),
+        ("run.json", "{}", "format = None: must be ethbrake-run"),
+        ("run.json", '{"format": "ethbrake-run", "status": "done"}', "status = 'done': must be running or finished"),
+        ("config.json", None, "is missing"),
+        ("config.json", "[]", "is damaged: holds no JSON object"),
+        ("config.json", "{}", "is not the configuration of a training: 'recipe' is missing"),
+        ("config.json", '{"recipe": 3}', "recipe: must be a mapping"),
+        ("config.json", {"scenario": {"name": "paper-random"}}, "scenario: .*braking_capacity_mps2: missing"),
+    ],
+)
+def test_resume__names_the_damaged_file(tmp_path: Path, file: str, content: str | dict | None, message: str) -> None:
+    run = create_run(tmp_path / "run", {"recipe": PPO.model_dump(mode="json")})
+    if content is None:
+        (run.path / file).unlink()
+    else:
+        text = content if isinstance(content, str) else json.dumps({**json.loads(run.config.read_text()), **content})
+        (run.path / file).write_text(text)
+    with pytest.raises(InvalidInput, match=f"{re.escape(str(run.path / file))}: {message}"):
+        resume(run.path)
 
 
 def test_resume__one_process_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

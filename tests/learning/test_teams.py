@@ -193,9 +193,11 @@ def test_resume_team__after_a_failure_or_ctrl_c_it_ends_as_if_nothing_had_happen
     with monkeypatch.context() as patch:
         _watched(patch, ctrl_c)
         assert resume_team(tmp_path / "run").status == "interrupted"
+    (tmp_path / "run" / "team.json").write_text("{}")
     result = resume_team(tmp_path / "run")
     assert (result.status, result.updates) == ("finished", 8)
     assert result.evaluations == whole.evaluations
+    assert (tmp_path / "run" / "team.json").read_bytes() == (tmp_path / "whole" / "team.json").read_bytes()
     for folder in ("policy", "policy-last"):
         assert _weights(tmp_path / "run" / folder) == _weights(tmp_path / "whole" / folder)
 
@@ -267,6 +269,19 @@ def test_scheme__of_a_recipe_and_who_drives_what() -> None:
     assert who_drives_what(drivers("independent", PAIR)) == told
 
 
+def test_train_team__takes_names_as_the_faces_do(tmp_path: Path) -> None:
+    recipe = tmp_path / "tiny.yaml"
+    recipe.write_text(json.dumps(TINY.model_dump(mode="json", exclude_unset=True)))
+    train_team(recipe, "cooperation-3-pair", tmp_path / "named", steps=1)
+    train_team(TINY, PAIR, tmp_path / "loaded", steps=1)
+    assert _weights(tmp_path / "named" / "policy-last") == _weights(tmp_path / "loaded" / "policy-last")
+    assert sorted(load_team(tmp_path / "named", "cooperation-3-pair").drivers) == [1, 2]
+    with pytest.raises(UnknownName, match="unknown recipe 'cooperatin'; did you mean 'cooperation'"):
+        train_team("cooperatin", PAIR, tmp_path / "no")
+    with pytest.raises(UnknownName, match="unknown scenario"):
+        train_team(TINY, "cooperation-3-pairs", tmp_path / "no")
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("team") / "run"
@@ -288,17 +303,34 @@ def test_load_team__drives_the_learners_that_the_scenario_has(trained: Path) -> 
         load_policy(trained)
     with pytest.raises(InvalidInput, match="holds no team"):
         load_team(trained / "policy", PAIR)
-    with pytest.raises(InvalidInput, match=r"go on with resume_team|has finished"):
+    with pytest.raises(InvalidInput, match=r"has finished; .* --scenario cooperation-3-pair --agents team@.*/run$"):
         resume(trained)
+
+
+def _replace(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def _without(file: Path, vehicle: str) -> None:
+    content = json.loads(file.read_text())
+    del content["drivers"][vehicle]
+    file.write_text(json.dumps(content))
 
 
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda t: t.write_text("{"), "team.json: "),
-        (lambda t: t.write_text(t.read_text().replace("policy/vehicle_3", "../policy")), "drivers.vehicle_3: "),
-        (lambda t: t.write_text(t.read_text().replace('"vehicles": 3', '"vehicles": 2')), "vehicle_3 in a line of 2"),
-        (lambda t: t.write_text(t.read_text().replace("independent", "together")), "scheme: "),
+        (lambda t: t.write_text("{"), r"team.json: is not JSON \(.*\); right is, for instance, {\"scheme\""),
+        (lambda t: t.write_text("[]"), "team.json: must be a mapping"),
+        (lambda t: t.write_text("{}"), r"scheme: missing; right is, for instance, {\"scheme\""),
+        (lambda t: _replace(t, "policy/vehicle_3", "../policy"), 'vehicle_3 = "../policy": must be policy/vehicle_3'),
+        (lambda t: _replace(t, "policy/vehicle_3", "policy/vehicle_2"), "must be policy/vehicle_3 under scheme ind"),
+        (lambda t: _replace(t, "independent", "shared"), "vehicle_2 = policy/vehicle_2: must be policy under scheme"),
+        (lambda t: _without(t, "vehicle_2"), "must be two vehicles or more under scheme independent"),
+        (lambda t: _replace(t, '"vehicles": 3', '"vehicles": 2'), "= vehicle_3: must be one of vehicle_1 to vehicle_2"),
+        (lambda t: _replace(t, "independent", "together"), "scheme = together: must be single, shared, independent"),
         (lambda t: (t.parent / "policy" / "vehicle_3" / "weights.safetensors").unlink(), "s: is missing"),
         (lambda t: (t.parent / "policy" / "vehicle_3" / "manifest.json").write_text("{}"), "manifest.json: "),
     ],
@@ -310,6 +342,14 @@ def test_load_team__a_damaged_folder_is_refused(
     damage(tmp_path / "run" / "team.json")
     with pytest.raises(CorruptBundle, match=message):
         load_team(tmp_path / "run", PAIR)
+
+
+def test_resume_team__of_another_library_is_refused(trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "run")
+    config = tmp_path / "run" / "config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), "library": "benchmarl"}))
+    with pytest.raises(InvalidInput, match="was trained by benchmarl, which leaves nothing to go on from"):
+        resume_team(tmp_path / "run")
 
 
 def test_load_team__needs_no_torch(trained: Path) -> None:

@@ -131,6 +131,15 @@ def test_train__learners_share_one_policy(recipe: TrainingRecipe, tmp_path: Path
     assert load_policy(tmp_path / "run").manifest.learners == ("vehicle_2", "vehicle_3")
 
 
+def test_train__takes_names_and_paths(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="recipe 'ppo': total_steps = 0"):
+        train("ppo", "paper-random", tmp_path / "run", steps=0)
+    with pytest.raises(InvalidInput, match="unknown recipe 'pppo'"):
+        train("pppo", SCENARIO, tmp_path / "run")
+    with pytest.raises(InvalidInput, match="unknown scenario 'paper-randm'"):
+        train("ppo", "paper-randm", tmp_path / "run")
+
+
 def test_train__refuses_before_it_makes_anything(recipe: TrainingRecipe, tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="'paper-random': no vehicle learns"):
         train(recipe, SCENARIO.replace(early_impacts="keep").with_learners([]), tmp_path / "run")

@@ -173,6 +173,7 @@ def test_initial_state__of_a_fixed_scenario_may_be_empty():
         ({"gaps_m": [7, 7]}, "initial_state: speeds_mps[0] is missing, and random in scenario 'paper-random'"),
         ({"speeds_mps": 20}, "initial_state: gaps_m[0] is missing, and random"),
         ({"gap_m": [7, 7], "speeds_mps": 20}, "unknown key 'gap_m'; did you mean gaps_m (metres)?"),
+        ({"restitution": [0.1, 0.2]}, "restitution has shape [2]; must be one number"),
         ({"gaps_m": [7, 7, 7], "speeds_mps": 20}, "gaps_m has shape [3]; 3 vehicles need 2 numbers, or one for all"),
         ({"gaps_m": [7, -7], "speeds_mps": 20}, "initial_state: gaps_m[1] = -7: must be finite and in [0, 10000] m"),
         ({"gaps_m": [7, np.nan], "speeds_mps": 20}, "initial_state: gaps_m[1] = nan: must be finite"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -79,7 +78,7 @@ def most_harmful(rng, shield, candidates=8):
     n = len(shield.first_bound)
     best, action = np.full(n, -1.0), np.full(n, 1.0)
     for candidate in np.linspace(-1.0, 1.0, candidates) + rng.uniform(-0.1, 0.1, candidates):
-        decision = certify(shield.running, np.full(n, candidate), shield.backup, shield.budget)
+        decision = certify(shield.running, np.full(n, candidate), shield.backup, shield.bound)
         free = ~decision.intervened & (decision.reason != 0)
         better = free & (decision.bound > best)
         best[better], action[better] = decision.bound[better], np.clip(candidate, -1.0, 1.0)
@@ -95,7 +94,7 @@ def attack(scenario: Scenario, worlds, adversary, *, count="first", allowance=0.
     learner = scenario.learners[0]
     scripts = {i: make_agent(spec) for i, spec in scenario.scripts.items()}
     engine = Engine(scenario, worlds.n, learners=(learner,), scripts=scripts, worlds=worlds)
-    attached = AttachedShield(SimpleNamespace(engine=engine), None, count=count, allowance=allowance)
+    attached = AttachedShield(engine, None, count=count, allowance=allowance)
     engine.reset(worlds=worlds)
     accepted, decisions, k = np.zeros(worlds.n, np.int64), 0, 0
     while not engine.ended.all():

@@ -1,4 +1,4 @@
-"""Thirteen bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
+"""Fourteen bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
 applied to a temporary copy. There ``test_certify``, ``test_guard`` and one test of ``test_robust`` run with compilation
@@ -85,6 +85,14 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     ),
     "a rollout disturbs the policy's memory": (
         Patch(ROLLOUTS, "return copy.deepcopy(policy), np.arange(n)", "return policy, np.arange(n)"),
+    ),
+    "a rollout writes another past into the plan": (
+        Patch(ROLLOUTS, "from_now(held[batch], -1.0, episodes.steps)", "np.full_like(held[batch], -1.0)"),
+        Patch(
+            GUARD,
+            "    assert (plan == from_now(decision.backup.plan[rows], plan, found.after.steps - 1)).all()",
+            "",
+        ),
     ),
     "only the world as told is certified, not its corners": (
         Patch(

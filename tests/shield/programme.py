@@ -166,7 +166,7 @@ def speed(decisions: int) -> bool:
         while not shield.running.finished.all():
             proposed = rng.uniform(-1.0, 1.0, 1)
             begun = time.perf_counter()
-            decision = certify(shield.running, proposed, shield.backup, shield.budget)
+            decision = certify(shield.running, proposed, shield.backup, shield.bound)
             took.append(time.perf_counter() - begun)
             shield.running, shield.backup = decision.after, decision.backup
     p50, p99 = np.quantile(took, [0.5, 0.99])

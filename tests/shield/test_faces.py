@@ -15,7 +15,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.shield import HybridShield, ShieldedEnv, shielded_aec
+from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 
 KEYS = {
@@ -44,6 +44,18 @@ def test_parallel__a_policy_proposes_where_nobody_does():
     alone.reset(seed=1)
     with pytest.raises(InvalidInput, match="no action was given"):
         alone.step({})
+
+
+def test_parallel__what_is_told_with_an_allowance_never_rises_and_holds():
+    env = HybridShield(parallel_env(), mode="step", allowance=50.0)
+    env.reset(seed=7)
+    told = []
+    while env.agents:
+        *_, infos = env.step({"vehicle_2": np.array([1.0])})
+        told.append(infos["vehicle_2"]["shield"]["bound_harm"])
+    assert told[0] == env.attached.shield.first_bound[0] + 50.0
+    assert told == sorted(told, reverse=True)
+    assert told[-1] == env.unwrapped.engine.ledger.world_harm("first")[0]
 
 
 def test_pettingzoo__checkers_pass():
@@ -83,6 +95,16 @@ def test_sb3__rows_keep_their_bounds_over_automatic_resets():
     assert ended >= 8
 
 
+def test_sb3__the_log_tells_episodes_apart():
+    env = ShieldedVecEnv(make_sb3_vec_env("paper-random", 2, seed=3), logging=True)
+    env.reset()
+    for _ in range(150):
+        env.step(np.ones((2, 1), np.float32))
+    log = env.attached.shield.log
+    assert len({(entry.world, entry.episode, entry.step) for entry in log}) == len(log)
+    assert {entry.episode for entry in log} >= {0, 1} and env.attached.shield.episode.min() >= 1
+
+
 def test_sb3__learns_under_the_shield():
     env = ShieldedVecEnv(make_sb3_vec_env("paper-random", 4), intervention_penalty=1.0)
     model = PPO("MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, seed=3, device="cpu")
@@ -96,6 +118,101 @@ def test_applied__something_between_the_shield_and_the_engine_is_found():
     env._engine.step = lambda actions, step=env._engine.step: step(np.zeros_like(actions) - 0.123)
     with pytest.raises(EthBrakeError, match="not the certified one"):
         env.step({"vehicle_2": np.array([-1.0])})
+
+
+class Speechless:
+    """Proposes nothing that is a number."""
+
+    name = "speechless"
+
+    def begin(self, worlds, vehicle, rows):
+        pass
+
+    def act(self, worlds, vehicle):
+        return np.full(worlds.n, np.nan)
+
+
+def test_parallel__a_policy_that_proposes_no_number_is_replaced():
+    env = HybridShield(parallel_env(), Speechless(), mode="step")
+    env.reset(seed=1)
+    *_, infos = env.step({})
+    told = infos["vehicle_2"]["shield"]
+    assert told["reason"] == "not a number" and told["intervened"] and np.isnan(told["proposed_action"])
+    with pytest.raises(InvalidInput, match=r"action of vehicle_2: nan; must be in \[-1, 1\]"):
+        env.step({"vehicle_2": np.array([np.nan])})
+
+
+@pytest.mark.parametrize("actions", [None, [0.0], np.array([0.0])])
+def test_parallel__actions_that_are_no_mapping_are_refused(actions):
+    env = HybridShield(parallel_env(), mode="step")
+    env.reset(seed=1)
+    with pytest.raises(InvalidInput, match="must be a dict"):
+        env.step(actions)
+
+
+@pytest.mark.parametrize(
+    ("face", "make", "shape"),
+    [
+        (HybridShield, parallel_env, None),
+        (ShieldedEnv, lambda: gymnasium.make("EthBrake-v0"), (1,)),
+        (ShieldedVectorEnv, lambda: gymnasium.make_vec("EthBrake-v0", num_envs=2), (2, 1)),
+        (ShieldedVecEnv, lambda: make_sb3_vec_env("paper-random", 2), (2, 1)),
+    ],
+)
+def test_faces__a_complex_action_is_refused(face, make, shape):
+    env = face(make(), mode="step") if face is HybridShield else face(make())
+    env.reset()
+    with pytest.raises(InvalidInput, match="is complex"):
+        env.step({"vehicle_2": np.array([1j])} if shape is None else np.full(shape, 1j))
+
+
+def others(face):
+    """Environments that a wrapper does not shield."""
+    makers = {
+        HybridShield: parallel_env,
+        ShieldedEnv: lambda: gymnasium.make("EthBrake-v0"),
+        ShieldedVectorEnv: lambda: gymnasium.make_vec("EthBrake-v0", num_envs=2),
+        ShieldedVecEnv: lambda: make_sb3_vec_env("paper-random", 2),
+    }
+    return [gymnasium.make("CartPole-v1"), None, *(make() for each, make in makers.items() if each is not face)]
+
+
+@pytest.mark.parametrize("face", [HybridShield, ShieldedEnv, ShieldedVectorEnv, ShieldedVecEnv])
+def test_faces__an_environment_of_another_kind_is_refused_by_name(face):
+    settings = {"mode": "step"} if face is HybridShield else {}
+    for env in others(face):
+        with pytest.raises(InvalidInput, match=f"^{face.__name__}: .* is not one of this package's environments"):
+            face(env, **settings)
+
+
+@pytest.mark.parametrize("policy", [lambda observation: observation, dict, 5, "ppo@shipped", Speechless])
+@pytest.mark.parametrize("mode", ["episode", "step", None])
+def test_faces__a_policy_that_is_none_is_refused_at_once(policy, mode):
+    with pytest.raises(InvalidInput, match="must be an agent or a policy"):
+        if mode is None:
+            ShieldedEnv(gymnasium.make("EthBrake-v0"), policy)
+        else:
+            HybridShield(parallel_env(), policy, mode=mode)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"allowance": 5.0}, "mode episode takes none"),
+        ({"mode": "step", "bound": "pairwise"}, "mode step takes none"),
+        ({"mode": "step", "allowance": "1"}, "allowance = '1': must be a number"),
+        ({"mode": "step", "allowance": float("nan")}, "allowance = nan: must be a number"),
+    ],
+)
+def test_parallel__settings_that_do_not_fit_are_refused(settings, message):
+    with pytest.raises(InvalidInput, match=message):
+        HybridShield(parallel_env(), make_agent("coast"), **settings)
+
+
+@pytest.mark.parametrize("penalty", ["x", float("nan"), -5.0, None])
+def test_gymnasium__a_penalty_that_is_none_is_refused(penalty):
+    with pytest.raises(InvalidInput, match="ShieldedEnv: intervention_penalty = "):
+        ShieldedEnv(gymnasium.make("EthBrake-v0"), intervention_penalty=penalty)
 
 
 def test_learners__exactly_one_is_needed():

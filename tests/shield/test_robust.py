@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -216,4 +217,4 @@ def test_refused__mode_and_uncertainty_that_do_not_fit(settings, message):
 
 def test_refused__by_the_gymnasium_face_too():
     with pytest.raises(InvalidInput, match="must be an Uncertainty or text"):
-        ShieldedEnv(parallel_env(), uncertainty=1)
+        ShieldedEnv(gymnasium.make("EthBrake-v0"), uncertainty=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.robustness_figure import robustness_figure, robustness_table
@@ -48,6 +49,18 @@ def test_step__breaks_its_bound_where_the_truth_differs_and_robust_pays_for_keep
     assert found["robust", "corner"].distrusted == found["robust", "inside"].distrusted == 0.0
     assert found["robust", "as told"].bound > told.bound + 1.0
     assert found["robust", "as told"].harm > told.harm
+
+
+def test_same_case__is_driven_once(monkeypatch):
+    drives = []
+    monkeypatch.setattr("ethbrake_marl.shield.robustness.drive", lambda *given: drives.append(given) or drive(*given))
+    robustness(WORLDS.take([0]), make_agent("full_brake"), SCENARIO, 1, INTERVALS, widths=(0.0, 1.0))
+    assert len(drives) == 1 + 5  # nothing differs at width 0, nor for step mode where the world is as told
+
+
+def test_refused__an_interval_that_is_possible_only_at_its_own_width():
+    with pytest.raises(InvalidInput, match="widths of up to 2 times those given are measured"):
+        robustness(WORLDS, make_agent("full_brake"), SCENARIO, 1, parse_uncertainty("mass_t=60%"))
 
 
 def test_figure__draws_the_points(points):

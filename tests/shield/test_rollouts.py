@@ -10,9 +10,10 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rehearsed import Rehearsed
 from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield import HybridShield, StepShield, StepShieldAgent
+from ethbrake_marl.shield import HybridShield, StepShield, StepShieldAgent, parse_uncertainty
 from ethbrake_marl.shield.certify import REASONS, Backup
 from ethbrake_marl.shield.rollouts import Proposer
 
@@ -121,6 +122,28 @@ def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_ex
     assert (harm <= agent.predicted_harm).all() and not agent.shield.distrusted.any()
 
 
+@pytest.mark.parametrize("distrusted", [False, True])
+def test_rollout__leaves_the_past_in_the_plan_what_was_applied(distrusted, monkeypatch):
+    weaker = parse_uncertainty("braking_capacity_mps2=20%").draw(WORLDS, np.random.default_rng(0))
+    believed = weaker if distrusted else None
+    agent, applied = StepShieldAgent(LearnedAgent(Weights()), PAPER, logging=True, believed=believed), {}
+    decide = StepShield.decide
+
+    def noted(shield, *arguments, **given):
+        steps = shield.running.steps.copy()
+        decision = decide(shield, *arguments, **given)
+        running = np.flatnonzero(given["only"] & (decision.reason != REASONS.index("ended")))
+        applied.update({(k, steps[k]): decision.applied[k] for k in running})
+        return decision
+
+    monkeypatch.setattr(StepShield, "decide", noted)
+    drive(WORLDS, agent, PAPER, 1)
+    assert (agent.shield.distrusted == distrusted).all()
+    assert all(agent.shield.backup.plan[k, step] == action for (k, step), action in applied.items())
+    for entry in agent.shield.log:
+        assert entry.plan[: entry.step].tolist() == [applied[entry.world, step] for step in range(entry.step)]
+
+
 def test_rollout__leaves_the_policys_memory_alone():
     policy = Remembering()
     _, _, reasons = driven(policy)
@@ -148,6 +171,21 @@ def test_rollout__of_some_worlds_alone_is_that_of_the_whole_batch():
             return self.policy.act(worlds, vehicle)
 
     assert driven(Whole())[1].tolist() == driven(LearnedAgent(Weights()))[1].tolist()
+
+
+def test_rollout__what_goes_wrong_when_a_policy_is_divided_is_told():
+    class Failing(LearnedAgent):
+        def take(self, rows):
+            raise InvalidInput("cannot")
+
+    with pytest.raises(InvalidInput, match="cannot"):
+        driven(Failing(Weights()))
+
+
+def test_rollout__is_refused_in_the_name_of_the_policy():
+    pair = load_scenario("cooperation-3-pair")
+    with pytest.raises(InvalidInput, match="agent 'coast' drives vehicle_2"):
+        StepShieldAgent(make_agent("coast"), pair).begin(pair.sample(1, 0).worlds, 1, np.arange(1))
 
 
 def test_later_rollouts__may_be_switched_off():

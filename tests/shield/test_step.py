@@ -11,7 +11,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.operating_figure import operating_figure
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield import HybridAgent, StepShield, StepShieldAgent
+from ethbrake_marl.shield import HybridAgent, StepShield, StepShieldAgent, parse_uncertainty
 from ethbrake_marl.shield.certify import REASONS
 from ethbrake_marl.shield.forensics import operating_curve, review
 from tests.shield.lines import ADVERSARIES, attack, line
@@ -144,6 +144,76 @@ def test_log__holds_every_intervention_and_forensics_says_what_it_was_good_for()
     assert all(found.without[k] == alone[world] for world, k in first.items())
 
 
+@pytest.mark.parametrize("mode", ["distrusted", "robust"])
+def test_review__tells_the_harm_of_the_engine_also_where_the_bound_is_not_it(mode):
+    worlds = WORLDS.take(np.arange(40))
+    other = parse_uncertainty("braking_capacity_mps2=20%").draw(worlds, np.random.default_rng(0))
+    settings = {"believed": other} if mode == "distrusted" else {"uncertainty": "gaps_m=0.5"}
+    step = StepShieldAgent(Wavering(), SCENARIO, logging=True, **settings)
+    harm = drive(worlds, step, SCENARIO, 1).ledger.world_harm("first")
+    assert abs(step.shield.bound - harm).max() > 1.0
+    found = review(step, worlds, 1)
+    assert found.realised.tolist() == harm[found.world].tolist()
+    assert found.trusted.tolist() == (~step.shield.distrusted[found.world]).tolist()
+    assert found.trusted.all() == (mode == "robust")
+
+
+def test_review__of_an_agent_driven_twice_is_of_the_last_batch():
+    smaller, again = WORLDS.take(np.arange(60, 90)), StepShieldAgent(Wavering(), SCENARIO, logging=True)
+    fresh = StepShieldAgent(Wavering(), SCENARIO, logging=True)
+    drive(WORLDS, again, SCENARIO, 1)
+    drive(smaller, again, SCENARIO, 1)
+    drive(smaller, fresh, SCENARIO, 1)
+    assert {entry.episode for entry in again.shield.log} == {0, 1}
+    for told, expected in zip(review(again, smaller, 1), review(fresh, smaller, 1), strict=True):
+        assert told.tolist() == expected.tolist()
+    with pytest.raises(InvalidInput, match="120 worlds, but 30 were driven last"):
+        review(again, WORLDS, 1)
+
+
+@pytest.mark.parametrize("agent", [StepShieldAgent, HybridAgent])
+@pytest.mark.parametrize("sizes", [(60, 30), (30, 60), (60, 1)])
+def test_agent__drives_a_batch_of_another_size_as_a_fresh_one_does(agent, sizes):
+    used = agent(make_agent("constant:3"), SCENARIO)
+    for n in sizes:
+        worlds, fresh = WORLDS.take(np.arange(n)), agent(make_agent("constant:3"), SCENARIO)
+        harms = [drive(worlds, each, SCENARIO, 1).ledger.world_harm("first").tolist() for each in (used, fresh)]
+        assert harms[0] == harms[1]
+        assert used.predicted_harm.tolist() == fresh.predicted_harm.tolist()
+        assert used.chosen_policy.tolist() == fresh.chosen_policy.tolist()
+
+
+def test_begin__of_a_row_that_is_not_there_is_refused():
+    shield = StepShield(SCENARIO, 1)
+    shield.begin(WORLDS.take(np.arange(5)), np.arange(5))
+    with pytest.raises(InvalidInput, match="begin in row 7 of a batch of 5"):
+        shield.begin(WORLDS.take([0, 1]), np.array([3, 7]))
+
+
+class Speechless:
+    """Full braking, and nothing that is a number in the second half of each second."""
+
+    name = "speechless"
+
+    def begin(self, worlds, vehicle, rows):
+        pass
+
+    def act(self, worlds, vehicle):
+        braking = -worlds.vehicles.braking_capacity_mps2[:, vehicle]
+        return np.where(worlds.time_s % 1.0 > 0.5, np.nan, braking)
+
+
+@pytest.mark.parametrize("capacity", [0.0, 5.0])
+def test_agent__what_is_no_number_is_replaced_and_told(capacity):
+    scenario = SCENARIO.replace(driving_capacity_mps2=capacity)
+    worlds = scenario.sample(20, 3).worlds
+    step = StepShieldAgent(Speechless(), scenario, logging=True)
+    harm = drive(worlds, step, scenario, 1).ledger.world_harm("first")
+    assert harm.tolist() == step.shield.bound.tolist() and (harm <= step.predicted_harm).all()
+    silent = [entry for entry in step.shield.log if REASONS[entry.reason] == "not a number"]
+    assert len({entry.world for entry in silent}) == 20 and all(np.isnan(entry.proposed) for entry in silent)
+
+
 def test_operating_curve__fewer_interventions_cost_harm():
     worlds = WORLDS.take(np.arange(60))
     points = operating_curve(worlds, make_agent("coast"), SCENARIO, 1, [0.0, 20.0, 1e6])
@@ -155,6 +225,32 @@ def test_operating_curve__fewer_interventions_cost_harm():
     assert line_drawn.get_xdata().tolist() == rates
     with pytest.raises(InvalidInput, match="at least one point"):
         operating_figure([])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: StepShieldAgent(make_agent("coast"), "paper-random"), "scenario = 'paper-random': must be a Scenario"),
+        (lambda: HybridAgent(make_agent("coast"), "paper-random"), "scenario = 'paper-random': must be a Scenario"),
+        (lambda: StepShieldAgent(make_agent("coast"), SCENARIO, believed=3), "believed = 3: must be worlds"),
+        (lambda: StepShield(SCENARIO, 9), "vehicle = 9: must be an index from 0 to 2"),
+        (lambda: StepShield(SCENARIO, 1, allowance="1"), "allowance = '1': must be a number, at least 0"),
+        (lambda: StepShield(SCENARIO, 1).decide(np.zeros(3)), "no episode has begun"),
+    ],
+)
+def test_refused__what_does_not_fit(wrong, message):
+    with pytest.raises(InvalidInput, match=message):
+        wrong()
+
+
+def test_refused__worlds_and_proposals_of_another_number():
+    step = StepShieldAgent(make_agent("coast"), SCENARIO, believed=WORLDS.take([0, 1]))
+    with pytest.raises(InvalidInput, match="believed holds 2 worlds, but row 2 begins"):
+        step.begin(WORLDS.take([0, 1, 2]), 1, np.arange(3))
+    shield = StepShield(SCENARIO, 1)
+    shield.begin(WORLDS.take([0, 1]), np.arange(2))
+    with pytest.raises(InvalidInput, match=r"proposed \(3,\); \(2,\) is needed"):
+        shield.decide(np.zeros(3))
 
 
 def test_review__without_a_log_is_refused():

@@ -29,6 +29,10 @@ def test_parse__reads_what_str_writes():
     assert str(found.scaled(2.0)) == "braking_capacity_mps2=10%,latency_s.vehicle_2=0.2,gaps_m.pair_1=1"
 
 
+def test_parse__blanks_change_nothing():
+    assert parse_uncertainty(" latency_s = 0.1 ,gaps_m= 5% ") == parse_uncertainty("latency_s=0.1,gaps_m=5%")
+
+
 def test_members__are_the_world_itself_and_every_corner():
     worlds = line()
     members = parse_uncertainty("gaps_m.pair_1=0.5,mass_t.vehicle_3=10%").members(worlds)
@@ -72,14 +76,16 @@ def test_draw__is_inside_the_box_or_at_a_corner():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "must be quantity=half-width"),
+        ("", "entry 1 is empty; it must be quantity=half-width"),
         ("latency_s", "must be quantity=half-width"),
         ("latency_s=", "must be quantity=half-width"),
         ("latency_s=-0.1", "must be quantity=half-width"),
         ("latency_s=nan", "must be quantity=half-width"),
         ("latency_s=1e999", "half-width inf"),
         ("latency_s=0.1;gaps_m=1", "must be quantity=half-width"),
-        ("latency_s=0.1,", "must be quantity=half-width"),
+        ("latency_s=0.1,", "entry 2 is empty; it must be quantity=half-width"),
+        ("latency_s=٣", "must be quantity=half-width"),
+        ("latency_s.vehicle_1٣=1", "must be quantity=half-width"),
         ("latency_s=100%", "below 100 %"),
         ("latency_s.vehicle_0=0.1", "must be quantity=half-width"),
         ("latency_s.pair_1=0.1", "gaps_m is of pairs"),
@@ -106,6 +112,12 @@ def test_refused__what_the_worlds_do_not_allow():
         parse_uncertainty("gaps_m.pair_3=0.1").members(line())
     with pytest.raises(InvalidInput, match="vehicle_1 in world 0 may be as low as 0; it must stay above 0"):
         parse_uncertainty("mass_t=1").members(line())
+    for text, message in (
+        ("gaps_m=1e308", r"10 of vehicle_1 to vehicle_2 in world 0 may be as high as 1e\+308; .* in \[0, 10000\] m"),
+        ("driving_capacity_mps2=99", r"2 of vehicle_1 in world 0 may be as high as 101; .* in \[0, 100\] m/s2"),
+    ):
+        with pytest.raises(InvalidInput, match=message):
+            parse_uncertainty(text).members(line())
     with pytest.raises(
         InvalidInput, match=f"11 uncertain numbers in each world make 2048 corners; at most {MOST_CORNERS}"
     ):
@@ -117,6 +129,15 @@ def test_python_form__is_checked_too():
         Uncertainty(())
     with pytest.raises(InvalidInput, match="half-width -1"):
         Interval("latency_s", -1.0)
+    for half_width in ("0.5", None, True, float("nan")):
+        with pytest.raises(InvalidInput, match="must be a number, at least 0"):
+            Interval("gaps_m", half_width)
+    for place in (0.5, "1", -1):
+        with pytest.raises(InvalidInput, match="must be an index from 0"):
+            Interval("gaps_m", 0.5, place=place)
+    for intervals in ("gaps_m=0.5", ["gaps_m=0.5"], ("gaps_m=0.5",)):
+        with pytest.raises(InvalidInput, match="must be a tuple of Interval"):
+            Uncertainty(intervals)
     with pytest.raises(InvalidInput, match="must be an Uncertainty or text"):
         checked_uncertainty(0.1)
     assert checked_uncertainty(None) is None

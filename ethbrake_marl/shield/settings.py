@@ -1,0 +1,73 @@
+"""What a shield is given, checked where it is built."""
+
+from __future__ import annotations
+
+from numbers import Real
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ethbrake_marl.actions import checked_action
+from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.observations import ObservationSpec
+from ethbrake_marl.physics import Floats
+from ethbrake_marl.scenario import Scenario
+
+
+def is_amount(value: object, below: float = np.inf) -> bool:
+    """Whether this is a number, at least 0 and ``below`` that."""
+    return isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) < below
+
+
+def check_amount(name: str, value: object, where: str, unit: str = "") -> None:
+    """Raise ``InvalidInput`` for what is not a finite number, at least 0."""
+    if not is_amount(value):
+        raise InvalidInput(f"{where}: {name} = {value!r}: must be a number, at least 0{unit}")
+
+
+def check_scenario(scenario: object, where: str) -> None:
+    """Raise ``InvalidInput`` for what is not a ``Scenario``, its name among that."""
+    if not isinstance(scenario, Scenario):
+        raise InvalidInput(f"{where}: scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")
+
+
+def proposing_agent(policy: Agent | LearnedPolicy | None, where: str) -> Agent:
+    """An agent as it is, a loaded policy as an agent. Raises ``InvalidInput`` for anything else."""
+    if not isinstance(policy, type):
+        if isinstance(policy, Agent):
+            return policy
+        if callable(policy) and isinstance(getattr(policy, "observation", None), ObservationSpec):
+            return LearnedAgent(policy)
+    raise InvalidInput(
+        f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy), which says what it observes"
+    )
+
+
+def checked_proposal(action: ArrayLike, shape: tuple[int, ...], names: str) -> Floats:
+    """``checked_action``, which also refuses complex numbers."""
+    if np.iscomplexobj(action):
+        raise InvalidInput(f"action of {names}: {action!r} is complex; a number in [-1, 1] is needed")
+    return checked_action(action, shape, names)
+
+
+def engine_of(env: object, face: type, where: str, maker: str) -> Engine:
+    """The engine of one of this package's environments, whatever wraps it; ``InvalidInput`` for another face."""
+    engine = getattr(getattr(env, "unwrapped", env), "engine", None)
+    if not (isinstance(env, face) and isinstance(engine, Engine)):
+        raise InvalidInput(f"{where}: {env} is not one of this package's environments ({maker})")
+    return engine
+
+
+def only_shielded(engine: Engine, where: str) -> int:
+    """Index of the one learner, which is shielded; ``InvalidInput`` when there is none or more than one."""
+    if len(engine.learners) != 1:
+        learners = ", ".join(engine.scenario.vehicle_names[i] for i in engine.learners) or "none"
+        raise InvalidInput(
+            f"{where}: the environment has {len(engine.learners)} learners ({learners}), a shield needs exactly"
+            " one learner: what is certified is known only if every other vehicle follows a script; pass"
+            " learners=['vehicle_2'] to the environment"
+        )
+    return engine.learners[0]
