@@ -17,8 +17,15 @@ import numpy as np
 from ethbrake_marl.ablation.levels import Level
 from ethbrake_marl.ablation.plan import Plan
 from ethbrake_marl.agents.team import Team
-from ethbrake_marl.analysis.best_harm import CHUNK, realised_harm, search_list, world_identity
-from ethbrake_marl.analysis.best_harm_table import BestHarmTable, load_table
+from ethbrake_marl.analysis.best_harm import (
+    CHUNK,
+    chunk_file,
+    kept_chunk,
+    realised_harm,
+    search_list,
+    world_identity,
+)
+from ethbrake_marl.analysis.best_harm_table import BestHarmTable
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.harm import COUNTS, HarmCount
@@ -54,15 +61,15 @@ def parts_left(plan: Plan, level: Level, part: Sample) -> tuple[int, list[Path]]
     """Worlds of a question that ``search_list`` will search, not finding them kept; and what it finds damaged."""
     left, damaged = 0, []
     identity = world_identity(level.scenario, part.worlds)
+    question = {"counts": list(COUNTS), "budget": plan.budget, "search_seed": 0}
     for first in range(0, part.worlds.n, CHUNK):
-        file = plan.optimum_folder(level) / f"{first:07d}.npz"
-        wanted, table = identity[first : first + CHUNK], None
+        file, wanted = chunk_file(plan.optimum_folder(level), first), identity[first : first + CHUNK]
         try:
-            table = load_table(file) if file.is_file() else None
+            kept = kept_chunk(file, wanted, question)
         except CorruptBundle:
+            kept = None
             damaged.append(file)
-        if table is None or table.header.get("budget") != plan.budget or not np.array_equal(table.identity, wanted):
-            left += len(wanted)
+        left += 0 if kept is not None else len(wanted)
     return left, damaged
 
 

@@ -6,7 +6,8 @@ What is found is realised harm: an upper bound of the true minimum, never below 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -122,11 +123,12 @@ def search_list(
         rows = np.arange(first, min(first + CHUNK, n))
         worlds = sample.worlds.take(rows)
         part = None
-        file = None if chunks is None else chunks / f"{first:07d}.npz"
+        file = None if chunks is None else chunk_file(chunks, first)
         before = {} if known is None else {"after": dict(known.header)}
         question = {"counts": list(counts), "budget": budget, "search_seed": seed, **before}
-        if file is not None and file.is_file():
-            part = _answer(file, scenario, worlds, vehicles, question)
+        if file is not None:
+            with suppress(CorruptBundle):
+                part = kept_chunk(file, world_identity(scenario, worlds, vehicles), question)
         if part is None:
             part = best_harm(
                 scenario,
@@ -147,17 +149,18 @@ def search_list(
     return join_tables(parts)
 
 
-def _answer(
-    file: Path, scenario: Scenario, worlds: Worlds, vehicles: Sequence[int] | None, question: dict[str, object]
-) -> BestHarmTable | None:
-    """What a kept chunk says, if it is whole and of this very question."""
-    try:
-        table = load_table(file)
-    except CorruptBundle:
+def chunk_file(chunks: Path, first: int) -> Path:
+    """Where the chunk that begins with world ``first`` is kept."""
+    return chunks / f"{first:07d}.npz"
+
+
+def kept_chunk(file: Path, identity: Words, question: Mapping[str, object]) -> BestHarmTable | None:
+    """A kept chunk, if it is there and answers this very question; raises ``CorruptBundle`` for a damaged one."""
+    if not file.is_file():
         return None
+    table = load_table(file)
     asked = {"counts": list(table.best), **{key: table.header[key] for key in question if key in table.header}}
-    same = asked == question and np.array_equal(table.identity, world_identity(scenario, worlds, vehicles))
-    return table if same else None
+    return table if asked == question and np.array_equal(table.identity, identity) else None
 
 
 def world_identity(scenario: Scenario, worlds: Worlds, vehicles: Sequence[int] | None = None) -> Words:

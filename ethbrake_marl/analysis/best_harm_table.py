@@ -152,7 +152,7 @@ def load_table(path: Path) -> BestHarmTable:
             counts = [count for count in _COUNTS if f"{count}_harm" in arrays]
             best = {count: _read_best(arrays, count) for count in counts}
             return BestHarmTable(arrays["identity"].astype(np.uint64), best, header)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         if isinstance(error, CorruptBundle):
             raise
         raise CorruptBundle(f"{path}: is not a table of best known harm") from error

@@ -245,8 +245,9 @@ def test_profiles__beyond_a_capacity_or_out_of_order_are_refused(worlds: Worlds)
         follow_profiles(problem, Profiles(np.array([[9]]), np.zeros((1, 1, 1))))
 
 
-def test_table__a_damaged_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "t.npz").write_bytes(b"no table")
+@pytest.mark.parametrize("content", [b"no table", b""])
+def test_table__a_damaged_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "t.npz").write_bytes(content)
     with pytest.raises(CorruptBundle, match="not a table"):
         load_table(tmp_path / "t.npz")
     with pytest.raises(InvalidInput, match="there is no such table"):
