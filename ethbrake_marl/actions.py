@@ -16,6 +16,8 @@ from ethbrake_marl.physics.compiled import compiled
 def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Floats:
     """The action as float64, refused with ``InvalidInput`` unless it has ``shape`` and lies in [-1, 1]."""
     try:
+        if np.iscomplexobj(action):
+            raise TypeError
         given = np.asarray(action, dtype=np.float64)
     except (TypeError, ValueError):
         raise InvalidInput(f"action of {names}: {action!r} is not a number; one in [-1, 1] is needed") from None

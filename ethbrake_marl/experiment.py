@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +20,7 @@ from ethbrake_marl.learning.bundle import Policy
 from ethbrake_marl.learning.callback import Progress
 from ethbrake_marl.learning.measure import measure_on_list
 from ethbrake_marl.learning.recipe import TrainingRecipe
-from ethbrake_marl.learning.run_directory import RunDirectory, RunStatus
+from ethbrake_marl.learning.run_directory import RunDirectory, RunStatus, read_object
 from ethbrake_marl.learning.train import TrainResult, resume, train
 from ethbrake_marl.learning.versions import installed_versions
 from ethbrake_marl.lineup import EPISODES, LIST_SEED, PROGRESS_EVERY, make_agents
@@ -208,7 +207,7 @@ def _shown(
     wall_s: float,
 ) -> Path:
     """Figures and page."""
-    config = json.loads(run.config.read_text("utf-8"))
+    config = read_object(run.config)
     plan = config["recipe"]["evaluation"]
     caption = (
         f"{evaluation.scenario.name}: worlds 0 to {plan['worlds'] - 1} of the list of seed {plan['seed']} at every"
@@ -252,6 +251,6 @@ def _status(run: RunDirectory, status: Ended) -> Iterator[None]:
 
 def _note(run: RunDirectory, status: RunStatus, stage: str, reason: str | None) -> None:
     """Bring ``run.json`` up to date; its steps and ``wall_s`` stay those of the training."""
-    content: dict[str, Any] = json.loads(run.status.read_text("utf-8"))
+    content = read_object(run.status)
     ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")
     run.write_json(run.status, {**content, "status": status, "stage": stage, "ended_utc": ended, "reason": reason})

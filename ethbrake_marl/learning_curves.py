@@ -21,7 +21,7 @@ from ethbrake_marl.experiment import resume_measured, train_measured
 from ethbrake_marl.learning.callback import Progress
 from ethbrake_marl.learning.course import HARM_METRIC
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of
-from ethbrake_marl.learning.run_directory import RunDirectory
+from ethbrake_marl.learning.run_directory import RunDirectory, read_object
 from ethbrake_marl.scenario import Scenario
 
 FIGURE, TABLE, SUMMARY = "learning_curves.png", "learning_curves.csv", "learning_curves.json"
@@ -112,11 +112,11 @@ def _train_one(scenario: Scenario, recipe: TrainingRecipe, path: Path, tell: Cal
     run = RunDirectory(path)
     if not run.status.is_file():
         return train_measured(scenario, path, recipe=recipe, on_progress=tell).status == "finished"
-    config = json.loads(run.config.read_text("utf-8"))
+    config = read_object(run.config)
     same = recipe_of(json.dumps(config["recipe"])) == recipe and config["scenario"].get("name") == scenario.name
     if not same:
         raise InvalidInput(f"{path}: holds the training of another recipe or scenario; give another folder (--output)")
-    if json.loads(run.status.read_text("utf-8"))["status"] == "finished":
+    if read_object(run.status).get("status") == "finished":
         return True
     return resume_measured(path, on_progress=tell).status == "finished"
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ethbrake_marl.ablation.comparison import TOLERANCE
 from ethbrake_marl.ablation.measurement import Harms, harms_of
-from ethbrake_marl.ablation.plan import read_object
+from ethbrake_marl.ablation.plan import read_kept
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.analysis.best_harm import best_harm
@@ -126,7 +126,7 @@ def _training(path: str, policy: Policy) -> dict[str, Any]:
     found = {name: manifest[name] for name in ("algorithm", "network", "observation", "learners", "reward", "scenario")}
     config = RunDirectory(Path(path)).config
     if config.is_file():
-        recipe = dict(read_object(config, f"give the policy instead: {Path(path) / 'policy'}").get("recipe") or {})
+        recipe = dict(read_kept(config, f"give the policy instead: {Path(path) / 'policy'}").get("recipe") or {})
         found["recipe"] = {name: value for name, value in recipe.items() if name not in (*WORDS, "seed")}
     return found
 

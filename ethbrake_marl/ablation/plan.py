@@ -12,7 +12,7 @@ from ethbrake_marl.ablation.levels import Level
 from ethbrake_marl.durable_files import check_writable, write_file
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.recipe import WORDS, PpoRecipe, Scheme, TrainingRecipe
-from ethbrake_marl.learning.run_directory import RunDirectory
+from ethbrake_marl.learning.run_directory import RunDirectory, read_object
 from ethbrake_marl.scenario import Scenario
 
 TRAININGS, OPTIMUM, SETTINGS = "trainings", "optimum", "settings.json"  # inside the ablation's folder
@@ -35,7 +35,7 @@ class Training:
             if self.folder.exists():
                 raise InvalidInput(f"{self.folder}: is no training; move it away, or give another --output")
             return self.recipe.total_steps
-        status, config = (read_object(file, "delete its folder to train anew") for file in (run.status, run.config))
+        status, config = (read_kept(file, "delete its folder to train anew") for file in (run.status, run.config))
         if not same_training(config, self.recipe, self.level.scenario):
             raise InvalidInput(
                 f"{self.folder}: holds the training of another recipe or scenario; give another folder (--output)"
@@ -135,7 +135,7 @@ def check_settings(plan: Plan) -> None:
     file = plan.folder / SETTINGS
     if not file.exists():
         return
-    kept, wanted = read_object(file, "delete it to compare anew"), plan.settings()
+    kept, wanted = read_kept(file, "delete it to compare anew"), plan.settings()
     other = [name for name, value in wanted.items() if kept.get(name) != value]
     if other:
         told = "; ".join(
@@ -161,12 +161,9 @@ def same_training(config: dict[str, Any], recipe: TrainingRecipe, scenario: Scen
     return (given, config.get("scenario")) == wanted
 
 
-def read_object(file: Path, advice: str) -> dict[str, Any]:
+def read_kept(file: Path, advice: str) -> dict[str, Any]:
     """What a JSON file holds; raises ``InvalidInput`` (file, reason, ``advice``) if that is no object."""
     try:
-        content = json.loads(file.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise InvalidInput(f"{file}: is damaged ({error}); {advice}") from None
-    if not isinstance(content, dict):
-        raise InvalidInput(f"{file}: is damaged (no JSON object); {advice}")
-    return content
+        return read_object(file)
+    except InvalidInput as error:
+        raise InvalidInput(f"{error}; {advice}") from None

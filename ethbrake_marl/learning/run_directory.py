@@ -78,7 +78,7 @@ class RunRecord:
 
     def __init__(self, run: RunDirectory) -> None:
         self._run = run
-        self._started = _read_object(run.status).get("started_utc") or _now()
+        self._started = read_object(run.status).get("started_utc") or _now()
         write_status(run, "running", {"started_utc": self._started})
 
     def end(self, status: RunStatus, reason: str | None, left: Mapping[str, Any]) -> None:
@@ -95,7 +95,7 @@ def write_status(run: RunDirectory, status: RunStatus, more: Mapping[str, Any]) 
     run.write_json(run.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **more})
 
 
-def _read_object(file: Path) -> dict[str, Any]:
+def read_object(file: Path) -> dict[str, Any]:
     """The JSON object in a file of a run; raises ``InvalidInput`` naming the file and what is wrong with it."""
     try:
         content = parse_strict_json(file.read_bytes())
@@ -148,7 +148,7 @@ def open_run(path: Path) -> tuple[RunDirectory, dict[str, Any]]:
     run = RunDirectory(path)
     if not (run.status.exists() or run.config.exists()):
         raise InvalidInput(f"{path}: holds no training; give the folder of a run, for instance runs/my-run")
-    status, config = _read_object(run.status), _read_object(run.config)
+    status, config = read_object(run.status), read_object(run.config)
     for key, right in (("format", ("ethbrake-run",)), ("status", get_args(RunStatus))):
         if status.get(key) not in right:
             raise InvalidInput(f"{run.status}: {key} = {status.get(key)!r:.60}: must be {' or '.join(right)}")
@@ -157,7 +157,7 @@ def open_run(path: Path) -> tuple[RunDirectory, dict[str, Any]]:
 
 def has_finished(run: RunDirectory) -> bool:
     """Whether the training in an open run has come to its end, though its report may not."""
-    status = _read_object(run.status)
+    status = read_object(run.status)
     resumable = any(run.checkpoints.glob("step_*"))
     return status.get("status") == "finished" or (status.get("stage") is not None and not resumable)
 

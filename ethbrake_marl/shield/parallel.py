@@ -11,7 +11,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.conversions import parallel_to_aec
 
-from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.actions import checked_action, command_to_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -20,7 +20,7 @@ from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Ints, Worlds
 from ethbrake_marl.shield.attached import AttachedShield
 from ethbrake_marl.shield.episode import Bound, HybridAgent
-from ethbrake_marl.shield.settings import checked_proposal, engine_of, only_shielded, proposing_agent
+from ethbrake_marl.shield.settings import engine_of, only_shielded, proposing_agent
 from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
 
 MODES = ("episode", "step", "robust")
@@ -89,7 +89,7 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
             )
         proposed = actions.get(agent)
         if proposed is not None:
-            checked_proposal(proposed, (1,), agent)
+            checked_action(proposed, (1,), agent)
         if not self.env.agents:
             self.env.step(actions)  # says that no episode is running
         if self.attached is not None:
@@ -113,7 +113,7 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
     ) -> tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]:
         """Advance by one step in mode ``step``."""
         agent = self.shielded
-        given = attached.proposal() if proposed is None else checked_proposal(proposed, (1,), agent)
+        given = attached.proposal() if proposed is None else checked_action(proposed, (1,), agent)
         applied = attached.decide(given)
         decision = attached.decision
         assert decision is not None

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
+from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, Rewards
@@ -16,7 +17,7 @@ from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
 from ethbrake_marl.shield.attached import AttachedShield
-from ethbrake_marl.shield.settings import check_amount, checked_proposal, engine_of
+from ethbrake_marl.shield.settings import check_amount, engine_of
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 
@@ -59,7 +60,7 @@ class ShieldedVecEnv(VecEnvWrapper):
         if self.attached.shield.running is None:
             self.venv.step_async(actions)
             return
-        self._proposed = checked_proposal(actions, (self.num_envs, 1), "the learners")[:, 0]
+        self._proposed = checked_action(actions, (self.num_envs, 1), "the learners")[:, 0]
         self.venv.step_async(self.attached.decide(self._proposed)[:, np.newaxis])
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:

@@ -5,15 +5,12 @@ from __future__ import annotations
 from numbers import Real
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec
-from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario
 
 
@@ -44,13 +41,6 @@ def proposing_agent(policy: Agent | LearnedPolicy | None, where: str) -> Agent:
     raise InvalidInput(
         f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy), which says what it observes"
     )
-
-
-def checked_proposal(action: ArrayLike, shape: tuple[int, ...], names: str) -> Floats:
-    """``checked_action``, which also refuses complex numbers."""
-    if np.iscomplexobj(action):
-        raise InvalidInput(f"action of {names}: {action!r} is complex; a number in [-1, 1] is needed")
-    return checked_action(action, shape, names)
 
 
 def engine_of(env: object, face: type, where: str, maker: str) -> Engine:

@@ -8,12 +8,13 @@ import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.shield.attached import AttachedShield
-from ethbrake_marl.shield.settings import check_amount, checked_proposal, engine_of
+from ethbrake_marl.shield.settings import check_amount, engine_of
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 
@@ -59,7 +60,7 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
         shield = self.attached
         if shield.shield.running is None or shield.engine.ended[0]:
             return self.env.step(action)  # type: ignore[return-value]  # says what is wrong
-        proposed = checked_proposal(action, (1,), shield.engine.scenario.vehicle_names[shield.vehicle])
+        proposed = checked_action(action, (1,), shield.engine.scenario.vehicle_names[shield.vehicle])
         applied = shield.decide(proposed)
         decision = shield.decision
         assert decision is not None

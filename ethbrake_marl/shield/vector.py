@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
 
+from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.envs.vector import EthBrakeVectorEnv
@@ -15,7 +16,7 @@ from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.shield.attached import AttachedShield
-from ethbrake_marl.shield.settings import check_amount, checked_proposal, engine_of
+from ethbrake_marl.shield.settings import check_amount, engine_of
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 
@@ -57,7 +58,7 @@ class ShieldedVectorEnv(VectorWrapper):
         given = np.array(actions)
         if before.any() and given.shape[:1] == before.shape:
             given[before] = 0.0  # whatever stands there, the autoreset mode ignores it
-        proposed = checked_proposal(given, (self.num_envs, 1), "the learners")[:, 0]
+        proposed = checked_action(given, (self.num_envs, 1), "the learners")[:, 0]
         applied = attached.decide(proposed)
         decision, told = attached.decision, attached.infos(proposed)
         assert decision is not None
