@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 
 import pytest
@@ -15,6 +16,9 @@ os.environ["MPLBACKEND"] = "Agg"
 os.environ["SDL_VIDEODRIVER"] = "dummy"
 os.environ["SDL_AUDIODRIVER"] = "dummy"
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
+
+# A shell's background job ignores Ctrl-C, and so would all processes that it starts; the tests send it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No deadline: the first example of a property pays for the kernel's compilation.
 settings.register_profile("deterministic", derandomize=True, deadline=None, database=None, print_blob=True)

@@ -219,6 +219,7 @@ def test_ablate__an_interruption_reaches_the_trainings_of_other_processes(tmp_pa
         _, err = process.communicate(timeout=300)
     finally:
         process.kill()
+        process.wait()
         process.stderr.close()
     assert process.returncode == 130 and "interrupted; the same command goes on" in err
     statuses = [json.loads(path.read_text())["status"] for path in folder.glob("trainings/*/run.json")]
