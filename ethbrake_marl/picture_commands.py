@@ -130,7 +130,9 @@ def picture_shield(
 )
 def picture_robustness(
     output: PictureOption,
-    agent: Annotated[str, typer.Option(help="Who proposes; any agent of `ethbrake evaluate`.")] = "full_brake",
+    agent: Annotated[
+        str, typer.Option(help="Who proposes; an agent of `ethbrake evaluate` without a shield.")
+    ] = "full_brake",
     uncertainty: Annotated[
         str, typer.Option(metavar="QUANTITY=WIDTH,...", help="The intervals; drawn at 0 to 2 times their width.")
     ] = "braking_capacity_mps2=10%,gaps_m=0.5",

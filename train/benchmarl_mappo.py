@@ -1,4 +1,4 @@
-"""BenchMARL's MAPPO on a level of cooperation. Needs `pip install 'ethbrake-marl[marl]'`.
+"""BenchMARL's MAPPO on a level of cooperation. Needs the extra `marl` (`.venv/bin/pip install '.[marl]'`).
 
     python train/benchmarl_mappo.py --scenario cooperation-3-pair --steps 200000 --output runs/mappo
     ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@runs/mappo
@@ -10,6 +10,7 @@ line) without the extra, with checkpoints and measuring on the way; this file is
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import ethbrake_marl as eb
@@ -25,7 +26,7 @@ def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> No
     try:
         from ethbrake_marl.learning.benchmarl_task import train_mappo  # only here: an extra
     except ModuleNotFoundError as error:
-        raise InvalidInput(f"needs BenchMARL: pip install 'ethbrake-marl[marl]' ({error})") from None
+        raise InvalidInput(f"needs BenchMARL: {sys.executable} -m pip install benchmarl ({error})") from None
     train_mappo(plan, line, output)
 
 

@@ -15,7 +15,7 @@ TASK = "ethbrake_marl.learning.benchmarl_task"
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "needs BenchMARL: pip install 'ethbrake-marl[marl]'"),
+        ([], "-m pip install benchmarl"),
         (["--scenario", "cooperation-3-pear"], "did you mean 'cooperation-3-pair'?"),
         (["--recipe", "sac"], "recipe 'sac': is for SAC; MAPPO needs one for PPO"),
         (["--steps", "-5"], "total_steps = -5: must be greater than or equal to 1"),
