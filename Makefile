@@ -24,7 +24,7 @@ help:
 	@echo "make check            lint and test"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
-	@echo "make test-shield      try to break the step shield: speed, search, faces, bound (half an hour of one core)"
+	@echo "make test-shield      try to break the step shield: speed, search, faces, bound (three quarters of an hour of one core)"
 	@echo "make shield-bugs      plant 14 bugs in copies of the shield; each must turn a test red"
 	@echo "make planted-bugs     plant 23 bugs in copies of the code; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of physics and harm (ARGS='--sample 100')"
