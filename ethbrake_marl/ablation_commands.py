@@ -17,7 +17,7 @@ from ethbrake_marl.terminal import INTERRUPTED, interruptible, progress_bars, sa
 if TYPE_CHECKING:
     from ethbrake_marl.ablation.plan import Plan
 
-QUICK = {"seeds": 2, "steps_per_learner": 250_000, "episodes": 500, "search_episodes": 40, "budget": 2_000}
+QUICK = {"seeds": 2, "steps_per_learner": 200_000, "episodes": 500, "search_episodes": 40, "budget": 2_000}
 FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_episodes": 600, "budget": 20_000}
 KEPT = "the same command goes on with what is in the folder"
 
