@@ -25,20 +25,11 @@ from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.run_directory import create_run
 from ethbrake_marl.learning.train import TrainResult, resume, train
 from ethbrake_marl.scenario import Scenario, load_scenario
+from tests.learning.tiny import TINY_PPO
 
 SCENARIO = load_scenario("paper-random")
 
-PPO = load_recipe("ppo").replace(
-    total_steps=12 * 128,
-    n_envs=8,
-    n_steps=16,
-    batch_size=64,
-    n_epochs=2,
-    network={"policy": [8], "value": [8, 4]},
-    reward={"harm": 0.05, "shaping": 0.02, "shaping_discount": 0.995},
-    evaluation={"every_updates": 3, "worlds": 10, "seed": 7},
-    checkpoint_every_updates=2,
-)
+PPO = TINY_PPO.replace(total_steps=12 * 128)
 SAC = load_recipe("sac").replace(
     total_steps=90 * 8,
     n_envs=8,

@@ -27,21 +27,12 @@ from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.schemes import check_scheme, drivers, scheme_of, who_drives_what
 from ethbrake_marl.learning.teams import is_team, load_team, resume_team, train_team
 from ethbrake_marl.learning.train import resume, run_training, train
+from tests.learning.tiny import TINY_PPO
 
 PAIR = eb.load_scenario("cooperation-3-pair")
 ALONE = eb.load_scenario("cooperation-2-paper")
 NAMES = ("vehicle_2", "vehicle_3")
-TINY = load_recipe("ppo").replace(
-    total_steps=8 * 256,
-    n_envs=8,
-    n_steps=16,
-    batch_size=64,
-    n_epochs=2,
-    network={"policy": [8], "value": [8, 4]},
-    reward={"harm": 0.05, "shaping": 0.02, "shaping_discount": 0.995},
-    evaluation={"every_updates": 3, "worlds": 10, "seed": 7},
-    checkpoint_every_updates=2,
-)
+TINY = TINY_PPO.replace(total_steps=8 * 256)
 
 
 def _weights(folder: Path) -> dict[str, str]:
