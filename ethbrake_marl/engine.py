@@ -7,7 +7,8 @@ when Vehicle 1 brakes; ``reset`` moves exactly to the first moment at which a le
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,14 +45,27 @@ from ethbrake_marl.rewards import (
     weighted_sum,
 )
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.starts import Script, Start, Stream, check_alert, is_state_free, moved, within_capacity
-from ethbrake_marl.stepping import BAD_ACTION, ENDED, OUTCOME_ROWS, START, Step, step_worlds
+from ethbrake_marl.starts import Script, Start, Stream, Told, check_alert, is_state_free, moved, within_capacity
+from ethbrake_marl.stepping import BAD_ACTION, ENDED, OUTCOME_ROWS, START, STEP, Step, step_worlds
 from ethbrake_marl.v2x import known_from, told_by_link
 
-OnBegin = Callable[[Worlds, Ints], None]  # the new worlds at the alert, and the rows where their episodes start
 Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 
 _RUNNING = ("_state", "_params", "_clock", "_wanted", "_potential")
+
+
+class Watcher(Protocol):
+    """Follows an engine's episodes (a shield does), and refuses what must not happen by raising.
+
+    What it remembers is kept by the engine beside the worlds (``Engine.memory``): both change in one piece, or, where
+    anything fails or is interrupted, neither does. A memory is therefore never changed in place.
+    """
+
+    def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
+        """The memory once episodes start in these rows; ``alert`` holds those worlds only, at t = 0."""
+
+    def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
+        """The memory once the engine, as it was ``before`` this step, is as ``after``."""
 
 
 class Engine:
@@ -61,8 +75,15 @@ class Engine:
     the scenario's training stream of ``seed`` unless they are given (``worlds``, at t = 0, here or in ``reset``).
     Steps start when the first of the ``deciders`` may act: the learners, or the scripted vehicles named instead (an
     evaluated agent drives its vehicle as a script, on a learner's grid of decisions). With none, they start at t = 0.
-    Whoever must see each episode's start (a shield) adds a function to ``on_begin``.
+    Whoever must see each episode's start and each step (a shield) follows it as a ``Watcher``.
     """
+
+    _state: Floats  # of the running episodes, as rows of ``physics.packed``
+    _params: Floats
+    _clock: Floats  # [n, CLOCK_WIDTH]
+    _wanted: Floats  # [n, N] m/s2
+    _potential: Floats  # [n, N]
+    _hazard: bool  # the rows have columns of an obstacle
 
     def __init__(
         self,
@@ -95,8 +116,10 @@ class Engine:
         self.reward, self._objectives = resolved_objective(reward_params(reward), scenario.objective, scenario.vehicles)
         self.observation = observation or observation_for(scenario)
         self._scaling = scaling(self.observation)
-        self.on_begin: list[OnBegin] = []
+        self._memories: dict[Watcher, Any] = {}
+        self.steps_made = 0  # steps of the batch that watchers let pass
         self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
+        self._told = {i: s for i, s in self._remembering.items() if isinstance(s, Told)}
         self._learner_index = np.array(self.learners, np.int64)
         total = float(self.reward.harm_count == "total")
         times = scenario.time_step_s, scenario.horizon_s
@@ -146,6 +169,28 @@ class Engine:
         ended: Bools = self._clock[:, ENDED] == 1.0
         return ended
 
+    @property
+    def steps(self) -> Ints:
+        """Steps that the running episodes have taken, [n]."""
+        return self._clock[:, STEP].astype(np.int64)
+
+    @property
+    def watchers(self) -> tuple[Watcher, ...]:
+        """Who follows this engine."""
+        return tuple(self._memories)
+
+    def memory(self, watcher: Watcher) -> Any:
+        """What a watcher remembers of the running episodes."""
+        return self._memories[watcher]
+
+    def watch(self, watcher: Watcher, memory: Any) -> None:
+        """Let a watcher follow, from ``memory`` on."""
+        self._memories = {**self._memories, watcher: memory}
+
+    def unwatch(self, watcher: Watcher) -> None:
+        """Let go of a watcher, if it follows."""
+        self._memories = {w: memory for w, memory in self._memories.items() if w is not watcher}
+
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
         """Start new episodes in all rows: the given worlds (at t = 0), or the next ones of the training stream.
 
@@ -158,32 +203,32 @@ class Engine:
         if seed is not None:
             stream.restart(seed)
         start = stream.take(self.n) if worlds is None else stream.prepare(worlds)
-        before = self.__dict__.copy()
-        self._stream = stream
-        self._hazard = self.scenario.hazard_gap_m is not None or has_hazard(start.packed.state, self.scenario.vehicles)
-        self._state, self._params = self._kept(start.packed.state).copy(), start.packed.params.copy()
-        self._clock, self._wanted = start.clock.copy(), start.wanted.copy()
-        self._potential = np.zeros(self._wanted.shape)
-        try:
-            self._begin(np.arange(self.n), start)
-        except Exception:
-            self.__dict__.update(before)
-            raise
+        new = copy.copy(self)
+        new._stream = stream
+        new._hazard = self.scenario.hazard_gap_m is not None or has_hazard(start.packed.state, self.scenario.vehicles)
+        new._state, new._params = new._kept(start.packed.state).copy(), start.packed.params.copy()
+        new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
+        new._potential = np.zeros(start.wanted.shape)
+        new._begin(np.arange(self.n), start)
+        self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
 
     def renew(self, rows: Ints) -> None:
         """Start new episodes of the training stream in these rows (autoreset). Whatever fails, nothing is changed."""
         if len(rows) == 0:
             return
-        if self.on_begin or self._remembering:
-            before = self.__dict__ | {"_stream": copy.copy(self._stream)}
-            before |= {name: getattr(self, name).copy() for name in _RUNNING}
-            try:
-                self._renew(rows)
-            except Exception:
-                self.__dict__.update(before)
-                raise
-        else:
+        if not (self._memories or self._remembering):
             self._renew(rows)
+            return
+        new = self._apart()
+        new._stream = copy.copy(self._stream)
+        new._renew(rows)
+        self.__dict__.update(new.__dict__)
+
+    def _apart(self) -> Engine:
+        """An engine that goes on from here without changing this one (scripts that remember are shared)."""
+        new = copy.copy(self)
+        new.__dict__.update({name: getattr(self, name).copy() for name in _RUNNING})
+        return new
 
     def _renew(self, rows: Ints) -> None:
         start = self._stream.take(len(rows))
@@ -215,9 +260,21 @@ class Engine:
         """Advance every running episode by one time step.
 
         ``actions``: for each learner (by vehicle index, or as columns [n, L] in the order of ``learners``) a number in
-        [-1, 1] per world. Rows whose episode has ended stay as they are until ``renew`` or ``reset``.
+        [-1, 1] per world. Rows whose episode has ended stay as they are until ``renew`` or ``reset``. What a watcher
+        refuses does not happen: the worlds stay as they are.
         """
         columns = self._columns(actions)
+        if not self._memories:
+            return self._advance(columns)
+        new = self._apart()
+        step = new._advance(columns)
+        new._memories = {w: w.stepped(memory, self, new) for w, memory in self._memories.items()}
+        new.steps_made += 1
+        self.__dict__.update(new.__dict__)
+        return step
+
+    def _advance(self, columns: Floats) -> Step:
+        """Advance every running episode by one time step, in place."""
         if self._remembering:
             worlds = self.worlds
             for vehicle, script in self._remembering.items():
@@ -235,6 +292,8 @@ class Engine:
             step.further["harm"] = before - self._objective_harm()
         if self._more_terms:
             self._add_further_terms(step)
+        for vehicle, script in self._told.items():
+            script.after_step(self.worlds, self.ledger, vehicle)
         return step
 
     def _columns(self, actions: Actions) -> Floats:
@@ -301,10 +360,9 @@ class Engine:
 
     def _begin(self, rows: Ints, start: Start) -> None:
         """Tell those who must know that episodes start in ``rows``, and move what depends on them."""
-        if self.on_begin or self._remembering:
+        if self._memories or self._remembering:
             alert = start.alert
-            for watch in self.on_begin:
-                watch(alert, rows)
+            self._memories = {w: w.begun(memory, alert, rows) for w, memory in self._memories.items()}
             for vehicle, script in self._remembering.items():
                 script.begin(alert, vehicle, rows)
             if self._remembering:

@@ -30,6 +30,10 @@ class PhysicsError(EthBrakeError, ArithmeticError):
     """The advance could not finish a segment: a defect of the kernel, never of the input."""
 
 
+class UncertifiedStep(EthBrakeError):
+    """An engine that a shield follows was made to do something else than was certified; the step was not made."""
+
+
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> UnknownName:
     """Build the error for an unknown ``name``, with a suggestion when one is close."""
     names = sorted(known)

@@ -33,8 +33,11 @@ def engine_snapshot(engine: Engine) -> Arrays:
 def restore_engine(engine: Engine, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Bring an engine of the same scenario, size and scripts to the state of ``engine_snapshot``.
 
-    Raises ``InvalidInput`` naming the array that is missing or has another shape, before anything is changed.
+    Raises ``InvalidInput``, before anything is changed, naming the array that is missing or has another shape, and
+    where a shield follows the engine, which would know nothing of these worlds.
     """
+    if engine.watchers:
+        raise InvalidInput("engine snapshot: a shield follows this engine; restore first, then put the shield around")
     for name in _RUNNING:
         have, wanted = arrays.get(name.lstrip("_")), getattr(engine, name)
         if have is None or have.shape != wanted.shape:

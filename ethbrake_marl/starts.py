@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate
 from ethbrake_marl.physics.packed import Packed, harm_at, has_hazard, pack, state_width
 from ethbrake_marl.scenario import Scenario
@@ -32,6 +33,14 @@ class Script(Protocol):
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """Wanted signed acceleration of ``vehicle`` (index from 0) in every world of the batch, [n] m/s2."""
+
+
+@runtime_checkable
+class Told(Protocol):
+    """A script with a memory that is told what came of each step, the last one included."""
+
+    def after_step(self, worlds: Worlds, ledger: Ledger, vehicle: int) -> None:
+        """The step was made: the worlds of the whole batch now, and their harm since the alert."""
 
 
 class Start(NamedTuple):

@@ -80,10 +80,11 @@ def test_renew__a_watcher_that_fails_leaves_the_running_episodes_alone():
     running = engine()
     before = state(running)
 
-    def refuse(worlds, rows):
-        raise InvalidInput("watcher: no")
+    class Refusing:
+        def begun(self, memory, alert, rows):
+            raise InvalidInput("watcher: no")
 
-    running.on_begin.append(refuse)
+    running.watch(Refusing(), None)
     for start in (lambda: running.renew(np.array([0])), running.reset):
         with pytest.raises(InvalidInput, match="watcher"):
             start()

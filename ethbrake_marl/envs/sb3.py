@@ -129,7 +129,7 @@ class EthBrakeVecEnv(VecEnv):
         self._return += reward
         self._steps += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        over = step.ended
+        over = engine.ended  # all that have ended: an interrupted step may have left some that nobody renewed
         ended = np.flatnonzero(over)
         if len(ended):
             self._close_episodes(ended, step, infos)

@@ -77,7 +77,8 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
             raise InvalidInput("step: no episode is running; call reset first")
         engine, before = self.engine, self.engine.ended
         step = engine.step(self._without_ignored(actions, before))
-        renewed = step.ended if self.autoreset_mode is AutoresetMode.SAME_STEP else before
+        # all that have ended: an interrupted step may have left some that nobody renewed
+        renewed = engine.ended if self.autoreset_mode is AutoresetMode.SAME_STEP else before
         infos: dict[str, Any] = {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and renewed.any():
             infos = self._final_infos(step)

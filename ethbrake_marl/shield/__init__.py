@@ -1,8 +1,9 @@
 """Shields: what stands between a proposed action and the applied one."""
 
+from ethbrake_marl.shield.attached import MovingAtHorizon
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
 from ethbrake_marl.shield.episode import HybridAgent
-from ethbrake_marl.shield.guard import StepShield
+from ethbrake_marl.shield.guard import Certified, StepShield
 from ethbrake_marl.shield.parallel import HybridShield, shielded_aec
 from ethbrake_marl.shield.single import ShieldedEnv
 from ethbrake_marl.shield.step import StepShieldAgent
@@ -11,10 +12,12 @@ from ethbrake_marl.shield.vector import ShieldedVectorEnv
 
 __all__ = [
     "Backup",
+    "Certified",
     "Decision",
     "HybridAgent",
     "HybridShield",
     "Interval",
+    "MovingAtHorizon",
     "Running",
     "ShieldedEnv",
     "ShieldedVectorEnv",

@@ -2,7 +2,8 @@
 
 **Claim.** Let ``B`` be the bound at the first decision: the harm of the backup plan, executed in the engine. If in each
 step what ``certify`` says is applied, the harm realised at the end of the episode is at most ``B``, whatever is
-proposed; and the bound never rises on the way.
+proposed; and the bound never rises on the way. The end is rest or the scenario's horizon: of what still moves then, and
+of what happens afterwards, nothing is claimed.
 
 **Induction.** Between two decisions the shield holds a *plan* (an action for every decision up to the horizon) and its
 harm ``c``: the harm of the whole episode, past harm and which pairs were hit before included, if that plan is executed

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,39 +32,46 @@ from ethbrake_marl.shield.certify import (
     plan_harm,
 )
 from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE
-from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, rolled_out
+from ethbrake_marl.shield.comparison import as_predicted
+from ethbrake_marl.shield.interventions import Intervention, interventions, write_down
+from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, merged, put, rolled_out
 from ethbrake_marl.shield.settings import check_amount, check_scenario
+from ethbrake_marl.shield.settling import plan_rests
 from ethbrake_marl.shield.uncertainty import Uncertainty
 from ethbrake_marl.starts import Script
 
-BROKEN, ROLLOUT = ENDED + 1, ENDED + 2  # the reasons that the kernel does not know
-Number = TypeVar("Number", bound=np.generic)
-SLACK = 1e-9  # by more than this (m, m/s) a world lies outside what several members predict; one member is exact
+BROKEN = ENDED + 1  # a reason that the kernel does not know
+PER_WORLD = ("first_bound", "alone_harm", "settles", "interventions", "distrusted", "episode")  # a shield's arrays [n]
 LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions, for the bound at the alert where there are several members
 
 
-class Intervention(NamedTuple):
-    """One decision in which something else than the proposal was applied."""
+class Certified(NamedTuple):
+    """A decision that was made, and is not carried out yet."""
 
-    world: int  # row of the batch
-    episode: int  # of that row, from 0
-    step: int  # number of the decision
-    time_s: float
-    proposed: float  # action, as it was given
-    applied: float  # action
-    reason: int  # place in REASONS
-    bound: float  # m2/s2, from now on
-    margin: float  # m2/s2; negative: what the proposal would have cost beyond the budget at least
-    state: Floats  # [S] at the decision
-    plan: Floats  # [L] that was held; before ``step`` what was applied
+    decision: Decision
+    asked: Bools  # [n] worlds that it is about; the others stay as they are
+    before: Running  # what it was made from
+    after: StepShield  # the shield as it will be once the decision was carried out
+
+    def carried_out(self) -> StepShield:
+        """The shield now that the decision was carried out."""
+        after = self.after
+        if after.log is not None:
+            write_down(after.log, after.found, self.before, after.episode)
+        return after
 
 
 class StepShield:
-    """Guarantees the harm of a batch: ``begin`` when episodes start, ``decide`` in every step.
+    """Guarantees the harm of a batch: ``begin`` when episodes start, ``propose`` and ``commit`` in every step.
+
+    What ``propose`` certifies changes nothing yet: ``commit`` it when the engine has made that step, and not otherwise.
+    Whatever fails before (or interrupts) leaves bound, plan and trust as they were.
 
     The bound starts as the harm of the coupled optimum, realised decision by decision, or as that of a ``policy``
     rolled out from the alert where that is lower, and only ever falls; ``allowance`` (m2/s2) is what the budget grants
-    above it (0: none), and the bound is then that budget until the episode ends. The other vehicles follow ``others``
+    above it (0: none), and the bound is then that budget until the episode ends. It bounds the harm up to the
+    scenario's horizon and says nothing of what still moves then, or of what happens afterwards (``settles`` [n]: where
+    the plan held at the alert leaves nothing moving). The other vehicles follow ``others``
     (default: the scenario's scripts), whose commands must be fixed at the alert. What happens is compared with what was
     predicted, bit by bit: where it differs (a vehicle that brakes beyond its capacity, a number that is none, a message
     that never came) ``distrusted`` [n] is set, nothing is guaranteed any more, and for the rest of the episode the
@@ -94,10 +102,12 @@ class StepShield:
         self.scenario, self.vehicle, self.count, self.allowance = scenario, vehicle, count, allowance
         self.uncertainty = uncertainty
         self.log: list[Intervention] | None = [] if logging else None
+        self.found: list[Intervention] = []  # in the last decision
         self.running: Running | None = None
         self.backup = Backup(np.zeros((0, 0)), np.zeros(0))
         self.first_bound: Floats = np.zeros(0)  # [n] harm of the backup at the first decision
         self.alone_harm: Floats = np.zeros(0)  # [n] of the policy rolled out; infinity without one
+        self.settles: Bools = np.zeros(0, np.bool_)  # [n] under the plan of the first decision all rest at the horizon
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
         self.episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode
         self.distrusted: Bools = np.zeros(0, np.bool_)
@@ -149,17 +159,19 @@ class StepShield:
             alone = plan_harm(running, actions)
             plan[alone <= harm] = actions[alone <= harm]
             harm = np.minimum(alone, harm)
-        self._place(rows, running, Backup(plan, harm), alone)
+        new = copy.copy(self)
+        new._place(rows, running, Backup(plan, harm), alone, plan_rests(running, plan))
+        self.__dict__.update(new.__dict__)
 
-    def decide(
+    def propose(
         self,
         proposed: Floats,
         *,
         seen: Floats | None = None,
         only: Bools | None = None,
         proposer: Proposer | None = None,
-    ) -> Decision:
-        """Decide in every running episode, or ``only`` in some; the others stay as they are.
+    ) -> Certified:
+        """Decide in every running episode, or ``only`` in some; the others stay as they are. Changes nothing.
 
         ``seen`` [n, columns]: the worlds as they are now, in the first columns of ``Running.states``. Where nothing
         else certifies a proposal, the ``proposer`` (if given) is rolled out from the state after it.
@@ -169,6 +181,32 @@ class StepShield:
         if np.shape(proposed) != self.distrusted.shape:
             raise InvalidInput(f"shield: proposed {np.shape(proposed)}; {self.distrusted.shape} is needed")
         asked = ~self.running.finished if only is None else only
+        after = copy.copy(self)
+        decision = after._decided(proposed, seen, asked, proposer)
+        return Certified(decision, asked & ~self.running.finished, self.running, after)
+
+    def commit(self, certified: Certified) -> None:
+        """The decision was carried out. Raises ``InvalidInput`` for one that was not made from here."""
+        if certified.before is not self.running:
+            raise InvalidInput("shield: commit of a decision that was made from another state; propose again")
+        self.__dict__.update(certified.carried_out().__dict__)  # in one piece: not even an interrupt comes between
+
+    def decide(
+        self,
+        proposed: Floats,
+        *,
+        seen: Floats | None = None,
+        only: Bools | None = None,
+        proposer: Proposer | None = None,
+    ) -> Decision:
+        """``propose`` and ``commit`` at once: where nothing can fail before the decision is carried out."""
+        certified = self.propose(proposed, seen=seen, only=only, proposer=proposer)
+        self.commit(certified)
+        return certified.decision
+
+    def _decided(self, proposed: Floats, seen: Floats | None, asked: Bools, proposer: Proposer | None) -> Decision:
+        """Decide, and become the shield as it will be once that was carried out."""
+        assert self.running is not None
         if seen is not None:
             self._compare(seen, asked)
         before = self.running
@@ -179,23 +217,22 @@ class StepShield:
         held, budget = self.backup, self.bound
         decision = certify(now, given, held, budget)
         if proposer is not None and (rows := np.flatnonzero(decision.reason == NO_CERTIFICATE)).size:
-            decision = _merged(decision, rows, certify_rollouts(now, given, rows, budget, held.plan, proposer))
+            decision = merged(decision, rows, certify_rollouts(now, given, rows, budget, held.plan, proposer))
         decision.reason[asked & self.distrusted] = BROKEN
         self.interventions = self.interventions + (decision.intervened & asked)
         self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
         self.backup = decision.backup
         decision = decision._replace(bound=self.bound)
         if self.log is not None:
-            self._write(now, proposed, decision, held)
+            self.found = interventions(now, self.episode, proposed, decision, held)
         return decision
 
     def keep(self, n: int) -> None:
         """Keep the first ``n`` rows only: a smaller batch has begun."""
         assert self.running is not None
-        self.running = self.running.take(np.arange(n))
-        self.backup = self.backup._replace(plan=self.backup.plan[:n], harm=self.backup.harm[:n])
-        for name in ("first_bound", "alone_harm", "interventions", "distrusted", "episode"):
-            setattr(self, name, getattr(self, name)[:n])
+        backup = self.backup._replace(plan=self.backup.plan[:n], harm=self.backup.harm[:n])
+        rows = {name: getattr(self, name)[:n] for name in PER_WORLD}
+        self.__dict__.update(rows | {"running": self.running.take(np.arange(n)), "backup": backup})
 
     def commands(self, actions: Floats) -> Floats:
         """Wanted signed accelerations of actions, to the bits of the engine, [n] m/s2."""
@@ -228,12 +265,12 @@ class StepShield:
             plan[better] = trial[better]
         self.backup = self.backup._replace(plan=plan, harm=harm)
 
-    def _place(self, rows: Ints, running: Running, backup: Backup, alone: Floats) -> None:
+    def _place(self, rows: Ints, running: Running, backup: Backup, alone: Floats, settles: Bools) -> None:
         """Keep new episodes in these rows."""
         count, old = len(rows), self.running
         new: dict[str, NDArray[Any]] = {
-            "first_bound": backup.harm, "alone_harm": alone, "interventions": np.zeros(count, np.int64),
-            "distrusted": np.zeros(count, np.bool_),
+            "first_bound": backup.harm, "alone_harm": alone, "settles": settles,
+            "interventions": np.zeros(count, np.int64), "distrusted": np.zeros(count, np.bool_),
         }  # fmt: skip
         if old is None or count >= old.n:
             order = np.argsort(rows)
@@ -244,75 +281,17 @@ class StepShield:
             return
         at = old.rows_of(rows)
         arrays: dict[str, Any] = {
-            name: _put(getattr(old.problem, name), at, getattr(running.problem, name)) for name in PER_ROW
+            name: put(getattr(old.problem, name), at, getattr(running.problem, name)) for name in PER_ROW
         }
         self.running = Running(
             replace(old.problem, **arrays),
-            _put(old.states, at, running.states),
-            _put(old.steps, rows, running.steps),
-            _put(old.ended, at, running.ended),
+            put(old.states, at, running.states),
+            put(old.steps, rows, running.steps),
+            put(old.ended, at, running.ended),
         )
-        self.backup = Backup(_put(self.backup.plan, rows, backup.plan), _put(self.backup.harm, rows, backup.harm))
+        self.backup = Backup(put(self.backup.plan, rows, backup.plan), put(self.backup.harm, rows, backup.harm))
         for name, values in {**new, "episode": self.episode[rows] + 1}.items():
-            setattr(self, name, _put(getattr(self, name), rows, values))
-
-    def _write(self, now: Running, proposed: Floats, decision: Decision, held: Backup) -> None:
-        assert self.log is not None
-        times, states = now.time_s, now.nominal().states
-        for k in np.flatnonzero(decision.intervened).tolist():
-            row = Intervention(
-                k, int(self.episode[k]), int(now.steps[k]), float(times[k]), float(proposed[k]),
-                float(decision.applied[k]), int(decision.reason[k]), float(decision.bound[k]),
-                float(decision.margin[k]), states[k].copy(), held.plan[k].copy(),
-            )  # fmt: skip
-            self.log.append(row)
-
-
-def as_predicted(running: Running, seen: Floats) -> Bools:
-    """Where what is seen [n, columns] does not contradict the prediction, [n].
-
-    One member: where it is what was predicted, to the bit. Several: where it lies within the range of their
-    predictions, by column; once one of them has had an impact, worlds between the corners may leave that range, and any
-    finite numbers will do.
-    """
-    columns, N = seen.shape[1], (running.states.shape[1] + 4) // 5
-    predicted = running.states.reshape(running.n, running.members, -1)
-    slack = 0.0 if running.members == 1 else SLACK
-    low, high = predicted[:, :, :columns].min(axis=1) - slack, predicted[:, :, :columns].max(axis=1) + slack
-    within: Bools = ((seen >= low) & (seen <= high)).all(axis=1)
-    if running.members > 1:
-        had_impact = (predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2))
-        within |= had_impact & np.isfinite(seen).all(axis=1)
-    return within
-
-
-def _put(old: NDArray[Number], rows: Ints, new: NDArray[Number]) -> NDArray[Number]:
-    placed = old.copy()
-    placed[rows] = new
-    return placed
-
-
-def _merged(decision: Decision, rows: Ints, found: Decision) -> Decision:
-    """A batch's decision with that of ``rows`` replaced where the policy's rollout kept the budget."""
-    margin = decision.margin.copy()
-    margin[rows] = np.maximum(margin[rows], found.margin)
-    kept = np.flatnonzero(~found.intervened)
-    at, after, plan = rows[kept], found.after, found.backup.plan
-    assert (plan == from_now(decision.backup.plan[rows], plan, found.after.steps - 1)).all()  # one past
-    return Decision(
-        _put(decision.applied, at, found.applied[kept]),
-        _put(decision.intervened, at, found.intervened[kept]),
-        _put(decision.reason, at, np.full(len(at), ROLLOUT)),
-        _put(decision.bound, at, found.bound[kept]),
-        margin,
-        decision.after._replace(
-            states=_put(decision.after.states, decision.after.rows_of(at), after.states[after.rows_of(kept)]),
-            ended=_put(decision.after.ended, decision.after.rows_of(at), after.ended[after.rows_of(kept)]),
-        ),
-        decision.backup._replace(
-            plan=_put(decision.backup.plan, at, plan[kept]), harm=_put(decision.backup.harm, at, found.bound[kept])
-        ),
-    )
+            setattr(self, name, put(getattr(self, name), rows, values))
 
 
 def _harm_of(running: Running, plan: Floats, rows: Ints) -> Floats:

@@ -11,19 +11,19 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.conversions import parallel_to_aec
 
-from ethbrake_marl.actions import checked_action, command_to_action
+from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
-from ethbrake_marl.physics import Ints, Worlds
-from ethbrake_marl.shield.attached import AttachedShield
+from ethbrake_marl.shield.attached import AttachedHybrid, AttachedShield
 from ethbrake_marl.shield.episode import Bound, HybridAgent
-from ethbrake_marl.shield.settings import engine_of, only_shielded, proposing_agent
+from ethbrake_marl.shield.settings import engine_of, only_shielded
 from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
 
 MODES = ("episode", "step", "robust")
+Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
 
 
 class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
@@ -69,20 +69,25 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
             raise InvalidInput(f"HybridShield: shields exactly one learner in mode {mode!r}; got {shielded}")
         self.mode = mode
         self.shielded = shielded[0]
-        self._vehicle = names.index(self.shielded)
         self.attached: AttachedShield | None = None
-        if mode != "episode":
+        self._chooser: AttachedHybrid | None = None
+        if mode == "episode":
+            self._chooser = AttachedHybrid(engine, policy, bound=bound, count=count, where="HybridShield")
+        else:
             self.attached = AttachedShield(
                 engine, policy, count=count, allowance=allowance, uncertainty=intervals, where="HybridShield"
             )
-            return
-        agent = proposing_agent(policy, "HybridShield")
-        self.hybrid = HybridAgent(agent, engine.scenario, bound=bound, count=count)
-        engine.on_begin.append(self._begin)
 
-    def step(self, actions: Mapping[str, Any]) -> tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]:
+    @property
+    def hybrid(self) -> HybridAgent:
+        """Who drives the running episode, in mode ``episode``. Raises ``InvalidInput`` in another mode."""
+        if self._chooser is None:
+            raise InvalidInput(f"HybridShield: hybrid: mode {self.mode} chooses nobody for a whole episode")
+        return self._chooser.hybrid
+
+    def step(self, actions: Mapping[str, Any]) -> Told:
         """Advance by one step with the shielded agent's action replaced; it may also be left out."""
-        engine, agent = self._engine, self.shielded
+        agent = self.shielded
         if not isinstance(actions, Mapping):
             raise InvalidInput(
                 f"HybridShield: actions = {actions!r}: must be a dict, for instance {{{agent!r}: [0.0]}}"
@@ -91,39 +96,27 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         if proposed is not None:
             checked_action(proposed, (1,), agent)
         if not self.env.agents:
-            self.env.step(actions)  # says that no episode is running
-        if self.attached is not None:
-            return self._certified(self.attached, actions, proposed)
-        command = self.hybrid.act(engine.worlds, self._vehicle)
-        applied = command_to_action(command, engine.worlds.vehicles, self._vehicle)
-        observations, rewards, terminations, truncations, infos = super().step({**actions, agent: applied})
-        infos[agent]["shield"] = self._info(proposed, float(applied[0]))
-        return observations, rewards, terminations, truncations, infos
-
-    def close(self) -> None:
-        """Let go of the environment: it no longer asks this shield when an episode starts."""
-        if self.attached is not None:
-            self.attached.detach()
-        if self._begin in self._engine.on_begin:
-            self._engine.on_begin.remove(self._begin)
-        super().close()
-
-    def _certified(
-        self, attached: AttachedShield, actions: Mapping[str, Any], proposed: Any
-    ) -> tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]:
-        """Advance by one step in mode ``step``."""
-        agent = self.shielded
+            return self.env.step(actions)  # type: ignore[no-any-return]  # says that no episode is running
+        if self._chooser is not None:
+            applied = self._chooser.decide()
+            told: Told = super().step({**actions, agent: applied})
+            self._chooser.confirm()
+            told[4][agent]["shield"] = self._info(proposed, float(applied[0]))
+            return told
+        attached = self.attached
+        assert attached is not None
         given = attached.proposal() if proposed is None else checked_action(proposed, (1,), agent)
-        applied = attached.decide(given)
-        decision = attached.decision
-        assert decision is not None
-        told: tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]] = super().step({**actions, agent: applied})
-        attached.check_applied()
-        told[4][agent]["shield"] = attached.info(0, float(given[0]), decision)
+        told = super().step({**actions, agent: attached.decide(given)})
+        attached.confirm()
+        told[4][agent]["shield"] = attached.info(0, float(given[0]))
         return told
 
-    def _begin(self, worlds: Worlds, rows: Ints) -> None:
-        self.hybrid.begin(worlds, self._vehicle, rows)
+    def close(self) -> None:
+        """Let go of the environment: this shield no longer follows it."""
+        for attached in (self.attached, self._chooser):
+            if attached is not None:
+                attached.detach()
+        super().close()
 
     def _info(self, proposed: Any, applied: float) -> dict[str, Any]:
         """What the shield did, for ``infos``; ``proposed_action`` is NaN when nothing was proposed."""

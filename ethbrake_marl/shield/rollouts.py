@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from typing import NamedTuple, TypeGuard
+from typing import NamedTuple, TypeGuard, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command, command_to_action
 from ethbrake_marl.agents.driving import drive, introduce, scripted
@@ -21,6 +22,10 @@ from ethbrake_marl.agents.rehearsed import Rehearsed
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify, from_now, plan_harm
+from ethbrake_marl.shield.certify_kernel import ENDED
+
+ROLLOUT = ENDED + 2  # a reason that the kernel does not know
+Number = TypeVar("Number", bound=np.generic)
 
 
 class Proposer(NamedTuple):
@@ -148,3 +153,33 @@ class _Recorder:
         rows = np.flatnonzero((step >= 0) & (step < self.actions.shape[1]))
         self.actions[rows, step[rows]] = action[rows]
         return action_to_command(action, worlds.vehicles, vehicle)
+
+
+def merged(decision: Decision, rows: Ints, found: Decision) -> Decision:
+    """A batch's decision with that of ``rows`` replaced where the policy's rollout kept the budget."""
+    margin = decision.margin.copy()
+    margin[rows] = np.maximum(margin[rows], found.margin)
+    kept = np.flatnonzero(~found.intervened)
+    at, after, plan = rows[kept], found.after, found.backup.plan
+    assert (plan == from_now(decision.backup.plan[rows], plan, found.after.steps - 1)).all()  # one past
+    return Decision(
+        put(decision.applied, at, found.applied[kept]),
+        put(decision.intervened, at, found.intervened[kept]),
+        put(decision.reason, at, np.full(len(at), ROLLOUT)),
+        put(decision.bound, at, found.bound[kept]),
+        margin,
+        decision.after._replace(
+            states=put(decision.after.states, decision.after.rows_of(at), after.states[after.rows_of(kept)]),
+            ended=put(decision.after.ended, decision.after.rows_of(at), after.ended[after.rows_of(kept)]),
+        ),
+        decision.backup._replace(
+            plan=put(decision.backup.plan, at, plan[kept]), harm=put(decision.backup.harm, at, found.bound[kept])
+        ),
+    )
+
+
+def put(old: NDArray[Number], rows: Ints, new: NDArray[Number]) -> NDArray[Number]:
+    """A copy of ``old`` with ``new`` in these rows."""
+    placed = old.copy()
+    placed[rows] = new
+    return placed

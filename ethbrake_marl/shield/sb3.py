@@ -65,14 +65,13 @@ class ShieldedVecEnv(VecEnvWrapper):
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
         """Advance every world by one step."""
-        shield, decision = self.attached, self.attached.decision
-        trusted = ~shield.shield.distrusted
+        shield = self.attached
         observation, reward, done, infos = self.venv.step_wait()
-        assert decision is not None
-        shield.check_applied(only=~done)
+        shield.confirm()
         for k, info in enumerate(infos):
-            info["shield"] = shield.info(k, float(self._proposed[k]), decision) | {"trusted": bool(trusted[k])}
-        paid = reward - np.float32(self.intervention_penalty) * decision.intervened.astype(np.float32)
+            info["shield"] = shield.info(k, float(self._proposed[k]))
+        intervened = np.array([info["shield"]["intervened"] for info in infos], np.float32)
+        paid = reward - np.float32(self.intervention_penalty) * intervened
         return observation, paid, done, infos  # type: ignore[return-value]
 
     def __getstate__(self) -> dict[str, Any]:

@@ -61,13 +61,10 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
         if shield.shield.running is None or shield.engine.ended[0]:
             return self.env.step(action)  # type: ignore[return-value]  # says what is wrong
         proposed = checked_action(action, (1,), shield.engine.scenario.vehicle_names[shield.vehicle])
-        applied = shield.decide(proposed)
-        decision = shield.decision
-        assert decision is not None
-        observation, reward, terminated, truncated, info = self.env.step(applied)
-        shield.check_applied()
-        info["shield"] = shield.info(0, float(proposed[0]), decision)
-        paid = float(reward) - self.intervention_penalty * float(decision.intervened[0])
+        observation, reward, terminated, truncated, info = self.env.step(shield.decide(proposed))
+        shield.confirm()
+        told = info["shield"] = shield.info(0, float(proposed[0]))
+        paid = float(reward) - self.intervention_penalty * float(told["intervened"])
         return observation, paid, terminated, truncated, info
 
     def close(self) -> None:

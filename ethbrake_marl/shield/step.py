@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ethbrake_marl.actions import action_to_command
 from ethbrake_marl.agents.driving import introduce, scripted
 from ethbrake_marl.agents.profile_problem import state_columns
 from ethbrake_marl.agents.protocol import Agent, check_agent, place
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.harm import HarmCount, Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.shield.guard import StepShield
+from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
+from ethbrake_marl.shield.guard import Certified, StepShield
 from ethbrake_marl.shield.rollouts import Proposer, proposed_action
 from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
 
@@ -20,6 +23,14 @@ from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
 def first_decision_s(worlds: Worlds, vehicle: int) -> Floats:
     """Time of a vehicle's first decision in worlds at the alert, [n] s."""
     return np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
+
+
+class _Asked(NamedTuple):
+    """What was decided when the agent was asked last, and is not known to be carried out."""
+
+    time_s: Floats  # [n] of the worlds then
+    certified: Certified
+    wanted: Floats  # [n] m/s2
 
 
 class StepShieldAgent:
@@ -62,6 +73,7 @@ class StepShieldAgent:
         self._later_rollouts = later_rollouts
         self._wanted: Floats = np.zeros(0)
         self._first_s: Floats = np.zeros(0)  # [n] time of the first decision
+        self._asked: _Asked | None = None
         self._make(0)  # refuses bad settings at once
 
     @property
@@ -76,7 +88,9 @@ class StepShieldAgent:
         if self._believed is not None and not (rows < self._believed.n).all():
             raise InvalidInput(f"step: believed holds {self._believed.n} worlds, but row {rows.max()} begins")
         if self.shield is None or self.shield.vehicle != vehicle:
-            self.shield = self._make(vehicle)
+            self.shield, self._asked = self._make(vehicle), None
+        if self._asked is not None and len(rows) < len(self._wanted):
+            self._commit(self._asked)  # some episodes of a batch are renewed: that step was made
         introduce(self.policy, vehicle, scripted(self.scenario, but=vehicle))
         self.policy.begin(worlds, vehicle, rows)
         self.shield.begin(worlds if self._believed is None else self._believed.take(rows), rows, self.policy)
@@ -84,9 +98,13 @@ class StepShieldAgent:
         self.predicted_harm = place(self.predicted_harm, rows, bound)
         self._wanted = place(self._wanted, rows, np.zeros(worlds.n))
         self._first_s = place(self._first_s, rows, first_decision_s(worlds, vehicle))
+        self._asked = None
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """The certified command, [n] m/s2. Asked twice at the same moment, it says the same."""
+        """The certified command, [n] m/s2. Asked again at the same moment, it says the same.
+
+        Raises ``UncertifiedStep`` where a decision was left out.
+        """
         shield = self.shield
         if shield is None or shield.running is None or len(self._wanted) < worlds.n:
             raise InvalidInput(f"agent {self.name!r}: act on {worlds.n} worlds, but begin was not called for each")
@@ -95,13 +113,65 @@ class StepShieldAgent:
             self.predicted_harm, self._wanted, self._first_s = (
                 values[: worlds.n] for values in (self.predicted_harm, self._wanted, self._first_s)
             )
-        proposed = proposed_action(self.policy, worlds, vehicle)
-        due = worlds.time_s == self._first_s + shield.running.steps * self.scenario.time_step_s
-        seen = state_columns(worlds)
-        proposer = Proposer(self.policy, worlds) if self._later_rollouts else None
-        decision = shield.decide(proposed, seen=seen, only=due, proposer=proposer)
-        self._wanted = np.where(due, action_to_command(decision.applied, worlds.vehicles, vehicle), self._wanted)
-        return self._wanted.copy()
+        self._follow(worlds)
+        if self._asked is None:
+            due = self._due(worlds)
+            proposed = proposed_action(self.policy, worlds, vehicle)
+            proposer = Proposer(self.policy, worlds) if self._later_rollouts else None
+            certified = shield.propose(proposed, seen=state_columns(worlds), only=due, proposer=proposer)
+            command = action_to_command(certified.decision.applied, worlds.vehicles, vehicle)
+            self._asked = _Asked(worlds.time_s, certified, np.where(due, command, self._wanted))
+        return self._asked.wanted.copy()
+
+    def after_step(self, worlds: Worlds, ledger: Ledger, vehicle: int) -> None:
+        """Follow the engine over a step, the last one included, and compare what came of it with what was certified.
+
+        Where nothing else was ``believed`` than what was told, a difference raises ``UncertifiedStep``: another command
+        was applied. Else the world is distrusted.
+        """
+        asked, shield = self._asked, self.shield
+        self._follow(worlds)
+        if asked is None or shield is None or self._asked is asked:
+            return
+        assert shield.running is not None
+        seen = seen_columns(worlds, ledger)
+        compared = asked.certified.asked & (worlds.time_s > asked.time_s) & ~shield.distrusted
+        wrong = compared & ~as_predicted(shield.running, seen)
+        if self._believed is None and wrong.any():
+            k = int(np.argmax(wrong))
+            told = difference(shield.running.nominal().states[k], seen[k])
+            raise UncertifiedStep(
+                f"agent {self.name!r}: after this step {told} (world {k}); what drives by this agent must pass its"
+                " commands on unchanged, and ask it at every decision"
+            )
+        shield.distrusted = shield.distrusted | wrong
+
+    def _due(self, worlds: Worlds) -> Bools:
+        """Where a decision is due now, [n]. Raises ``UncertifiedStep`` where one was due, and nobody asked."""
+        assert self.shield is not None and self.shield.running is not None
+        running, step_s = self.shield.running, self.scenario.time_step_s
+        due_s = self._first_s + running.steps * step_s
+        late = ~running.finished & (worlds.time_s > due_s + step_s / 2)
+        if late.any():
+            k = int(np.argmax(late))
+            raise UncertifiedStep(
+                f"agent {self.name!r}: asked at {worlds.time_s[k]:g} s in world {k}, but a decision was due at"
+                f" {due_s[k]:g} s; what drives by this agent must ask it at every decision, and once"
+            )
+        due: Bools = worlds.time_s == due_s
+        return due
+
+    def _follow(self, worlds: Worlds) -> None:
+        """Commit what was decided if the worlds have moved since: that step was made. Else it stays to be made."""
+        asked = self._asked
+        if asked is not None and (worlds.time_s > asked.time_s).any():
+            self._commit(asked)
+
+    def _commit(self, asked: _Asked) -> None:
+        assert self.shield is not None
+        if asked.certified.before is self.shield.running:  # else an interrupt came between the next two lines
+            self.shield.commit(asked.certified)
+        self.__dict__.update(_wanted=asked.wanted, _asked=None)
 
     def _make(self, vehicle: int) -> StepShield:
         return StepShield(self.scenario, vehicle, **self._settings)  # type: ignore[arg-type]

@@ -60,12 +60,11 @@ class ShieldedVectorEnv(VectorWrapper):
             given[before] = 0.0  # whatever stands there, the autoreset mode ignores it
         proposed = checked_action(given, (self.num_envs, 1), "the learners")[:, 0]
         applied = attached.decide(proposed)
-        decision, told = attached.decision, attached.infos(proposed)
-        assert decision is not None
         observation, reward, terminated, truncated, infos = self.env.step(applied[:, np.newaxis])
-        attached.check_applied(only=~(before | terminated | truncated))
+        attached.confirm()
+        told = attached.infos(proposed)
         infos |= {"shield": told, "_shield": ~before}
-        paid = reward - self.intervention_penalty * (decision.intervened & ~before)
+        paid = reward - self.intervention_penalty * (told["intervened"] & ~before)
         return observation, paid, terminated, truncated, infos
 
     def close(self, **kwargs: Any) -> None:

@@ -45,6 +45,9 @@ PROMISES: tuple[Callable[[str], None], ...] = (
 )
 
 
+pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
+
+
 @pytest.fixture(autouse=True)
 def _shielded_faces(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, face in SHIELDED.items():
@@ -142,4 +145,4 @@ def test_vector__refuses_what_is_no_vector_environment_of_ours() -> None:
 def test_vector__closed_lets_go_of_the_environment() -> None:
     env = EthBrakeVectorEnv(2, PAPER)
     ShieldedVectorEnv(env).close()
-    assert env.engine.on_begin == []
+    assert env.engine.watchers == ()

@@ -103,7 +103,6 @@ def attack(scenario: Scenario, worlds, adversary, *, count="first", allowance=0.
         reason = attached.decision.reason
         accepted += (reason == 1) | (reason == 2)
         engine.step(actions[:, np.newaxis])
-        attached.check_applied()
         k += 1
     assert not attached.shield.distrusted.any()
     shield = attached.shield

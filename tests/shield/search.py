@@ -57,8 +57,7 @@ def _batch(n: int, seed: int, done: int, leak: Leak | None, count) -> tuple[np.n
     scenario = line(3 if (done // BATCH) % 2 == 0 else 5)
     worlds = scenario.sample(n, seed, first=done).worlds
     shield, engine = StepShield(scenario, scenario.learners[0], count=count), _engine(scenario, worlds)
-    engine.on_begin.append(lambda alert, rows: shield.begin(alert, rows))
-    engine.reset(worlds=worlds)
+    shield.begin(worlds, np.arange(n))
     bound, way = shield.first_bound.copy(), rng.integers(WAYS, size=n)
     held, proposals, decision = rng.uniform(-1.0, 1.0, n), [], None
     while not engine.ended.all():

@@ -14,12 +14,12 @@ from stable_baselines3 import PPO
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 
 KEYS = {
-    "mode", "proposed_action", "applied_action", "intervened", "reason", "bound_harm", "margin", "trusted",
+    "mode", "proposed_action", "applied_action", "intervened", "reason", "bound_harm", "margin", "trusted", "settles",
 }  # fmt: skip
 
 
@@ -116,7 +116,7 @@ def test_applied__something_between_the_shield_and_the_engine_is_found():
     env = HybridShield(parallel_env(), mode="step")
     env.reset(seed=0)
     env._engine.step = lambda actions, step=env._engine.step: step(np.zeros_like(actions) - 0.123)
-    with pytest.raises(EthBrakeError, match="not the certified one"):
+    with pytest.raises(UncertifiedStep, match="not the certified one"):
         env.step({"vehicle_2": np.array([-1.0])})
 
 
@@ -226,4 +226,4 @@ def test_close__lets_go_of_the_environment():
     env = gymnasium.make("EthBrake-v0").unwrapped
     shielded = ShieldedEnv(env)
     shielded.close()
-    assert env.engine.on_begin == []
+    assert env.engine.watchers == ()

@@ -16,6 +16,8 @@ from ethbrake_marl.shield.certify import REASONS
 from ethbrake_marl.shield.forensics import operating_curve, review
 from tests.shield.lines import ADVERSARIES, attack, line
 
+pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
+
 SCENARIO = load_scenario("paper-random")
 WORLDS = SCENARIO.sample(120, 3).worlds
 

@@ -1,0 +1,43 @@
+"""Whether a world comes to rest before the horizon, where every bound ends."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ethbrake_marl.agents.profile_motion import at_rest
+from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.segment import ROW_WIDTH, TABLE_ROWS
+from ethbrake_marl.shield.certify import Running
+from ethbrake_marl.shield.certify_kernel import Members, follow_plan
+
+
+def plan_rests(running: Running, plan: Floats) -> Bools:
+    """Where everything rests at the horizon if the plans [n, L] are executed from here, in every member, [n]."""
+    problem, rests = running.problem, np.empty(running.n, np.bool_)
+    rests_after_plans(
+        running.states, running.steps, running.ended, problem.clock, problem.bounds[:, 0], problem.command,
+        problem.latency, problem.mass, problem.limit, int(problem.vehicles[0]), np.ascontiguousarray(plan), rests,
+    )  # fmt: skip
+    return rests
+
+
+@compiled
+def rests_after_plans(
+    states: Floats, steps: Ints, ended: Bools, clock: Floats, bounds: Floats, command: Floats, latency: Floats,
+    mass: Floats, limit: Floats, vehicle: int, plans: Floats, rests: Bools,
+) -> None:  # fmt: skip
+    """Fill ``rests`` [n]: under the plan every member of the world comes to rest before the horizon, and stays so."""
+    N, n = mass.shape[1], steps.shape[0]
+    table, harm, critical = np.zeros((TABLE_ROWS, N)), np.zeros((2, N - 1)), np.zeros(1, np.int64)
+    M = states.shape[0] // max(n, 1)
+    world = Members(
+        table, harm, np.empty((0, ROW_WIDTH)), clock, bounds, command, latency, mass, limit, vehicle, critical
+    )
+    for k in range(n):
+        rests[k] = True
+        for m in range(k * M, k * M + M):
+            follow_plan(world, m, states[m], ended[m], steps[k], plans[k], math.inf)
+            rests[k] = rests[k] and at_rest(table)

@@ -1,0 +1,25 @@
+"""A sample of the gate "interference": nothing that fails, and nothing in between, gets above the bound."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
+
+BATCHED = ("vector", "vector, next step", "sb3")
+INSIDE = [name for name in PLAYS if name != "evaluation"]  # the engine itself asks that one: nothing is in between
+
+
+@pytest.mark.parametrize("name", PLAYS)
+def test_disturbed__calls_that_fail_or_are_interrupted_change_nothing_and_no_episode_gets_above_its_bound(name):
+    found = disturbed(name, 12 if name in (*BATCHED, "evaluation") else 5, seed=3)
+    assert found.refused > 5 and found.interrupted > 3
+    assert (found.above, found.broken) == (0, 0)
+
+
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+@pytest.mark.parametrize("name", INSIDE)
+def test_wrapped__what_is_not_passed_on_as_certified_is_refused_and_no_episode_gets_above_its_bound(name, wrapper):
+    found = wrapped(name, wrapper, 60, seed=5)
+    assert found.refused >= 15
+    assert (found.above, found.broken) == (0, 0)
