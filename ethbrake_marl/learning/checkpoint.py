@@ -22,8 +22,8 @@ from safetensors import SafetensorError
 from ethbrake_marl.durable_files import new_folder, remove_folder, write_file
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.learning.policy_team import Trained, read_trained, save_trained
-from ethbrake_marl.learning.strict_json import parse_strict_json
 from ethbrake_marl.snapshots import Arrays
+from ethbrake_marl.strict_json import parse_strict_json
 
 FORMAT_VERSION = 1
 LISTING = "checkpoint.json"

@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 
 from ethbrake_marl.durable_files import new_folder, write_file
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.learning.strict_json import parse_strict_json
+from ethbrake_marl.strict_json import parse_strict_json
 
 RunStatus = Literal["running", "finished", "interrupted", "failed"]
 

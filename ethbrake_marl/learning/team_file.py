@@ -15,11 +15,11 @@ from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.learning.bundle import Policy, load_policy
 from ethbrake_marl.learning.recipe import Scheme
 from ethbrake_marl.learning.schemes import driver, drivers
-from ethbrake_marl.learning.strict_json import parse_strict_json
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.consistency import refuse
 from ethbrake_marl.scenario.validation_messages import explain
 from ethbrake_marl.scenario.yaml_loading import Document, YamlPath
+from ethbrake_marl.strict_json import parse_strict_json
 
 TEAM = "team.json"
 _LIMIT_BYTES = 1 << 20
