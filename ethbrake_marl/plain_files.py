@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
@@ -18,13 +21,31 @@ def read_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> bytes:
-    """The content of a plain file of at most ``limit_bytes``.
+    """The content of a plain file of at most ``limit_bytes``; raises ``refusal`` as ``open_plain``.
+
+    Of a file that grows no more than that is read.
+    """
+    with open_plain(path, limit_bytes, refusal=refusal, follow_links=follow_links) as stream:
+        data = _read(stream.fileno(), limit_bytes + 1)
+    if len(data) > limit_bytes:
+        raise _too_large(Path(path), limit_bytes, refusal)
+    return data
+
+
+@contextmanager
+def open_plain(
+    path: str | os.PathLike[str],
+    limit_bytes: int,
+    *,
+    refusal: type[EthBrakeError] = InvalidInput,
+    follow_links: bool = True,
+) -> Iterator[BufferedReader]:
+    """A plain file of at most ``limit_bytes``, open for reading.
 
     Its kind and size are looked at before anything of it is read: a pipe or device is not even opened, so nothing
-    waits for a writer and no device notices. What takes its place in between is opened without waiting and looked at
-    again, and never more than ``limit_bytes + 1`` bytes are read of a file that grows. Raises ``refusal`` naming the
-    path and the reason: nothing there, a folder, a device, a pipe, too large, not to be read, or a symbolic link where
-    none is to be followed.
+    waits for a writer and no device notices; what takes its place in between is opened without waiting and looked at
+    again. Raises ``refusal`` naming the path and the reason: nothing there, a folder, a device, a pipe, too large, not
+    to be read (inside the block too), or a symbolic link where none is to be followed.
     """
     file = Path(path)
     try:
@@ -32,12 +53,9 @@ def read_plain(
         flags = os.O_RDONLY | (0 if follow_links else getattr(os, "O_NOFOLLOW", 0))
         for name in _FLAGS:
             flags |= getattr(os, name, 0)
-        descriptor = os.open(file, flags)
-        try:
-            _check_kind(file, os.fstat(descriptor), limit_bytes, refusal)
-            data = _read(descriptor, limit_bytes + 1)
-        finally:
-            os.close(descriptor)
+        with os.fdopen(os.open(file, flags), "rb") as stream:
+            _check_kind(file, os.fstat(stream.fileno()), limit_bytes, refusal)
+            yield stream
     except FileNotFoundError:
         raise refusal(f"{file}: no such file") from None
     except OSError as error:
@@ -46,9 +64,6 @@ def read_plain(
         if isinstance(error, EthBrakeError):
             raise
         raise refusal(f"{file}: cannot be read ({error})") from None
-    if len(data) > limit_bytes:
-        raise _too_large(file, limit_bytes, refusal)
-    return data
 
 
 def _read(descriptor: int, most_bytes: int) -> bytes:
