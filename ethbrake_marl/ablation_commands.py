@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.lineup import LIST_SEED, load_runnable
 from ethbrake_marl.machine import this_machine
-from ethbrake_marl.terminal import INTERRUPTED, interruptible, progress_bars, say, write_json
+from ethbrake_marl.terminal import INTERRUPTED, interruptible, progress_bars, say, show, write_json
 
 if TYPE_CHECKING:
     from ethbrake_marl.ablation.plan import Plan
@@ -117,7 +117,7 @@ def generalise_command(
     if as_json:
         write_json([one.to_json() for one in found])
     else:
-        typer.echo(lines_markdown(found, question, len(agents)), nl=False)
+        show(lines_markdown(found, question, len(agents)), end="")
 
 
 def _lengths(text: str) -> tuple[int, ...]:
@@ -168,5 +168,5 @@ def _run(plan: Plan, jobs: int, as_json: bool) -> None:
     if as_json:
         write_json(found)
     else:
-        typer.echo((plan.folder / PAGE).read_text("utf-8"), nl=False)
+        show((plan.folder / PAGE).read_text("utf-8"), end="")
     say(f"tables: {plan.folder / PAGE}; figures: {', '.join(FIGURES)}")

@@ -15,7 +15,7 @@ from ethbrake_marl.command_options import ForceOption, JsonOption
 from ethbrake_marl.evaluation.output_files import write_output
 from ethbrake_marl.machine import this_machine
 from ethbrake_marl.picture_commands import picture_target
-from ethbrake_marl.terminal import interruptible, progress_bars, result_console, say, write_json
+from ethbrake_marl.terminal import interruptible, progress_bars, result_console, say, show, write_json
 
 Measured = TypeVar("Measured")
 
@@ -45,7 +45,7 @@ def bench_command(
         write_json({"machine": asdict(machine), "figures": [asdict(speed) for speed in speeds]})
         return
     result_console().print(speed_table(speeds))
-    typer.echo(f"Machine: {machine}")
+    show(f"Machine: {machine}")
 
 
 def _bench_scaling(output: Path, *, quick: bool, force: bool, as_json: bool) -> None:
@@ -67,7 +67,7 @@ def _bench_scaling(output: Path, *, quick: bool, force: bool, as_json: bool) -> 
         for cost in costs:
             batch = f"{cost.what:33} n = {cost.worlds:6,}  N = {cost.vehicles:2}"
             share = cost.nanoseconds / cost.vehicles
-            typer.echo(f"{batch} {cost.nanoseconds:10,.1f} ns per world-step {share:9,.1f} ns per vehicle-step")
+            show(f"{batch} {cost.nanoseconds:10,.1f} ns per world-step {share:9,.1f} ns per vehicle-step")
     say(f"picture: {target}")
 
 

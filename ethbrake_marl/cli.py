@@ -36,6 +36,7 @@ from ethbrake_marl.lineup import (
     load_runnable,
 )
 from ethbrake_marl.picture_commands import picture_app
+from ethbrake_marl.plain_files import read_plain
 from ethbrake_marl.policy_commands import export_command, import_legacy_command
 from ethbrake_marl.scenario import (
     list_scenarios,
@@ -44,6 +45,7 @@ from ethbrake_marl.scenario import (
     scenario_json_schema,
     scenario_path,
 )
+from ethbrake_marl.scenario.yaml_loading import SIZE_LIMIT
 from ethbrake_marl.search_commands import best_harm_command
 from ethbrake_marl.shield_commands import shield_command
 from ethbrake_marl.terminal import (
@@ -51,6 +53,7 @@ from ethbrake_marl.terminal import (
     interruptible,
     progress_bars,
     say,
+    show,
     tolerate_narrow_streams,
     write_json,
 )
@@ -182,14 +185,14 @@ def scenario_list(as_json: JsonOption = False) -> None:
         return
     width = max(len(entry.name) for entry in entries)
     for entry in entries:
-        typer.echo(f"{entry.name:{width}}  {entry.title}")
+        show(f"{entry.name:{width}}  {entry.title}")
 
 
 @scenario_app.command("show", epilog="Example: ethbrake scenario show paper-random")
 def scenario_show(scenario: Annotated[str, typer.Argument(metavar="NAME|PATH")]) -> None:
     """Print the YAML of a scenario that is in order."""
     load_scenario(scenario)
-    typer.echo(scenario_path(scenario).read_text("utf-8"), nl=False)
+    show(read_plain(scenario_path(scenario), SIZE_LIMIT).decode("utf-8"), end="")
 
 
 @scenario_app.command("validate", epilog="Example: ethbrake scenario validate my-scenario.yaml")
@@ -199,7 +202,7 @@ def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")])
     sample = scenario.sample(CHECKED_DRAWS, LIST_SEED)
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "none"
     counts = f"{CHECKED_DRAWS:,} worlds drawn, {sample.rejected:,} more refused for an early impact"
-    typer.echo(f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}")
+    show(f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}")
 
 
 @scenario_app.command("new", epilog="Example: ethbrake scenario new my-scenario --based-on paper-distance")
@@ -236,12 +239,12 @@ def doctor(as_json: JsonOption = False) -> None:
     else:
         width = max(len(check.name) for check in checks)
         for check in checks:
-            typer.echo(f"{'OK' if check.ok else 'FAIL':4}  {check.name:{width}}  {check.detail}")
+            show(f"{'OK' if check.ok else 'FAIL':4}  {check.name:{width}}  {check.detail}")
     if not all(check.ok for check in checks):
         raise typer.Exit(1)
 
 
 def _refuse(reason: str) -> int:
     """Say why, in one line; gives the exit status."""
-    say(f"ethbrake: error: {' '.join(reason.split())}")
+    say(f"ethbrake: error: {reason}")
     return BAD_INPUT

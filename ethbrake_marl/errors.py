@@ -5,9 +5,39 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+LINE_LIMIT = 1_500  # characters of a message; of a longer one the beginning and the end are shown
+_KEPT_BEGINNING, _KEPT_END = 1_000, 400
+
+
+def plain_text(text: str, keep: str = "") -> str:
+    """``text`` as a terminal may have it: what is not printable is written as in Python's own escapes.
+
+    That is every control, direction and separator character but the blank and those in ``keep``. Names, keys and paths
+    come from files and command lines: shown as they are, they could move the cursor or turn a line around.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in keep else c.encode("unicode_escape").decode() for c in text)
+
+
+def one_line(text: str) -> str:
+    """``text`` as one line of at most ``LINE_LIMIT`` characters of ``plain_text``, its middle left out if need be.
+
+    A message begins with where and what, and ends with what would be right.
+    """
+    blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
+    line = plain_text(blanks)
+    if len(text) == len(blanks) and len(line) <= LINE_LIMIT:
+        return line
+    return f"{line[:_KEPT_BEGINNING]} ... ({len(text):,} characters) ... {line[-_KEPT_END:]}"
+
 
 class EthBrakeError(Exception):
-    """Base of every error that this package raises on purpose."""
+    """Base of every error that this package raises on purpose; its text is one line, whatever it tells of."""
+
+    def __str__(self) -> str:
+        """The message as ``one_line``."""
+        return one_line(super().__str__())
 
 
 class InvalidInput(EthBrakeError, ValueError):

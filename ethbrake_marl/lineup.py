@@ -30,6 +30,7 @@ from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
 
 EPISODES = 10_000
 PROGRESS_EVERY = 500  # worlds between two signs of life
+TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only checked
 LIST_SEED = 7  # of the worlds on which everything is measured; has nothing to do with the seed of a training
 
 LADDER = (  # from no decision at all up to the best that is known
@@ -71,7 +72,8 @@ def load_runnable(name_or_path: str) -> Scenario:
     worlds = scenario.replace(early_impacts="keep").sample(1, LIST_SEED).worlds
     for vehicle, script in scenario.scripts.items():
         try:
-            _try_out(make_agent(script, horizon_s=scenario.horizon_s), worlds, vehicle)
+            agent = make_agent(script, horizon_s=scenario.horizon_s, most_candidates=TRIED_CANDIDATES)
+            _try_out(agent, worlds, vehicle)
         except InvalidInput as error:
             role = scenario.vehicle_names[vehicle]
             where = _place_of_role(name_or_path, role)

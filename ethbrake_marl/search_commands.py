@@ -24,7 +24,7 @@ from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable, make_agents
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample, Scenario
-from ethbrake_marl.terminal import interruptible, progress_bars, say, write_json
+from ethbrake_marl.terminal import interruptible, progress_bars, say, show, write_json
 
 TABLE_ENDING = ".npz"
 
@@ -136,7 +136,7 @@ def _show(figures: dict[str, object], *, as_json: bool) -> None:
         write_json(figures)
         return
     for name, value in figures.items():
-        typer.echo(f"{name:36} {value:.4f}" if isinstance(value, float) else f"{name:36} {value}")
+        show(f"{name:36} {value:.4f}" if isinstance(value, float) else f"{name:36} {value}")
 
 
 def best_harm_figures(table: BestHarmTable) -> dict[str, object]:

@@ -11,15 +11,23 @@ from contextlib import contextmanager
 from typing import Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.segment import Segment
+
+from ethbrake_marl.errors import one_line, plain_text
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
 
 def say(text: str) -> None:
-    """One line to the person at the terminal."""
-    typer.echo(text, err=True)
+    """One line to the person at the terminal, on stderr."""
+    typer.echo(one_line(text), err=True)
+
+
+def show(text: str, end: str = "\n") -> None:
+    """Lines of a result, on stdout; nothing in them but line ends and tabs commands the terminal."""
+    typer.echo(plain_text(text, keep="\n\t") + end, nl=False)
 
 
 def write_json(content: Any) -> None:
@@ -64,7 +72,7 @@ class Bars:
     ) -> None:
         """The part ``name`` has come to ``done`` of ``total``; ``note`` is said once, above the bars."""
         harm = (metrics or {}).get("first_impact_harm")
-        label = name if harm is None else f"{name}, first-impact harm {harm:.2f}"
+        label = one_line(name if harm is None else f"{name}, first-impact harm {harm:.2f}")
         if note:
             self.tell(note)
         if self._bars is None:
@@ -81,21 +89,33 @@ class Bars:
         if self._bars is None:
             say(text)
         else:
-            self._bars.console.print(text, highlight=False)
+            self._bars.console.print(one_line(text), highlight=False)
 
 
 @contextmanager
 def progress_bars() -> Iterator[Bars]:
     """Bars on stderr while the block runs."""
-    console = Console(stderr=True)
+    console = _PlainConsole(stderr=True)
     if not console.is_terminal:
         yield Bars(None)
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console) as bars:
         yield Bars(bars)
 
 
+class _PlainConsole(Console):
+    """Shows text as it is: no markup in the names of agents and paths, and nothing that commands the terminal."""
+
+    def __init__(self, *, stderr: bool = False, width: int | None = None) -> None:
+        super().__init__(stderr=stderr, width=width, markup=False, emoji=False)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """The pieces of a line or table; those that rich made to style and move keep what they hold."""
+        for piece in super().render(renderable, options):
+            yield piece if piece.control else Segment(plain_text(piece.text, keep="\n\t"), piece.style)
+
+
 def result_console() -> Console:
     """Where tables go: stdout, at the terminal's width or 100 columns in a file."""
-    return Console() if sys.stdout.isatty() else Console(width=100)
+    return _PlainConsole(width=None if sys.stdout.isatty() else 100)

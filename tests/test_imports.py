@@ -18,7 +18,7 @@ PACKAGE = "ethbrake_marl"
 # From the bottom up. A room imports lower levels; inside a level one room may import another, but not both ways.
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("errors", "numerals"),
-    ("durable_files",),
+    ("durable_files", "plain_files", "strict_json", "array_files"),
     ("physics",),
     ("harm",),
     ("objectives",),

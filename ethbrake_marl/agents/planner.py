@@ -21,6 +21,7 @@ from ethbrake_marl.starts import Script
 
 CANDIDATES = 256  # per world and decision
 ROUND = 256  # candidates between two looks at the clock
+MOST_CANDIDATES, MOST_MILLISECONDS = 1_000_000, 60_000.0  # per world and decision
 _CONSTANTS = 15
 _ARGUMENT = re.compile(r"(?P<number>[0-9]+(\.[0-9]+)?)(?P<unit>ms)?")
 
@@ -30,18 +31,28 @@ class Planner:
 
     Each search starts from the plan so far, from constants and, at first, from the pairwise optimum. ``argument`` is
     the number of candidates per world and decision (deterministic), or a time like ``20ms`` per world and decision
-    (as many rounds of candidates as fit, at least one; depends on the machine). ``predicted_harm`` [n] is that of the
-    first plan (m2/s2); no more is done if the others do as expected. Vehicles that are not in ``others`` (learners)
-    are taken to brake fully. Raises ``InvalidInput`` for any other argument or an unknown count and, when an episode
-    begins, for another vehicle's script whose command is not fixed at the alert.
+    (as many rounds of candidates as fit, at least one; depends on the machine). ``most_candidates`` bounds a search
+    whatever the argument says. ``predicted_harm`` [n] is that of the first plan (m2/s2); no more is done if the others
+    do as expected. Vehicles that are not in ``others`` (learners) are taken to brake fully. Raises ``InvalidInput`` for
+    any other argument or an unknown count and, when an episode begins, for another vehicle's script whose command is
+    not fixed at the alert.
     """
 
-    def __init__(self, argument: str | None = None, *, count: HarmCount = "first", horizon_s: float = 8.0) -> None:
+    def __init__(
+        self,
+        argument: str | None = None,
+        *,
+        count: HarmCount = "first",
+        horizon_s: float = 8.0,
+        most_candidates: int | None = None,
+    ) -> None:
         check_count(count)
         self.others: Mapping[int, Script] = {}
         self.name = "planner" if argument is None else f"planner:{argument}"
         self.predicted_harm: Floats = np.empty(0)
         self._candidates, self._milliseconds = _budget(argument)
+        if most_candidates is not None:
+            self._candidates, self._milliseconds = min(self._candidates, most_candidates), 0.0
         self._count: HarmCount = count
         self._horizon_s = horizon_s
         self._latency_s: Floats = np.empty(0)
@@ -125,11 +136,13 @@ def _budget(argument: str | None) -> tuple[int, float]:
     if argument is None:
         return CANDIDATES, 0.0
     match = _ARGUMENT.fullmatch(argument)
-    if match is not None and match["unit"] is None and match["number"].isdigit() and int(argument) >= 1:
-        return int(argument), 0.0
-    if match is not None and match["unit"] == "ms" and float(match["number"]) > 0.0:
-        return ROUND, float(match["number"])
+    if match is not None:
+        number = float(match["number"])
+        if match["unit"] == "ms" and 0.0 < number <= MOST_MILLISECONDS:
+            return ROUND, number
+        if match["unit"] is None and number.is_integer() and 1.0 <= number <= MOST_CANDIDATES and "." not in argument:
+            return int(number), 0.0
     raise InvalidInput(
-        f"agent 'planner:{argument}': the argument must be a number of candidates per decision, for instance 256, or a"
-        " time per decision, for instance 20ms"
+        f"agent 'planner:{argument}': the argument must be a number of candidates per decision, for instance 256 (at"
+        f" most {MOST_CANDIDATES:,}), or a time per decision, for instance 20ms (at most {MOST_MILLISECONDS:,.0f}ms)"
     )

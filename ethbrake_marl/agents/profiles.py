@@ -124,6 +124,21 @@ def follow_profiles(problem: ProfileProblem, profiles: Profiles) -> tuple[Floats
 
     Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity.
     """
+    check_profiles(problem, profiles)
+    n = problem.n
+    first, total = np.zeros(n), np.zeros(n)
+    failed = follow_worlds(
+        problem.start, problem.clock, problem.bounds, problem.command, problem.latency, problem.mass, problem.limit,
+        problem.vehicles, np.ascontiguousarray(profiles.ends, np.int64),
+        np.ascontiguousarray(profiles.commands_mps2, np.float64), first, total,
+    )  # fmt: skip
+    if failed >= 0:
+        raise PhysicsError(f"profiles: world {failed} could not be advanced")
+    return first, total
+
+
+def check_profiles(problem: ProfileProblem, profiles: Profiles) -> None:
+    """Raise ``InvalidInput`` unless there is one profile per world, within the capacities, its phases in order."""
     n, C = problem.n, len(problem.vehicles)
     K = profiles.ends.shape[-1]
     if profiles.ends.shape != (n, K) or profiles.commands_mps2.shape != (n, K, C):
@@ -142,15 +157,6 @@ def follow_profiles(problem: ProfileProblem, profiles: Profiles) -> tuple[Floats
     ).all()
     if not ordered:
         raise InvalidInput("profiles: phases must end in order, the last one at the last step")
-    first, total = np.zeros(n), np.zeros(n)
-    failed = follow_worlds(
-        problem.start, problem.clock, problem.bounds, problem.command, problem.latency, problem.mass, problem.limit,
-        problem.vehicles, np.ascontiguousarray(profiles.ends, np.int64),
-        np.ascontiguousarray(profiles.commands_mps2, np.float64), first, total,
-    )  # fmt: skip
-    if failed >= 0:
-        raise PhysicsError(f"profiles: world {failed} could not be advanced")
-    return first, total
 
 
 @compiled

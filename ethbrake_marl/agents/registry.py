@@ -22,17 +22,21 @@ class AgentSettings:
 
     count: HarmCount = "first"  # which harm an optimising agent minimises
     horizon_s: float = 8.0  # until when it looks ahead
+    most_candidates: int | None = None  # of a search, whatever its argument says; None: what that says
 
 
 Factory = Callable[[str | None, AgentSettings], Agent]
 
 
-def make_agent(spec: str, *, count: HarmCount = "first", horizon_s: float = 8.0) -> Agent:
+def make_agent(
+    spec: str, *, count: HarmCount = "first", horizon_s: float = 8.0, most_candidates: int | None = None
+) -> Agent:
     """A fresh agent for one vehicle in one batch.
 
     ``full_brake``, ``coast``, ``constant:a`` (deceleration in m/s2, negative = drive), ``copy_leader``,
     ``gentlest_front``, ``e_v2x_bm`` (= ``e_v2x_bm:coupled``), ``e_v2x_bm:pairwise``, ``planner``,
-    ``planner:candidates``, ``planner:20ms`` (a time per decision), and what was registered.
+    ``planner:candidates``, ``planner:20ms`` (a time per decision), and what was registered. ``most_candidates`` is for
+    trying an agent out: no search of it takes more.
     Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, count or horizon.
     """
     check_count(count)
@@ -41,7 +45,7 @@ def make_agent(spec: str, *, count: HarmCount = "first", horizon_s: float = 8.0)
     name, argument = _split(spec)
     if name not in _FACTORIES:
         raise unknown_name("agent", name, _FACTORIES)
-    return _FACTORIES[name](argument, AgentSettings(count, horizon_s))
+    return _FACTORIES[name](argument, AgentSettings(count, horizon_s, most_candidates))
 
 
 def agent_names() -> tuple[str, ...]:
@@ -98,7 +102,9 @@ def _e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
 
 
 def _planner(argument: str | None, settings: AgentSettings) -> Agent:
-    return Planner(argument, count=settings.count, horizon_s=settings.horizon_s)
+    return Planner(
+        argument, count=settings.count, horizon_s=settings.horizon_s, most_candidates=settings.most_candidates
+    )
 
 
 _FACTORIES: dict[str, Factory] = {

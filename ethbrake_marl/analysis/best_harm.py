@@ -67,6 +67,8 @@ def best_harm(
     search = _Search(scenario, worlds, scripted_commands(scenario, worlds, chosen), budget, seed, workers)
     found: list[Found] = []
     identity = search.problem(chosen).identity
+    if known is not None:
+        known.check_fits(search.problem(chosen))
     for count in counts:
         given = [earlier.profiles for earlier in found]
         if known is not None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ethbrake_marl.agents.planner import MOST_CANDIDATES
 from ethbrake_marl.agents.profile_problem import ProfileProblem
 from ethbrake_marl.agents.profiles import Profiles, pad_profiles
 from ethbrake_marl.agents.protocol import Agent
@@ -17,6 +18,7 @@ from ethbrake_marl.analysis.best_harm import world_identity
 from ethbrake_marl.analysis.best_harm_table import BestHarmTable, load_table
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.numerals import parse_numeral
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.scenario import Scenario
 
@@ -61,9 +63,11 @@ def shipped_profiles(problem: ProfileProblem, count: HarmCount) -> tuple[Profile
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
     """``best_harm[:candidates]``: the shipped profile, or a search with so many candidates where there is none."""
-    if argument is not None and not (argument.isdigit() and int(argument) >= 1):
+    number = SEARCH_BUDGET if argument is None else parse_numeral(argument)
+    if number is None or (argument is not None and not argument.isdecimal()) or not 1 <= number <= MOST_CANDIDATES:
         raise InvalidInput(
-            f"agent 'best_harm:{argument}': the argument must be a number of candidates, for instance {SEARCH_BUDGET}"
+            f"agent 'best_harm:{argument}': the argument must be a number of candidates, for instance {SEARCH_BUDGET},"
+            f" at most {MOST_CANDIDATES:,}"
         )
-    budget = SEARCH_BUDGET if argument is None else int(argument)
+    budget = int(number) if settings.most_candidates is None else min(int(number), settings.most_candidates)
     return BestHarm(shipped_profiles, count=settings.count, horizon_s=settings.horizon_s, budget=budget)

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ethbrake_marl.agents.profile_motion import Words
-from ethbrake_marl.agents.profiles import Profiles, pad_profiles
+from ethbrake_marl.agents.profile_problem import ProfileProblem
+from ethbrake_marl.agents.profiles import Profiles, check_profiles, pad_profiles
+from ethbrake_marl.array_files import ArrayArchive, ArrayRow
 from ethbrake_marl.durable_files import write_file
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.plain_files import read_plain
+from ethbrake_marl.strict_json import parse_strict_json
 
 TABLE_FORMAT = 1
+SIZE_LIMIT_BYTES = 64 << 20  # of a file
+UNPACKED_LIMIT_BYTES = 256 << 20  # of its arrays
+DECODED_LIMIT = 1 << 26  # numbers of the profiles of one count, every world with as many phases as the longest
 TOLERANCE = 1e-6  # an agent must be this much (m2/s2) below the table to replace its value
 _ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # of the header, in an error
 _COUNTS: tuple[HarmCount, ...] = ("first", "total")
@@ -56,6 +63,14 @@ class BestHarmTable:
                 f"table of best known harm ({made}): holds none of these {len(identity)} worlds; give the scenario,"
                 " seed and vehicles that it was made for"
             )
+
+    def check_fits(self, problem: ProfileProblem) -> None:
+        """Raise ``InvalidInput`` if a profile kept for one of these worlds cannot be driven there."""
+        for count in self.best:
+            try:
+                check_profiles(problem, self.profiles(problem.identity, count, problem.last_step)[0])
+            except InvalidInput as error:
+                raise InvalidInput(f"table of best known harm, {count}: {error}") from None
 
     def harm(self, identity: Words, count: HarmCount) -> Floats:
         """Best known harm of each world (m2/s2), NaN where it is not in the table."""
@@ -141,37 +156,92 @@ def save_table(path: Path, table: BestHarmTable) -> None:
 
 
 def load_table(path: Path) -> BestHarmTable:
-    """Read a table. Raises ``InvalidInput`` if there is no file and ``CorruptBundle`` if it is not a table."""
-    if not path.is_file():
+    """Read a table. Raises ``InvalidInput`` if there is no file and ``CorruptBundle`` if it is not a table.
+
+    Names, types, shapes and sizes are checked from the headers before anything is unpacked. What a table says of a
+    world is believed; that its profiles fit a problem is for ``check_fits`` to say.
+    """
+    if not path.exists():
         raise InvalidInput(f"{path}: there is no such table of best known harm")
+    data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            header = json.loads(arrays["header"].tobytes())
-            if header.pop("format") != TABLE_FORMAT:
-                raise CorruptBundle(f"{path}: is a table of another format; this version reads {TABLE_FORMAT}")
-            counts = [count for count in _COUNTS if f"{count}_harm" in arrays]
-            best = {count: _read_best(arrays, count) for count in counts}
-            return BestHarmTable(arrays["identity"].astype(np.uint64), best, header)
-    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        if isinstance(error, CorruptBundle):
-            raise
-        raise CorruptBundle(f"{path}: is not a table of best known harm") from error
+        archive = ArrayArchive(data, UNPACKED_LIMIT_BYTES)
+        counts = [count for count in _COUNTS if f"{count}_harm" in archive.headers]
+        arrays = archive.unpack([row for count in counts or _COUNTS for row in _rows(count)])
+        header = _header(arrays["header"].tobytes())
+        best = {count: _read_best(arrays, count) for count in counts}
+    except ValueError as error:
+        raise CorruptBundle(f"{path}: is not a table of best known harm: {error}") from None
+    return BestHarmTable(arrays["identity"].astype(np.uint64), best, header)
+
+
+def _rows(count: HarmCount) -> list[ArrayRow]:
+    """What a table holds of one count: n worlds, m phases in all, C controlled vehicles."""
+    return [
+        ArrayRow("header", "|u1", ("bytes",)),
+        ArrayRow("identity", "<u8", ("n",)),
+        ArrayRow(f"{count}_harm", "<f8", ("n",)),
+        ArrayRow(f"{count}_phases", "<u2", ("n",)),
+        ArrayRow(f"{count}_ends", "<u2", (f"m of {count}",)),
+        ArrayRow(f"{count}_commands", "|u1", (8, f"m of {count}", "C")),
+    ]
+
+
+class _Header(BaseModel):
+    """What other code relies on in a header; it may say more."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    format: Literal[1]
+    scenario: str = ""
+    vehicles: list[str] = []
+    budget: int = 0
+    search_seed: int = 0
+    episodes: int = 0
+    list_seed: int = 0
+    after: dict[str, Any] = {}
+    lowered_by: dict[str, dict[str, int]] = {}
+
+
+def _header(data: bytes) -> dict[str, Any]:
+    content = parse_strict_json(data)
+    try:
+        _Header.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ValueError(f"header: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    del content["format"]
+    return dict(content)
 
 
 def _read_best(arrays: Mapping[str, NDArray[Any]], count: HarmCount) -> Best:
+    """One count of a table whose arrays have the right shapes; raises ``ValueError`` for numbers that cannot be."""
+    harm = arrays[f"{count}_harm"].astype(np.float64)
     used = arrays[f"{count}_phases"].astype(np.int64)
     planes = arrays[f"{count}_commands"]
     flat = np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f8")[..., 0].astype(np.float64)
-    width = max(int(used.max(initial=1)), 1)
+    if not len(harm):
+        raise ValueError("it holds no world")
+    if not (np.isfinite(harm).all() and (harm >= 0.0).all()):
+        raise ValueError(f"{count}_harm: a harm must be a finite number of at least 0 m2/s2")
+    if not np.isfinite(flat).all():
+        raise ValueError(f"{count}_commands: a command must be a finite number")
+    if used.sum() != len(flat):
+        raise ValueError(f"{count}_phases: {used.sum()} phases in all, but there are {len(flat)} commands")
+    width, controlled = max(int(used.max()), 1), flat.shape[1]
+    if not 1 <= controlled <= 64 or len(used) * width * (controlled + 1) > DECODED_LIMIT:
+        raise ValueError(f"{len(used)} worlds of {width} phases of {controlled} vehicles are beyond what is kept")
     inside = np.arange(width) < used[:, np.newaxis]
-    ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, flat.shape[1]))
+    ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, controlled))
     ends[inside] = arrays[f"{count}_ends"]
     commands[inside] = flat
     last = np.maximum(used - 1, 0)
     rows = np.arange(len(used))
     ends = np.where(inside, ends, ends[rows, last][:, np.newaxis])
     commands = np.where(inside[..., np.newaxis], commands, commands[rows, last][:, np.newaxis])
-    return Best(arrays[f"{count}_harm"].astype(np.float64), Profiles(ends, commands))
+    if not ((np.diff(ends, axis=1) >= 0).all() and ((ends[:, -1] > 0) == (used > 0)).all()):
+        raise ValueError(f"{count}_ends: the phases of a world must end in order, the last one after step 0")
+    return Best(harm, Profiles(ends, commands))
 
 
 def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:

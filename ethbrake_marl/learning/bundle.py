@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,13 +18,15 @@ import safetensors.numpy
 from pydantic import ValidationError
 from safetensors import SafetensorError
 
+from ethbrake_marl.array_files import ArrayRow, check_arrays, safetensors_headers
 from ethbrake_marl.durable_files import new_folder, write_file
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.learning.forward import Actor, Float32s
 from ethbrake_marl.learning.manifest import Manifest, content_sha256, observation_schema
-from ethbrake_marl.learning.networks import TensorRow, tensor_table
-from ethbrake_marl.learning.strict_json import parse_strict_json
+from ethbrake_marl.learning.networks import tensor_table
 from ethbrake_marl.observations import ObservationSpec
+from ethbrake_marl.plain_files import read_plain
+from ethbrake_marl.strict_json import parse_strict_json
 
 MANIFEST = "manifest.json"
 WEIGHTS = "weights.safetensors"
@@ -138,20 +139,7 @@ def _check_files(folder: Path) -> None:
 
 
 def _read(path: Path, limit: int) -> bytes:
-    """Read a regular file of at most ``limit`` bytes; follows no link and does not wait on a pipe."""
-    if path.is_symlink():
-        raise CorruptBundle(f"{path}: is a symbolic link; a bundle holds plain files")
-    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-    try:
-        with os.fdopen(os.open(path, flags), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise CorruptBundle(f"{path}: is not a plain file")
-            data = file.read(limit + 1)
-    except OSError as error:
-        raise CorruptBundle(f"{path}: cannot be read ({error.strerror})") from None
-    if len(data) > limit:
-        raise CorruptBundle(f"{path}: larger than {limit} bytes")
-    return data
+    return read_plain(path, limit, refusal=CorruptBundle, follow_links=False)
 
 
 def _manifest(path: Path) -> Manifest:
@@ -191,8 +179,8 @@ def _serialise(tensors: Mapping[str, Float32s]) -> bytes:
 
 def _tensors(data: bytes, manifest: Manifest) -> dict[str, Float32s]:
     """Check ``data`` against the tensor table, then read it; raises ``ValueError`` naming the tensor."""
-    table = tensor_table(manifest.network)
-    _check_header(data, table)
+    rows = [ArrayRow(row.name, "F32", row.shape) for row in tensor_table(manifest.network)]
+    check_arrays(safetensors_headers(data), rows, "tensor")
     try:
         tensors = safetensors.numpy.load(data)
     except SafetensorError as error:
@@ -202,22 +190,3 @@ def _tensors(data: bytes, manifest: Manifest) -> dict[str, Float32s]:
             raise ValueError(f"tensor {name!r} holds a number that is not finite")
         tensor.setflags(write=False)
     return tensors
-
-
-def _check_header(data: bytes, table: tuple[TensorRow, ...]) -> None:
-    """Compare names, dtypes and shapes of a safetensors header with ``table``."""
-    length = int.from_bytes(data[:8], "little")
-    if not 2 <= length <= min(len(data) - 8, MANIFEST_LIMIT_BYTES):
-        raise ValueError(f"not a safetensors file (a header of {length} bytes in a file of {len(data)})")
-    header = parse_strict_json(data[8 : 8 + length])
-    if not isinstance(header, dict) or not all(isinstance(entry, dict) for entry in header.values()):
-        raise ValueError("not a safetensors file (the header is not a table of tensors)")
-    wanted = {row.name: row for row in table}
-    for name in sorted(wanted.keys() - header.keys()):
-        raise ValueError(f"tensor {name!r} is missing")
-    for name in sorted(header.keys() - wanted.keys()):
-        raise ValueError(f"tensor {name!r} does not belong to this network")
-    for name, row in wanted.items():
-        dtype, shape = header[name].get("dtype"), header[name].get("shape")
-        if dtype != "F32" or shape != list(row.shape):
-            raise ValueError(f"tensor {name!r} is {dtype} {shape}, should be F32 {list(row.shape)}")

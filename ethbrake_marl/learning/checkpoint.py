@@ -19,10 +19,12 @@ import safetensors.numpy
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
+from ethbrake_marl.array_files import map_npy, safetensors_headers
 from ethbrake_marl.durable_files import new_folder, remove_folder, write_file
-from ethbrake_marl.errors import CorruptBundle
+from ethbrake_marl.errors import CorruptBundle, EthBrakeError
+from ethbrake_marl.learning.checkpoint_schema import Listing, Numbers, checked_json
 from ethbrake_marl.learning.policy_team import Trained, read_trained, save_trained
-from ethbrake_marl.learning.strict_json import parse_strict_json
+from ethbrake_marl.plain_files import open_plain, read_plain
 from ethbrake_marl.snapshots import Arrays
 
 FORMAT_VERSION = 1
@@ -38,6 +40,9 @@ _NUMBERS, _ARRAYS, _TABLE, _POLICY, _BEST, _MEMORY = (
     "replay",
 )
 _LISTING_LIMIT_BYTES = 1 << 20
+_HELD_LIMITS_BYTES = {_NUMBERS: 256 << 20, _ARRAYS: 1 << 30, _TABLE: 256 << 20}  # of what is read as a whole
+_SIZE_LIMIT_BYTES = 1 << 36  # of any other file: a replay memory of ten million decisions
+_DTYPES = {"BOOL", "F32", "F64", "I32", "I64", "U8", "U32", "U64"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,29 +88,54 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
 
 def read_checkpoint(folder: Path) -> TrainingState:
     """Read and check every file of ``folder``; raises ``CorruptBundle`` naming the file and what is wrong with it."""
-    listing = _checked_listing(folder)
+    listing, data = _checked_files(folder)
     try:
+        place = folder / _NUMBERS
+        numbers = checked_json(Numbers, data[_NUMBERS])
+        place = folder / _ARRAYS
+        arrays = _arrays(data[_ARRAYS])
+        replay = {}
+        for place in sorted(folder.glob(f"{_MEMORY}-*.npy")):
+            with open_plain(place, _SIZE_LIMIT_BYTES, refusal=CorruptBundle, follow_links=False) as stream:
+                replay[place.stem.removeprefix(f"{_MEMORY}-")] = map_npy(stream, place.stem)
+        place = folder / _POLICY
         return TrainingState(
             steps=listing["steps"],
             updates=listing["updates"],
-            numbers=parse_strict_json((folder / _NUMBERS).read_bytes()),
-            arrays=dict(safetensors.numpy.load((folder / _ARRAYS).read_bytes())),
-            replay={
-                file.stem.removeprefix(f"{_MEMORY}-"): np.load(file, mmap_mode="r", allow_pickle=False)
-                for file in sorted(folder.glob(f"{_MEMORY}-*.npy"))
-            },
+            numbers=numbers,
+            arrays=arrays,
+            replay=replay,
             policy=read_trained(folder / _POLICY),
             best=read_trained(folder / _BEST) if (folder / _BEST).is_dir() else None,
-            table=(folder / _TABLE).read_bytes(),
+            table=_text(data[_TABLE]),
             versions=listing["versions"],
         )
-    except (ValueError, SafetensorError) as error:
+    except EthBrakeError as error:
         raise CorruptBundle(f"{folder}: {error}") from None
+    except KeyError as error:
+        raise CorruptBundle(f"{folder / error.args[0]}: is missing") from None
+    except (ValueError, SafetensorError) as error:
+        raise CorruptBundle(f"{place}: {error}") from None
+
+
+def _arrays(data: bytes) -> Arrays:
+    for name, header in safetensors_headers(data).items():
+        if header.dtype not in _DTYPES:
+            raise ValueError(f"array {name!r} is {header.dtype}; must be one of {', '.join(sorted(_DTYPES))}")
+    return dict(safetensors.numpy.load(data))
+
+
+def _text(table: bytes) -> bytes:
+    """The progress table, if it is one: text with a column ``steps``, or empty."""
+    names = table.decode("utf-8").partition("\n")[0].split(",")
+    if table and names[0] != "steps":
+        raise ValueError("the first column of the progress table must be steps")
+    return table
 
 
 def checkpoint_folders(folder: Path) -> list[Path]:
     """Checkpoints in ``folder``, the newest first; whether they are whole is not known yet."""
-    return sorted((path for path in folder.glob("step_*") if path.is_dir()), reverse=True)
+    return sorted((path for path in folder.glob("step_*") if _is_folder(path)), reverse=True)
 
 
 def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:
@@ -126,29 +156,42 @@ def prune(folder: Path, keep: int = KEPT) -> None:
         remove_folder(path)
 
 
-def _checked_listing(folder: Path) -> dict[str, Any]:
+def _checked_files(folder: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """The listing, and the content of the files beside it; every file is there, and is what the listing says."""
     path = folder / LISTING
     try:
-        with path.open("rb") as file:
-            listing: Any = parse_strict_json(file.read(_LISTING_LIMIT_BYTES))
-        wanted = ("ethbrake-checkpoint", FORMAT_VERSION)
-        if (listing["format"], listing["format_version"]) != wanted:
-            raise CorruptBundle(f"{path}: is not of format {wanted[0]} {wanted[1]}")
-        files = {str(name): (int(entry["bytes"]), str(entry["sha256"])) for name, entry in listing["files"].items()}
+        listing = checked_json(Listing, _read(path, _LISTING_LIMIT_BYTES))
+        found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if not _is_folder(path)}
     except OSError as error:
-        raise CorruptBundle(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CorruptBundle(f"{folder}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
         if isinstance(error, CorruptBundle):
             raise
         raise CorruptBundle(f"{path}: is damaged ({error})") from None
-    found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
+    files = listing["files"]
     if found.keys() != files.keys() | {LISTING}:
         different = sorted(found.keys() ^ (files.keys() | {LISTING}))[0]
         raise CorruptBundle(f"{folder / different}: is {'extra' if different in found else 'missing'}")
-    for name, (size, digest) in files.items():
-        if found[name].stat().st_size != size or _sha256(found[name]) != digest:
+    data = {}
+    for name, entry in files.items():
+        digest, size = hashlib.sha256(), 0
+        if name in _HELD_LIMITS_BYTES:
+            data[name] = _read(found[name], _HELD_LIMITS_BYTES[name])
+            digest, size = hashlib.sha256(data[name]), len(data[name])
+        else:
+            with open_plain(found[name], _SIZE_LIMIT_BYTES, refusal=CorruptBundle, follow_links=False) as stream:
+                digest, size = hashlib.file_digest(stream, "sha256"), stream.tell()
+        if (size, digest.hexdigest()) != (entry["bytes"], entry["sha256"]):
             raise CorruptBundle(f"{found[name]}: is not the file that was written (size or SHA-256 differ)")
-    return dict(listing)
+    return listing, data
+
+
+def _read(path: Path, limit_bytes: int) -> bytes:
+    return read_plain(path, limit_bytes, refusal=CorruptBundle, follow_links=False)
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()
 
 
 def _contiguous(arrays: Mapping[str, NDArray[Any]]) -> Arrays:

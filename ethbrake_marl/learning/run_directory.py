@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,7 +14,10 @@ from typing import Any, Literal, get_args
 
 from ethbrake_marl.durable_files import new_folder, write_file
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.learning.strict_json import parse_strict_json
+from ethbrake_marl.plain_files import read_plain
+from ethbrake_marl.strict_json import parse_strict_json
+
+_LIMIT_BYTES = 16 << 20  # of a JSON file
 
 RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
@@ -97,12 +101,11 @@ def write_status(run: RunDirectory, status: RunStatus, more: Mapping[str, Any]) 
 
 def read_object(file: Path) -> dict[str, Any]:
     """The JSON object in a file of a run; raises ``InvalidInput`` naming the file and what is wrong with it."""
+    if not os.path.lexists(file):
+        raise InvalidInput(f"{file}: is missing; without it this training cannot go on")
+    data = read_plain(file, _LIMIT_BYTES)
     try:
-        content = parse_strict_json(file.read_bytes())
-    except FileNotFoundError:
-        raise InvalidInput(f"{file}: is missing; without it this training cannot go on") from None
-    except OSError as error:
-        raise InvalidInput(f"{file}: cannot be read ({error.strerror})") from None
+        content = parse_strict_json(data)
     except ValueError as error:
         raise InvalidInput(f"{file}: is damaged: {error}") from None
     if not isinstance(content, dict):
@@ -146,8 +149,11 @@ def open_run(path: Path) -> tuple[RunDirectory, dict[str, Any]]:
     Raises ``InvalidInput`` when there is none, or naming the file of it that is damaged.
     """
     run = RunDirectory(path)
-    if not (run.status.exists() or run.config.exists()):
+    if not (os.path.lexists(run.status) or os.path.lexists(run.config)):
         raise InvalidInput(f"{path}: holds no training; give the folder of a run, for instance runs/my-run")
+    for folder in (run.checkpoints, run.tensorboard):
+        if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+            raise InvalidInput(f"{folder}: is not a plain folder; a training deletes in it what it no longer needs")
     status, config = read_object(run.status), read_object(run.config)
     for key, right in (("format", ("ethbrake-run",)), ("status", get_args(RunStatus))):
         if status.get(key) not in right:
@@ -168,7 +174,13 @@ def only_process(run: RunDirectory) -> Iterator[None]:
 
     Raises ``InvalidInput`` when another process trains in this folder.
     """
-    with (run.path / "run.lock").open("w") as file:
+    path = run.path / "run.lock"
+    try:
+        # What stands there is neither emptied nor, where it is a link, followed, and a pipe keeps nobody waiting.
+        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+    except OSError as error:
+        raise InvalidInput(f"{path}: cannot be used as a lock ({error.strerror}); delete it") from None
+    with os.fdopen(lock, "rb+", buffering=0) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:

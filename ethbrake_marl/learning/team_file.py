@@ -15,11 +15,12 @@ from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.learning.bundle import Policy, load_policy
 from ethbrake_marl.learning.recipe import Scheme
 from ethbrake_marl.learning.schemes import driver, drivers
-from ethbrake_marl.learning.strict_json import parse_strict_json
+from ethbrake_marl.plain_files import read_plain
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.consistency import refuse
 from ethbrake_marl.scenario.validation_messages import explain
 from ethbrake_marl.scenario.yaml_loading import Document, YamlPath
+from ethbrake_marl.strict_json import parse_strict_json
 
 TEAM = "team.json"
 _LIMIT_BYTES = 1 << 20
@@ -78,7 +79,7 @@ def team_content(scheme: Scheme, scenario: Scenario) -> dict[str, Any]:
 def is_team(path: str | os.PathLike[str]) -> bool:
     """Whether ``path`` is a run whose learners have a policy each, so that no policy alone drives all of them."""
     file = Path(path) / TEAM
-    return os.path.isfile(file) and len(set(_read(file).drivers.values())) > 1
+    return os.path.lexists(file) and len(set(_read(file).drivers.values())) > 1
 
 
 def load_team(path: str | os.PathLike[str], scenario: str | Path | Scenario, name: str = "team") -> Team:
@@ -90,7 +91,7 @@ def load_team(path: str | os.PathLike[str], scenario: str | Path | Scenario, nam
     """
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     file = Path(path) / TEAM
-    if not file.is_file():
+    if not os.path.lexists(file):
         raise InvalidInput(f"{path}: holds no team ({TEAM}); give the folder of a run, or a bundle as ppo@{path}")
     team = _read(file)
     if team.vehicles != scenario.vehicles:
@@ -121,12 +122,10 @@ def load_driver(path: str | os.PathLike[str], vehicle: str) -> Policy:
 
 
 def _read(file: Path) -> _TeamFile:
+    data = read_plain(file, _LIMIT_BYTES)
     try:
-        with file.open("rb") as opened:
-            content = parse_strict_json(opened.read(_LIMIT_BYTES))
+        content = parse_strict_json(data)
         return _TeamFile.model_validate(content)
-    except OSError as error:
-        raise InvalidInput(f"{file}: cannot be read ({error.strerror})") from None
     except ValidationError as error:
         raise CorruptBundle(str(explain(error, Document(str(file), content, {}), _TeamWording()))) from None
     except ValueError as error:

@@ -17,6 +17,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.bundle import Policy, first_line
 from ethbrake_marl.learning.callback import BetweenUpdates, Evaluate, Progress
 from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
+from ethbrake_marl.learning.checkpoint_fit import check_fits
 from ethbrake_marl.learning.course import Course
 from ethbrake_marl.learning.models import make_model, policy_maker
 from ethbrake_marl.learning.random_state import own_random_state
@@ -187,11 +188,14 @@ def _run(
         model = make_model(recipe, environment)
         run, other_versions = begin()
         with only_process(run):
+            policy_now = policy_maker(recipe, scenario, observation_for(scenario))
             found = None if other_versions is None else _newest(run, other_versions)
+            if found is not None and found[0] is not None:
+                check_fits(found[0], model, policy_now(model))
             session = Session(run, model, recipe)
             between = BetweenUpdates(
                 recipe,
-                policy_maker(recipe, scenario, observation_for(scenario)),
+                policy_now,
                 save=session.save,
                 stop=stop,
                 evaluate=evaluate,

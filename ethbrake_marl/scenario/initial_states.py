@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.numerals import parse_numeral
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds, make_worlds
+from ethbrake_marl.plain_files import read_plain
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.quantities import DECLARED, OPTIONAL, QUANTITIES, QuantityRule, suggestion
 from ethbrake_marl.scenario.schema import Scenario
@@ -214,18 +215,15 @@ def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
     """Header and rows of a CSV file, unchecked, and the line on which each row begins; there is at least one row."""
     rows: list[list[str]] = []
     lines: list[int] = []
+    data = read_plain(file, SIZE_LIMIT)
     try:
-        with file.open("rb") as stream:
-            data = stream.read(SIZE_LIMIT + 1)
-        if len(data) > SIZE_LIMIT:
-            raise ValueError(f"larger than {SIZE_LIMIT >> 20} MiB, the limit for a table")
         reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
         begins = 1
         for row in reader:
             rows.append(row)
             lines.append(begins)
             begins = reader.line_num + 1
-    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
+    except (csv.Error, ValueError) as error:
         raise InvalidInput(f"{file}: cannot be read as CSV: {error}") from None
     while rows and not rows[-1]:
         rows.pop()  # blank lines at the end

@@ -17,6 +17,7 @@ import yaml
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.numerals import parse_numeral
+from ethbrake_marl.plain_files import read_plain
 
 SIZE_LIMIT = 64 * 1024  # bytes
 DEPTH_LIMIT = 16  # mappings and lists inside each other
@@ -58,17 +59,7 @@ class _Open:
 
 def read_yaml(path: str | Path) -> Document:
     """Read one YAML file; raises ``InvalidInput`` with file, line, column and reason for every defect."""
-    file = Path(path)
-    try:
-        if not file.is_file():
-            raise InvalidInput(f"{file}: no such file" if not file.exists() else f"{file}: not a regular file")
-        with file.open("rb") as stream:
-            data = stream.read(SIZE_LIMIT + 1)
-    except (OSError, ValueError) as error:
-        if isinstance(error, InvalidInput):
-            raise
-        raise InvalidInput(f"{file}: cannot be read: {error}") from None
-    return parse_yaml(data, str(file))
+    return parse_yaml(read_plain(path, SIZE_LIMIT), str(Path(path)))
 
 
 def parse_yaml(text: str | bytes, file: str = "<text>") -> Document:

@@ -168,7 +168,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "huge_integer": (_manifest(lambda data: data.replace(b"1024", b"9" * 5000)), r"manifest.json: "),
     "deep": (_manifest(lambda _: b"[" * 200_000), r"manifest.json: nested too deeply"),
     "two_values": (_manifest(lambda data: data + data), r"manifest.json: Extra data"),
-    "large": (_manifest(lambda data: data + b" " * (1 << 20)), r"manifest.json: larger than 1048576 bytes"),
+    "large": (_manifest(lambda data: data + b" " * (1 << 20)), r"manifest.json: larger than 1 MiB"),
     "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: Extra inputs"),
     "dotted_algorithm": (
         _edit(algorithm="subprocess.Popen"),
@@ -256,7 +256,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     ),
     "extra_tensor": (
         _tensors(lambda t: _with(t, "policy.9.bias", np.zeros(3, "f4"))),
-        r"tensor 'policy.9.bias' does not belong to this network",
+        r"tensor 'policy.9.bias' does not belong here",
     ),
     "wrong_shape": (
         _tensors(lambda t: _with(t, "policy.0.bias", np.zeros(14, "f4"))),

@@ -147,7 +147,7 @@ def test_bytes__a_byte_order_mark_is_ignored():
 def test_file__missing_or_not_a_file(tmp_path: Path):
     with pytest.raises(InvalidInput, match=r"gone\.yaml: no such file"):
         read_yaml(tmp_path / "gone.yaml")
-    with pytest.raises(InvalidInput, match="not a regular file"):
+    with pytest.raises(InvalidInput, match="not a plain file"):
         read_yaml(tmp_path)
 
 

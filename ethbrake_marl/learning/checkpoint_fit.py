@@ -1,0 +1,158 @@
+"""Whether a checkpoint belongs to a model: every array, counter and policy is as this model would have written it.
+
+A listing whose hashes agree says that a checkpoint was not damaged, not that it is of this training.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import SAC
+
+from ethbrake_marl.array_files import ArrayHeader, ArrayRow, check_arrays
+from ethbrake_marl.errors import CorruptBundle
+from ethbrake_marl.learning.bundle import Policy
+from ethbrake_marl.learning.checkpoint import TrainingState
+from ethbrake_marl.learning.model_state import REPLAY, Model, optimizers_of
+from ethbrake_marl.learning.policy_team import Trained, drivers_of
+from ethbrake_marl.snapshots import Arrays
+
+_SCRIPT = "environment.engine.script."
+_STREAM = "environment.engine.stream"
+_DRAWN_LIMIT = 1 << 53  # worlds
+
+
+def check_fits(state: TrainingState, model: Model, policy: Trained) -> None:
+    """Raise ``CorruptBundle`` unless ``state`` is one of this freshly built ``model``, whose policy is ``policy``.
+
+    Resets the model's environment, which the state is going to replace.
+    """
+    try:
+        _check_arrays(state.arrays, model)
+        _check_generators(state.arrays)
+        _check_numbers(state, model)
+        _check_replay(state, model)
+        for name, trained in (("policy", state.policy), ("best", state.best)):
+            if trained is not None:
+                _check_policy(name, trained, policy)
+    except ValueError as error:
+        raise CorruptBundle(f"checkpoint of step {state.steps}: is not of this training: {error}") from None
+
+
+def _check_arrays(arrays: Arrays, model: Model) -> None:
+    environment: Any = model.env
+    environment.reset()
+    rows = [_row(f"policy.{name}", tensor.numpy()) for name, tensor in model.policy.state_dict().items()]
+    if isinstance(model, SAC) and model.log_ent_coef is not None:
+        rows.append(_row("log_ent_coef", model.log_ent_coef.detach().numpy()))
+    for name, optimizer in optimizers_of(model).items():
+        rows += _optimizer_rows(f"optimizer.{name}.", optimizer, arrays)
+    fresh: Arrays = {f"environment.{name}": array for name, array in environment.snapshot().items()}
+    rows += [_environment_row(name, array) for name, array in fresh.items()]
+    last = np.empty((environment.num_envs, *environment.observation_space.shape), np.float32)
+    rows += [
+        _row("last.observations", last),
+        _row("last.episode_starts", np.empty(environment.num_envs, np.bool_)),
+        ArrayRow("random.torch", "|u1", torch.get_rng_state().numpy().shape),
+        ArrayRow("random.numpy", "<u4", (624,)),
+        ArrayRow("random.python", "<u8", (625,)),
+        ArrayRow("episodes.return", "<f8", ("episodes",)),
+        ArrayRow("episodes.steps", "<i8", ("episodes",)),
+    ]
+    check_arrays(_headers(arrays), rows)
+    (seed, drawn), (right, _) = arrays[_STREAM].tolist(), fresh[_STREAM].tolist()
+    if seed != right or drawn > _DRAWN_LIMIT:
+        raise ValueError(f"array {_STREAM!r} is [{seed}, {drawn}]; must be [{right}, worlds drawn so far]")
+    for name in sorted(arrays):
+        if name.startswith(("policy.", "optimizer.", "log_ent_coef")) and not np.isfinite(arrays[name]).all():
+            raise ValueError(f"array {name!r} holds a number that is not finite")
+
+
+def _optimizer_rows(prefix: str, optimizer: torch.optim.Optimizer, arrays: Arrays) -> Iterator[ArrayRow]:
+    """Adam's three arrays of each parameter that has had a gradient."""
+    for index, parameter in enumerate(optimizer.param_groups[0]["params"]):
+        if f"{prefix}{index}.step" in arrays:
+            yield ArrayRow(f"{prefix}{index}.step", "<f4", ())
+            yield ArrayRow(f"{prefix}{index}.exp_avg", "<f4", tuple(parameter.shape))
+            yield ArrayRow(f"{prefix}{index}.exp_avg_sq", "<f4", tuple(parameter.shape))
+
+
+def _environment_row(name: str, array: NDArray[Any]) -> ArrayRow:
+    """The environment's arrays are known to the last axis, a script's memory only where it does not depend on worlds.
+
+    What a script keeps of a plan has as many columns as its longest plan.
+    """
+    if not name.startswith(_SCRIPT):
+        return _row(name, array)
+    record = name.rpartition(".")[0]
+    return ArrayRow(name, array.dtype.str, (*array.shape[:1], *(f"axis {k} of {record}" for k in range(1, array.ndim))))
+
+
+def _check_generators(arrays: Arrays) -> None:
+    numbers = arrays["random.python"]
+    if not ((numbers < 2**32).all() and numbers[-1] <= 624):
+        raise ValueError("array 'random.python' is no state of Python's generator")
+    try:
+        torch.Generator().set_state(torch.from_numpy(arrays["random.torch"].copy()))
+    except RuntimeError as error:
+        raise ValueError(f"array 'random.torch' is no state of torch's generator ({error})") from None
+
+
+def _check_numbers(state: TrainingState, model: Model) -> None:
+    """The counters agree with each other, and there is a learning rate for every optimiser."""
+    counters, optimizers = state.numbers["counters"], optimizers_of(model)
+    if counters["num_timesteps"] != state.steps or state.numbers["between"]["updates"] != state.updates:
+        raise ValueError("state.json: steps or updates are not those of the listing")
+    if counters["_total_timesteps"] < counters["num_timesteps"]:
+        raise ValueError("state.json: counters._total_timesteps is below the steps done")
+    if state.numbers["learning_rates"].keys() != optimizers.keys():
+        raise ValueError(f"state.json: learning_rates must be of {', '.join(optimizers)}")
+
+
+def _check_replay(state: TrainingState, model: Model) -> None:
+    memory: Any = getattr(model, "replay_buffer", None)
+    place = state.numbers["replay"]
+    if memory is None:
+        if state.replay or place:
+            raise ValueError("it has a replay memory, and this algorithm has none")
+        return
+    rows = [ArrayRow(name, array.dtype.str, ("filled", *array.shape[1:])) for name, array in _replay_of(memory)]
+    filled = check_arrays(_headers(state.replay), rows)["filled"]
+    position = place.get("pos"), place.get("full")
+    if filled > memory.buffer_size or position not in ((filled, False), *_full_at(memory.buffer_size, filled, place)):
+        raise ValueError(f"state.json: replay = {place}: does not go with a memory of {filled} entries")
+
+
+def _full_at(size: int, filled: int, place: Mapping[str, Any]) -> list[tuple[Any, bool]]:
+    """Where a full memory may go on: anywhere in it."""
+    position = place.get("pos")
+    return [(position, True)] if filled == size and position is not None and position < size else []
+
+
+def _replay_of(memory: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    for name in REPLAY:
+        yield name, getattr(memory, name)
+
+
+def _check_policy(name: str, trained: Trained, policy: Trained) -> None:
+    learners = policy.manifest.learners if isinstance(policy, Policy) else tuple(policy.members)
+    right, found = drivers_of(policy, learners), drivers_of(trained, learners)
+    same = found.keys() == right.keys() and all(
+        (found[each].manifest.network, found[each].manifest.observation, found[each].manifest.learners)
+        == (right[each].manifest.network, right[each].manifest.observation, right[each].manifest.learners)
+        for each in right
+    )
+    if type(trained) is not type(policy) or not same:
+        raise ValueError(f"{name}: is not a policy of these learners and this network")
+
+
+def _row(name: str, array: NDArray[Any]) -> ArrayRow:
+    return ArrayRow(name, array.dtype.str, array.shape)
+
+
+def _headers(arrays: Arrays) -> dict[str, ArrayHeader]:
+    return {name: ArrayHeader(array.dtype.str, array.shape) for name, array in arrays.items()}
