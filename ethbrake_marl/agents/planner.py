@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.others import fixed_commands
 from ethbrake_marl.agents.pairwise import optimise_pairwise
 from ethbrake_marl.agents.profile_problem import TIME_STEP_S, ProfileProblem, profile_problem
@@ -35,6 +36,8 @@ class Planner:
     are taken to brake fully. Raises ``InvalidInput`` for any other argument or an unknown count and, when an episode
     begins, for another vehicle's script whose command is not fixed at the alert.
     """
+
+    knows = Source.MODEL
 
     def __init__(self, argument: str | None = None, *, count: HarmCount = "first", horizon_s: float = 8.0) -> None:
         check_count(count)
