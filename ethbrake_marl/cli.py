@@ -25,6 +25,7 @@ from ethbrake_marl.command_options import (
     VehicleOption,
 )
 from ethbrake_marl.doctor import diagnose
+from ethbrake_marl.equal_time_command import equal_time_command
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.evaluate_command import evaluate_command, show_rows
 from ethbrake_marl.evaluation.output_files import write_output
@@ -99,6 +100,7 @@ app.command(
 app.command("best-harm", epilog="Example: ethbrake best-harm --episodes 200 --budget 20000 --json")(best_harm_command)
 app.command("shield", epilog="Example: ethbrake shield --agents ppo@shipped,full_brake --episodes 500")(shield_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
+app.command("equal-time", epilog="Example: ethbrake equal-time --episodes 200 --repeats 1")(equal_time_command)
 
 
 def main() -> None:

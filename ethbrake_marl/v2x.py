@@ -28,7 +28,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics.worlds import Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds
 
 PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
 PER_LINK = 4  # uniform numbers of one link: wait, burst, loss, hop; one Philox counter
@@ -240,6 +240,22 @@ def news_of(columns: Floats) -> Floats:
     known = columns.copy()
     known[:, :: N + 1] = 0.0
     return known.reshape(-1, N, N)
+
+
+def hidden_from(vehicles: Vehicles, vehicle: int) -> Bools:
+    """Worlds in which the channel hides something of the line from ``vehicle`` at its first decision, [n].
+
+    Either news of another vehicle has not arrived by then, or another one reacts later than the own part of its
+    latency, which is all that a message tells. Never without a channel.
+    """
+    n, N = vehicles.latency_s.shape
+    if not vehicles.known_from_s.shape[1]:
+        return np.zeros(n, np.bool_)
+    own_part = vehicles.known_from_s[:, :: N + 1]
+    hidden = (known_from(vehicles)[:, vehicle] > vehicles.latency_s[:, [vehicle]]) | (vehicles.latency_s > own_part)
+    hidden[:, vehicle] = False
+    some: Bools = np.any(hidden, axis=1)
+    return some
 
 
 def told_by_link(worlds: Worlds) -> Worlds:

@@ -40,6 +40,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("doctor", "terminal", "command_options", "machine", "benchmark", "scaling"),
     (
         "evaluate_command",
+        "equal_time_command",
         "picture_commands",
         "search_commands",
         "bench_commands",

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ethbrake_marl.agents.coupled import optimise_coupled
+from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.others import fixed_commands
 from ethbrake_marl.agents.pairwise import optimise_pairwise
 from ethbrake_marl.agents.protocol import place, recall
@@ -34,6 +35,7 @@ class EV2XBM:
             raise InvalidInput(f"e_v2x_bm mode {mode!r}: must be 'coupled' or 'pairwise'")
         check_count(count)
         self.name = "e_v2x_bm" if mode == "coupled" else "e_v2x_bm:pairwise"
+        self.knows = Source.MODEL if mode == "coupled" else Source.STATE
         self.predicted_harm: Floats = np.empty(0)
         self.deceleration_mps2: Floats = np.empty(0)  # a* [n]
         self.others: Mapping[int, Script] = {}

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command
+from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations, ObservationSpec, observe
 from ethbrake_marl.physics import Floats, Ints, Worlds
@@ -28,6 +29,8 @@ class LearnedPolicy(Protocol):
 
 class LearnedAgent:
     """Drives one vehicle by a policy's deterministic action; holds no state between steps."""
+
+    knows = Source.MESSAGES
 
     def __init__(self, policy: LearnedPolicy, name: str = "learned") -> None:
         self.policy = policy

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.others import fixed_commands
 from ethbrake_marl.agents.pairwise import optimise_pairwise
 from ethbrake_marl.agents.profile_problem import TIME_STEP_S, ProfileProblem, profile_problem
@@ -37,6 +38,8 @@ class Planner:
     any other argument or an unknown count and, when an episode begins, for another vehicle's script whose command is
     not fixed at the alert.
     """
+
+    knows = Source.MODEL
 
     def __init__(
         self,

@@ -14,7 +14,10 @@ from ethbrake_marl.starts import Script
 
 @runtime_checkable
 class Agent(Script, Protocol):
-    """A ``Script`` with a name: ``begin`` and ``act`` for one vehicle in every world of a batch of ``n``."""
+    """A ``Script`` with a name: ``begin`` and ``act`` for one vehicle in every world of a batch of ``n``.
+
+    It says with ``knows`` what it knows of the line (``agents.knowledge``); without it tables say "not stated".
+    """
 
     name: str
 

@@ -7,6 +7,7 @@ import copy
 import numpy as np
 
 from ethbrake_marl.agents.driving import drive, introduce, scripted
+from ethbrake_marl.agents.knowledge import Knowledge, Source, combined
 from ethbrake_marl.agents.protocol import Agent, Divisible, check_agent, place, recall
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
@@ -57,6 +58,11 @@ class Rehearsed:
         self.predicted_harm: Floats = np.empty(0)
         self._deviation: Floats = np.empty((0, _SEGMENTS))  # [n, segments] that is driven
         self._stage = copy.deepcopy(policy)  # rehearsing must not disturb the policy's memory of running episodes
+
+    @property
+    def knows(self) -> Knowledge:
+        """What the policy knows, and the model in which it rehearses."""
+        return combined(self.policy, also=Source.MODEL)
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Rehearse for these rows; ``worlds`` holds those rows only, at the alert."""

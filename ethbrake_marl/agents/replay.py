@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ethbrake_marl.agents.coupled import optimise_coupled
+from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.others import fixed_commands
 from ethbrake_marl.agents.profile_motion import START
 from ethbrake_marl.agents.profile_problem import TIME_STEP_S, ProfileProblem, profile_problem
@@ -32,6 +33,8 @@ class BestHarm:
     (m2/s2), to the same bits, if the engine's time step is that. Raises ``InvalidInput`` for a budget below 1 or an
     unknown count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
     """
+
+    knows = Source.MODEL
 
     def __init__(
         self, recall: Recall, *, count: HarmCount = "first", horizon_s: float = 8.0, budget: int = SEARCH_BUDGET

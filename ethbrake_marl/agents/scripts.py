@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.pairwise import optimise_pairwise
 from ethbrake_marl.agents.protocol import place, recall
 from ethbrake_marl.errors import InvalidInput
@@ -19,6 +20,7 @@ class StateFree:
     """
 
     state_free = True
+    knows = Source.SENSORS
 
     def __init__(self, spec: str) -> None:
         if not is_state_free(spec):
@@ -47,6 +49,7 @@ class CopyLeader:
 
     name = "copy_leader"
     state_free = True
+    knows = Source.STATE
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Nothing to remember."""
@@ -68,6 +71,7 @@ class GentlestFront:
 
     name = "gentlest_front"
     state_free = True  # once the episode has begun
+    knows = Source.STATE
 
     def __init__(self) -> None:
         self._deceleration_mps2: Floats = np.empty(0)

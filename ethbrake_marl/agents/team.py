@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
+from ethbrake_marl.agents.knowledge import Knowledge, combined
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput
 
@@ -30,6 +31,11 @@ class Team:
             )
         self.drivers = {int(vehicle): drivers[vehicle] for vehicle in sorted(drivers)}
         self.name = name
+
+    @property
+    def knows(self) -> Knowledge:
+        """What its drivers know between them; nothing where nobody is driven."""
+        return combined(*self.drivers.values())
 
     @classmethod
     def copies(cls, agent: Agent, vehicles: Collection[int]) -> Team:

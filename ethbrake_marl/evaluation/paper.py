@@ -51,7 +51,9 @@ PAPER_NOTE = (
     " 59 %; and in its 5,000-world test the hybrid avoids 2,005 collisions, although its two parts together avoid at"
     " most 2,000. If Vehicle 2 could act at about 0.2 s instead of the stated 0.5 s, full braking would come close to"
     " the paper's row (the scenario paper-random-early). The paper's E-V2X-BM harm is close to what the pairwise closed"
-    " form predicts at the alert, not to what those commands cause. Nothing here is tuned to these rows."
+    " form predicts at the alert, not to what those commands cause; for the 5,000-world table that holds only at the"
+    " speeds of the random test, since at those of the paper's figure of distances it predicts 3.07. Nothing here is"
+    " tuned to these rows. docs/paper.md goes through the paper's equations, figures and tables one by one."
 )
 
 _SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant of which the note speaks

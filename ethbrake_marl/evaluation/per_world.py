@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.agents.knowledge import knowledge_text
 from ethbrake_marl.evaluation.output_files import check_target, write_output
 from ethbrake_marl.evaluation.parameters import quantity, quantity_rules
 from ethbrake_marl.evaluation.regret import Regrets, assess
@@ -45,9 +46,11 @@ def write_per_world_csv(
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     initial, regrets = initial_columns(evaluation), assess(evaluation)
+    hidden: Columns = {"hidden": evaluation.hidden.astype(int).tolist()}
     for number, (agent, outcome) in enumerate(evaluation.outcomes.items()):
         columns = {"agent": [agent] * evaluation.worlds.n, **initial, **outcome_columns(outcome)}
         columns |= regret_columns(outcome, regrets) | objective_columns(outcome, objectives)
+        columns |= {"knows": [knowledge_text(outcome.knows)] * evaluation.worlds.n, **hidden}
         if number == 0:
             writer.writerow(columns)
         writer.writerows(zip(*columns.values(), strict=True))

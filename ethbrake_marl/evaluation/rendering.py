@@ -10,6 +10,7 @@ from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderR
 from rich.table import Table
 from rich.text import Text
 
+from ethbrake_marl.agents.knowledge import Source, knowledge_text
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS, PAPER_ROWS, PaperRow
 from ethbrake_marl.evaluation.parameters import parameter_line
 from ethbrake_marl.evaluation.regret import Distance
@@ -17,6 +18,7 @@ from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.evaluation.table import SummaryRow
 
 NONE = "–"
+SEES_THROUGH = "† "  # before what an agent knows that no channel brought
 
 _TERMINAL_HEADINGS = (
     "Collisions",
@@ -47,6 +49,7 @@ class Line:
 
     agent: str
     cells: tuple[Cell, ...]
+    knows: str = NONE
 
 
 COLUMNS = (
@@ -64,6 +67,11 @@ MEANINGS = {
     "Agent": "What drives the controlled vehicle; all other vehicles follow the scenario. full_brake is the paper's"
     " non-ethical strategy (Non-E). e_v2x_bm is the best constant deceleration found in this simulation;"
     " e_v2x_bm:pairwise is the paper's closed form, which treats the pairs as independent.",
+    "Knows": "What the agent has to know of the line. own sensors: its own vehicle and what its sensors see. messages:"
+    " also the messages that have reached it. true state: the others' states, capacities and latencies as they are,"
+    " received or not. true model: also masses, restitution and scripts, enough to simulate the line ahead. Of a policy"
+    " behind a shield, or one that rehearses, both parts are told. † marks agents that see through a channel that hides"
+    " something here.",
     "Collisions": "Share of worlds with at least one impact; Wilson's interval. Every agent meets the same worlds, each"
     " once.",
     "First-impact harm": "Squared closing speed (m²/s²), summed over the pairs, each pair's first impact only (the"
@@ -95,6 +103,7 @@ def our_lines(rows: Sequence[SummaryRow]) -> list[Line]:
                 _regret(row.distance),
                 _percent(row.distance.realised_first, 1),
             ),
+            SEES_THROUGH * row.sees_through + knowledge_text(row.knows),
         )
         for row in rows
     ]
@@ -125,11 +134,14 @@ class _TerminalTable:
 
     def _table(self, shown: Sequence[int]) -> Table:
         table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=0, pad_edge=False)
-        table.add_column("Agent", overflow="fold")
+        table.add_column("Agent,\nwhat it knows", overflow="fold")
         for k in shown:
             table.add_column(_TERMINAL_HEADINGS[k], justify="right", no_wrap=True)
         for line in our_lines(self.rows):
-            table.add_row(Text(line.agent), *(_terminal_cell(k, line.cells[k]) for k in shown))
+            table.add_row(
+                Text(line.agent).append(f"\n{line.knows}", style="dim"),
+                *(_terminal_cell(k, line.cells[k]) for k in shown),
+            )
         for name, lines in paper_blocks(self.rows):
             table.add_section()
             table.add_row(Text(f"paper, {name}", style="dim"))
@@ -146,8 +158,8 @@ def _terminal_cell(column: int, cell: Cell) -> Text:
 
 def markdown_table(rows: Sequence[SummaryRow]) -> str:
     """The table for a document, with the conditions of ours and of the paper's below it."""
-    head = ["Agent", *COLUMNS]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" + " ---: |" * len(COLUMNS)]
+    head = ["Agent", "Knows", *COLUMNS]
+    lines = ["| " + " | ".join(head) + " |", "|" + 2 * " --- |" + " ---: |" * len(COLUMNS)]
     lines += [_markdown_line(line) for line in our_lines(rows)]
     for name, block in paper_blocks(rows):
         lines += [_markdown_line(Line(f"paper, {name}: {line.agent}", line.cells)) for line in block]
@@ -160,7 +172,7 @@ def _bracketed(cell: Cell) -> str:
 
 def _markdown_line(line: Line) -> str:
     cells = map(_bracketed, line.cells)
-    return "| " + " | ".join([line.agent.replace("|", "\\|"), *cells]) + " |"
+    return "| " + " | ".join([line.agent.replace("|", "\\|"), line.knows, *cells]) + " |"
 
 
 def _conditions(rows: Sequence[SummaryRow]) -> str:
@@ -170,7 +182,7 @@ def _conditions(rows: Sequence[SummaryRow]) -> str:
         f"Ours: {parameter_line(rows[0].parameters)}. Harms are means per world in m²/s²; in brackets or"
         " below a value: its 95 % interval; decreases are relative to full braking."
     ]
-    texts += limit_lines(rows)
+    texts += limit_lines(rows) + knowledge_lines(rows)
     blocks = paper_blocks(rows)
     texts += [f"Paper, {name}: {PAPER_PARAMETERS[name]}." for name, _ in blocks]
     return "\n\n".join([*texts, *([PAPER_NOTE] if blocks else [])])
@@ -199,6 +211,25 @@ def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
         counts = ", ".join(f"{agent} in {count:,} worlds" for agent, count in below.items())
         text += f" Below what was known: {counts}."
     return [text]
+
+
+def knowledge_lines(rows: Sequence[SummaryRow]) -> list[str]:
+    """Who sees through the channel, and who does not say, as sentences; none where the channel hides nothing."""
+    hidden = rows[0].hidden_share if rows else 0.0
+    if not hidden:
+        return []
+    text = (
+        f"In {100 * hidden:.1f} % of these worlds the channel hides something of the line from a driven vehicle at its"
+        " first decision: news that has not arrived, or how late another vehicle will react."
+    )
+    through = ", ".join(row.agent for row in rows if row.sees_through)
+    if through:
+        text += (
+            f" {SEES_THROUGH.strip()} {through}: drives by the line as it is all the same. That is a limit to compare"
+            " with, and nothing that a vehicle on this channel could do."
+        )
+    silent = ", ".join(row.agent for row in rows if Source.UNSTATED in row.knows)
+    return [text + (f" Not stated what it knows: {silent}." if silent else "")]
 
 
 def _paper_line(row: PaperRow) -> Line:

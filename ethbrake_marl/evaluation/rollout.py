@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_of
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -19,6 +20,7 @@ from ethbrake_marl.harm import HarmCount, Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.starts import check_alert
+from ethbrake_marl.v2x import hidden_from
 
 CHUNK = 10_000  # worlds advanced together: bounds memory, changes no result
 
@@ -34,6 +36,7 @@ class Outcome:
     at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
     predicted_harm: Floats | None  # [n] what the agent expected at the alert, if it predicts and drives alone
     chosen_policy: Bools | None  # [n] a hybrid drove by its policy; else by its backup
+    knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
 
     @property
     def collided(self) -> Bools:
@@ -83,6 +86,14 @@ class Evaluation:
             driven = ", ".join(self.scenario.vehicle_names[i] for i in self.vehicles) or "none"
             raise InvalidInput(f"scenario {self.scenario.name!r}: needs one driven vehicle; driven are: {driven}")
         return self.vehicles[0]
+
+    @property
+    def hidden(self) -> Bools:
+        """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
+        hidden = np.zeros(self.worlds.n, np.bool_)
+        for vehicle in self.vehicles:
+            hidden |= hidden_from(self.worlds.vehicles, vehicle)
+        return hidden
 
     def outcome(self, agent: str) -> Outcome:
         """The outcome of one agent; raises ``InvalidInput`` naming those that were evaluated."""
@@ -142,6 +153,7 @@ def _check_request(worlds: object, agents: object, scenario: object, chunk: obje
     for name, agent in agents.items():
         if not isinstance(agent, Agent | Team):
             raise InvalidInput(f"evaluate: agent {name!r} = {agent!r}: must be an agent, as make_agent(name) gives")
+        knowledge_of(agent)  # refuses what is no statement
     if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or not chunk >= 1:
         raise InvalidInput(f"evaluate: chunk = {chunk!r}; a whole number of worlds, at least 1 at a time, is needed")
 
@@ -189,6 +201,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario) -> Outcome:
         episodes.at_rest,
         None if predicted is None else predicted.astype(np.float64),
         None if chosen is None else chosen.astype(np.bool_),
+        knowledge_of(team),
     )
 
 
@@ -216,4 +229,5 @@ def _joined(parts: list[Outcome]) -> Outcome:
         np.concatenate([part.at_rest for part in parts]),
         np.concatenate(predicted) if predicted else None,
         np.concatenate(chosen) if chosen else None,
+        parts[0].knows,
     )

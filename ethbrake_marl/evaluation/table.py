@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_text, sees_through
 from ethbrake_marl.evaluation.paper import is_papers_test
 from ethbrake_marl.evaluation.parameters import parameters
 from ethbrake_marl.evaluation.regret import Distance, assess, distance
@@ -34,11 +35,21 @@ class SummaryRow:
     parameters: dict[str, Any]
     distance: Distance = field(default_factory=Distance)  # to the best known harm
     beside_paper: bool = False  # these are results of the test that the paper's rows are about
+    knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
+    hidden_share: float = 0.0  # worlds in which the channel hides something from a driven vehicle, whoever drives
+
+    @property
+    def sees_through(self) -> bool:
+        """Whether the channel hides something here that this agent reads all the same."""
+        return self.hidden_share > 0.0 and sees_through(self.knows)
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
         return {
             "agent": self.agent,
+            "knows": knowledge_text(self.knows),
+            "sees_through_channel": self.sees_through,
+            "hidden_share": self.hidden_share,
             "episodes": self.episodes,
             "collisions": self.collisions,
             "horizon_ends": self.horizon_ends,
@@ -71,9 +82,16 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> list[Summa
     conditions = parameters(evaluation)
     reference = evaluation.outcomes.get(baseline)
     beside, regrets, braking = is_papers_test(evaluation), assess(evaluation), evaluation.outcomes.get(BASELINE)
+    hidden = float(evaluation.hidden.mean())
     rows = [_row(agent, outcome, reference, conditions) for agent, outcome in evaluation.outcomes.items()]
     return [
-        replace(row, beside_paper=beside, distance=distance(regrets, evaluation.outcome(row.agent), braking))
+        replace(
+            row,
+            beside_paper=beside,
+            distance=distance(regrets, evaluation.outcome(row.agent), braking),
+            knows=evaluation.outcome(row.agent).knows,
+            hidden_share=hidden,
+        )
         for row in rows
     ]
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import drive, introduce, scripted
 from ethbrake_marl.agents.e_v2x_bm import EV2XBM
+from ethbrake_marl.agents.knowledge import Knowledge, Source, combined
 from ethbrake_marl.agents.protocol import Agent, check_agent, place, recall
 from ethbrake_marl.agents.rehearsed import Rehearsed
 from ethbrake_marl.harm import HarmCount
@@ -47,6 +48,11 @@ class HybridAgent:
         self.policy_harm: Floats = np.zeros(0)
         self.bound_harm: Floats = np.zeros(0)
         self._rehearsal = copy.deepcopy(policy)  # predicting must not disturb the policy's memory of running episodes
+
+    @property
+    def knows(self) -> Knowledge:
+        """What the policy knows, and the model in which both are compared."""
+        return combined(self.policy, also=Source.MODEL)
 
     @property
     def chosen_policy(self) -> Bools:

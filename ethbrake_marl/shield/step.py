@@ -8,6 +8,7 @@ import numpy as np
 
 from ethbrake_marl.actions import action_to_command
 from ethbrake_marl.agents.driving import introduce, scripted
+from ethbrake_marl.agents.knowledge import Knowledge, Source, combined
 from ethbrake_marl.agents.profile_problem import state_columns
 from ethbrake_marl.agents.protocol import Agent, check_agent, place
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
@@ -75,6 +76,11 @@ class StepShieldAgent:
         self._first_s: Floats = np.zeros(0)  # [n] time of the first decision
         self._asked: _Asked | None = None
         self._make(0)  # refuses bad settings at once
+
+    @property
+    def knows(self) -> Knowledge:
+        """What the policy knows, and the model in which its actions are certified."""
+        return combined(self.policy, also=Source.MODEL)
 
     @property
     def chosen_policy(self) -> Bools:

@@ -56,7 +56,7 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
     for name, values in expected.items():
         np.testing.assert_array_equal(column(rows, name), values.astype(float), err_msg=name)
     assert {row["ended"] for row in rows} == {"at_rest"}
-    assert set(rows[0]) == {"agent", "world", "ended", *expected, *REGRET_COLUMNS}
+    assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected, *REGRET_COLUMNS}
 
 
 def test_per_world__the_initial_columns_make_the_same_worlds_again(tmp_path: Path, evaluation: Evaluation) -> None:

@@ -84,7 +84,7 @@ def test_report__is_well_formed_and_says_everything(report: Report, evaluation: 
     assert "paper-random: 200 worlds, seed 7; d = " in text
     assert "Training seed 5 Command ethbrake run" in text
     assert "numpy 2.4.6" in text
-    assert "Hybrid PPO 59.74 % 5.6202" in text
+    assert "Hybrid PPO – 59.74 % 5.6202" in text
     assert "62.6 %" in text
 
 

@@ -14,7 +14,8 @@ from ethbrake_marl.evaluation.parameters import parameter_line, parameters
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
 
 ALWAYS = {
-    "agent", "episodes", "collisions", "horizon_ends", "collision_rate", "collision_rate_interval",
+    "agent", "knows", "sees_through_channel", "hidden_share", "episodes", "collisions",
+    "horizon_ends", "collision_rate", "collision_rate_interval",
     "first_impact_harm", "first_impact_harm_interval", "total_harm", "total_harm_interval",
     "first_impact_harm_difference", "first_impact_harm_difference_interval", "total_harm_difference",
     "total_harm_difference_interval", "harm_decrease_first", "harm_decrease_first_interval", "harm_decrease_total",
@@ -154,7 +155,7 @@ def test_markdown_table__a_bar_in_a_name_makes_no_column(pair: Scenario) -> None
 
 def test_markdown_table__every_row_has_every_column(evaluation: Evaluation) -> None:
     rows = [line for line in markdown_table(summarise(evaluation)).splitlines() if line.startswith("|")]
-    assert {line.count("|") for line in rows} == {10}
+    assert {line.count("|") for line in rows} == {11}
     assert len(rows) == 2 + 3 + len(PAPER_ROWS)
     estimate = summarise(evaluation)[0].first_impact_harm
     assert f"{estimate.value:.2f} [{estimate.interval[0]:.2f}, {estimate.interval[1]:.2f}]" in rows[2]
