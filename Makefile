@@ -3,6 +3,7 @@
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # PEERS:       the environment of `make bench-peers`, apart from the project's own.
 # ARGS:        passed on by `make run` (to `ethbrake run`) and `make test` (to pytest).
+# WORKERS:     processes of `make test`; each compiles the kernels for itself, once. 0: one process, as a debugger needs.
 
 SHELL := /bin/sh
 VENV := .venv
@@ -12,10 +13,11 @@ PEERS := .venv-peers
 TORCH_INDEX ?=
 PYTHON ?=
 ARGS ?=
+WORKERS ?= 2
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield planted-bugs shield-bugs mutation bench-peers
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-order planted-bugs shield-bugs mutation bench-peers
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -26,8 +28,9 @@ help:
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, search, faces, bound (three quarters of an hour of one core)"
 	@echo "make shield-bugs      plant 14 bugs in copies of the shield; each must turn a test red"
-	@echo "make planted-bugs     plant 23 bugs in copies of the code; each must turn a test red"
-	@echo "make mutation [ARGS=] mutation testing of physics and harm (ARGS='--sample 100')"
+	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
+	@echo "make planted-bugs     plant 23 bugs in copies of the physics, 44 in the rest; each must turn a test red"
+	@echo "make mutation [ARGS=] mutation testing of the physics (ARGS='--modules rewards,v2x --sample 40': of others)"
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make clean            remove $(VENV), $(PEERS), caches and builds (runs/ stays)"
@@ -75,7 +78,7 @@ run: $(STAMP)
 
 test: $(STAMP)
 	@echo "== pytest"
-	@$(BIN)/python -m pytest -q $(ARGS)
+	@$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal $(ARGS)
 
 lint: $(STAMP)
 	@echo "== ruff check"
@@ -100,6 +103,10 @@ test-shield: $(STAMP)
 	@echo "== trying to break the step shield"
 	@$(BIN)/python -m tests.shield.programme $(ARGS)
 
+test-order: $(STAMP)
+	@echo "== the suite in random orders"
+	@$(BIN)/python -m tests.programme.order $(ARGS)
+
 shield-bugs: $(STAMP)
 	@echo "== planted shield bugs"
 	@$(BIN)/python -m tests.shield.planted_bugs $(ARGS)
@@ -107,6 +114,7 @@ shield-bugs: $(STAMP)
 planted-bugs: $(STAMP)
 	@echo "== planted bugs"
 	@$(BIN)/python -m tests.physics.programme.planted_bugs $(ARGS)
+	@$(BIN)/python -m tests.programme.planted_bugs $(ARGS)
 
 mutation: $(STAMP)
 	@echo "== mutation testing"

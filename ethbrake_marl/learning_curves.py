@@ -20,7 +20,8 @@ from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
 from ethbrake_marl.experiment import resume_measured, train_measured
 from ethbrake_marl.learning.callback import Progress
 from ethbrake_marl.learning.course import HARM_METRIC
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of
+from ethbrake_marl.learning.kept_training import check_same
+from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.run_directory import RunDirectory, read_object
 from ethbrake_marl.scenario import Scenario
 
@@ -64,16 +65,22 @@ def train_all(
     """Train every seed of every recipe into ``folder/RECIPE-seedK``: finished ones are kept, begun ones go on.
 
     Gives False when Ctrl-C stopped it. Raises ``InvalidInput`` for a folder that holds another training than this one
-    would be, besides what ``train`` raises.
+    would be (``learning.kept_training``), before any is begun, besides what ``train`` raises.
     """
-    for trainings in plan:
-        for seed in range(trainings.seeds):
-            path = folder / f"{trainings.recipe.name}-seed{seed}"
-            changes = {"seed": seed} | ({} if steps is None else {"total_steps": steps})
-            recipe = trainings.recipe.replace(**changes)
-            if not _train_one(scenario, recipe, path, None if tell is None else partial(tell, path.name)):
-                return False
-    return True
+    wanted = {
+        folder / f"{trainings.recipe.name}-seed{seed}": trainings.recipe.replace(
+            seed=seed, total_steps=trainings.recipe.total_steps if steps is None else steps
+        )
+        for trainings in plan
+        for seed in range(trainings.seeds)
+    }
+    for path, recipe in wanted.items():
+        if RunDirectory(path).status.is_file():
+            check_same(path, recipe, scenario)
+    return all(
+        _train_one(scenario, recipe, path, None if tell is None else partial(tell, path.name))
+        for path, recipe in wanted.items()
+    )
 
 
 def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) -> dict[str, Any]:
@@ -112,10 +119,6 @@ def _train_one(scenario: Scenario, recipe: TrainingRecipe, path: Path, tell: Cal
     run = RunDirectory(path)
     if not run.status.is_file():
         return train_measured(scenario, path, recipe=recipe, on_progress=tell).status == "finished"
-    config = read_object(run.config)
-    same = recipe_of(json.dumps(config["recipe"])) == recipe and config["scenario"].get("name") == scenario.name
-    if not same:
-        raise InvalidInput(f"{path}: holds the training of another recipe or scenario; give another folder (--output)")
     if read_object(run.status).get("status") == "finished":
         return True
     return resume_measured(path, on_progress=tell).status == "finished"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import time
+from collections.abc import Callable
 
 import numba
 import numpy as np
@@ -116,6 +118,24 @@ def test_machine__is_named_in_words() -> None:
     assert f"numba {numba.__version__}" in words and machine.processor
 
 
+def watched() -> bool:
+    """Whether a tracer, profiler or monitor runs beside the code (coverage, a debugger): it slows down Python alone."""
+    monitoring = getattr(sys, "monitoring", None)  # from Python 3.12 on
+    tools = [] if monitoring is None else [monitoring.get_tool(number) for number in range(6)]
+    return sys.gettrace() is not None or sys.getprofile() is not None or any(tools)
+
+
+@pytest.mark.parametrize("switch", [sys.settrace, sys.setprofile])
+def test_watched__sees_a_tracer_and_a_profiler(switch: Callable[[object], None]) -> None:
+    before = {sys.settrace: sys.gettrace, sys.setprofile: sys.getprofile}[switch]()
+    try:
+        switch(lambda *event: None)
+        seen = watched()
+    finally:
+        switch(before)
+    assert seen
+
+
 @compiled_only
 @pytest.mark.parametrize(
     ("name", "least"),
@@ -128,6 +148,8 @@ def test_machine__is_named_in_words() -> None:
     ],
 )
 def test_speed__is_not_far_below_the_calibration(name: str, least: float) -> None:
+    if watched():
+        pytest.skip("a tracer slows down Python and not the compiled calibration")
     effort = Effort(3, 0.03)
     (calibration,) = speeds_of("calibration", effort)
     speeds = speeds_of(name, effort)

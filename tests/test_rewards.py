@@ -10,10 +10,12 @@ from pydantic import ValidationError
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
+from ethbrake_marl.envs.build import make_engine
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics import advance, forecast, make_worlds
 from ethbrake_marl.rewards import RewardParams, StepOutcome, potential, reward_params, reward_terms, weighted_sum
 from ethbrake_marl.scenario import load_scenario
+from tests.envs.lines import CRASH, REST
 
 
 def sigmoid(x: float) -> float:
@@ -52,6 +54,18 @@ def test_collision__is_weighted_by_k_energy():
     assert terms["collision"][0, 0] == -50.0
 
 
+def test_collision__counts_every_impact_whatever_the_harm_counts():
+    facts = {
+        "gaps_m": np.ones((2, 2)), "speeds_mps": np.zeros((2, 3)), "command_mps2": np.zeros((2, 3)),
+        "previous_mps2": np.zeros((2, 3)), "time_step_s": 0.1, "safe_end": np.zeros(2, np.bool_),
+        "first_impact_harm": np.array([100.0, 0.0]), "total_harm": np.array([130.0, 7.0]),
+    }  # fmt: skip
+    for count, harm in (("first", [-100.0, 0.0]), ("total", [-130.0, -7.0])):
+        terms = reward_terms(RewardParams(harm_count=count, collision=1.0, k_energy=0.5), StepOutcome(**facts))
+        assert terms["collision"][:, 0].tolist() == [-65.0, -3.5]
+        assert terms["harm"][:, 0].tolist() == harm
+
+
 def test_risk__ignores_the_time_to_collision_of_opening_pairs():
     # after: gap 1 = 0 + 5 m/s * 0.4 s = 2 m opening; gap 2: 5 + 2 + 0.4 * 12.5 - (2 - 0.25) = 10.25 m opening
     params = RewardParams(harm=0.0, risk=1.0, safety_buffer_m=1.0, target_gap_m=3.0, distance_slope_per_m=0.5)
@@ -87,6 +101,21 @@ def test_paper__has_its_four_terms():
     assert terms.keys() == {"collision", "risk", "jerk", "terminal"}
 
 
+@pytest.mark.parametrize(("action", "safe"), [(0.0, False), (-1.0, True)])
+def test_terminal__is_paid_at_the_horizon_too_and_once(action, safe):
+    engine = make_engine(CRASH, 1, reward=RewardParams(harm=0.0, terminal=3.0))  # both are cut off in their 8th step
+    results = [engine.step(np.full((1, 1), action)) for _ in range(9)]
+    assert [bool(result.truncated[0]) for result in results] == [k == 7 for k in range(9)]
+    assert [result.reward[0].tolist() for result in results] == [[3.0 * (safe and k == 7)] * 2 for k in range(9)]
+    assert [result.shared["terminal"][0] for result in results] == [float(safe and k == 7) for k in range(9)]
+
+
+def test_terminal__is_paid_at_rest_too():
+    engine = make_engine(REST, 1, reward=RewardParams(harm=0.0, terminal=3.0))
+    rewards = [engine.step(np.full((1, 1), -1.0)).reward[0].tolist() for _ in range(10)]
+    assert rewards == [[0.0, 0.0]] * 9 + [[3.0, 3.0]]
+
+
 @pytest.mark.parametrize("discount", [1.0, 0.9])
 def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(discount):
     scenario = load_scenario("paper-random")
@@ -105,6 +134,24 @@ def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(discount):
         assert (result.reward[:, [0, 2]] == 0.0).all()
     assert (least > 0).sum() > 20
     assert total == pytest.approx(least, abs=1e-9)
+
+
+def test_shaping__of_an_episode_after_autoreset_begins_with_the_potential_of_its_own_world():
+    scenario = load_scenario("paper-random")
+    reward = RewardParams(harm=0.0, shaping=1.0)
+    scripts = {0: make_agent("full_brake"), 2: make_agent("full_brake")}
+    engine = Engine(scenario, 6, learners=(1,), scripts=scripts, reward=reward)
+    rng = np.random.default_rng(5)
+    begun, gained, compared = potential(reward, engine.worlds, (1,), scenario.horizon_s), np.zeros(6), 0
+    while compared < 30:
+        result = engine.step(rng.uniform(-1.0, 0.0, (6, 1)))
+        gained += result.reward[:, 1]
+        rows = np.flatnonzero(result.ended)
+        assert gained[rows] == pytest.approx(-begun[rows], abs=1e-9)
+        engine.renew(rows)
+        compared += (begun[rows] < 0.0).sum()
+        begun[rows] = potential(reward, engine.worlds, (1,), scenario.horizon_s)[rows]
+        gained[rows] = 0.0
 
 
 def test_potential__of_two_learners_lets_each_choose_given_the_other():

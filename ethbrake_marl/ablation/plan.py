@@ -11,9 +11,9 @@ from typing import Any
 from ethbrake_marl.ablation.levels import Level
 from ethbrake_marl.durable_files import check_writable, write_file
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.learning.kept_training import check_same
 from ethbrake_marl.learning.recipe import WORDS, PpoRecipe, Scheme, TrainingRecipe
 from ethbrake_marl.learning.run_directory import RunDirectory, read_object
-from ethbrake_marl.scenario import Scenario
 
 TRAININGS, OPTIMUM, SETTINGS = "trainings", "optimum", "settings.json"  # inside the ablation's folder
 _NUMBERS = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
@@ -35,11 +35,8 @@ class Training:
             if self.folder.exists():
                 raise InvalidInput(f"{self.folder}: is no training; move it away, or give another --output")
             return self.recipe.total_steps
-        status, config = (read_kept(file, "delete its folder to train anew") for file in (run.status, run.config))
-        if not same_training(config, self.recipe, self.level.scenario):
-            raise InvalidInput(
-                f"{self.folder}: holds the training of another recipe or scenario; give another folder (--output)"
-            )
+        status = read_kept(run.status, "delete its folder to train anew")
+        check_same(self.folder, self.recipe, self.level.scenario)
         if status.get("status") == "finished":
             return 0
         steps = status.get("steps", 0)
@@ -152,13 +149,6 @@ def keep_settings(plan: Plan) -> None:
     """Make the folder, and write the settings into it."""
     plan.folder.mkdir(parents=True, exist_ok=True)
     write_file(plan.folder / SETTINGS, (json.dumps(plan.settings(), indent=2) + "\n").encode())
-
-
-def same_training(config: dict[str, Any], recipe: TrainingRecipe, scenario: Scenario) -> bool:
-    """Whether a run's configuration is that of this recipe and scenario."""
-    given = {name: value for name, value in dict(config.get("recipe") or {}).items() if name not in WORDS}
-    wanted = recipe.model_dump(mode="json", exclude=set(WORDS)), scenario.model_dump(mode="json", exclude_unset=True)
-    return (given, config.get("scenario")) == wanted
 
 
 def read_kept(file: Path, advice: str) -> dict[str, Any]:

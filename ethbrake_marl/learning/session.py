@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.logger import Logger
 
 from ethbrake_marl.durable_files import remove_folder
 from ethbrake_marl.learning.callback import BetweenUpdates, StopRequested
 from ethbrake_marl.learning.checkpoint import TrainingState, prune, write_checkpoint
 from ethbrake_marl.learning.divergence import TrainingDiverged, weights_are_finite
-from ethbrake_marl.learning.event_files import cut_back, event_sizes
+from ethbrake_marl.learning.event_files import EventFile, cut_back, event_sizes
+from ethbrake_marl.learning.kept_training import fingerprint
 from ethbrake_marl.learning.model_state import (
     Model,
     capture_model,
@@ -24,6 +25,7 @@ from ethbrake_marl.learning.progress_table import ProgressTable
 from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.learning.run_directory import RunDirectory, RunRecord, RunStatus
 from ethbrake_marl.learning.versions import installed_versions
+from ethbrake_marl.scenario import Scenario
 
 Ended = Literal["finished", "interrupted"]
 
@@ -31,23 +33,23 @@ Ended = Literal["finished", "interrupted"]
 class Session:
     """Keeps the run's folder complete while a model learns in it."""
 
-    def __init__(self, run: RunDirectory, model: Model, recipe: TrainingRecipe) -> None:
+    def __init__(self, run: RunDirectory, model: Model, recipe: TrainingRecipe, scenario: Scenario) -> None:
         self._run, self._model, self._recipe = run, model, recipe
+        self._training = fingerprint(recipe, scenario)
         self._record = RunRecord(run)
         self._table = ProgressTable(run.progress)
         self._restored: TrainingState | None = None
-        self._events: TensorBoardOutputFormat | None = None
 
     def save(self, between: BetweenUpdates) -> None:
         """Write a checkpoint of this moment, unless there is one, and delete those that are old."""
         course, folder = between.course, self._run.checkpoint(between.course.steps)
         if folder.exists():
             return
-        assert course.policy is not None and self._events is not None
-        self._events.writer.flush()
+        assert course.policy is not None
         arrays, numbers = capture_model(self._model)
         replay, replay_numbers = replay_arrays(self._model)
         numbers |= {
+            "training": self._training,
             "between": between.state(),
             "replay": replay_numbers,
             "events": event_sizes(self._run.tensorboard),
@@ -82,8 +84,7 @@ class Session:
     def learn(self, between: BetweenUpdates) -> Ended:
         """Train to the end, and leave the folder complete whatever that end is."""
         model, state = self._model, self._restored
-        self._events = TensorBoardOutputFormat(str(self._run.tensorboard))
-        logger = Logger(str(self._run.path), [self._table, self._events])
+        logger = Logger(str(self._run.path), [self._table, EventFile(self._run.tensorboard)])
         model.set_logger(logger)
         if state is not None:
             restore_log(model, state.numbers)

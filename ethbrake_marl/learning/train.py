@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from ethbrake_marl.durable_files import remove_unfinished
 from ethbrake_marl.envs.sb3 import Appended, EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.bundle import Policy, first_line
+from ethbrake_marl.learning.bundle import Policy
 from ethbrake_marl.learning.callback import BetweenUpdates, Evaluate, Progress
 from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
 from ethbrake_marl.learning.checkpoint_fit import check_fits
 from ethbrake_marl.learning.course import Course
+from ethbrake_marl.learning.kept_training import asked_for, fingerprint
 from ethbrake_marl.learning.models import make_model, policy_maker
 from ethbrake_marl.learning.random_state import own_random_state
-from ethbrake_marl.learning.recipe import SacRecipe, Scheme, TrainingRecipe, load_recipe, recipe_of
+from ethbrake_marl.learning.recipe import SacRecipe, Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.learning.run_directory import RunDirectory, create_run, has_finished, only_process, open_run
 from ethbrake_marl.learning.schemes import scheme_of
 from ethbrake_marl.learning.session import Ended, Session
@@ -122,8 +120,8 @@ def resume(
     It goes on from the newest checkpoint that is whole, or from the beginning when there is none; rows and events
     after that checkpoint are dropped, so that nothing stands twice. ``evaluate(recipe, scenario)`` gives the function
     that measures, which must be the one of ``train``. Raises ``InvalidInput`` for a folder without a training, one
-    that has finished, one in which another process trains, and a checkpoint written by other versions, whose numbers
-    may differ, unless ``other_versions``.
+    that has finished, one in which another process trains, one whose ``config.json`` was edited since the checkpoint,
+    and a checkpoint written by other versions, whose numbers may differ, unless ``other_versions``.
     """
     if scheme_of(*_asked_for(Path(directory))[1:]) == "independent":
         raise InvalidInput(f"{directory}: its learners have a policy each; go on with resume_team")
@@ -151,19 +149,7 @@ def resume_training(
 def _asked_for(directory: Path) -> tuple[RunDirectory, TrainingRecipe, Scenario]:
     """The training that was begun in a folder."""
     run, config = open_run(directory)
-    if "library" in config:
-        raise InvalidInput(
-            f"{directory}: was trained by {config['library']}, which leaves nothing to go on from; train again"
-        )
-    try:
-        recipe = recipe_of(json.dumps(config["recipe"]))
-        scenario = Scenario.model_validate_json(json.dumps(config["scenario"]))
-    except KeyError as error:
-        raise InvalidInput(f"{run.config}: is not the configuration of a training: {error} is missing") from None
-    except ValidationError as error:
-        raise InvalidInput(f"{run.config}: scenario: {first_line(error)}") from None
-    except InvalidInput as error:
-        raise InvalidInput(f"{run.config}: {error}") from None
+    recipe, scenario = asked_for(directory, config)
     if has_finished(run):
         agents = f"{'team' if len(scenario.learners) > 1 else 'hybrid'}@{directory}"
         raise InvalidInput(
@@ -189,10 +175,10 @@ def _run(
         run, other_versions = begin()
         with only_process(run):
             policy_now = policy_maker(recipe, scenario, observation_for(scenario))
-            found = None if other_versions is None else _newest(run, other_versions)
+            found = None if other_versions is None else _newest(run, fingerprint(recipe, scenario), other_versions)
             if found is not None and found[0] is not None:
                 check_fits(found[0], model, policy_now(model))
-            session = Session(run, model, recipe)
+            session = Session(run, model, recipe, scenario)
             between = BetweenUpdates(
                 recipe,
                 policy_now,
@@ -224,16 +210,33 @@ def _result(training: Training) -> TrainResult:
     )
 
 
-def _newest(run: RunDirectory, other_versions: bool) -> tuple[TrainingState | None, list[str]]:
+def _newest(run: RunDirectory, training: str, other_versions: bool) -> tuple[TrainingState | None, list[str]]:
     """The newest whole checkpoint, if there is one, and what was wrong with newer ones."""
     remove_unfinished(run.path)
     if not run.checkpoints.is_dir():
         return None, []
     remove_unfinished(run.checkpoints)
     state, damaged = newest_usable(run.checkpoints)
-    if state is not None and not other_versions:
-        _check_versions(run, state.versions)
+    if state is not None:
+        _check_training(run, state, training, other_versions)
+        if not other_versions:
+            _check_versions(run, state.versions)
     return state, damaged
+
+
+def _check_training(run: RunDirectory, state: TrainingState, training: str, other_versions: bool) -> None:
+    """Raise ``InvalidInput`` for a checkpoint of another training than ``config.json`` asks for."""
+    then, name = state.numbers.get("training"), run.checkpoint(state.steps).name
+    if then is None and not other_versions:
+        raise InvalidInput(
+            f"{run.path}: {name} was written by an earlier version, which does not say of which training it is; go on"
+            " all the same with --other-versions"
+        )
+    if then not in (None, training):
+        raise InvalidInput(
+            f"{run.config}: was changed after the checkpoint {name} of this training; put it back as it was, or train"
+            " again in another folder"
+        )
 
 
 def _check_versions(run: RunDirectory, then: Mapping[str, str]) -> None:

@@ -157,7 +157,7 @@ def test_ablate__another_training_in_the_folder_is_refused(ablation, tmp_path, t
     shutil.copytree(ablation, tmp_path / "copy")
     (tmp_path / "copy" / "settings.json").unlink()
     err = refused(capsys, "--output", tmp_path / "copy", "--recipes", tiny, *SMALL, "--steps", "4096")
-    assert "holds the training of another recipe or scenario" in err
+    assert "holds another training (here other: recipe total_steps); give another folder" in err
 
 
 def test_ablate__other_settings_in_the_folder_are_refused_and_nothing_is_lost(ablation, tmp_path, tiny, capsys):

@@ -124,7 +124,29 @@ def test_learning_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_re
     assert min(last) <= low <= high <= max(last)
     other = tiny_recipe.parent / "other.yaml"
     other.write_text(yaml.safe_dump({**TINY_RECIPE, "gamma": 0.9}))
-    refused(ethbrake("learning-curves", "--recipes", f"{other}:1", "--output", folder), "another recipe or scenario")
+    answer = ethbrake("learning-curves", "--recipes", f"{other}:1", "--output", folder)
+    refused(answer, "holds another training (here other: recipe gamma); give another folder")
+
+
+def test_learning_curves__of_an_edited_scenario_are_not_those_of_the_old_one(
+    ethbrake, tiny_recipe, scenario_file, tmp_path
+):
+    command = ("learning-curves", "--recipes", f"{tiny_recipe}:1", "--output", tmp_path / "curves", "--scenario")
+    assert ethbrake(*command, scenario_file("horizon_s: 8", "horizon_s: 8")).status == 0
+    drawn = (tmp_path / "curves" / "learning_curves.json").stat().st_mtime_ns
+    answer = ethbrake(*command, scenario_file("horizon_s: 8", "horizon_s: 9"))
+    refused(answer, "tiny-seed0: holds another training (here other: scenario horizon_s); give another folder")
+    assert (tmp_path / "curves" / "learning_curves.json").stat().st_mtime_ns == drawn
+    words = scenario_file('title: "One line for lists and figures"', 'title: "Another line"')
+    assert ethbrake(*command, words).status == 0  # words change no training: its result is kept
+
+
+def test_learning_curves__another_training_is_told_before_any_is_begun(ethbrake, tiny_recipe, tiny_sac, tmp_path):
+    folder = tmp_path / "curves"
+    assert ethbrake("train", "--recipe", tiny_sac, "--seed", "0", "--output", folder / "tiny-sac-seed0").status == 0
+    both = ("learning-curves", "--recipes", f"{tiny_recipe}:1,{tiny_sac}:1", "--steps", "160", "--output", folder)
+    refused(ethbrake(*both), "tiny-sac-seed0: holds another training (here other: recipe total_steps)")
+    assert [path.name for path in folder.iterdir()] == ["tiny-sac-seed0"]
 
 
 @pytest.mark.parametrize("recipes", ["ppo", "ppo:0", "ppo:2,ppo:3", "pppo:2", ""])

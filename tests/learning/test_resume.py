@@ -19,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.learning import session as session_module
 from ethbrake_marl.learning import train as train_module
 from ethbrake_marl.learning.bundle import Policy, load_policy
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
@@ -268,6 +269,35 @@ def test_resume__refuses_what_it_cannot_go_on_with(
         resume(tmp_path / "run")
     assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"
     assert resume(tmp_path / "run", other_versions=True).status == "finished"
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [("recipe", {"gamma": 0.9}), ("recipe", {"seed": 5}), ("scenario", {"horizon_s": 9.0})],
+)
+def test_resume__an_edited_configuration_is_another_training(
+    part: str, change: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _stopped(tmp_path / "run", monkeypatch)
+    file = tmp_path / "run" / "config.json"
+    asked = file.read_text()
+    config = json.loads(asked)
+    file.write_text(json.dumps({**config, part: {**config[part], **change}}))
+    with pytest.raises(InvalidInput, match=r"config.json: was changed after the checkpoint step_\d+ of this training"):
+        resume(tmp_path / "run", evaluate=_measure)
+    file.write_text(json.dumps({**config, part: {**config[part], "title": "Words change no training"}}))
+    assert resume(tmp_path / "run", evaluate=_measure).status == "finished"
+
+
+def test_resume__a_checkpoint_that_does_not_say_of_which_training_it_is_is_one_of_other_versions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(session_module, "fingerprint", lambda recipe, scenario: None)
+        _stopped(tmp_path / "run", monkeypatch)
+    with pytest.raises(InvalidInput, match=r"does not say of which training it is; .*--other-versions"):
+        resume(tmp_path / "run", evaluate=_measure)
+    assert resume(tmp_path / "run", evaluate=_measure, other_versions=True).status == "finished"
 
 
 @pytest.mark.parametrize(

@@ -129,10 +129,10 @@ BILLION_LAUGHS = "a: &a [x, x]\n" + "".join(
     ],
 )
 def test_hostile_text__is_refused_quickly(hostile):
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(InvalidInput, match=r"^hostile.yaml"):
         parse_yaml(hostile, "hostile.yaml")
-    assert time.perf_counter() - start < 2.0
+    assert time.process_time() - start < 2.0
 
 
 def test_bytes__not_utf8_are_located():

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[3]
+from tests.programme.suites import ROOT, below_package
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Mutant:
     @property
     def key(self) -> str:
         """Where and what, without the line: stays the same while code above moves."""
-        return f"{Path(self.file).name}: {self.change}"
+        return f"{below_package(self.file).removeprefix('physics/')}: {self.change}"
 
     @property
     def digest(self) -> str:

@@ -16,11 +16,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.physics.programme.mutation import ROOT, copy_repository
+from tests.programme.copies import KERNELS, copy_repository
+from tests.programme.suites import ROOT
 
 QUICK = tuple(
     f"tests/{name}.py"
@@ -34,6 +36,7 @@ QUICK = tuple(
 )
 WHOLE = ("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py")
 LIMIT_S = 900.0
+QUIETLY = ("-p", "no:cacheprovider", "-p", "no:randomly")  # in a fixed order, leaving nothing behind
 
 EVENTS, IMPACT, SEGMENT, ADVANCE = (
     f"ethbrake_marl/physics/{name}.py" for name in ("events", "impact", "segment", "advance")
@@ -165,8 +168,8 @@ def plant(folder: Path, patches: tuple[Patch, ...]) -> None:
 def first_red(folder: Path, suite: tuple[str, ...], *, compiled: bool) -> str:
     """The first test of a suite that fails in ``folder``, or an empty string."""
     switch = "0" if compiled else "1"
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "numba"), "NUMBA_DISABLE_JIT": switch}
-    command = [sys.executable, "-B", "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--rootdir=.", *suite]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / KERNELS), "NUMBA_DISABLE_JIT": switch}
+    command = [sys.executable, "-B", "-m", "pytest", "-x", "-q", *QUIETLY, "--rootdir=.", *suite]
     try:
         done = subprocess.run(
             command, cwd=folder, env=environment, capture_output=True, text=True, timeout=LIMIT_S, check=False
@@ -197,12 +200,12 @@ def red_with(patches: tuple[Patch, ...], suite: tuple[str, ...], *, compiled: bo
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def check_patches() -> list[str]:
-    """What is wrong with the list itself, without running anything."""
+def misfits(root: Path, bugs: Mapping[str, tuple[Patch, ...]]) -> list[str]:
+    """What is wrong with a list of bugs itself, without running anything."""
     wrong = []
-    for name, patches in BUGS.items():
+    for name, patches in bugs.items():
         for patch in patches:
-            count = (ROOT / patch.file).read_text("utf-8").count(patch.old)
+            count = (root / patch.file).read_text("utf-8").count(patch.old)
             if count != 1:
                 wrong.append(f"{name}: {patch.file} holds {patch.old!r} {count} times, not once")
     return wrong
@@ -214,9 +217,9 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", default="", help="only bugs whose name contains this")
     given = parser.parse_args()
-    for wrong in (misfits := check_patches()):
+    for wrong in (unfit := misfits(ROOT, BUGS)):
         print(f"ERROR  {wrong}")
-    if misfits:
+    if unfit:
         return 1
     if red := red_with((), QUICK, compiled=False):
         print(f"ERROR  red without any bug: {red}")
