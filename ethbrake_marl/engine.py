@@ -160,7 +160,7 @@ class Engine:
         start = stream.take(self.n) if worlds is None else stream.prepare(worlds)
         before = self.__dict__.copy()
         self._stream = stream
-        self._hazard = self.scenario.hazard_gap_m is not None or has_hazard(start.packed.state, self.scenario.vehicles)
+        self._hazard = self.scenario.has_obstacle or has_hazard(start.packed.state, self.scenario.vehicles)
         self._state, self._params = self._kept(start.packed.state).copy(), start.packed.params.copy()
         self._clock, self._wanted = start.clock.copy(), start.wanted.copy()
         self._potential = np.zeros(self._wanted.shape)
@@ -313,10 +313,16 @@ class Engine:
             self._potential[rows] = self._potentials(unpack(Packed(self._state[rows], self._params[rows])))
 
     def _begin_with_memory(self, rows: Ints, alert: Worlds, start_s: Floats) -> None:
-        """Scripts with a memory act at the alert on the whole batch; then the new worlds move to the first decision."""
+        """Scripts with a memory act at the alert on the whole batch; then the new worlds move to the first decision.
+
+        Deciders do not: like a learner they coast, and are seen to coast, until their first decision.
+        """
+        early = {i: script for i, script in self._remembering.items() if i not in self.deciders}
+        if not early:
+            return
         self._state[rows] = self._kept(pack(alert).state)
         worlds = self.worlds
-        for vehicle, script in self._remembering.items():
+        for vehicle, script in early.items():
             wanted = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
             self._wanted[rows, vehicle] = wanted[rows]
         self._state[rows] = self._kept(moved(alert, self._wanted[rows], start_s).state)
