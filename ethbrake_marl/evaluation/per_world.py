@@ -106,6 +106,8 @@ def outcome_columns(outcome: Outcome) -> Columns:
     ):
         columns |= {f"{name}_{i + 1}": harm[:, i].tolist() for i in range(harm.shape[1])}
     columns |= {"first_impact_harm": outcome.first_impact_harm.tolist(), "total_harm": outcome.total_harm.tolist()}
+    for name, column in (("sampled_harm", outcome.sampled_harm), ("vehicle_1_shoved_m", outcome.shoved_m)):
+        columns[name] = [""] * n if column is None else column.tolist()
     final = outcome.final
     if np.isfinite(final.hazard_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
         columns |= {"hazard_first_impact_harm": outcome.ledger.hazard_harm("first").tolist()}

@@ -22,6 +22,9 @@ _TERMINAL_HEADINGS = (
     "Collisions",
     "First-impact\nharm",
     "Total\nharm",
+    "Sampled\nharm",
+    "Shoved\nm",
+    "Shoved\n> 5 m",
     "Decrease\nfirst",
     "Decrease\ntotal",
     "Pre-\ndicted",
@@ -29,8 +32,8 @@ _TERMINAL_HEADINGS = (
     "Realised\nfirst",
 )
 _ALL = tuple(range(len(_TERMINAL_HEADINGS)))
-_NARROW, _NARROW_WITHOUT = (0, 1, 2, 3, 6, 7), (0, 1, 2, 3, 4, 5)  # with and without a regret to show
-_WIDE = 96  # terminal columns that all of them need
+_NARROW, _NARROW_WITHOUT = (0, 1, 2, 3, 4, 9, 10), (0, 1, 2, 3, 4, 6, 7)  # with and without a regret to show
+_WIDE = 120  # terminal columns that all of them need
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +56,9 @@ COLUMNS = (
     "Collisions",
     "First-impact harm",
     "Total harm",
+    "Sampled harm",
+    "Vehicle 1 shoved (m)",
+    "Vehicle 1 shoved > 5 m",
     "Decrease, first-impact",
     "Decrease, total",
     "Predicted harm",
@@ -70,6 +76,12 @@ MEANINGS = {
     " paper's protocol); mean per world.",
     "Total harm": "The same over every impact. A light early touch makes a later, harder impact of the same pair free"
     " under the first count, so both are shown.",
+    "Sampled harm": "The paper's own sum (its eq. Jharm): the agent's commands replayed through the paper's fixed-step"
+    " map at the time step; at every sample each pair that overlaps and closes adds its squared closing speed (m²/s²), so"
+    " pushing costs harm for as long as it lasts. No agent here was trained for it, and none saw that map.",
+    "Vehicle 1 shoved (m)": "How far Vehicle 1 ends beyond the point where it would stop by itself, mean per world; and"
+    " the share of worlds in which that is more than 5 m. Both counts of harm leave pushing free unless something"
+    " stands ahead; Vehicle 1 brakes for something.",
     "Decrease": "1 − harm / harm of full braking in the same worlds; interval by the delta method, paired by world.",
     "Predicted harm": "What the agent itself expected at the alert, under the count that it minimises.",
     "Regret": "First-impact harm minus the best known first-impact harm of the same world; mean per world. The best"
@@ -89,6 +101,9 @@ def our_lines(rows: Sequence[SummaryRow]) -> list[Line]:
                 _percent(row.collision_rate, 1),
                 _number(row.first_impact_harm),
                 _number(row.total_harm),
+                _number(row.sampled_harm),
+                _number(row.shoved_m),
+                _percent(row.shoved_far, 1),
                 _percent(row.first_decrease, 1),
                 _percent(row.total_decrease, 1),
                 _number(row.predicted_harm),
@@ -204,7 +219,7 @@ def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
 def _paper_line(row: PaperRow) -> Line:
     """The paper's figures with the digits that it prints."""
     decrease = NONE if row.harm_decrease is None else f"{100 * row.harm_decrease:.4g} %"
-    cells = (f"{100 * row.collision_rate:.4g} %", f"{row.average_harm:.6g}", NONE, decrease, *[NONE] * 4)
+    cells = (f"{100 * row.collision_rate:.4g} %", f"{row.average_harm:.6g}", *[NONE] * 4, decrease, *[NONE] * 4)
     return Line(row.agent, tuple(Cell(cell) for cell in cells))
 
 
