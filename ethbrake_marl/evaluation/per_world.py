@@ -71,14 +71,15 @@ def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
     """What was avoidable and the best known in each world; empty where nothing is proven."""
     if regrets is None:
         return {name: [""] * len(outcome.collided) for name in REGRET_COLUMNS}
+    n, certain, proven = len(outcome.collided), regrets.limits.impact_proven, regrets.limits.proven_harm
     columns = (
         regrets.limits.avoidable.astype(int),
         regrets.limits.reason,
         regrets.first_impact_harm,
         regrets.total_harm,
         regrets.source,
-        regrets.limits.impact_proven.astype(int),
-        regrets.limits.proven_harm,
+        np.full(n, "") if certain is None else certain.astype(int),
+        np.full(n, "") if proven is None else proven,
         regrets.regret(outcome, "first"),
         regrets.regret(outcome, "total"),
     )

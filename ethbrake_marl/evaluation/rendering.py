@@ -77,8 +77,8 @@ MEANINGS = {
     "Total harm": "The same over every impact. A light early touch makes a later, harder impact of the same pair free"
     " under the first count, so both are shown.",
     "Sampled harm": "The paper's own sum (its eq. Jharm): the agent's commands replayed through the paper's fixed-step"
-    " map at the time step; at every sample each pair that overlaps and closes adds its squared closing speed (m²/s²), so"
-    " pushing costs harm for as long as it lasts. No agent here was trained for it, and none saw that map.",
+    " map at the time step; at every sample each pair that overlaps and closes adds its squared closing speed (m²/s²),"
+    " so pushing costs harm for as long as it lasts.",
     "Vehicle 1 shoved (m)": "How far Vehicle 1 ends beyond the point where it would stop by itself, mean per world; and"
     " the share of worlds in which that is more than 5 m. Both counts of harm leave pushing free unless something"
     " stands ahead; Vehicle 1 brakes for something.",
@@ -194,16 +194,23 @@ def _conditions(rows: Sequence[SummaryRow]) -> str:
 def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
     """What nobody could avoid in these worlds and the best known harm, as sentences; none where nothing is proven."""
     found = rows[0].distance if rows else None
-    if found is None or not (found.best_known_first and found.best_known_total and found.proven_harm):
+    if found is None or not (found.best_known_first and found.best_known_total):
         return []
-    contact, impact = (_bracketed(_percent(one, 1)) for one in (found.unavoidable_rate, found.impact_proven_rate))
-    first, total, proven = found.best_known_first.value, found.best_known_total.value, found.proven_harm.value
-    text = (
-        f"In {contact} of these worlds no command of Vehicle 2 avoids contact, in {impact} none avoids an impact (both"
-        f" proven; in those between, vehicles may get away with leaning on each other). Best known harm: {first:.2f}"
-        f" first-impact, {total:.2f} total; proven: no less than {proven:.2f}; gap: {first - proven:.2f} and"
-        f" {total - proven:.2f}."
-    )
+    contact = _bracketed(_percent(found.unavoidable_rate, 1))
+    first, total = found.best_known_first.value, found.best_known_total.value
+    text = f"In {contact} of these worlds no command of Vehicle 2 avoids contact"
+    if found.proven_harm is None:
+        text += (
+            f" (proven). Best known harm: {first:.2f} first-impact, {total:.2f} total; with an obstacle ahead no least"
+            " harm is proven."
+        )
+    else:
+        impact, proven = _bracketed(_percent(found.impact_proven_rate, 1)), found.proven_harm.value
+        text += (
+            f", in {impact} none avoids an impact (both proven; in those between, vehicles may get away with leaning on"
+            f" each other). Best known harm: {first:.2f} first-impact, {total:.2f} total; proven: no less than"
+            f" {proven:.2f}; gap: {first - proven:.2f} and {total - proven:.2f}."
+        )
     if found.known_best_share is not None and found.known_best_share < 1.0:
         text += (
             f" Found beforehand in {100 * found.known_best_share:.1f} % of the worlds; in the others it is the best of"
