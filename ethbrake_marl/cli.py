@@ -27,7 +27,7 @@ from ethbrake_marl.command_options import (
 from ethbrake_marl.doctor import diagnose
 from ethbrake_marl.equal_time_command import equal_time_command
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.evaluate_command import evaluate_command, show_rows
+from ethbrake_marl.evaluate_command import evaluate_command, show_beside, show_rows
 from ethbrake_marl.evaluation.output_files import write_output
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.lineup import (
@@ -147,7 +147,8 @@ def run(
 ) -> None:
     """Train a policy, shield it, compare with the baselines, report.
 
-    Writes the run's folder: the policy, results as CSV and JSON, every world, three figures, and report.html.
+    Writes the run's folder: the policy, results as CSV and JSON, every world, three figures, and report.html. After
+    one of the three tests (paper-random, -brake-only, -obstacle) the policy also drives the other two.
     Ctrl-C ends the training early, and what it has is evaluated; a second Ctrl-C stops at once.
     """
     with interruptible(KEPT):
@@ -169,6 +170,8 @@ def run(
                 on_stage=lambda stage: bars.show(stage.name, stage.done, stage.total, stage.metrics, stage.note),
             )
     show_rows(result.rows, as_json)
+    if not as_json:
+        show_beside(result.beside)
     say(f"report: {result.report}")
     end_of_training(result.status, result.steps, folder)
 

@@ -205,7 +205,7 @@ class Engine:
         start = stream.take(self.n) if worlds is None else stream.prepare(worlds)
         new = copy.copy(self)
         new._stream = stream
-        new._hazard = self.scenario.hazard_gap_m is not None or has_hazard(start.packed.state, self.scenario.vehicles)
+        new._hazard = self.scenario.has_obstacle or has_hazard(start.packed.state, self.scenario.vehicles)
         new._state, new._params = new._kept(start.packed.state).copy(), start.packed.params.copy()
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
         new._potential = np.zeros(start.wanted.shape)
@@ -371,10 +371,16 @@ class Engine:
             self._potential[rows] = self._potentials(unpack(Packed(self._state[rows], self._params[rows])))
 
     def _begin_with_memory(self, rows: Ints, alert: Worlds, start_s: Floats) -> None:
-        """Scripts with a memory act at the alert on the whole batch; then the new worlds move to the first decision."""
+        """Scripts with a memory act at the alert on the whole batch; then the new worlds move to the first decision.
+
+        Deciders do not: like a learner they coast, and are seen to coast, until their first decision.
+        """
+        early = {i: script for i, script in self._remembering.items() if i not in self.deciders}
+        if not early:
+            return
         self._state[rows] = self._kept(pack(alert).state)
         worlds = self.worlds
-        for vehicle, script in self._remembering.items():
+        for vehicle, script in early.items():
             wanted = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
             self._wanted[rows, vehicle] = wanted[rows]
         self._state[rows] = self._kept(moved(alert, self._wanted[rows], start_s).state)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -21,6 +21,7 @@ from ethbrake_marl.evaluation import (
     summarise,
     write_per_world_csv,
 )
+from ethbrake_marl.evaluation.three_tests import TESTS
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.lineup import (
     EPISODES,
@@ -110,3 +111,10 @@ def show_rows(rows: Sequence[SummaryRow], as_json: bool, told: Sequence[Rescored
     if told:
         found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
     write_json(found)
+
+
+def show_beside(beside: Mapping[str, Sequence[SummaryRow]]) -> None:
+    """The rows of the other tests, each below what its test asks."""
+    for test, rows in beside.items():
+        result_console().print(f"\n{TESTS[test]}\n", highlight=False, markup=False)
+        result_console().print(rich_table(rows))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -16,6 +16,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, evaluate, parameter_line, summarise
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
+from ethbrake_marl.evaluation.three_tests import TESTS, other_tests
 from ethbrake_marl.learning.bundle import Policy
 from ethbrake_marl.learning.callback import Progress
 from ethbrake_marl.learning.measure import measure_on_list
@@ -24,13 +25,15 @@ from ethbrake_marl.learning.run_directory import RunDirectory, RunStatus, read_o
 from ethbrake_marl.learning.train import TrainResult, resume, train
 from ethbrake_marl.learning.versions import installed_versions
 from ethbrake_marl.lineup import EPISODES, LIST_SEED, PROGRESS_EVERY, make_agents
-from ethbrake_marl.results_folder import write_figures, write_page, write_results
+from ethbrake_marl.results_folder import write_beside, write_figures, write_page, write_results
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.shield import HybridAgent
 
 RUNS = Path("runs")
 BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
+BESIDE = ("full_brake", "e_v2x_bm")  # baselines on the other two of the three tests
+BESIDE_EPISODES = 2_000  # at most so many worlds of each
 
 Ended = Literal["finished", "interrupted"]
 
@@ -58,6 +61,7 @@ class ExperimentResult:
     steps: int
     rows: list[SummaryRow]
     report: Path
+    beside: Mapping[str, list[SummaryRow]] = field(default_factory=dict)  # by test: the other two of the three tests
 
 
 def run_folder(
@@ -132,6 +136,8 @@ def run_experiment(
 ) -> ExperimentResult:
     """Train a policy on ``scenario``, evaluate it, its hybrid and the baselines on a fixed list, write everything.
 
+    On one of the three tests the policy also drives the other two, which it was not trained for.
+
     ``seed`` is the training's; the list is ``episodes`` worlds of ``list_seed``. Ctrl-C during the training ends it
     after the update in progress, and the policy so far is evaluated; a second one, or one during the evaluation,
     raises ``KeyboardInterrupt``, and the folder keeps the policy. ``run.json`` always says which. Raises what
@@ -156,20 +162,32 @@ def run_experiment(
         evaluation = _evaluated(sample, agents, scenario, vehicle, list_seed, trained, tell)
         tell(Stage("figures", 0, 1))
         rows = summarise(evaluation)
+        beside = _beside(trained.policy, scenario, min(episodes, BESIDE_EPISODES), list_seed)
         write_results(run.path, evaluation, rows)
-        report = _shown(run, evaluation, rows, trained, agents, wall_s=time.monotonic() - started)
+        write_beside(run.path, beside)
+        report = _shown(run, evaluation, rows, beside, trained, agents, wall_s=time.monotonic() - started)
         tell(Stage("figures", 1, 1))
-    return ExperimentResult(run.path, trained.status, trained.steps, rows, report)
+    return ExperimentResult(run.path, trained.status, trained.steps, rows, report, beside)
 
 
-def _agents(policy: Policy, scenario: Scenario) -> dict[str, Agent]:
+def _beside(policy: Policy, scenario: Scenario, episodes: int, list_seed: int) -> dict[str, list[SummaryRow]]:
+    """The same policy, trained on ``scenario`` alone, on the other two of the three tests, beside two baselines."""
+    found = {}
+    for other in other_tests(scenario):
+        agents = _agents(policy, other, BESIDE)
+        evaluation = evaluate(other.sample(episodes, list_seed), agents, scenario=other, seed=list_seed)
+        found[other.name] = summarise(evaluation)
+    return found
+
+
+def _agents(policy: Policy, scenario: Scenario, baselines: Sequence[str] = BASELINES) -> dict[str, Agent]:
     """The baselines, the policy alone (``ppo`` or ``sac``), and the policy behind its shield (``hybrid``)."""
     name = policy.manifest.algorithm
     learned: dict[str, Agent] = {
         name: LearnedAgent(policy, name),
         "hybrid": HybridAgent(LearnedAgent(policy, name), scenario),
     }
-    return {**make_agents(BASELINES, scenario), **learned}
+    return {**make_agents(baselines, scenario), **learned}
 
 
 def _evaluated(
@@ -201,6 +219,7 @@ def _shown(
     run: RunDirectory,
     evaluation: Evaluation,
     rows: list[SummaryRow],
+    beside: Mapping[str, list[SummaryRow]],
     trained: TrainResult,
     agents: Mapping[str, Agent],
     *,
@@ -226,9 +245,13 @@ def _shown(
     manifest = trained.policy.manifest
     which = f"{manifest.algorithm.upper()} after {manifest.steps:,} steps (least harm on its own list)"
     summary = f"{which}, alone and behind its shield, against the baselines."
+    if evaluation.scenario.name in TESTS and beside:
+        summary += f" {TESTS[evaluation.scenario.name]} The other two tests stand below."
     if trained.status == "interrupted":
         summary += " The training was interrupted; this is the policy it had by then."
-    return write_page(run.path, rows, figures, summary=summary, settings=settings, versions=installed_versions())
+    return write_page(
+        run.path, rows, figures, beside=beside, summary=summary, settings=settings, versions=installed_versions()
+    )
 
 
 def _reward(given: dict[str, Any]) -> str:

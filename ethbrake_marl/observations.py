@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.events import stopping_distance
 from ethbrake_marl.physics.packed import (
     RESTITUTION,
     TIME,
@@ -142,10 +143,9 @@ class ObservationSpec:
 def observation_for(scenario: Scenario) -> ObservationSpec:
     """What vehicles observe in this scenario unless somebody says otherwise: one neighbour on each side.
 
-    Where Vehicle 1 has an obstacle ahead (``hazard_gap_m``), also the own place in the line and the obstacle.
+    Where Vehicle 1 has an obstacle ahead, also the own place in the line and the obstacle.
     """
-    hazard = scenario.hazard_gap_m is not None
-    return ObservationSpec(role=hazard, hazard=hazard)
+    return ObservationSpec(role=scenario.has_obstacle, hazard=scenario.has_obstacle)
 
 
 def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
@@ -206,7 +206,7 @@ def _observe_rows(  # noqa: C901
         for o in range(observers.shape[0]):
             i = observers[o]
             own_speed, own_latency = state[k, speed + i], max(params[k, own_part + i * to_next] - time, 0.0)
-            own_stop = _stopping_distance(own_speed, own_latency, params[k, braking + i])
+            own_stop = stopping_distance(own_speed, own_latency, params[k, braking + i])
             value[0] = own_speed
             value[1] = state[k, command + i]
             value[2] = params[k, braking + i]
@@ -228,7 +228,7 @@ def _observe_rows(  # noqa: C901
                 in_front = j < i
                 other_speed = state[k, speed + j]
                 other_latency = max(params[k, own_part + j * to_next] - time, 0.0)
-                other_stop = _stopping_distance(other_speed, other_latency, params[k, braking + j])
+                other_stop = stopping_distance(other_speed, other_latency, params[k, braking + j])
                 room = gap + other_stop if in_front else other_stop - gap
                 value[c] = 1.0
                 value[c + 1] = gap
@@ -260,13 +260,6 @@ def _observe_rows(  # noqa: C901
                     value[c + 4] = _fitting_deceleration(own_speed, own_latency, gap)
             for c in range(out.shape[2]):
                 out[k, o, c] = min(max(value[c] * features[0, c], features[1, c]), features[2, c])
-
-
-@compiled
-def _stopping_distance(speed: float, latency_left: float, capacity: float) -> float:
-    """Distance to rest under full braking once the latency has elapsed: ``v tau + v^2 / (2 a)``, 0 if not moving on."""
-    speed = max(speed, 0.0)
-    return speed * latency_left + speed * speed / (2.0 * capacity)
 
 
 @compiled

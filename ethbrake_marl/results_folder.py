@@ -16,8 +16,9 @@ from ethbrake_marl.evaluation import Evaluation, SummaryRow, record_episode, wri
 from ethbrake_marl.evaluation.figure_style import png_bytes
 from ethbrake_marl.evaluation.figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.evaluation.output_files import write_output
-from ethbrake_marl.evaluation.report import Report, ReportFigure, write_report
+from ethbrake_marl.evaluation.report import Report, ReportFigure, ReportTest, write_report
 from ethbrake_marl.evaluation.table import BASELINE
+from ethbrake_marl.evaluation.three_tests import MAIN_TEST, TESTS
 from ethbrake_marl.evaluation.trajectories import trajectories
 
 REFERENCES = ("full_brake", "e_v2x_bm")  # level lines beside the learning curve
@@ -35,6 +36,15 @@ def write_results(folder: Path, evaluation: Evaluation, rows: Sequence[SummaryRo
     write_output(folder / "results.json", content.encode(), force=True)
     write_output(folder / "results.csv", results_csv(rows).encode(), force=True)
     write_per_world_csv(folder / "per_world.csv", evaluation, force=True)
+
+
+def write_beside(folder: Path, beside: Mapping[str, Sequence[SummaryRow]]) -> None:
+    """Write ``other_tests.json`` and ``other_tests.csv``: the rows of the other tests; nothing where there are none."""
+    rows = [row for rows in beside.values() for row in rows]
+    if rows:
+        content = json.dumps([row.to_json() for row in rows], indent=2, allow_nan=False) + "\n"
+        write_output(folder / "other_tests.json", content.encode(), force=True)
+        write_output(folder / "other_tests.csv", results_csv(rows).encode(), force=True)
 
 
 def results_csv(rows: Sequence[SummaryRow]) -> str:
@@ -128,13 +138,16 @@ def write_page(
     rows: Sequence[SummaryRow],
     figures: Sequence[ReportFigure],
     *,
+    beside: Mapping[str, Sequence[SummaryRow]],
     summary: str,
     settings: Mapping[str, object],
     versions: Mapping[str, str],
 ) -> Path:
     """Write ``report.html``, which holds the figures inside it; gives its path."""
     path = folder / "report.html"
-    title = f"ethbrake run: {rows[0].parameters['scenario']}"
-    report = Report(title, rows, figures, summary=summary, settings=settings, versions=versions)
+    scenario = rows[0].parameters["scenario"]
+    title = f"ethbrake run: {scenario}{' (the main test of three)' if beside and scenario == MAIN_TEST else ''}"
+    tests = [ReportTest(name, TESTS[name], other) for name, other in beside.items()]
+    report = Report(title, rows, figures, tests, summary=summary, settings=settings, versions=versions)
     write_report(path, report, force=True)
     return path

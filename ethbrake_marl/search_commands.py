@@ -19,7 +19,7 @@ from ethbrake_marl.analysis.lower_bound import lower_bound
 from ethbrake_marl.command_options import ForceOption, JsonOption, ScenarioOption
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
-from ethbrake_marl.evaluation.regret import limits_do_not_apply
+from ethbrake_marl.evaluation.regret import harm_is_bounded, limits_do_not_apply
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable, make_agents
 from ethbrake_marl.physics import Worlds
@@ -165,7 +165,7 @@ def _command_text(
 
 def _proven(scenario: Scenario, worlds: Worlds, vehicles: Sequence[int]) -> dict[str, object]:
     """The mean harm (m2/s2) that no command undercuts, where that is proven: one of three vehicles is controlled."""
-    if len(vehicles) != 1 or limits_do_not_apply(worlds, scenario, vehicles[0]) is not None:
+    if len(vehicles) != 1 or limits_do_not_apply(worlds, scenario, vehicles[0]) or not harm_is_bounded(worlds):
         return {}
     proven = lower_bound(worlds, vehicles[0], horizon_s=scenario.horizon_s)
     return {"proven_harm": float(proven.harm.mean()), "impact_proven_rate": float(proven.impact_proven.mean())}

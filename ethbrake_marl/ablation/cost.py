@@ -98,9 +98,9 @@ def _timed(training: Training, sample: Sample) -> tuple[float, float]:
 def _driving_s(folder: Path, scenario: Scenario, sample: Sample) -> float:
     """Seconds per world that a trained team drives."""
     team = load_team(folder, scenario)
-    evaluate(sample.worlds.take(np.arange(min(5, sample.worlds.n))), {"warm": team}, scenario=scenario)
+    evaluate(sample.worlds.take(np.arange(min(5, sample.worlds.n))), {"warm": team}, scenario=scenario, aftermath=False)
     started = time.monotonic()
-    evaluate(sample, {"team": team}, scenario=scenario)
+    evaluate(sample, {"team": team}, scenario=scenario, aftermath=False)
     return (time.monotonic() - started) / sample.worlds.n
 
 

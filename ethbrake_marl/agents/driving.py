@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import Ledger
-from ethbrake_marl.physics import Bools, Worlds
+from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.starts import Script
 
@@ -25,6 +26,17 @@ class Episodes:
     ledger: Ledger
     final: Worlds  # each world as its episode left it
     at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
+
+
+class Watch(Protocol):
+    """Sees every step of a batch of episodes."""
+
+    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
+        """``before`` moved to the times ``until_s`` [n] under ``command_mps2`` [n, N]; ended worlds stay at theirs.
+
+        The first step is from the alert to the first decision. Nothing of what is given may be changed.
+        """
+        ...
 
 
 def scripted(scenario: Scenario, *, but: int | Collection[int] | None = None) -> dict[int, Agent]:
@@ -67,10 +79,29 @@ def episode_engine(worlds: Worlds, agent: Agent | Team, scenario: Scenario, vehi
     )
 
 
-def drive(worlds: Worlds, agent: Agent | Team, scenario: Scenario, vehicle: int | None = None) -> Episodes:
+def drive(
+    worlds: Worlds,
+    agent: Agent | Team,
+    scenario: Scenario,
+    vehicle: int | None = None,
+    *,
+    watched_by: Sequence[Watch] = (),
+) -> Episodes:
     """Let ``agent`` drive ``vehicle``, or a team its vehicles, through every world (at t = 0) to its episode's end."""
     engine = episode_engine(worlds, agent, scenario, vehicle)
     at_rest = np.zeros(worlds.n, np.bool_)
+    now = _show(watched_by, worlds, engine, engine.worlds.command_mps2)
     while not engine.ended.all():
         at_rest |= engine.step({}).terminated
+        now = _show(watched_by, now, engine, engine.wanted_mps2.copy())
     return Episodes(engine.ledger, engine.worlds, at_rest)
+
+
+def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:
+    """Show the step that the engine has just made; gives the worlds as they are now."""
+    if not watched_by:
+        return before
+    now = engine.worlds
+    for watch in watched_by:
+        watch.see(before, command_mps2, now.time_s)
+    return now

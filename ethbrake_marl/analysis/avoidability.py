@@ -26,6 +26,7 @@ from ethbrake_marl.analysis.avoidability_kernel import (
 )
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.events import stopping_distances
 
 REASONS = ("", "early", "front", "rear")  # the name of each code; "" where contact is avoidable
 
@@ -98,8 +99,8 @@ def _check(worlds: Worlds, vehicle: int, scripts: Mapping[int, str]) -> None:
     An obstacle that Vehicle 1 cannot reach by braking fully changes nothing: only a push could bring it there, and that
     is an impact already.
     """
-    v1, own = worlds.speeds_mps[:, 0], np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
-    way = v1 * own + v1 * v1 / (2.0 * worlds.vehicles.braking_capacity_mps2[:, 0])
+    own = np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
+    way = stopping_distances(worlds.speeds_mps[:, 0], own, worlds.vehicles.braking_capacity_mps2[:, 0])
     _refuse(~(way < worlds.hazard_gap_m), worlds.hazard_gap_m, "hazard_gap_m", None, "beyond full braking of vehicle_1")
     if vehicle == 0 and np.isfinite(worlds.hazard_gap_m).any():
         raise InvalidInput("avoidability: vehicle_1 controlled, with an obstacle ahead (hazard_gap_m): not decided")

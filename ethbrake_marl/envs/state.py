@@ -40,7 +40,7 @@ def state_features(scenario: Scenario) -> tuple[Feature, ...]:
     vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in OWN_FEATURES]
     pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
     time = Feature("time", "s", scenario.horizon_s, 0.0, 1.0, "time since Vehicle 1 began to brake; scale: the horizon")
-    hazard = [] if scenario.hazard_gap_m is None else _HAZARD_FEATURES
+    hazard = _HAZARD_FEATURES if scenario.has_obstacle else ()
     return (*vehicles, *pairs, time, *hazard)
 
 
@@ -51,7 +51,7 @@ def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
     pair_values = {"gap": worlds.gaps_m, "hit": worlds.pair_hit.astype(np.float64)}
     columns = [pair_values[f.name][:, p] for p in range(worlds.N - 1) for f in _PAIR_FEATURES]
     columns.append(worlds.time_s)
-    if scenario.hazard_gap_m is not None:
+    if scenario.has_obstacle:
         columns += [worlds.hazard_gap_m, worlds.hazard_hit.astype(np.float64)]
     features = state_features(scenario)[-len(columns) :]
     rest = [np.clip(c / f.scale, f.low, f.high) for c, f in zip(columns, features, strict=True)]

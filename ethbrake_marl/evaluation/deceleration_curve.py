@@ -183,7 +183,8 @@ def _mark_best_known(axes: Axes, limits: Limits | None) -> None:
     first, total = float(limits.first_impact_harm[0]), float(limits.total_harm[0])
     for (_, _, colour, dashes), harm in zip(_COUNTS, (first, total), strict=True):
         axes.axhline(harm, color=colour, linewidth=0.9, linestyle=dashes, alpha=0.7)
-    proof = " (avoidable)" if limits.avoidable[0] else f"; proven: no less than {limits.proven_harm[0]:.2f}"
+    least = "" if limits.proven_harm is None else f"; proven: no less than {limits.proven_harm[0]:.2f}"
+    proof = " (avoidable)" if limits.avoidable[0] else least
     axes.annotate(
         f"best known profile: {first:.2f} first-impact, {total:.2f} total{proof}", (0.0, max(first, total)),
         xytext=(6, 3), textcoords="offset points", fontsize=8.5, color=GREY,

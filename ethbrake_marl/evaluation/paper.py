@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ethbrake_marl.evaluation.rollout import Evaluation
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.evaluation.three_tests import is_as_shipped
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,6 @@ PAPER_NOTE = (
 )
 
 _SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant of which the note speaks
-_TEXTS = {"title", "description", "source"}
 
 
 def is_papers_test(evaluation: Evaluation) -> bool:
@@ -68,4 +67,4 @@ def is_papers_test(evaluation: Evaluation) -> bool:
     scenario = evaluation.scenario
     if scenario.name not in _SHOWN_WITH or evaluation.seed is None or evaluation.vehicles != (1,):
         return False
-    return scenario.model_dump(exclude=_TEXTS) == load_scenario(scenario.name).model_dump(exclude=_TEXTS)
+    return is_as_shipped(scenario)

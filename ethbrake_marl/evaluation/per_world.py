@@ -74,14 +74,15 @@ def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
     """What was avoidable and the best known in each world; empty where nothing is proven."""
     if regrets is None:
         return {name: [""] * len(outcome.collided) for name in REGRET_COLUMNS}
+    n, certain, proven = len(outcome.collided), regrets.limits.impact_proven, regrets.limits.proven_harm
     columns = (
         regrets.limits.avoidable.astype(int),
         regrets.limits.reason,
         regrets.first_impact_harm,
         regrets.total_harm,
         regrets.source,
-        regrets.limits.impact_proven.astype(int),
-        regrets.limits.proven_harm,
+        np.full(n, "") if certain is None else certain.astype(int),
+        np.full(n, "") if proven is None else proven,
         regrets.regret(outcome, "first"),
         regrets.regret(outcome, "total"),
     )
@@ -109,6 +110,8 @@ def outcome_columns(outcome: Outcome) -> Columns:
     ):
         columns |= {f"{name}_{i + 1}": harm[:, i].tolist() for i in range(harm.shape[1])}
     columns |= {"first_impact_harm": outcome.first_impact_harm.tolist(), "total_harm": outcome.total_harm.tolist()}
+    for name, column in (("sampled_harm", outcome.sampled_harm), ("vehicle_1_shoved_m", outcome.shoved_m)):
+        columns[name] = [""] * n if column is None else column.tolist()
     final = outcome.final
     if np.isfinite(final.hazard_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
         columns |= {"hazard_first_impact_harm": outcome.ledger.hazard_harm("first").tolist()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from ethbrake_marl.agents.driving import episode_engine
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
+from ethbrake_marl.evaluation.travel import with_post_ahead
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
 from ethbrake_marl.scenario import Scenario
@@ -86,34 +87,15 @@ def _samples(segments: list[Segment], sample_s: float) -> Iterator[tuple[Floats,
         start = float(before.time_s[0])
         count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
         times = np.linspace(start, end, count + 1)
-        distance, post = _post_ahead(before, end - start)
+        post = with_post_ahead(before, np.array([end - start]))
         copies = post.take(np.zeros(count + 1, np.int64))
         moved, _ = advance(copies, command, until_s=times)
-        position, gaps, speeds = front + (distance - moved.hazard_gap_m), moved.gaps_m, moved.speeds_mps
+        position, gaps, speeds = front + (post.hazard_gap_m - moved.hazard_gap_m), moved.gaps_m, moved.speeds_mps
         in_force = np.where(before.vehicles.latency_s <= times[:, np.newaxis], command, 0.0)
         rows = slice(None) if number == len(segments) - 1 else slice(count)
         columns = (times, gaps, speeds, _positions(position, gaps), in_force)
         yield tuple(column[rows] for column in columns)
         front = float(position[-1])
-
-
-def _post_ahead(world: Worlds, duration_s: float) -> tuple[float, Worlds]:
-    """The distance to an obstacle ahead, and the world with it."""
-    if np.isfinite(world.hazard_gap_m[0]):
-        return float(world.hazard_gap_m[0]), world
-    distance = _farthest(world, duration_s) + 1.0
-    return distance, replace(world, hazard_gap_m=np.array([distance]))
-
-
-def _farthest(world: Worlds, duration_s: float) -> float:
-    """More than Vehicle 1 can travel, m: ``T sqrt(2 E / m_1)``, had it all the energy E that the line can ever have.
-
-    Impacts and brakes only take energy; driving adds at most ``m a v`` per second, and never above the speed limit.
-    """
-    vehicles = world.vehicles
-    driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s
-    energy = float((vehicles.mass_t * (world.speeds_mps**2 / 2.0 + driving)).sum())
-    return 1.01 * duration_s * math.sqrt(2.0 * energy / float(vehicles.mass_t[0, 0]))
 
 
 def _positions(front: Floats, gaps: Floats) -> Floats:

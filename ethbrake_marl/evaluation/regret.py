@@ -3,7 +3,8 @@
 Three vehicles, Vehicle 2 driven, the others braking fully: for these it is proven world by world whether some command
 avoids all contact (``analysis.avoidability``) and which harm no command undercuts (``analysis.lower_bound``). The least
 harm known is the first proof's witness (harm 0), or the result of a search (``analysis.best_harm``), or what an agent
-of the same evaluation achieved, whichever is least.
+of the same evaluation achieved, whichever is least. An obstacle that Vehicle 1 does not reach by itself leaves the
+first proof as it is (only a push brings it there); the second knows none.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate, relative_decrease
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.physics.events import stopping_distances
+from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.scenario import Scenario
 
 TOLERANCE = 1e-6  # m2/s2; less than this below the best known harm is rounding
@@ -37,12 +40,12 @@ class Limits:
     reason: NDArray[np.str_]  # why not: "early", "front" or "rear"; "" where avoidable
     first_impact_harm: Floats  # least known (m2/s2): 0 where avoidable, else a table's; NaN in no table
     total_harm: Floats
-    proven_harm: Floats  # no command does less harm than this (m2/s2), under either count
+    proven_harm: Floats | None  # no command does less (m2/s2), under either count; None with an obstacle ahead
 
     @property
-    def impact_proven(self) -> Bools:
-        """Worlds in which every command leads to an impact, not only to contact."""
-        return self.proven_harm > 0.0
+    def impact_proven(self) -> Bools | None:
+        """Worlds in which every command leads to an impact, not only to contact; None with an obstacle ahead."""
+        return None if self.proven_harm is None else self.proven_harm > 0.0
 
     @property
     def known(self) -> Bools:
@@ -122,13 +125,19 @@ def limits_do_not_apply(worlds: Worlds, scenario: Scenario, vehicle: int) -> str
         script = scenario.scripts.get(i, "full_brake")
         if script != "full_brake":
             return f"{scenario.vehicle_names[i]} follows {script}; avoidability is proven where it follows full_brake"
-    if np.isfinite(worlds.hazard_gap_m).any():
-        return "an obstacle stands ahead of vehicle_1 (hazard_gap_m); no harm is proven then"
-    latency_s = worlds.vehicles.latency_s
+    speeds_mps, latency_s = worlds.speeds_mps, worlds.vehicles.latency_s
+    way_m = stopping_distances(speeds_mps[:, 0], latency_s[:, 0], worlds.vehicles.braking_capacity_mps2[:, 0])
+    if not (way_m < worlds.hazard_gap_m).all():
+        return "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"
     if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():
         front, driven = scenario.vehicle_names[: _DRIVEN + 1]
         return f"{front} may brake later than {driven}; nothing is proven then"
     return None
+
+
+def harm_is_bounded(worlds: Worlds) -> bool:
+    """Whether the proof of a least harm applies where avoidability does: it knows no obstacle."""
+    return not obstacle_ahead(worlds).any()
 
 
 def no_limits_because(evaluation: Evaluation) -> str | None:
@@ -145,7 +154,8 @@ def known_limits(worlds: Worlds, scenario: Scenario, vehicle: int) -> Limits | N
         return None
     proof = avoidability(worlds, vehicle)
     first, total = (best_known(worlds, scenario, count, vehicles=(vehicle,)) for count in COUNTS)
-    proven = lower_bound(worlds, vehicle, count="first", horizon_s=scenario.horizon_s).harm
+    bounded = harm_is_bounded(worlds)
+    proven = lower_bound(worlds, vehicle, count="first", horizon_s=scenario.horizon_s).harm if bounded else None
     free = proof.avoidable
     return Limits(free, proof.reason_name, np.where(free, 0.0, first), np.where(free, 0.0, total), proven)
 
@@ -174,18 +184,19 @@ def distance(regrets: Regrets | None, outcome: Outcome, full_brake: Outcome | No
     """
     if regrets is None:
         return Distance()
-    avoidable, known, proven = regrets.limits.avoidable, regrets.limits.known, regrets.limits.proven_harm
+    limits = regrets.limits
+    avoidable, known, proven, certain = limits.avoidable, limits.known, limits.proven_harm, limits.impact_proven
     first, total = regrets.regret(outcome, "first"), regrets.regret(outcome, "total")
     reference = full_brake if bool(known.all()) else None
     return Distance(
         unavoidable_rate=rate(int((~avoidable).sum()), len(avoidable)),
-        impact_proven_rate=rate(int(regrets.limits.impact_proven.sum()), len(avoidable)),
+        impact_proven_rate=None if certain is None else rate(int(certain.sum()), len(avoidable)),
         avoidable_collision_rate=rate(int((outcome.collided & avoidable).sum()), len(avoidable)),
         best_known_first=mean(regrets.first_impact_harm),
         best_known_total=mean(regrets.total_harm),
-        proven_harm=mean(proven),
-        gap_first=mean(regrets.first_impact_harm - proven),
-        gap_total=mean(regrets.total_harm - proven),
+        proven_harm=None if proven is None else mean(proven),
+        gap_first=None if proven is None else mean(regrets.first_impact_harm - proven),
+        gap_total=None if proven is None else mean(regrets.total_harm - proven),
         regret_first=mean(first),
         regret_total=mean(total),
         realised_first=relative_decrease(first, regrets.regret(reference, "first")) if reference else None,

@@ -24,6 +24,9 @@ _TERMINAL_HEADINGS = (
     "Collisions",
     "First-impact\nharm",
     "Total\nharm",
+    "Sampled\nharm",
+    "Shoved\nm",
+    "Shoved\n> 5 m",
     "Decrease\nfirst",
     "Decrease\ntotal",
     "Pre-\ndicted",
@@ -31,8 +34,8 @@ _TERMINAL_HEADINGS = (
     "Realised\nfirst",
 )
 _ALL = tuple(range(len(_TERMINAL_HEADINGS)))
-_NARROW, _NARROW_WITHOUT = (0, 1, 2, 3, 6, 7), (0, 1, 2, 3, 4, 5)  # with and without a regret to show
-_WIDE = 96  # terminal columns that all of them need
+_NARROW, _NARROW_WITHOUT = (0, 1, 2, 3, 4, 9, 10), (0, 1, 2, 3, 4, 6, 7)  # with and without a regret to show
+_WIDE = 120  # terminal columns that all of them need
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +59,9 @@ COLUMNS = (
     "Collisions",
     "First-impact harm",
     "Total harm",
+    "Sampled harm",
+    "Vehicle 1 shoved (m)",
+    "Vehicle 1 shoved > 5 m",
     "Decrease, first-impact",
     "Decrease, total",
     "Predicted harm",
@@ -78,6 +84,12 @@ MEANINGS = {
     " paper's protocol); mean per world.",
     "Total harm": "The same over every impact. A light early touch makes a later, harder impact of the same pair free"
     " under the first count, so both are shown.",
+    "Sampled harm": "The paper's own sum (its eq. Jharm): the agent's commands replayed through the paper's fixed-step"
+    " map at the time step; at every sample each pair that overlaps and closes adds its squared closing speed (m²/s²),"
+    " so pushing costs harm for as long as it lasts.",
+    "Vehicle 1 shoved (m)": "How far Vehicle 1 ends beyond the point where it would stop by itself, mean per world; and"
+    " the share of worlds in which that is more than 5 m. Both counts of harm leave pushing free unless something"
+    " stands ahead; Vehicle 1 brakes for something.",
     "Decrease": "1 − harm / harm of full braking in the same worlds; interval by the delta method, paired by world.",
     "Predicted harm": "What the agent itself expected at the alert, under the count that it minimises.",
     "Regret": "First-impact harm minus the best known first-impact harm of the same world; mean per world. The best"
@@ -97,6 +109,9 @@ def our_lines(rows: Sequence[SummaryRow]) -> list[Line]:
                 _percent(row.collision_rate, 1),
                 _number(row.first_impact_harm),
                 _number(row.total_harm),
+                _number(row.sampled_harm),
+                _number(row.shoved_m),
+                _percent(row.shoved_far, 1),
                 _percent(row.first_decrease, 1),
                 _percent(row.total_decrease, 1),
                 _number(row.predicted_harm),
@@ -191,16 +206,23 @@ def _conditions(rows: Sequence[SummaryRow]) -> str:
 def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
     """What nobody could avoid in these worlds and the best known harm, as sentences; none where nothing is proven."""
     found = rows[0].distance if rows else None
-    if found is None or not (found.best_known_first and found.best_known_total and found.proven_harm):
+    if found is None or not (found.best_known_first and found.best_known_total):
         return []
-    contact, impact = (_bracketed(_percent(one, 1)) for one in (found.unavoidable_rate, found.impact_proven_rate))
-    first, total, proven = found.best_known_first.value, found.best_known_total.value, found.proven_harm.value
-    text = (
-        f"In {contact} of these worlds no command of Vehicle 2 avoids contact, in {impact} none avoids an impact (both"
-        f" proven; in those between, vehicles may get away with leaning on each other). Best known harm: {first:.2f}"
-        f" first-impact, {total:.2f} total; proven: no less than {proven:.2f}; gap: {first - proven:.2f} and"
-        f" {total - proven:.2f}."
-    )
+    contact = _bracketed(_percent(found.unavoidable_rate, 1))
+    first, total = found.best_known_first.value, found.best_known_total.value
+    text = f"In {contact} of these worlds no command of Vehicle 2 avoids contact"
+    if found.proven_harm is None:
+        text += (
+            f" (proven). Best known harm: {first:.2f} first-impact, {total:.2f} total; with an obstacle ahead no least"
+            " harm is proven."
+        )
+    else:
+        impact, proven = _bracketed(_percent(found.impact_proven_rate, 1)), found.proven_harm.value
+        text += (
+            f", in {impact} none avoids an impact (both proven; in those between, vehicles may get away with leaning on"
+            f" each other). Best known harm: {first:.2f} first-impact, {total:.2f} total; proven: no less than"
+            f" {proven:.2f}; gap: {first - proven:.2f} and {total - proven:.2f}."
+        )
     if found.known_best_share is not None and found.known_best_share < 1.0:
         text += (
             f" Found beforehand in {100 * found.known_best_share:.1f} % of the worlds; in the others it is the best of"
@@ -235,7 +257,7 @@ def knowledge_lines(rows: Sequence[SummaryRow]) -> list[str]:
 def _paper_line(row: PaperRow) -> Line:
     """The paper's figures with the digits that it prints."""
     decrease = NONE if row.harm_decrease is None else f"{100 * row.harm_decrease:.4g} %"
-    cells = (f"{100 * row.collision_rate:.4g} %", f"{row.average_harm:.6g}", NONE, decrease, *[NONE] * 4)
+    cells = (f"{100 * row.collision_rate:.4g} %", f"{row.average_harm:.6g}", *[NONE] * 4, decrease, *[NONE] * 4)
     return Line(row.agent, tuple(Cell(cell) for cell in cells))
 
 

@@ -12,7 +12,15 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from ethbrake_marl.evaluation.output_files import write_output
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
 from ethbrake_marl.evaluation.parameters import parameter_line
-from ethbrake_marl.evaluation.rendering import COLUMNS, MEANINGS, knowledge_lines, limit_lines, our_lines, paper_blocks
+from ethbrake_marl.evaluation.rendering import (
+    COLUMNS,
+    MEANINGS,
+    Line,
+    knowledge_lines,
+    limit_lines,
+    our_lines,
+    paper_blocks,
+)
 from ethbrake_marl.evaluation.table import SummaryRow
 
 _TEMPLATE = "report.html.j2"
@@ -33,12 +41,32 @@ class ReportFigure:
 
 
 @dataclass(frozen=True, slots=True)
+class ReportTest:
+    """Results on another test, to stand below the main table."""
+
+    title: str
+    description: str  # what differs from the main table's test
+    rows: Sequence[SummaryRow]
+
+    @property
+    def lines(self) -> list[Line]:
+        """The lines of its table."""
+        return our_lines(self.rows)
+
+    @property
+    def conditions(self) -> list[str]:
+        """Conditions and limits, as sentences."""
+        return [f"{parameter_line(self.rows[0].parameters)}.", *limit_lines(self.rows)] if self.rows else []
+
+
+@dataclass(frozen=True, slots=True)
 class Report:
     """Everything on the page. ``settings`` and ``versions`` are printed as they are given, name and value."""
 
     title: str
     rows: Sequence[SummaryRow]
     figures: Sequence[ReportFigure] = ()
+    tests: Sequence[ReportTest] = ()  # the same agents elsewhere
     summary: str = ""  # a sentence or two below the title
     settings: Mapping[str, object] = field(default_factory=dict)  # command, seeds, training set-up
     versions: Mapping[str, str] = field(default_factory=dict)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_of
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.evaluation.sampled_harm import SampledHarm
+from ethbrake_marl.evaluation.travel import ShovedFront
 from ethbrake_marl.harm import HarmCount, Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate
 from ethbrake_marl.scenario import Sample, Scenario
@@ -37,6 +40,8 @@ class Outcome:
     predicted_harm: Floats | None  # [n] what the agent expected at the alert, if it predicts and drives alone
     chosen_policy: Bools | None  # [n] a hybrid drove by its policy; else by its backup
     knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
+    shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself, see ``travel``
+    sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands, see ``sampled_harm``
 
     @property
     def collided(self) -> Bools:
@@ -111,14 +116,17 @@ def evaluate(
     seed: int | None = None,
     chunk: int = CHUNK,
     on_progress: Progress | None = None,
+    aftermath: bool = True,
 ) -> Evaluation:
     """Let each agent drive every world once, from the alert to the episode's end.
 
     The scenario's learners are driven, each by its own copy of the agent, or by its driver in a ``Team``; or just
     ``vehicle``, a name (``vehicle_2``) or an index (0 = front). All others follow the scenario's scripts (see
     ``agents.driving``). A world's outcome depends neither on ``chunk`` nor on the other worlds, and the given agents
-    are left as they are. ``seed`` is noted, not used. Raises ``InvalidInput`` for worlds that do not fit the scenario
-    or are not at the alert, no agents, no vehicle to drive, a team of other vehicles, or a learner that nobody drives.
+    are left as they are. ``seed`` is noted, not used. Without ``aftermath`` nobody looks how far Vehicle 1 was shoved
+    and what the paper's sum over samples is, which saves time where only the harm counts. Raises ``InvalidInput`` for
+    worlds that do not fit the scenario or are not at the alert, no agents, no vehicle to drive, a team of other
+    vehicles, or a learner that nobody drives.
     """
     _check_request(worlds, agents, scenario, chunk)
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
@@ -129,7 +137,7 @@ def evaluate(
         parts = []
         for first in range(0, sample.worlds.n, chunk):
             rows = np.arange(first, min(first + chunk, sample.worlds.n))
-            parts.append(_roll_out(sample.worlds.take(rows), team_of(agent, driven), scenario))
+            parts.append(_roll_out(sample.worlds.take(rows), team_of(agent, driven), scenario, aftermath))
             if on_progress is not None:
                 on_progress(name, int(rows[-1]) + 1)
         outcomes[name] = _joined(parts)
@@ -190,9 +198,12 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
     return int(vehicle)
 
 
-def _roll_out(worlds: Worlds, team: Team, scenario: Scenario) -> Outcome:
+def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -> Outcome:
     """Outcome of a fresh team; what an agent says about a world counts where it drives alone."""
-    episodes = drive(worlds, team, scenario)
+    driven = tuple(team.drivers)
+    shoved = ShovedFront.of(worlds, scenario, driven) if aftermath else None
+    sampled = SampledHarm.of(worlds, scenario, driven) if aftermath else None
+    episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled) if w is not None])
     alone = next(iter(team.drivers.values())) if len(team.drivers) == 1 else None
     predicted, chosen = (_said(alone, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
     return Outcome(
@@ -202,6 +213,8 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario) -> Outcome:
         None if predicted is None else predicted.astype(np.float64),
         None if chosen is None else chosen.astype(np.bool_),
         knowledge_of(team),
+        None if shoved is None else shoved.metres,
+        None if sampled is None else sampled.finish(),
     )
 
 
@@ -221,13 +234,16 @@ def _said(agent: Agent | None, attribute: str, n: int) -> NDArray[np.generic] | 
 def _joined(parts: list[Outcome]) -> Outcome:
     """One outcome from those of consecutive chunks."""
     ledger = Ledger(*(np.concatenate([getattr(part.ledger, f.name) for part in parts]) for f in fields(Ledger)))
-    predicted = [part.predicted_harm for part in parts if part.predicted_harm is not None]
-    chosen = [part.chosen_policy for part in parts if part.chosen_policy is not None]
+
+    def column(name: str) -> NDArray[Any] | None:
+        found = [getattr(part, name) for part in parts]
+        return None if found[0] is None else np.concatenate(found)
+
     return Outcome(
         ledger,
         concatenate([part.final for part in parts]),
         np.concatenate([part.at_rest for part in parts]),
-        np.concatenate(predicted) if predicted else None,
-        np.concatenate(chosen) if chosen else None,
+        *map(column, ("predicted_harm", "chosen_policy")),
         parts[0].knows,
+        *map(column, ("shoved_m", "sampled_harm")),
     )

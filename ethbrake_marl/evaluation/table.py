@@ -13,6 +13,7 @@ from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, rate, relative_decrease
 
 BASELINE = "full_brake"
+FAR_M = 5.0  # Vehicle 1 counts as shoved far beyond this
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +35,9 @@ class SummaryRow:
     policy_share: float | None  # share of worlds in which a hybrid drove by its policy
     parameters: dict[str, Any]
     distance: Distance = field(default_factory=Distance)  # to the best known harm
+    shoved_m: Estimate | None = None  # how far Vehicle 1 ends beyond where it would by itself
+    shoved_far: Estimate | None = None  # share of worlds in which that is more than ``FAR_M``
+    sampled_harm: Estimate | None = None  # the paper's sum over samples
     beside_paper: bool = False  # these are results of the test that the paper's rows are about
     knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
     hidden_share: float = 0.0  # worlds in which the channel hides something from a driven vehicle, whoever drives
@@ -56,6 +60,9 @@ class SummaryRow:
             **_named("collision_rate", self.collision_rate),
             **_named("first_impact_harm", self.first_impact_harm),
             **_named("total_harm", self.total_harm),
+            **_named("sampled_harm", self.sampled_harm),
+            **_named("vehicle_1_shoved_m", self.shoved_m),
+            **_named("vehicle_1_shoved_far_rate", self.shoved_far),
             **_named("first_impact_harm_difference", self.first_difference),
             **_named("total_harm_difference", self.total_difference),
             **_named("harm_decrease_first", self.first_decrease),
@@ -115,6 +122,9 @@ def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: di
         predicted_harm=None if outcome.predicted_harm is None else mean(outcome.predicted_harm),
         policy_share=None if outcome.chosen_policy is None else float(outcome.chosen_policy.mean()),
         parameters=conditions,
+        shoved_m=None if outcome.shoved_m is None else mean(outcome.shoved_m),
+        shoved_far=None if outcome.shoved_m is None else rate(int((outcome.shoved_m > FAR_M).sum()), episodes),
+        sampled_harm=None if outcome.sampled_harm is None else mean(outcome.sampled_harm),
     )
 
 

@@ -19,7 +19,9 @@ def measure_on_list(recipe: TrainingRecipe, scenario: Scenario) -> Evaluate:
     worlds = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
 
     def measure(trained: Trained) -> dict[str, float]:
-        row = summarise(evaluate(worlds, {"policy": driver_of(trained, scenario)}, scenario=scenario))[0]
+        row = summarise(evaluate(worlds, {"policy": driver_of(trained, scenario)}, scenario=scenario, aftermath=False))[
+            0
+        ]
         return {name: getattr(row, name).value for name in METRICS}
 
     return measure

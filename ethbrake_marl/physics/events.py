@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.worlds import Floats
 
 TOUCH_SPEED_MPS = 1e-5  # a contact at or below this closing speed is a touch: no impact, no harm
 PLASTIC_SPEED_MPS = 0.05  # a cluster whose largest closing speed is below this does not bounce
@@ -119,3 +122,19 @@ def solo_motion(
             driving = (limit - speed) / command
             return limit, way + 0.5 * (speed + limit) * driving + limit * (duration - driving), math.nan
     return after, way + (speed + 0.5 * command * duration) * duration, steady
+
+
+@compiled
+def stopping_distance(speed: float, latency_left: float, capacity: float) -> float:
+    """Distance to rest under full braking once the latency has elapsed: ``v tau + v^2 / (2 a)``, 0 if not moving on."""
+    speed = max(speed, 0.0)
+    return speed * latency_left + speed * speed / (2.0 * capacity)
+
+
+@compiled
+def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats) -> Floats:
+    """``stopping_distance`` of n vehicles, each [n]."""
+    distance = np.empty(len(speed))
+    for k in range(len(speed)):
+        distance[k] = stopping_distance(speed[k], latency_left[k], capacity[k])
+    return distance

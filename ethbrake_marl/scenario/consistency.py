@@ -15,9 +15,10 @@ from pydantic_core import PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.objectives import Declared, objectives_of
+from ethbrake_marl.scenario.derivation import farthest_hazard_m
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.flow_text import flow_text
-from ethbrake_marl.scenario.quantities import ALTERNATIVES, QUANTITIES, QuantityRule
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, OPTIONAL, QUANTITIES, QuantityRule
 from ethbrake_marl.scenario.scripts import (
     LEARNER,
     STATE_FREE,
@@ -97,13 +98,13 @@ def check_objective(declared: Declared, vehicles: int) -> None:
 
 
 def check_alternatives(scenario: Scenario) -> None:
-    """Gaps are declared in exactly one of two ways, and so are speeds; deviations go with the speed of the line."""
+    """Gaps and speeds are declared in one of two ways, an obstacle in one at most; deviations need a line speed."""
     if "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None:
         right = "needs line_speed_mps, the speed that it is added to"
         refuse(("speed_deviations_mps",), _plain(scenario.speed_deviations_mps), right)
     for usual, other in ALTERNATIVES.items():
         given = [key for key in (usual, other) if getattr(scenario, key) is not None]
-        if not given:
+        if not given and usual not in OPTIONAL:
             raise PydanticCustomError("missing", "missing", {"at": (usual,)})
         if len(given) == 2:
             refuse((other,), _plain(getattr(scenario, other)), f"give either {usual} or {other}, not both")
@@ -121,8 +122,10 @@ def check_whole(scenario: Scenario) -> None:
     _check_speeds(scenario)
     if scenario.time_gaps_s is not None:
         _check_time_gaps(scenario)
+    if scenario.hazard_margin_m is not None:
+        _check_hazard_margin(scenario)
     _check_constant_scripts(scenario)
-    if 0 in scenario.learners and scenario.hazard_gap_m is None:
+    if 0 in scenario.learners and not scenario.has_obstacle:
         right = "has nothing to lose without an obstacle ahead; give hazard_gap_m too, for instance hazard_gap_m: 42"
         refuse(("roles", "vehicle_1"), LEARNER, right)
     if scenario.early_impacts == "reject" and scenario.learners:
@@ -161,6 +164,16 @@ def _check_time_gaps(scenario: Scenario) -> None:
         if not high <= largest:
             right = f"is up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"
             refuse(_path(scenario, "time_gaps_s", pair), scenario.quantities("time_gaps_s")[pair], right)
+
+
+def _check_hazard_margin(scenario: Scenario) -> None:
+    farthest = farthest_hazard_m(scenario)
+    if not farthest <= OPTIONAL["hazard_gap_m"].high:
+        right = (
+            f"puts the obstacle up to {farthest:g} m ahead of vehicle_1; that distance must not be above"
+            f" {OPTIONAL['hazard_gap_m'].high:g} m"
+        )
+        refuse(("hazard_margin_m",), scenario.hazard_margin_m, right)
 
 
 def _check_constant_scripts(scenario: Scenario) -> None:

@@ -16,8 +16,9 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.numerals import parse_numeral
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds, make_worlds
 from ethbrake_marl.plain_files import read_plain
+from ethbrake_marl.scenario.derivation import hazard_gap
 from ethbrake_marl.scenario.distributions import support
-from ethbrake_marl.scenario.quantities import DECLARED, OPTIONAL, QUANTITIES, QuantityRule, suggestion
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OPTIONAL, QUANTITIES, QuantityRule, suggestion
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.v2x import fixed_news
 
@@ -51,8 +52,7 @@ class _Naming:
 
 def _quantities(scenario: Scenario) -> dict[str, QuantityRule]:
     """What a world of this scenario has."""
-    optional = {field: rule for field, rule in OPTIONAL.items() if getattr(scenario, field) is not None}
-    return {**QUANTITIES, **optional}
+    return {**QUANTITIES, **OPTIONAL} if scenario.has_obstacle else QUANTITIES
 
 
 def table_columns(scenario: Scenario) -> dict[str, Entry]:
@@ -157,11 +157,16 @@ def _worlds(given: Mapping[Entry, Floats], scenario: Scenario, naming: _Naming) 
 
 
 def _fixed(scenario: Scenario, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:
-    """What the scenario fixes for this entry, [n] or [1]: a time gap at the speeds in ``full``; None if random."""
+    """What the scenario fixes for this entry, [n] or [1]; None if random.
+
+    A time gap is taken at the speeds in ``full``, the margin to an obstacle from where Vehicle 1 stops there.
+    """
+    if field in OPTIONAL:
+        declared = ALTERNATIVES[field] if getattr(scenario, field) is None else field
+        low, high = support(scenario.quantities(declared)[0])
+        return hazard_gap(scenario, full, lambda key: np.array([low])) if low == high else None
     by_time = field == "gaps_m" and scenario.time_gaps_s is not None
-    declared = "time_gaps_s" if by_time else field
-    drawn = by_time or field in OPTIONAL
-    low, high = support(scenario.quantities(declared)[index]) if drawn else scenario.bounds(field)[index]
+    low, high = support(scenario.quantities("time_gaps_s")[index]) if by_time else scenario.bounds(field)[index]
     if low != high:
         return None
     return low * full["speeds_mps"][:, index + 1] if by_time else np.array([low])

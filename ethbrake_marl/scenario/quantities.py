@@ -1,7 +1,7 @@
 """The quantities that describe a world: meaning, unit, allowed range, and the place of each in the random numbers.
 
-Speeds and gaps may be declared in another way (``OTHERWISE``). One table serves the schema, its messages, the
-tables of initial states and the sampling.
+Speeds, gaps and an obstacle may be declared in another way (``OTHERWISE``). One table serves the schema, its messages,
+the tables of initial states and the sampling.
 """
 
 from __future__ import annotations
@@ -108,8 +108,8 @@ QUANTITIES = {
     )
 }  # fmt: skip
 
-# Other ways to declare speeds and gaps. What replaces a quantity takes over its uniform numbers; the speed of the line
-# has the one number of vehicle_2 that restitution, one per world, leaves free.
+# Other ways to declare speeds, gaps and an obstacle. What replaces a quantity takes over its uniform numbers; the speed
+# of the line has the one number of vehicle_2 that restitution, one per world, leaves free.
 OTHERWISE = {
     rule.name: rule
     for rule in (
@@ -125,6 +125,10 @@ OTHERWISE = {
             "speed_deviations_mps", "mps", "vehicle", 200.0, False, 1, "",
             "what each vehicle adds to line_speed_mps", "[0, -2, 0]", low=-200.0,
         ),
+        QuantityRule(
+            "hazard_margin_m", "m", "world", 1e4, True, 0, "",
+            "distance of that obstacle from where vehicle_1 stops by full braking as soon as it can", "1.7",
+        ),
     )
 }  # fmt: skip
 # What a world need not have. It has a stream of random numbers of its own.
@@ -138,7 +142,8 @@ OPTIONAL = {
     )
 }  # fmt: skip
 DECLARED = {**QUANTITIES, **OTHERWISE, **OPTIONAL}  # every key that declares a quantity
-ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps"}  # a scenario has exactly one of each two
+# A scenario has exactly one of each two, or at most one where what they declare is optional.
+ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "hazard_gap_m": "hazard_margin_m"}
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, concatenate, make_worlds
-from ethbrake_marl.scenario.derivation import drawn_quantities
+from ethbrake_marl.scenario.derivation import drawn_quantities, hazard_gap
 from ethbrake_marl.scenario.distributions import values
 from ethbrake_marl.scenario.quantities import BLOCK
 from ethbrake_marl.scenario.scripts import constant_command
@@ -142,11 +142,13 @@ def _draw(scenario: Scenario, seed: int, channel: Channel, attempt: int, index: 
     if len(u) != len(index):
         u = u[index - first]
     drawn = drawn_quantities(scenario, u)
-    restitution = drawn.pop("restitution")[:, 0]
-    hazard_gap_m = None
-    if scenario.hazard_gap_m is not None:
+
+    def drawn_hazard(key: str) -> Floats:
         u_hazard = uniform_numbers(seed, channel, attempt, first, last - first + 1, HAZARD_WIDTH, of=HAZARD)
-        hazard_gap_m = values(scenario.hazard_gap_m, u_hazard[index - first, 0])
+        return values(scenario.quantities(key)[0], u_hazard[index - first, 0])
+
+    hazard_gap_m = hazard_gap(scenario, drawn, drawn_hazard)
+    restitution = drawn.pop("restitution")[:, 0]
     worlds = make_worlds(
         drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, hazard_gap_m=hazard_gap_m, **drawn
     )

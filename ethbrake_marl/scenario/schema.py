@@ -81,6 +81,7 @@ class Scenario(BaseModel):
         description="learner or a script for each vehicle; vehicles left out of a given mapping brake fully",
     )
     hazard_gap_m: Quantity | None = Field(default=None, description=DECLARED["hazard_gap_m"].meaning)
+    hazard_margin_m: Quantity | None = Field(default=None, description=DECLARED["hazard_margin_m"].meaning)
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="what happens to worlds with an impact before the first learner may act"
     )
@@ -104,7 +105,7 @@ class Scenario(BaseModel):
         _build(scenario, document)
         return scenario
 
-    @field_validator(*ALTERNATIVES, *ALTERNATIVES.values(), *OPTIONAL, mode="before")
+    @field_validator(*ALTERNATIVES, *ALTERNATIVES.values(), mode="before")
     @classmethod
     def _given(cls, value: Any) -> Any:
         """``null`` is no value: a key that is not used is left out."""
@@ -155,6 +156,11 @@ class Scenario(BaseModel):
         """Index (from 0) -> script of every vehicle that does not learn."""
         roles = [self.roles[name] for name in self.vehicle_names]
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
+
+    @property
+    def has_obstacle(self) -> bool:
+        """Whether an obstacle stands ahead of Vehicle 1, however its distance is declared."""
+        return self.hazard_gap_m is not None or self.hazard_margin_m is not None
 
     def quantities(self, field: str) -> tuple[AnyQuantity, ...]:
         """What is declared under a key, one entry per vehicle (gaps: per pair; restitution, line speed: one).
@@ -225,7 +231,10 @@ class Scenario(BaseModel):
 
 def scenario_json_schema() -> dict[str, Any]:
     """JSON Schema of a scenario file, for editors that complete and check YAML."""
-    one_of_two = [{"oneOf": [{"required": [key]} for key in pair]} for pair in ALTERNATIVES.items()]
+    one_of_two = [
+        {"not": {"required": [*pair]}} if pair[0] in OPTIONAL else {"oneOf": [{"required": [key]} for key in pair]}
+        for pair in ALTERNATIVES.items()
+    ]
     needed = {"speed_deviations_mps": ["line_speed_mps"]}
     schema = Scenario.model_json_schema(schema_generator=_FileSchema)
     return {

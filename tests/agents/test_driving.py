@@ -7,8 +7,10 @@ import pytest
 
 from ethbrake_marl.agents.driving import drive, scripted
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.build import make_engine
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.observations import observation_for, observe
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent
 
@@ -105,3 +107,23 @@ def test_scripts__fixed_at_the_alert_are_asked_once_to_the_same_motion(script):
     one, other = drive(worlds, fixed, PAPER, 1), drive(worlds, remembering, PAPER, 1)
     assert one.final.gaps_m.tolist() == other.final.gaps_m.tolist()
     assert one.ledger.total_harm.tolist() == other.ledger.total_harm.tolist()
+
+
+class Looking(Steering):
+    """Brakes half, and keeps what a learner with the usual observation would have seen."""
+
+    def __init__(self):
+        self.seen = []
+
+    def act(self, worlds, vehicle):
+        self.seen.append(observe(worlds, vehicle, observation_for(PAPER)))
+        return np.full(worlds.n, -3.5)
+
+
+def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
+    worlds, agent = PAPER.sample(20, 7).worlds, Looking()
+    drive(worlds, agent, PAPER, 1)
+    engine = Engine(PAPER, 20, learners=(1,), scripts=scripted(PAPER, but=1), worlds=worlds)
+    for seen in agent.seen[:3]:
+        assert engine.observe(1).tobytes() == seen.tobytes()
+        engine.step(np.full((20, 1), -0.5))

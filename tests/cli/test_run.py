@@ -72,6 +72,28 @@ def test_run__results_agree_in_json_csv_and_per_world(finished_run):
     assert flat[0]["scenario"] == "paper-random"
 
 
+def test_run__the_other_two_tests_stand_beside_the_main_one(finished_run):
+    rows = json.loads((finished_run / "other_tests.json").read_text())
+    flat = list(csv.DictReader((finished_run / "other_tests.csv").read_text().splitlines()))
+    tests = ["paper-random-brake-only", "paper-random-obstacle"]
+    assert [row["parameters"]["scenario"] for row in rows] == [line["scenario"] for line in flat]
+    assert [(row["parameters"]["scenario"], row["agent"]) for row in rows] == [
+        (test, agent) for test in tests for agent in ("full_brake", "e_v2x_bm", "ppo", "hybrid")
+    ]
+    page = (finished_run / "report.html").read_text()
+    assert "<h1>ethbrake run: paper-random (the main test of three)</h1>" in page
+    assert all(f"<h2>{test}</h2>" in page for test in tests)
+    for heading in ("Vehicle 1 shoved (m)", "Sampled harm"):
+        assert page.count(f">{heading}</th>") == 3
+    for test in tests:
+        scenario = load_scenario(test)
+        (row,) = summarise(
+            evaluate(scenario.sample(60, 7), make_lineup(["full_brake"], scenario), scenario=scenario, seed=7)
+        )
+        mine = next(r for r in rows if (r["parameters"]["scenario"], r["agent"]) == (test, "full_brake"))
+        assert mine["total_harm"] == row.total_harm.value
+
+
 def test_run__the_hybrid_is_in_no_world_worse_than_its_baseline(finished_run):
     harm = {
         (row["agent"], row["world"]): float(row["first_impact_harm"])
@@ -121,6 +143,7 @@ def test_run__vehicle_chooses_among_several_learners(ethbrake, tiny_recipe, scen
     answer = ethbrake("run", "--recipe", tiny_recipe, *chosen, "--json")
     assert answer.status == 0
     assert {row["parameters"]["controlled_vehicle"] for row in json.loads(answer.out)} == {"vehicle_3"}
+    assert not (tmp_path / "new" / "other_tests.json").exists()  # not one of the three tests
 
 
 def test_run__the_learning_curve_has_the_lines_of_its_references(monkeypatch, finished_run, tmp_path):

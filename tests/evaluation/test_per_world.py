@@ -41,6 +41,8 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
         "impacts": outcome.impacts,
         "first_impact_harm": outcome.first_impact_harm,
         "total_harm": outcome.total_harm,
+        "sampled_harm": outcome.sampled_harm,
+        "vehicle_1_shoved_m": outcome.shoved_m,
         "predicted_harm": outcome.predicted_harm,
         "chosen_policy": outcome.chosen_policy,
         "end_s": outcome.final.time_s,

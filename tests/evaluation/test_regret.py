@@ -169,6 +169,26 @@ def test_limits__do_not_apply_to_other_scripts_and_vehicles(
     assert (known_limits(worlds, scenario, vehicle) is None) == (reason is not None)
 
 
+def test_limits__an_obstacle_out_of_vehicle_1_s_own_reach_leaves_avoidability_and_no_least_harm(tmp_path: Path) -> None:
+    scenario, plain = load_scenario("paper-random-obstacle"), load_scenario("paper-random")
+    agents = {"full_brake": make_agent("full_brake")}
+    result, usual = (evaluate(s.sample(50, 7), agents, scenario=s, seed=7) for s in (scenario, plain))
+    (row,), (other,) = ([one.to_json() for one in summarise(each)] for each in (result, usual))
+    assert row["unavoidable_rate"] == other["unavoidable_rate"] > 0.0
+    assert row["impact_proven_rate"] is row["proven_harm"] is row["best_known_minus_proven_first"] is None
+    assert row["mean_regret"] is not None and row["parameters"]["no_limits_because"] is None
+    text = markdown_table(summarise(result))
+    assert "with an obstacle ahead no least harm is proven" in text
+    write_per_world_csv(tmp_path / "out.csv", result)
+    with (tmp_path / "out.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    assert {line["proven_harm"] + line["impact_proven"] for line in lines} == {""}
+    assert {line["avoidable"] for line in lines} == {"0", "1"}
+    near = scenario.replace(hazard_gap_m=30.0)
+    found = limits_do_not_apply(near.sample(50, 7).worlds, near, 1)
+    assert found == "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"
+
+
 def test_limits__do_not_apply_where_vehicle_1_may_brake_after_vehicle_2(paper_random: Scenario) -> None:
     late = paper_random.replace(latency_s=[0.6, 0.5, 0.8])
     result = evaluate(late.sample(2, 7), {"coast": make_agent("coast")}, scenario=late)

@@ -17,6 +17,8 @@ ALWAYS = {
     "agent", "knows", "sees_through_channel", "hidden_share", "episodes", "collisions",
     "horizon_ends", "collision_rate", "collision_rate_interval",
     "first_impact_harm", "first_impact_harm_interval", "total_harm", "total_harm_interval",
+    "sampled_harm", "sampled_harm_interval", "vehicle_1_shoved_m", "vehicle_1_shoved_m_interval",
+    "vehicle_1_shoved_far_rate", "vehicle_1_shoved_far_rate_interval",
     "first_impact_harm_difference", "first_impact_harm_difference_interval", "total_harm_difference",
     "total_harm_difference_interval", "harm_decrease_first", "harm_decrease_first_interval", "harm_decrease_total",
     "harm_decrease_total_interval", "unavoidable_rate", "unavoidable_rate_interval", "impact_proven_rate",
@@ -105,16 +107,15 @@ def test_rich_table__fits_80_columns_and_shows_both_counts(evaluation: Evaluatio
     collided = evaluation.outcome("full_brake").collided.mean()
     assert f"full_brake {100 * collided:.1f} % " in " ".join(text.split())
     compared = summarise(evaluation)[2]
-    decrease, lost = compared.first_decrease, compared.distance.regret_first
-    assert f"{100 * decrease.value:.1f} %" in text
-    assert f"{lost.value:.2f}" in text
+    for value in (compared.sampled_harm, compared.shoved_m, compared.distance.regret_first):
+        assert f"{value.value:.2f}" in text
 
 
-def test_rich_table__in_100_columns_has_every_column(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rich_table__in_120_columns_has_every_column(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(regret, "best_known", lambda worlds, scenario, count, vehicles: np.zeros(worlds.n))
-    text = printed(evaluation, width=100)
+    text = printed(evaluation, width=120)
     row = summarise(evaluation)[2]
-    for share in (row.total_decrease, row.distance.realised_first):
+    for share in (row.first_decrease, row.total_decrease, row.shoved_far, row.distance.realised_first):
         assert f"{100 * share.value:.1f} %" in text
     for value in (row.predicted_harm, row.distance.regret_first):
         assert f" {value.value:.2f}" in text
@@ -129,9 +130,9 @@ def test_rich_table__without_a_limit_keeps_the_decrease_of_total_harm(pair: Scen
 
 
 def test_rich_table__has_the_papers_rows_beside_ours_and_its_conditions(evaluation: Evaluation) -> None:
-    text = " ".join(printed(evaluation, width=100).split())
+    text = " ".join(printed(evaluation, width=120).split())
     assert "Non-E 93.91 % 33.5878" in text
-    assert "Hybrid PPO 59.74 % 5.6202 – 83.26 %" in text
+    assert "Hybrid PPO 59.74 % 5.6202 – – – – 83.26 %" in text
     assert "Standalone DRL 74.74 % 12.229" in text
     assert "m = (4.5, 5.5, 5.9) t; not stated: e" in text
     assert "62.6 %" in text
@@ -155,7 +156,7 @@ def test_markdown_table__a_bar_in_a_name_makes_no_column(pair: Scenario) -> None
 
 def test_markdown_table__every_row_has_every_column(evaluation: Evaluation) -> None:
     rows = [line for line in markdown_table(summarise(evaluation)).splitlines() if line.startswith("|")]
-    assert {line.count("|") for line in rows} == {11}
+    assert {line.count("|") for line in rows} == {14}
     assert len(rows) == 2 + 3 + len(PAPER_ROWS)
     estimate = summarise(evaluation)[0].first_impact_harm
     assert f"{estimate.value:.2f} [{estimate.interval[0]:.2f}, {estimate.interval[1]:.2f}]" in rows[2]
