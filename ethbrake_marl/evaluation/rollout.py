@@ -243,7 +243,9 @@ def _joined(parts: list[Outcome]) -> Outcome:
         ledger,
         concatenate([part.final for part in parts]),
         np.concatenate([part.at_rest for part in parts]),
-        *map(column, ("predicted_harm", "chosen_policy")),
+        column("predicted_harm"),
+        column("chosen_policy"),
         parts[0].knows,
-        *map(column, ("shoved_m", "sampled_harm")),
+        column("shoved_m"),
+        column("sampled_harm"),
     )
