@@ -265,12 +265,15 @@ class Engine:
         """
         columns = self._columns(actions)
         if not self._memories:
-            return self._advance(columns)
-        new = self._apart()
-        step = new._advance(columns)
-        new._memories = {w: w.stepped(memory, self, new) for w, memory in self._memories.items()}
-        new.steps_made += 1
-        self.__dict__.update(new.__dict__)
+            step = self._advance(columns)
+        else:
+            new = self._apart()
+            step = new._advance(columns)
+            new._memories = {w: w.stepped(memory, self, new) for w, memory in self._memories.items()}
+            new.steps_made += 1
+            self.__dict__.update(new.__dict__)
+        for vehicle, script in self._told.items():
+            script.after_step(self.worlds, self.ledger, vehicle)
         return step
 
     def _advance(self, columns: Floats) -> Step:
@@ -292,8 +295,6 @@ class Engine:
             step.further["harm"] = before - self._objective_harm()
         if self._more_terms:
             self._add_further_terms(step)
-        for vehicle, script in self._told.items():
-            script.after_step(self.worlds, self.ledger, vehicle)
         return step
 
     def _columns(self, actions: Actions) -> Floats:

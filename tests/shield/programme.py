@@ -1,9 +1,10 @@
 """Trying to break the step shield: ``make test-shield`` (``python -m tests.shield.programme``).
 
-Four gates, one line each, exit status 1 if one fails:
+Five gates, one line each, exit status 1 if one fails:
 
 bound   random worlds against every adversary of ``tests.shield.lines``, both counts, N = 3 and 5, e from 0 to 0.3
 faces   worlds through every wrapped face (``tests.shield.face_attack``)
+interference  refused calls, exceptions and interrupts at random lines on every face, and wrappers in between
 search  restarts of a search against the shield, and against twelve leaks of it (``tests.shield.search``)
 speed   decisions per second in a batch, and the latency of one decision
 
@@ -35,6 +36,7 @@ from ethbrake_marl.shield.certify import certify
 from ethbrake_marl.shield.guard import StepShield
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.shield.face_attack import FACES
+from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
 from tests.shield.lines import ADVERSARIES, attack, line
 from tests.shield.sabotage import LEAKS
 from tests.shield.search import search
@@ -155,6 +157,29 @@ def search_gate(restarts: int, seed: int) -> bool:
     return good
 
 
+def interference_gate(episodes: int, seed: int) -> bool:
+    """Whatever fails, whatever stands in between: no episode above its bound, and the shield where the engine is."""
+    good = True
+    for name in PLAYS:
+        found = disturbed(name, episodes, seed)
+        good = good and (found.above, found.broken) == (0, 0) and found.refused > 0 and found.interrupted > 0
+        print(
+            f"  {name:20s} {found.episodes:7,} episodes {found.refused:8,} refused {found.interrupted:7,} interrupted"
+            f"  above the bound: {found.above}, changed by what failed: {found.broken}",
+            flush=True,
+        )
+    for wrapper in WRAPPERS:
+        tallies = [wrapped(name, wrapper, episodes, seed) for name in PLAYS if name != "evaluation"]
+        total = [sum(column) for column in zip(*tallies, strict=True)]
+        good = good and total[1] == total[4] == 0 and all(tally.refused > 0 for tally in tallies)
+        print(
+            f"  inside: {wrapper:15s} {total[0]:4,} episodes {total[2]:8,} steps refused"
+            f"  above the bound: {total[1]}, changed by what failed: {total[4]}",
+            flush=True,
+        )
+    return good
+
+
 def speed(decisions: int) -> bool:
     """Batched decisions per second and the latency of one, N = 3."""
     scenario = load_scenario("paper-random")
@@ -228,10 +253,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--worlds", type=int, default=1_000_000, help="of the gate 'bound', all cells together")
     parser.add_argument("--face-worlds", type=int, default=10_000, help="through each face")
+    parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each face")
     parser.add_argument("--restarts", type=int, default=1_000, help="of the search")
     parser.add_argument("--decisions", type=int, default=5_000, help="timed one by one")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", default="speed,search,faces,bound", help="gates, with commas between them")
+    parser.add_argument(
+        "--only", default="speed,interference,search,faces,bound", help="gates, with commas between them"
+    )
     parser.add_argument("--results", type=Path, default=ROOT / "runs" / "test-shield", help="folder of finished chunks")
     parser.add_argument("--part", default="1/1", help="this process's share of the chunks, for instance 1/2")
     given = parser.parse_args()
@@ -239,6 +267,7 @@ def main() -> int:
     gates = {
         "speed": lambda: speed(given.decisions),
         "search": lambda: search_gate(given.restarts, given.seed),
+        "interference": lambda: interference_gate(given.interfered, given.seed),
         "faces": lambda: run_chunks(list(face_chunks(given.face_worlds)), face_chunk, given, code),
         "bound": lambda: run_chunks(list(bound_chunks(given.worlds)), attack_chunk, given, code),
     }
