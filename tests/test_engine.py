@@ -7,9 +7,11 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
+from ethbrake_marl.envs.build import make_engine
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import advance
+from ethbrake_marl.physics import advance, concatenate
 from ethbrake_marl.scenario import initial_state_worlds, load_scenario
+from ethbrake_marl.starts import Stream
 
 PAPER = load_scenario("paper-random").replace(early_impacts="keep")
 
@@ -112,3 +114,36 @@ def test_reset__takes_worlds_at_the_alert_only():
     worlds.pair_hit[0, 1] = True
     with pytest.raises(InvalidInput, match="world 0 is after an impact"):
         engine().reset(worlds=worlds)
+
+
+def test_stream__gives_every_world_of_its_list_once_and_in_order_across_its_blocks():
+    scripts = {0: make_agent("full_brake"), 2: make_agent("constant:5")}
+    stream = Stream(PAPER, [1], scripts, seed=4)
+    taken = concatenate([stream.take(count).alert for count in (1000, 100, 3000, 50)])
+    expected = PAPER.sample(4150, 4, channel="training").worlds
+    assert (taken.gaps_m == expected.gaps_m).all() and (taken.speeds_mps == expected.speeds_mps).all()
+
+
+@pytest.mark.parametrize(
+    ("horizon_s", "latency_s", "steps"), [(8.0, 0.5, 75), (3.0, 0.65, 24), (3.0, 2.3, 7), (8.0, 5.1, 29)]
+)
+def test_horizon__is_reached_after_as_many_steps_as_fit(horizon_s, latency_s, steps):
+    scenario = PAPER.replace(horizon_s=horizon_s, latency_s=[0, latency_s, latency_s], gaps_m=100, speeds_mps=30)
+    scripts = {0: make_agent("coast"), 2: make_agent("coast")}
+    running = Engine(scenario, 1, learners=(1,), scripts=scripts)
+    ended = [bool(running.step(np.zeros((1, 1))).truncated[0]) for _ in range(steps)]
+    assert ended == [False] * (steps - 1) + [True]
+    assert running.worlds.time_s.tolist() == [horizon_s]
+
+
+def test_ended__rows_are_paid_nothing_until_they_are_renewed():
+    reward = {"harm": 1.0, "risk": 1.0, "jerk": 1.0, "terminal": 5.0, "shaping": 1.0}
+    running = make_engine("paper-random", 20, seed=1, reward=reward)
+    rng = np.random.default_rng(0)
+    paid_after = np.zeros(20)
+    for _ in range(80):
+        over = running.ended
+        paid = running.step(rng.uniform(-1.0, 1.0, (20, 1))).reward
+        assert (paid[over] == 0.0).all() and (paid[~over] != 0.0).any(axis=1).all()
+        paid_after[over] += 1
+    assert (paid_after > 0).all()

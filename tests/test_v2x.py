@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from ethbrake_marl.v2x import (
     PER_LINK,
     PRESETS,
     V2X,
+    Channel,
     burst_periods,
     known_from,
     link_delays,
@@ -41,7 +43,7 @@ def channel_of(name: str, **changes: object) -> Scenario:
 
 def vehicles(latency_s, n=1):
     given = {"braking_capacity_mps2": 6, "driving_capacity_mps2": 6, "mass_t": 5, "restitution": 0.1}
-    return make_worlds(5.0, np.full((n, len(latency_s)), 20.0), latency_s=latency_s, **given).vehicles
+    return make_worlds(5.0, np.full((n, np.shape(latency_s)[-1]), 20.0), latency_s=latency_s, **given).vehicles
 
 
 @pytest.mark.parametrize("name", RADIO)
@@ -114,6 +116,85 @@ def test_with_news__front_news_only_at_the_papers_times():
     told = with_news(V2X.model_validate({"hears": "front"}), vehicles([0.0, 0.5, 0.8]), np.zeros((1, 36)))
     assert told.latency_s.tolist() == [[0.0, 0.5, 0.8]]
     assert known_from(told)[0].tolist() == [[0.0, np.inf, np.inf], [0.5, 0.0, np.inf], [0.8, 0.8, 0.0]]
+
+
+def slow_news(channel: Channel, own_s: list[float], links: np.ndarray) -> tuple[list[float], np.ndarray]:
+    """Latencies and news of one world, link by link; ``links`` [N, N, 4]: receiver, sender, uniform numbers."""
+    N, latency = len(own_s), list(own_s)
+    heard, seen = np.full((N, N), math.inf), np.full((N, N), math.inf)
+    low, high = channel.sensing_s
+    for i in range(N):
+        for j in {"all": range(N), "front": range(i), "none": ()}[channel.hears]:
+            wait, burst, loss, _ = links[i, j]
+            share, periods = channel.loss_begins / (channel.loss_begins + channel.loss_ends), 0
+            while burst < share * (1.0 - channel.loss_ends) ** periods:
+                periods += 1
+            generated = (wait + periods) * channel.message_period_s
+            generated += channel.radio_s + channel.processing_s + channel.actuation_s
+            arrives = {"latency": -math.inf, "fixed": channel.link_latency_s, "messages": generated}[channel.timing]
+            heard[i, j] = math.inf if loss < channel.lost else arrives
+        for j in {"both": (i - 1, i + 1), "front": (i - 1,), "none": ()}[channel.senses]:
+            if 0 <= j < N:
+                seen[i, j] = low + (high - low) * links[i, j, 3]
+    for i in range(1, N) if channel.timing != "latency" else ():
+        latency[i] = max(latency[i], min(heard[i, 0], latency[i - 1] + seen[i, i - 1]))
+    known = np.maximum(np.array(latency)[:, np.newaxis], np.minimum(heard, seen))
+    known[np.arange(N), np.arange(N)] = 0.0
+    return latency, known
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        *PRESETS, {"hears": "front"}, {"lost": 0.3, "senses": "front"}, {"preset": "congested", "hears": "front"},
+        {"preset": "blocked", "senses": "front"}, {"preset": "nominal", "link_latency_s": 0.4, "lost": 0.3},
+        {"preset": "clear", "radio_s": 0.5, "processing_s": 0.25, "actuation_s": 0.125, "message_period_s": 0.3},
+        {"preset": "sensors-only", "sensing_s": [0.3, 0.9]}, {"link_latency_s": 0.4, "senses": "none"},
+    ],
+)  # fmt: skip
+def test_with_news__is_what_a_loop_over_the_links_gives(given):
+    v2x, rng = V2X.model_validate(given), np.random.default_rng(6)
+    u, own = rng.random((40, 16 * PER_LINK)), rng.choice([0.0, 0.2, 0.7, 1.5], (40, 4))
+    told = with_news(v2x, vehicles(own, 40), u)
+    for k in range(40):
+        latency, known = slow_news(v2x.channel, own[k].tolist(), u[k].reshape(4, 4, PER_LINK))
+        assert told.latency_s[k] == pytest.approx(latency, rel=1e-12)
+        assert known_from(told)[k] == pytest.approx(known, rel=1e-12)
+
+
+def test_channels__are_those_of_the_page():
+    usual = ("all", "both", 0.0)
+    rest = (0.1, 0.02, 0.1, 0.2, (0.8, 1.1))
+    assert {name: tuple(channel) for name, channel in CHANNELS.items()} == {
+        "paper": ("latency", "all", "none", 0.0, 0.0, 1.0, 0.0, *rest),
+        "clear": ("messages", *usual, 0.01, 0.5, 0.0, *rest),
+        "nominal": ("messages", *usual, 0.05, 0.5, 0.0, *rest),
+        "congested": ("messages", *usual, 0.1, 0.3, 0.05, *rest),
+        "blocked": ("messages", *usual, 0.2, 0.2, 0.2, *rest),
+        "sensors-only": ("messages", "none", "both", 0.0, 0.0, 1.0, 0.0, *rest),
+    }
+
+
+@pytest.mark.parametrize(
+    ("given", "by_link", "drawn"),
+    [
+        ("paper", False, False),
+        ("nominal", True, True),
+        ("sensors-only", True, True),
+        ({"preset": "sensors-only", "sensing_s": [0.9, 0.9]}, True, False),
+        ({"hears": "front"}, True, False),
+        ({"lost": 0.5}, True, True),
+        ({"lost": 1.0}, True, False),
+        ({"preset": "nominal", "link_latency_s": 0.4}, True, True),  # the hops
+        ({"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1]}, True, False),
+        ({"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1], "lost": 0.5}, True, True),
+        ({"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1], "lost": 1.0}, True, False),
+        ({"link_latency_s": 0.4, "senses": "none"}, True, False),
+    ],
+)
+def test_v2x__says_whether_it_differs_from_the_paper_and_whether_chance_decides(given, by_link, drawn):
+    v2x = V2X.model_validate(given)
+    assert (v2x.by_link, v2x.drawn) == (by_link, drawn)
 
 
 def test_paper__is_the_rule_of_the_own_latency():

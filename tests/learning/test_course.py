@@ -17,6 +17,7 @@ def _evaluations(returns: list[float], harms: list[float]) -> list[dict[str, flo
     ("returns", "harms", "alarm"),
     [
         ([-10.0, -9.0, -8.0, -7.0, -6.0], [7.0, 7.0, 7.5, 8.0, 7.0], True),
+        ([-10.0, -9.0, -8.0, -7.0, -6.0], [7.0, 7.1, 7.5, 8.0, 9.0], True),  # it was never as little again
         ([-10.0, -9.0, -8.0, -7.0, -6.0], [7.0, 7.0, 6.9, 8.0, 9.0], False),  # once it was less
         ([-10.0, -9.0, -8.0, -7.0, -9.6], [7.0, 7.5, 7.5, 8.0, 9.0], False),  # a rise of 4 %
         ([-6.0, -7.0, -8.0, -9.0, -10.0], [7.0, 7.5, 7.5, 8.0, 9.0], False),  # both are bad: no contradiction
