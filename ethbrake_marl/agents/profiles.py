@@ -74,6 +74,17 @@ def constant_profiles(problem: ProfileProblem, commands_mps2: Floats) -> Profile
     )
 
 
+def even_grid(problem: ProfileProblem, number: int) -> Floats:
+    """``number`` commands from each vehicle's least to its greatest, evenly spaced, both included; [n, number, C] m/s2.
+
+    ``low + (high - low)`` may lie an ulp beyond ``high``, so the greatest is taken as it is.
+    """
+    low, high = problem.bounds[:, np.newaxis, :, 0], problem.bounds[:, np.newaxis, :, 1]
+    share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
+    grid: Floats = np.minimum(low + share * (high - low), high)
+    return grid
+
+
 def pad_profiles(parts: Sequence[Profiles], least: int) -> list[Profiles]:
     """The same profiles, all with as many phases (at least ``least``): empty ones are added. In their own memory."""
     width = max([least, *(part.ends.shape[1] for part in parts)])

@@ -23,6 +23,7 @@ from ethbrake_marl.agents.profiles import (
     Found,
     Profiles,
     constant_profiles,
+    even_grid,
     follow_profiles,
     pad_profiles,
     search_profiles,
@@ -221,9 +222,7 @@ class _Search:
     ) -> Found:
         """The best profiles that start from constants, from ``given``, and from each vehicle's own best profile."""
         problem = self.problem(vehicles, count, deciders)
-        low, high = problem.bounds[:, np.newaxis, :, 0], problem.bounds[:, np.newaxis, :, 1]
-        share = np.linspace(0.0, 1.0, CONSTANTS)[:, np.newaxis]
-        starts = [constant_profiles(problem, low + share * (high - low)), *given]
+        starts = [constant_profiles(problem, even_grid(problem, CONSTANTS)), *given]
         if len(vehicles) == 1:
             coupled = optimise_coupled(
                 self.worlds, vehicles[0], count=count, horizon_s=self.scenario.horizon_s, others_mps2=self.others
@@ -232,7 +231,8 @@ class _Search:
         else:
             for c, vehicle in enumerate(vehicles):
                 alone = self.best([vehicle], count, (), vehicles if deciders is None else deciders).profiles
-                commands = np.broadcast_to(low, (*alone.ends.shape, len(vehicles))).copy()
+                least = problem.bounds[:, np.newaxis, :, 0]
+                commands = np.broadcast_to(least, (*alone.ends.shape, len(vehicles))).copy()
                 commands[..., c] = alone.commands_mps2[..., 0]
                 starts.append(Profiles(alone.ends, commands))
         return search_profiles(
