@@ -54,7 +54,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
 
 
 class FailedWorld(UserWarning):
-    """A running episode was cut off because its world could not be advanced (``PhysicsError`` in a batch that goes on)."""
+    """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
 
 
 @contextmanager

@@ -77,7 +77,7 @@ class Roster:
             del self.failed[row]
 
     def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
-        """Enter the worlds that a step from ``from_s`` to ``until_s`` [n] could not advance: those with a ``status``."""
+        """Enter the worlds with a ``status``: a step from ``from_s`` to ``until_s`` [n] could not advance them."""
         new = failure(np.where(status == 0, DONE, status), from_s, until_s).worlds
         self.failed |= new
         for row, reason in new.items() if self.warns else ():

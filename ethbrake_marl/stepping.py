@@ -85,7 +85,8 @@ class Step(NamedTuple):
     @property
     def failed(self) -> Ints:
         """What went wrong in the worlds that could not be advanced (a status of the kernel), 0 elsewhere, [n]."""
-        return self.outcome[FAILED].astype(np.int64)
+        status: Ints = self.outcome[FAILED].astype(np.int64)
+        return status
 
     @property
     def safe_end(self) -> Bools:

@@ -127,5 +127,5 @@ def _harms(own: Answer, other: Answer, rows: Ints) -> Iterator[dict[HarmCount, F
         kept = best._replace(harm=best.harm[rows], profiles=best.profiles.take(rows))
         yield dict(zip(COUNTS, realised_harm(scenario, worlds, kept, scenario.learners), strict=True))
     for team in other.teams:
-        ledger = evaluate(worlds, {team.name: team}, scenario=scenario).outcome(team.name).ledger
+        ledger = evaluate(worlds, {team.name: team}, scenario=scenario).complete().outcome(team.name).ledger
         yield {count: ledger.world_harm(count) for count in COUNTS}

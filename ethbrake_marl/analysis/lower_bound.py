@@ -73,9 +73,10 @@ def lower_bound(
 ) -> LowerBound:
     """Proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicle``.
 
-    ``harm = early + max(front_pair + rear_pair, combined)``, each part rounded outward (``rounding``). The combined bound is proven for a controlled vehicle that
-    brakes at least as hard as both neighbours; elsewhere it is 0. What may come only after the horizon counts as 0, and
-    so does the next impact of a pair that was hit before where ``count`` is "first".
+    ``harm = early + max(front_pair + rear_pair, combined)``, each part rounded outward (``rounding``). The combined
+    bound is proven for a controlled vehicle that brakes at least as hard as both neighbours; elsewhere it is 0. What
+    may come only after the horizon counts as 0, and so does the next impact of a pair that was hit before where
+    ``count`` is "first".
 
     Covers the same lines as ``avoidability``, without an obstacle ahead, and raises ``InvalidInput`` for others, for an
     unknown ``count``, and for a horizon that is not finite or lies before the vehicle may act.
@@ -108,11 +109,11 @@ def rounding(worlds: Worlds, vehicle: int) -> Floats:
 
     A squared closing speed is ``D = w^2 + 2 b g``. With ``V`` the largest speed in the line, ``G`` its gaps, ``A`` the
     largest closing acceleration and ``a`` the weakest brakes, every ``w^2`` is at most ``V^2`` and no gap grows beyond
-    ``G + V^2 / 2a``, so all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``. A segment of motion rounds each speed
-    twice and each gap five times, a round of impacts each speed by ``CLUSTER_EPS``: D moves by at most 8 eps S in either
-    (roundings of speeds over time add up, they are not multiplied: the proofs compare a run with itself, not with
-    another one). ``BOUND_EPS`` grants 500 of them, 80 being the steps of an episode of 8 s; the bound's own
-    arithmetic, a few hundred roundings, is among them.
+    ``G + V^2 / 2a``, so all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``. A segment of motion rounds each
+    speed twice and each gap five times, a round of impacts each speed by ``CLUSTER_EPS``: either moves D by at most
+    8 eps S. These add up and are not multiplied, for the proofs compare a run with itself, not with another one.
+    ``BOUND_EPS`` grants 500 of them; the steps of an episode of 8 s are 80, and the bound's own arithmetic, a few
+    hundred roundings, is among them too.
     """
     v = worlds.vehicles
     drives = v.driving_capacity_mps2[:, vehicle] > 0.0

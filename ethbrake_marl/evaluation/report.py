@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from ethbrake_marl.evaluation.output_files import write_output
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
 from ethbrake_marl.evaluation.parameters import parameter_line
-from ethbrake_marl.evaluation.rendering import COLUMNS, MEANINGS, limit_lines, our_lines, paper_blocks
+from ethbrake_marl.evaluation.rendering import COLUMNS, MEANINGS, left_out_lines, limit_lines, our_lines, paper_blocks
 from ethbrake_marl.evaluation.table import SummaryRow
 
 _TEMPLATE = "report.html.j2"
@@ -60,6 +60,7 @@ def render_report(report: Report) -> str:
         meanings=MEANINGS,
         ours=our_lines(report.rows),
         conditions=parameter_line(report.rows[0].parameters) if report.rows else "",
+        left_out=left_out_lines(report.rows),
         limits=limit_lines(report.rows),
         paper=blocks,
         paper_conditions={name: PAPER_PARAMETERS[name] for name, _ in blocks},

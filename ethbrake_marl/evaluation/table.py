@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from ethbrake_marl.evaluation.paper import is_papers_test
 from ethbrake_marl.evaluation.parameters import parameters
 from ethbrake_marl.evaluation.regret import Distance, assess, distance
-from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
+from ethbrake_marl.evaluation.rollout import Evaluation, LeftOut, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, rate, relative_decrease
 
 BASELINE = "full_brake"
@@ -33,6 +33,7 @@ class SummaryRow:
     policy_share: float | None  # share of worlds in which a hybrid drove by its policy
     parameters: dict[str, Any]
     distance: Distance = field(default_factory=Distance)  # to the best known harm
+    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that no row counts: they could not be advanced
     beside_paper: bool = False  # these are results of the test that the paper's rows are about
 
     def to_json(self) -> dict[str, Any]:
@@ -52,6 +53,7 @@ class SummaryRow:
             **(_named("predicted_harm", self.predicted_harm) if self.predicted_harm else {}),
             **({"policy_share": self.policy_share} if self.policy_share is not None else {}),
             **self._distance_to_json(),
+            "left_out": [left._asdict() for left in self.left_out],
             "parameters": self.parameters,
         }
 
@@ -63,6 +65,7 @@ class SummaryRow:
             **found,
             "known_best_share": self.distance.known_best_share,
             "below_best_known": self.distance.below_best_known,
+            "impact_unproven": None if self.distance.between is None else asdict(self.distance.between),
         }
 
 
@@ -73,7 +76,12 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> list[Summa
     beside, regrets, braking = is_papers_test(evaluation), assess(evaluation), evaluation.outcomes.get(BASELINE)
     rows = [_row(agent, outcome, reference, conditions) for agent, outcome in evaluation.outcomes.items()]
     return [
-        replace(row, beside_paper=beside, distance=distance(regrets, evaluation.outcome(row.agent), braking))
+        replace(
+            row,
+            beside_paper=beside,
+            left_out=evaluation.left_out,
+            distance=distance(regrets, evaluation.outcome(row.agent), braking),
+        )
         for row in rows
     ]
 
