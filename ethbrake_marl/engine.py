@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import checked_action
-from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.objectives import objective_harm
 from ethbrake_marl.observations import Observations, ObservationSpec, observation_for, observe_packed, scaling
@@ -45,7 +45,7 @@ from ethbrake_marl.rewards import (
     weighted_sum,
 )
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.starts import Script, Start, Stream, Told, check_alert, is_state_free, moved, within_capacity
+from ethbrake_marl.starts import Roster, Script, Start, Stream, Told, check_alert, is_state_free, moved, within_capacity
 from ethbrake_marl.stepping import BAD_ACTION, ENDED, OUTCOME_ROWS, START, STEP, Step, step_worlds
 from ethbrake_marl.v2x import known_from, told_by_link
 
@@ -75,9 +75,11 @@ class Engine:
     the scenario's training stream of ``seed`` unless they are given (``worlds``, at t = 0, here or in ``reset``).
     Steps start when the first of the ``deciders`` may act: the learners, or the scripted vehicles named instead (an
     evaluated agent drives its vehicle as a script, on a learner's grid of decisions). With none, they start at t = 0.
-    Whoever must see each episode's start and each step (a shield) follows it as a ``Watcher``.
+    Whoever must see each episode's start and each step (a shield) follows it as a ``Watcher``. A world that the physics
+    cannot advance takes no other with it: its episode is cut off (truncated), and the ``roster`` names it.
     """
 
+    roster: Roster  # who runs in which row, and which worlds failed
     _state: Floats  # of the running episodes, as rows of ``physics.packed``
     _params: Floats
     _clock: Floats  # [n, CLOCK_WIDTH]
@@ -202,9 +204,10 @@ class Engine:
         stream = copy.copy(self._stream)
         if seed is not None:
             stream.restart(seed)
+        first = None if worlds is not None else stream.position
         start = stream.take(self.n) if worlds is None else stream.prepare(worlds)
         new = copy.copy(self)
-        new._stream = stream
+        new._stream, new.roster = stream, Roster(self.n, stream.seed, first)
         new._hazard = self.scenario.has_obstacle or has_hazard(start.packed.state, self.scenario.vehicles)
         new._state, new._params = new._kept(start.packed.state).copy(), start.packed.params.copy()
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
@@ -228,10 +231,13 @@ class Engine:
         """An engine that goes on from here without changing this one (scripts that remember are shared)."""
         new = copy.copy(self)
         new.__dict__.update({name: getattr(self, name).copy() for name in _RUNNING})
+        new.roster = copy.deepcopy(self.roster)
         return new
 
     def _renew(self, rows: Ints) -> None:
+        position = self._stream.position
         start = self._stream.take(len(rows))
+        self.roster.renew(rows, position)
         state, params = start.packed
         if params.shape[1] < self._params.shape[1]:  # worlds that were given have news by link, those of the stream not
             params = pack(told_by_link(unpack(start.packed))).params
@@ -288,9 +294,12 @@ class Engine:
             self._state, self._params, self._clock, columns, self._learner_index, self._settings, NO_ROWS,
             self._wanted, reward, outcome,
         )  # fmt: skip
-        if status != DONE:
-            self._fail(world, status, columns)
+        if status == BAD_ACTION:
+            self._refuse(world, columns)
         step = Step(reward, outcome, self.reward, {})
+        if status != DONE:
+            times = self._state[:, 0]
+            self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
         if before is not None and self.reward.harm > 0.0:
             step.further["harm"] = before - self._objective_harm()
         if self._more_terms:
@@ -312,11 +321,10 @@ class Engine:
             columns[:, c] = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
         return columns
 
-    def _fail(self, world: int, status: int, actions: Floats) -> None:
-        if status == BAD_ACTION:
-            for c, vehicle in enumerate(self.learners):
-                checked_action(actions[:, c], (self.n,), f"vehicle_{vehicle + 1}")
-        raise PhysicsError(f"world {world}: the step from {self._state[world, 0]:g} s failed with status {status}")
+    def _refuse(self, world: int, actions: Floats) -> None:
+        for c, vehicle in enumerate(self.learners):
+            checked_action(actions[:, c], (self.n,), f"vehicle_{vehicle + 1}")
+        raise AssertionError(f"world {world}: an action was refused, and then not")
 
     def _objective_harm(self) -> Floats:
         """What the objective of each vehicle makes of the harm so far, [n, N]."""
@@ -363,9 +371,10 @@ class Engine:
         """Tell those who must know that episodes start in ``rows``, and move what depends on them."""
         if self._memories or self._remembering:
             alert = start.alert
-            self._memories = {w: w.begun(memory, alert, rows) for w, memory in self._memories.items()}
-            for vehicle, script in self._remembering.items():
-                script.begin(alert, vehicle, rows)
+            with renumbered(rows):
+                self._memories = {w: w.begun(memory, alert, rows) for w, memory in self._memories.items()}
+                for vehicle, script in self._remembering.items():
+                    script.begin(alert, vehicle, rows)
             if self._remembering:
                 self._begin_with_memory(rows, alert, start.clock[:, START])
         if self.reward.shaping > 0.0:
@@ -384,4 +393,5 @@ class Engine:
         for vehicle, script in early.items():
             wanted = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
             self._wanted[rows, vehicle] = wanted[rows]
-        self._state[rows] = self._kept(moved(alert, self._wanted[rows], start_s).state)
+        with renumbered(rows):
+            self._state[rows] = self._kept(moved(alert, self._wanted[rows], start_s).state)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 
+import numpy as np
+from numpy.typing import NDArray
+
+_NAMED = 5  # failed worlds that a message names one by one
 LINE_LIMIT = 1_500  # characters of a message; of a longer one the beginning and the end are shown
 _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
@@ -57,7 +62,37 @@ class CorruptBundle(EthBrakeError, ValueError):
 
 
 class PhysicsError(EthBrakeError, ArithmeticError):
-    """The advance could not finish a segment: a defect of the kernel, never of the input."""
+    """Some worlds of a batch could not be advanced: a defect of the kernel, never of the input.
+
+    ``worlds``: what is wrong, by the world's row in the batch that was given. All others are well, and a world's result
+    does not depend on its batch: who has a list may leave these out and go on (``physics.leaving_out_failed``).
+    """
+
+    def __init__(self, worlds: Mapping[int, str]) -> None:
+        super().__init__(worlds)
+        self.worlds = dict(worlds)
+
+    def __str__(self) -> str:
+        named = [f"world {row}: {reason}" for row, reason in list(self.worlds.items())[:_NAMED]]
+        more = len(self.worlds) - len(named)
+        return one_line("; ".join([*named, f"and {more:,} more worlds"] if more else named))
+
+    def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> PhysicsError:
+        """The same of the batch from which the worlds of this one were taken: world k was its world ``rows[k]``."""
+        return PhysicsError({int(rows[row]): reason for row, reason in self.worlds.items()})
+
+
+class FailedWorld(UserWarning):
+    """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
+
+
+@contextmanager
+def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
+    """Worlds that fail inside are told by the rows of the batch from which they were taken."""
+    try:
+        yield
+    except PhysicsError as error:
+        raise error.renumbered(rows) from error
 
 
 class UncertifiedStep(EthBrakeError):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,11 +15,10 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.analysis.best_harm import BUDGET, search_list
 from ethbrake_marl.analysis.best_harm_table import BestHarmTable, load_table, save_table
 from ethbrake_marl.analysis.driven_profiles import fold_agent
-from ethbrake_marl.analysis.lower_bound import lower_bound
 from ethbrake_marl.command_options import ForceOption, JsonOption, ScenarioOption
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
-from ethbrake_marl.evaluation.regret import harm_is_bounded, limits_do_not_apply
+from ethbrake_marl.evaluation.bounds import proven_of_table, shipped_bounds, shipped_lines
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable, make_agents
 from ethbrake_marl.physics import Worlds
@@ -55,6 +54,9 @@ def best_harm_command(
     output: Annotated[
         Path | None, typer.Option(metavar="FILE.npz", help="Also write the table of every world to this file.")
     ] = None,
+    shipped: Annotated[
+        bool, typer.Option("--shipped", help="Instead: proven and best known harm of every shipped table, and the gap.")
+    ] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -63,6 +65,9 @@ def best_harm_command(
     The other vehicles follow their scripts. With --output, finished parts are kept beside the file, and the same
     command goes on where it was interrupted.
     """
+    if shipped:
+        _show_shipped(as_json=as_json)
+        return
     _check_output(output, force=force)
     chosen = load_runnable(scenario)
     names = None if vehicles is None else [name.strip() for name in vehicles.split(",")]
@@ -87,7 +92,8 @@ def best_harm_command(
         shutil.rmtree(parts)
         say(f"every world: {output}")
     _show(
-        {**best_harm_figures(table), **_proven(chosen, sample.worlds, controlled or chosen.learners)}, as_json=as_json
+        {**best_harm_figures(table), **_proven(chosen, sample.worlds, table, controlled or chosen.learners)},
+        as_json=as_json,
     )
 
 
@@ -163,9 +169,21 @@ def _command_text(
     return shlex.join([*words, "--output", "FILE.npz"])
 
 
-def _proven(scenario: Scenario, worlds: Worlds, vehicles: Sequence[int]) -> dict[str, object]:
-    """The mean harm (m2/s2) that no command undercuts, where that is proven: one of three vehicles is controlled."""
-    if len(vehicles) != 1 or limits_do_not_apply(worlds, scenario, vehicles[0]) or not harm_is_bounded(worlds):
+def _proven(scenario: Scenario, worlds: Worlds, table: BestHarmTable, vehicles: Sequence[int]) -> dict[str, object]:
+    """What is proven beside what was found, where one of three vehicles is controlled; see ``evaluation.bounds``."""
+    found = proven_of_table(scenario, worlds, table, vehicles[0]) if len(vehicles) == 1 else None
+    if found is None:
         return {}
-    proven = lower_bound(worlds, vehicles[0], horizon_s=scenario.horizon_s)
-    return {"proven_harm": float(proven.harm.mean()), "impact_proven_rate": float(proven.impact_proven.mean())}
+    told = {"proven_harm": found.proven_harm, "contact_proven_rate": found.contact_proven_rate}
+    told["impact_proven_rate"] = found.impact_proven_rate
+    return told | {f"between_{name}": value for name, value in asdict(found.between).items() if value is not None}
+
+
+def _show_shipped(*, as_json: bool) -> None:
+    """Print the bounds of every shipped table."""
+    found = list(shipped_bounds())
+    if as_json:
+        write_json([bounds.to_json() for bounds in found])
+        return
+    for line in shipped_lines(found):
+        typer.echo(line)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.starts import Roster
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -23,8 +24,7 @@ def engine_snapshot(engine: Engine) -> Arrays:
     """
     arrays: Arrays = {name.lstrip("_"): getattr(engine, name).copy() for name in _RUNNING}
     stream = engine._stream
-    waiting = 0 if stream._pool is None else len(stream._pool.clock) - stream._next
-    arrays["stream"] = np.array([stream.seed, stream._drawn - waiting], np.uint64)
+    arrays["stream"] = np.array([stream.seed, stream.position], np.uint64)
     for vehicle, script in engine._remembering.items():
         arrays |= {f"script.{vehicle}.{name}": array.copy() for name, array in _memory(script).items()}
     return arrays
@@ -48,6 +48,7 @@ def restore_engine(engine: Engine, arrays: Mapping[str, NDArray[Any]]) -> None:
     seed, taken = (int(number) for number in arrays["stream"])
     engine._stream.restart(seed)
     engine._stream._drawn = taken
+    engine.roster = Roster(engine.n, seed, None)  # a snapshot does not keep the numbers of running episodes
     for vehicle, script in engine._remembering.items():
         prefix = f"script.{vehicle}."
         _remember(script, {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})

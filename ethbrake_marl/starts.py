@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import FailedWorld, InvalidInput, PhysicsError
 from ethbrake_marl.harm import Ledger
-from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate
+from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
+from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.packed import Packed, harm_at, has_hazard, pack, state_width
+from ethbrake_marl.physics.segment import DONE
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.stepping import CLOCK_WIDTH, LAST_STEP, START
 
@@ -64,6 +67,34 @@ class Start(NamedTuple):
         return Start(self.origin, self.first + first, packed, self.clock[rows], self.wanted[rows])
 
 
+class Roster:
+    """Which world of the stream stands in each row of a batch, and which of them could not be advanced.
+
+    ``first`` is the number of row 0's world, the others follow; None: the worlds were given, and have no number.
+    """
+
+    def __init__(self, n: int, seed: int, first: int | None) -> None:
+        self.failed: dict[int, str] = {}  # by row, and why; until a new episode begins there
+        self.warns = True  # with a ``FailedWorld`` that names the world; off: the caller looks at ``failed``
+        self._seed = seed
+        self._numbers = np.full(n, -1, np.int64) if first is None else first + np.arange(n)
+
+    def renew(self, rows: Ints, first: int) -> None:
+        """World ``first`` of the stream and those after it now stand in these rows."""
+        self._numbers[rows] = first + np.arange(len(rows))
+        for row in self.failed.keys() & rows.tolist() if self.failed else ():
+            del self.failed[row]
+
+    def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
+        """Enter the worlds with a ``status``: a step from ``from_s`` to ``until_s`` [n] could not advance them."""
+        new = failure(np.where(status == 0, DONE, status), from_s, until_s).worlds
+        self.failed |= new
+        for row, reason in new.items() if self.warns else ():
+            number = int(self._numbers[row])
+            name = f"world {number} of seed {self._seed}" if number >= 0 else f"the world of row {row}"
+            warnings.warn(FailedWorld(f"{name}: {reason}; its episode was cut off there"), stacklevel=4)
+
+
 class Stream:
     """The training worlds of a seed, one after the other, each ready for its first decision.
 
@@ -83,6 +114,11 @@ class Stream:
         self._pool: Start | None = None
         self._next = 0
 
+    @property
+    def position(self) -> int:
+        """Number of the next world in the stream."""
+        return self._drawn - (0 if self._pool is None else len(self._pool.clock) - self._next)
+
     def take(self, count: int) -> Start:
         """The next ``count`` worlds."""
         if self._pool is None or self._next + count > len(self._pool.clock):
@@ -98,9 +134,25 @@ class Stream:
             left = self._pool.part(self._next, len(self._pool.clock) - self._next).alert
         size = max(4 * count, _SAMPLED_AT_ONCE)
         sample = self._scenario.sample(size, self.seed, first=self._drawn, channel="training")
-        self._pool = self.prepare(sample.worlds if left is None else concatenate([left, sample.worlds]))
+        self._pool = self._prepare_all(sample.worlds if left is None else concatenate([left, sample.worlds]))
         self._drawn += size
         self._next = 0
+
+    def _prepare_all(self, alert: Worlds) -> Start:
+        """``prepare``; a world that cannot be advanced to its first decision gives its place to the next one that can.
+
+        A ``FailedWorld`` warning names it. So worlds keep their places in the stream, and a training goes on.
+        """
+        start, kept, failed = leaving_out_failed(lambda rows: self.prepare(alert.take(rows)), np.arange(alert.n))
+        if start is None:
+            raise PhysicsError(failed)
+        if not failed:
+            return start
+        first = self.position
+        for row, reason in failed.items():
+            warnings.warn(FailedWorld(f"world {first + row} of seed {self.seed}: {reason}; left out"), stacklevel=2)
+        later = np.searchsorted(kept, np.arange(alert.n)) % len(kept)
+        return self.prepare(alert.take(kept[later]))
 
     def prepare(self, alert: Worlds) -> Start:
         """Worlds at t = 0, made ready for their first decision. Raises ``InvalidInput`` if nobody may ever decide."""

@@ -52,7 +52,8 @@ STEP_TOTAL_HARM = 1
 TERMINATED = 2  # 1 if the step ended the episode in this way, else 0
 TRUNCATED = 3
 SAFE_END = 4  # without any collision
-OUTCOME_ROWS = 5
+FAILED = 5  # what went wrong (a status of the kernel) where the world could not be advanced, else 0
+OUTCOME_ROWS = 6
 # places in settings
 TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT = range(5)
 BAD_ACTION = -1
@@ -80,6 +81,12 @@ class Step(NamedTuple):
     def ended(self) -> Bools:
         """Episodes that ended with this step, [n]."""
         return self.terminated | self.truncated
+
+    @property
+    def failed(self) -> Ints:
+        """What went wrong in the worlds that could not be advanced (a status of the kernel), 0 elsewhere, [n]."""
+        status: Ints = self.outcome[FAILED].astype(np.int64)
+        return status
 
     @property
     def safe_end(self) -> Bools:
@@ -129,7 +136,9 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     """Advance every running world by one step, in place (state, clock, wanted); fills the last two arrays.
 
     ``actions`` [n, L] become the learners' commands in ``wanted`` [n, N]; nothing is moved if one of them is not in
-    [-1, 1]. Returns a world and what went wrong there (BAD_ACTION or a status of the kernel), or (-1, DONE).
+    [-1, 1]. A world that cannot be advanced stays where it was; its episode is cut off there, without a reward, and
+    marked in ``outcome``. Returns a world and what went wrong there (BAD_ACTION, or the status of one that could not be
+    advanced), or (-1, DONE).
     """
     n, N = wanted.shape
     for k in range(n):
@@ -141,6 +150,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         params_at(0, N), params_at(1, N), params_at(2, N), params_at(3, N), params_at(4, N),
     )  # fmt: skip
     P, hazard = N - 1, state_width(N)
+    worst, worst_status = -1, DONE
     at = 1 if state.shape[1] > hazard else 0  # vehicle i stands in column at + i, behind an obstacle
     table = np.zeros((TABLE_ROWS, N + at))
     for k in range(n):
@@ -171,8 +181,18 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             table[GAP, at + p] = state[k, gap + p]
             table[HIT, at + p] = state[k, gap + P + p]
         status = advance_table(table, params[k, RESTITUTION], until - time, time, k, no_rows, 0)[1]
+        outcome[FAILED, k] = 0.0
         if status != DONE:
-            return k, status
+            worst, worst_status = k, status
+            for f in range(OUTCOME_ROWS):
+                outcome[f, k] = 0.0
+            outcome[TRUNCATED, k], outcome[FAILED, k] = 1.0, status
+            clock[k, ENDED] = 1.0
+            clock[k, STEP] -= 1.0
+            for i in range(N):
+                state[k, command + i] = state[k, previous + i]
+                reward[k, i] = 0.0
+            continue
         state[k, TIME] = until
         at_rest = True
         for i in range(N):
@@ -208,4 +228,4 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         shared -= settings[HARM_WEIGHT] * (total_harm if settings[HARM_IS_TOTAL] == 1.0 else first_harm)
         for i in range(N):
             reward[k, i] = shared
-    return -1, DONE
+    return worst, worst_status

@@ -127,5 +127,6 @@ def _harms(own: Answer, other: Answer, rows: Ints) -> Iterator[dict[HarmCount, F
         kept = best._replace(harm=best.harm[rows], profiles=best.profiles.take(rows))
         yield dict(zip(COUNTS, realised_harm(scenario, worlds, kept, scenario.learners), strict=True))
     for team in other.teams:
-        ledger = evaluate(worlds, {team.name: team}, scenario=scenario, aftermath=False).outcome(team.name).ledger
+        driven = evaluate(worlds, {team.name: team}, scenario=scenario, aftermath=False).complete()
+        ledger = driven.outcome(team.name).ledger
         yield {count: ledger.world_harm(count) for count in COUNTS}

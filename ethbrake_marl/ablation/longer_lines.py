@@ -179,7 +179,7 @@ def _of_length(
 
 def _driven(agents: Sequence[Agent], scenario: Scenario, sample: Sample, tell: Tell | None) -> Harms:
     named = {str(k): agent for k, agent in enumerate(agents)}
-    result = evaluate(sample, named, scenario=scenario, chunk=PROGRESS_EVERY)
+    result = evaluate(sample, named, scenario=scenario, chunk=PROGRESS_EVERY).complete()
     if tell is not None:
         tell(f"{scenario.vehicles} vehicles, {agents[0].name}", sample.worlds.n, sample.worlds.n)
     return harms_of([result.outcome(name) for name in named])

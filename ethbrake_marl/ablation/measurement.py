@@ -90,7 +90,7 @@ def _driven(scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: Tel
     """Harms of several teams of one level."""
     outcomes = []
     for team in teams:
-        result = evaluate(sample, {team.name: team}, scenario=scenario, chunk=PROGRESS_EVERY)
+        result = evaluate(sample, {team.name: team}, scenario=scenario, chunk=PROGRESS_EVERY).complete()
         outcomes.append(result.outcome(team.name))
         tell(f"driving {team.name}", sample.worlds.n, sample.worlds.n)
     return harms_of(outcomes)

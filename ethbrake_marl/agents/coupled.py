@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.pairwise import optimise_pairwise, pairwise_breakpoints
+from ethbrake_marl.errors import renumbered
 from ethbrake_marl.harm import HarmCount, check_count
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance
 
@@ -76,7 +77,8 @@ def optimise_coupled(
     minima, on the safe side where the harm jumps. Equal harms are decided by the other count, then by the middle one of
     the equal decelerations. A world's result does not depend on the batch it is in.
 
-    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``count`` or others beyond their capacities.
+    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``count`` or others beyond their capacities, ``PhysicsError``
+    naming the worlds in which some candidate could not be simulated.
     """
     check_count(count)
     search = _Search(worlds, vehicle, count, horizon_s, others_mps2)
@@ -113,7 +115,8 @@ class _Search:
             part = slice(start, start + _SIMULATIONS_AT_ONCE)
             command = self._command[rows[part]]
             command[:, self._vehicle] = -deceleration[part]
-            _, impacts = advance(self._worlds.take(rows[part]), command, until_s=self._horizon_s)
+            with renumbered(rows[part]):
+                _, impacts = advance(self._worlds.take(rows[part]), command, until_s=self._horizon_s)
             first[part] = impacts.first_impact_harm.sum(axis=1) + impacts.hazard_first_harm
             total[part] = impacts.total_harm.sum(axis=1) + impacts.hazard_total_harm
             course[part] = impacts.count @ digits[:-1] + impacts.hazard_count * digits[-1]

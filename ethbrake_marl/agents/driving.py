@@ -12,7 +12,7 @@ from ethbrake_marl.agents.protocol import Agent, LookingAhead
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine import Engine
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.scenario import Scenario
@@ -74,9 +74,11 @@ def episode_engine(worlds: Worlds, agent: Agent | Team, scenario: Scenario, vehi
     scripts = scripted(scenario, but=drivers)
     for i, driver in drivers.items():
         introduce(driver, i, scripts)
-    return Engine(
+    engine = Engine(
         scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, deciders=tuple(drivers), worlds=worlds
     )
+    engine.roster.warns = False  # who drives looks
+    return engine
 
 
 def drive(
@@ -87,13 +89,18 @@ def drive(
     *,
     watched_by: Sequence[Watch] = (),
 ) -> Episodes:
-    """Let ``agent`` drive ``vehicle``, or a team its vehicles, through every world (at t = 0) to its episode's end."""
+    """Let ``agent`` drive ``vehicle``, or a team its vehicles, through every world (at t = 0) to its episode's end.
+
+    Raises ``PhysicsError`` naming all worlds that could not be advanced; the others are well without them.
+    """
     engine = episode_engine(worlds, agent, scenario, vehicle)
     at_rest = np.zeros(worlds.n, np.bool_)
     now = _show(watched_by, worlds, engine, engine.worlds.command_mps2)
     while not engine.ended.all():
         at_rest |= engine.step({}).terminated
         now = _show(watched_by, now, engine, engine.wanted_mps2.copy())
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
     return Episodes(engine.ledger, engine.worlds, at_rest)
 
 

@@ -13,7 +13,7 @@ from ethbrake_marl.agents.others import fixed_commands
 from ethbrake_marl.agents.pairwise import optimise_pairwise
 from ethbrake_marl.agents.profile_problem import TIME_STEP_S, ProfileProblem, profile_problem
 from ethbrake_marl.agents.profile_search import MOST_PHASES
-from ethbrake_marl.agents.profiles import Profiles, constant_profiles, search_profiles
+from ethbrake_marl.agents.profiles import Profiles, constant_profiles, even_grid, search_profiles
 from ethbrake_marl.agents.protocol import place
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
@@ -124,9 +124,7 @@ class Planner:
 
 def _with_constants(problem: ProfileProblem, plan: Profiles) -> Profiles:
     """Each world's plan, then constants: [n * Q]."""
-    low, high = problem.bounds[:, np.newaxis, :, 0], problem.bounds[:, np.newaxis, :, 1]
-    share = np.linspace(0.0, 1.0, _CONSTANTS)[:, np.newaxis]
-    constants = constant_profiles(problem, low + share * (high - low))
+    constants = constant_profiles(problem, even_grid(problem, _CONSTANTS))
     n, K = plan.ends.shape
     ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
     commands = constants.commands_mps2.reshape(n, -1, K, 1)

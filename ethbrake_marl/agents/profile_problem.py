@@ -27,6 +27,7 @@ from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle
 from ethbrake_marl.physics.packed import TIME, command_at, gap_at, harm_at, pack, params_at, speed_at
 
 TIME_STEP_S = 0.1  # between two decisions, where nobody says otherwise
+PER_WORLD = ("start", "clock", "bounds", "command", "latency", "mass", "limit", "identity")  # arrays of a problem
 _MIX = 0xD1342543DE82EF95  # an odd number: spreads seeds over 64 bits
 
 
@@ -48,6 +49,10 @@ class ProfileProblem:
     def n(self) -> int:
         """Number of worlds."""
         return len(self.start)
+
+    def take(self, rows: Ints) -> ProfileProblem:
+        """That of some of the worlds."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in PER_WORLD})
 
     @property
     def last_step(self) -> Ints:

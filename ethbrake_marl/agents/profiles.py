@@ -18,7 +18,7 @@ from ethbrake_marl.agents.profile_problem import ProfileProblem, seeded
 from ethbrake_marl.agents.profile_search import MOST_PHASES, copy_rows, search_world
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import MASS
 from ethbrake_marl.physics.segment import COMMAND, LIMIT, TABLE_ROWS
@@ -74,6 +74,17 @@ def constant_profiles(problem: ProfileProblem, commands_mps2: Floats) -> Profile
     )
 
 
+def even_grid(problem: ProfileProblem, number: int) -> Floats:
+    """``number`` commands from each vehicle's least to its greatest, evenly spaced, both included; [n, number, C] m/s2.
+
+    ``low + (high - low)`` may lie an ulp beyond ``high``, so the greatest is taken as it is.
+    """
+    low, high = problem.bounds[:, np.newaxis, :, 0], problem.bounds[:, np.newaxis, :, 1]
+    share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
+    grid: Floats = np.minimum(low + share * (high - low), high)
+    return grid
+
+
 def pad_profiles(parts: Sequence[Profiles], least: int) -> list[Profiles]:
     """The same profiles, all with as many phases (at least ``least``): empty ones are added. In their own memory."""
     width = max([least, *(part.ends.shape[1] for part in parts)])
@@ -90,8 +101,8 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
     """The best profiles of at most ``MOST_PHASES`` phases that about ``budget`` candidates per world find.
 
     ``given`` [n * Q]: Q profiles of each world, world by world, from which to start; the result is never worse than
-    any of them. Raises ``InvalidInput`` for a budget below 1 and ``PhysicsError`` if no profile of a world could be
-    advanced.
+    any of them. Raises ``InvalidInput`` for a budget below 1 and ``PhysicsError`` naming the worlds of which no profile
+    could be followed.
     """
     for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or not value >= least:
@@ -115,25 +126,26 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
         with ThreadPoolExecutor(threads) as pool:
             used = list(pool.map(work, range(n)))
     if 0 in used:
-        raise PhysicsError(f"search: world {used.index(0)} could not be advanced")
+        raise PhysicsError({k: "no profile could be followed" for k in range(n) if used[k] == 0})
     return Found(best, *follow_profiles(problem, best))
 
 
 def follow_profiles(problem: ProfileProblem, profiles: Profiles) -> tuple[Floats, Floats]:
     """First-impact and total harm [n] of one profile per world, as the engine counts it, to the same bits.
 
-    Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity.
+    Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity, ``PhysicsError`` naming the
+    worlds in which a check of the kernel failed.
     """
     check_profiles(problem, profiles)
     n = problem.n
-    first, total = np.zeros(n), np.zeros(n)
-    failed = follow_worlds(
+    first, total, failed = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_)
+    follow_worlds(
         problem.start, problem.clock, problem.bounds, problem.command, problem.latency, problem.mass, problem.limit,
         problem.vehicles, np.ascontiguousarray(profiles.ends, np.int64),
-        np.ascontiguousarray(profiles.commands_mps2, np.float64), first, total,
+        np.ascontiguousarray(profiles.commands_mps2, np.float64), first, total, failed,
     )  # fmt: skip
-    if failed >= 0:
-        raise PhysicsError(f"profiles: world {failed} could not be advanced")
+    if failed.any():
+        raise PhysicsError({k: "its profile could not be followed" for k in np.flatnonzero(failed).tolist()})
     return first, total
 
 
@@ -175,9 +187,9 @@ def make_setting(
 @compiled
 def follow_worlds(
     start: Floats, clock: Floats, bounds: Floats, command: Floats, latency: Floats, mass: Floats, limit: Floats,
-    vehicles: Ints, ends: Ints, commands: Floats, first: Floats, total: Floats,
-) -> int:  # fmt: skip
-    """Fill ``first`` and ``total`` [n] with the harm of one profile per world; a world that failed, or -1."""
+    vehicles: Ints, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools,
+) -> None:  # fmt: skip
+    """Fill ``first`` and ``total`` [n] with the harm of one profile per world, and ``failed`` [n] where it ended."""
     no_random = np.zeros(1, np.uint64)
     for k in range(start.shape[0]):
         world = make_setting(clock[k], bounds[k], command[k], latency[k], mass[k], limit[k], vehicles, no_random)
@@ -185,8 +197,8 @@ def follow_worlds(
         copy_rows(start[k : k + 1], states, 1)
         world.clock[STEPWISE] = 1.0
         if follow_whole(world, ends[k], commands[k], states, math.inf)[1] < 0:
-            return k
+            failed[k] = True
+            continue
         for p in range(mass.shape[1] - 1):
             first[k] += world.harm[0, p]
             total[k] += world.harm[1, p]
-    return -1

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.profile_problem import TIME_STEP_S, ProfileProblem, pr
 from ethbrake_marl.agents.profile_search import MOST_PHASES
 from ethbrake_marl.agents.profiles import Profiles, constant_profiles, follow_profiles, pad_profiles, search_profiles
 from ethbrake_marl.agents.protocol import place
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.harm import HarmCount, check_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.starts import Script
@@ -82,10 +82,11 @@ class BestHarm:
         """The given profiles with those of ``unknown`` worlds replaced by searched ones."""
         part, theirs = worlds.take(unknown), others[unknown]
         problem = self._problem(part, vehicle, theirs)
-        coupled = optimise_coupled(part, vehicle, count=self._count, horizon_s=self._horizon_s, others_mps2=theirs)
-        best = coupled.deceleration_mps2
-        given = constant_profiles(problem, -best[:, np.newaxis, np.newaxis])
-        found = search_profiles(problem, given, budget=self._budget).profiles
+        horizon_s, count = self._horizon_s, self._count
+        with renumbered(unknown):
+            coupled = optimise_coupled(part, vehicle, count=count, horizon_s=horizon_s, others_mps2=theirs)
+            given = constant_profiles(problem, -coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
+            found = search_profiles(problem, given, budget=self._budget).profiles
         whole, found = pad_profiles([profiles, found], MOST_PHASES)
         whole.ends[unknown] = found.ends
         whole.commands_mps2[unknown] = found.commands_mps2

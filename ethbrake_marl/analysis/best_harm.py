@@ -9,7 +9,9 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,18 +25,20 @@ from ethbrake_marl.agents.profiles import (
     Found,
     Profiles,
     constant_profiles,
+    even_grid,
     follow_profiles,
     pad_profiles,
     search_profiles,
 )
 from ethbrake_marl.analysis.best_harm_table import Best, BestHarmTable, join_tables, load_table, save_table
-from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.harm import COUNTS, HarmCount
-from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
 from ethbrake_marl.scenario import Sample, Scenario
 
 BUDGET = 100_000  # candidates per world and count
 CHUNK = 200  # worlds between two reports of progress
+LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is in no row
 CONSTANTS = 29  # even grid of constant commands from which every search also starts
 
 Progress = Callable[[int, int], None]  # worlds done, of how many
@@ -114,41 +118,56 @@ def search_list(
     """``best_harm`` of a long list, ``CHUNK`` worlds at a time, resumable.
 
     With ``chunks``, a folder, each finished chunk is kept there as a file, and a later call with the same question
-    takes it from there. A file that answers another question is computed anew and replaced. Raises ``InvalidInput``, as
-    ``best_harm`` does, and if ``known`` holds no world of the list.
+    takes it from there. A file that answers another question is computed anew and replaced. A world that cannot be
+    advanced (a defect of the physics) is left out: no table holds it, and the header names it under ``LEFT_OUT``.
+    Raises ``InvalidInput``, as ``best_harm`` does, and if ``known`` holds no world of the list; ``PhysicsError`` if no
+    world is left.
     """
-    if known is not None:
-        known.check_holds_any(world_identity(scenario, sample.worlds, vehicles))
-    parts = []
+    parts: list[BestHarmTable] = []
+    left_out: dict[int, str] = {}
     n = sample.worlds.n
+    if known is not None:
+        every, _, _ = leaving_out_failed(
+            lambda at: world_identity(scenario, sample.worlds.take(at), vehicles), np.arange(n)
+        )
+        if every is not None:
+            known.check_holds_any(every)
+    options = {"counts": counts, "budget": budget, "seed": seed, "threads": threads, "known": known}
     for first in range(0, n, CHUNK):
         rows = np.arange(first, min(first + CHUNK, n))
-        worlds = sample.worlds.take(rows)
-        part = None
         file = None if chunks is None else chunk_file(chunks, first)
-        before = {} if known is None else {"after": dict(known.header)}
-        question = {"counts": list(counts), "budget": budget, "search_seed": seed, **before}
-        if file is not None:
-            with suppress(CorruptBundle):
-                part = kept_chunk(file, world_identity(scenario, worlds, vehicles), question)
-        if part is None:
-            part = best_harm(
-                scenario,
-                worlds,
-                counts=counts,
-                vehicles=vehicles,
-                budget=budget,
-                seed=seed,
-                threads=threads,
-                known=known,
-            )
-            if file is not None:
-                file.parent.mkdir(parents=True, exist_ok=True)
-                save_table(file, part)
-        parts.append(part)
+        work = partial(_kept_or_searched, scenario, sample.worlds, file, vehicles, options)
+        part, _, failed = leaving_out_failed(work, rows)
+        parts += [] if part is None else [part]
+        left_out |= {int(sample.index[row]): reason for row, reason in failed.items()}
         if on_progress is not None:
             on_progress(int(rows[-1]) + 1, n)
-    return join_tables(parts)
+    if not parts:
+        raise PhysicsError(left_out)
+    table = join_tables(parts)
+    named = {LEFT_OUT: {str(world): reason for world, reason in left_out.items()}} if left_out else {}
+    return replace(table, header={**table.header, **named})
+
+
+def _kept_or_searched(
+    scenario: Scenario, every: Worlds, file: Path | None, vehicles: Sequence[int] | None, options: dict[str, Any],
+    rows: Ints,
+) -> BestHarmTable:  # fmt: skip
+    """A chunk of a list, its ``rows``: from its file where that answers the same question, else searched, and kept."""
+    worlds = every.take(rows)
+    known = options["known"]
+    question = {"counts": list(options["counts"]), "budget": options["budget"], "search_seed": options["seed"]}
+    question |= {} if known is None else {"after": dict(known.header)}
+    if file is not None:
+        with suppress(CorruptBundle):
+            part = kept_chunk(file, world_identity(scenario, worlds, vehicles), question)
+            if part is not None:
+                return part
+    part = best_harm(scenario, worlds, vehicles=vehicles, **options)
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        save_table(file, part)
+    return part
 
 
 def chunk_file(chunks: Path, first: int) -> Path:
@@ -223,9 +242,7 @@ class _Search:
     ) -> Found:
         """The best profiles that start from constants, from ``given``, and from each vehicle's own best profile."""
         problem = self.problem(vehicles, count, deciders)
-        low, high = problem.bounds[:, np.newaxis, :, 0], problem.bounds[:, np.newaxis, :, 1]
-        share = np.linspace(0.0, 1.0, CONSTANTS)[:, np.newaxis]
-        starts = [constant_profiles(problem, low + share * (high - low)), *given]
+        starts = [constant_profiles(problem, even_grid(problem, CONSTANTS)), *given]
         if len(vehicles) == 1:
             coupled = optimise_coupled(
                 self.worlds, vehicles[0], count=count, horizon_s=self.scenario.horizon_s, others_mps2=self.others
@@ -234,7 +251,8 @@ class _Search:
         else:
             for c, vehicle in enumerate(vehicles):
                 alone = self.best([vehicle], count, (), vehicles if deciders is None else deciders).profiles
-                commands = np.broadcast_to(low, (*alone.ends.shape, len(vehicles))).copy()
+                least = problem.bounds[:, np.newaxis, :, 0]
+                commands = np.broadcast_to(least, (*alone.ends.shape, len(vehicles))).copy()
                 commands[..., c] = alone.commands_mps2[..., 0]
                 starts.append(Profiles(alone.ends, commands))
         return search_profiles(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from ethbrake_marl.analysis.best_harm import scripted_commands, world_identity
 from ethbrake_marl.analysis.best_harm_table import BestHarmTable
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.starts import Script
 
@@ -29,7 +30,8 @@ def fold_agent(
 
     ``agents``: for each count, ``name`` made to minimise it. Each drives the scenario's learner through ``worlds`` (at
     t = 0; those that are known to end without harm are left out), and either count takes from either episode. Harms are
-    those of the profiles, driven again. Raises ``InvalidInput`` if the scenario has not exactly one learner.
+    those of the profiles, driven again. Where an agent cannot drive a world to its end, the table stays as it is.
+    Raises ``InvalidInput`` if the scenario has not exactly one learner.
     """
     if len(scenario.learners) != 1:
         raise InvalidInput(f"scenario {scenario.name!r}: agents drive one learner, and it has {len(scenario.learners)}")
@@ -48,13 +50,20 @@ def fold_agent(
             others_mps2=scripted_commands(scenario, worlds, scenario.learners),
         )
         for agent in agents.values():
-            profiles = driven_profiles(agent, scenario, worlds, vehicle, problem.last_step)
-            first, total = follow_profiles(problem, profiles)
+            work = partial(_driven_in, agent, scenario, worlds, vehicle, problem.last_step)
+            profiles, rows, _ = leaving_out_failed(work, np.arange(worlds.n))
+            if profiles is None:
+                continue
+            first, total = follow_profiles(problem.take(rows), profiles)
             for count in table.best:
-                table, better = table.improved(identity, count, first if count == "first" else total, profiles)
+                table, better = table.improved(identity[rows], count, first if count == "first" else total, profiles)
                 lowered[count] += int(better.sum())
     before = table.header.get(LOWERED, {})
     return replace(table, header={**table.header, LOWERED: {**before, name: lowered}})
+
+
+def _driven_in(agent: Agent, scenario: Scenario, every: Worlds, vehicle: int, last_step: Ints, rows: Ints) -> Profiles:
+    return driven_profiles(agent, scenario, every.take(rows), vehicle, last_step[rows])
 
 
 def driven_profiles(agent: Agent, scenario: Scenario, worlds: Worlds, vehicle: int, last_step: Ints) -> Profiles:

@@ -9,6 +9,9 @@ pushing as the physics has them:
   other one is bounded by momentum and energy.
 
 To these comes what has happened, for certain, before the vehicle may act.
+
+The proofs are about exact arithmetic; the bound and the harm that it is compared with are made of doubles. So every
+part is rounded outward: lowered by ``rounding``, more than both can be off together.
 """
 
 from __future__ import annotations
@@ -40,6 +43,7 @@ from ethbrake_marl.analysis.avoidability_meetings import (
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count, empty_ledger
 from ethbrake_marl.physics import Bools, Floats, Worlds, advance
+from ethbrake_marl.physics.tolerances import BOUND_EPS, EPS
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +73,10 @@ def lower_bound(
 ) -> LowerBound:
     """Proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicle``.
 
-    ``harm = early + max(front_pair + rear_pair, combined)``. The combined bound is proven for a controlled vehicle that
-    brakes at least as hard as both neighbours; elsewhere it is 0. What may come only after the horizon counts as 0, and
-    so does the next impact of a pair that was hit before where ``count`` is "first".
+    ``harm = early + max(front_pair + rear_pair, combined)``, each part rounded outward (``rounding``). The combined
+    bound is proven for a controlled vehicle that brakes at least as hard as both neighbours; elsewhere it is 0. What
+    may come only after the horizon counts as 0, and so does the next impact of a pair that was hit before where
+    ``count`` is "first".
 
     Covers the same lines as ``avoidability``, without an obstacle ahead, and raises ``InvalidInput`` for others, for an
     unknown ``count``, and for a horizon that is not finite or lies before the vehicle may act.
@@ -94,8 +99,30 @@ def lower_bound(
     unavoidable = has_front & has_rear & (verdict.reason >= 2)
     out = np.empty((worlds.n, BOUNDS))
     bound_worlds(_states(at_onset, vehicle), horizon_s - start, has_front, has_rear, unavoidable, out)
-    front, rear, combined = (out[:, column].copy() for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND))
+    parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
+    early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined)
+
+
+def rounding(worlds: Worlds, vehicle: int) -> Floats:
+    """How far arithmetic can move a bound and a realised harm apart, at most; [n] m2/s2.
+
+    A squared closing speed is ``D = w^2 + 2 b g``. With ``V`` the largest speed in the line, ``G`` its gaps, ``A`` the
+    largest closing acceleration and ``a`` the weakest brakes, every ``w^2`` is at most ``V^2`` and no gap grows beyond
+    ``G + V^2 / 2a``, so all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``. A segment of motion rounds each
+    speed twice and each gap five times, a round of impacts each speed by ``CLUSTER_EPS``: either moves D by at most
+    8 eps S. These add up and are not multiplied, for the proofs compare a run with itself, not with another one.
+    ``BOUND_EPS`` grants 500 of them; the steps of an episode of 8 s are 80, and the bound's own arithmetic, a few
+    hundred roundings, is among them too.
+    """
+    v = worlds.vehicles
+    drives = v.driving_capacity_mps2[:, vehicle] > 0.0
+    fastest = np.maximum(worlds.speeds_mps.max(axis=1), np.where(drives, v.speed_limit_mps[:, vehicle], 0.0))
+    closing = v.braking_capacity_mps2.max(axis=1) + v.driving_capacity_mps2[:, vehicle]
+    weakest = v.braking_capacity_mps2.min(axis=1)
+    scale = fastest * fastest * (1.0 + closing / weakest) + 2.0 * closing * worlds.gaps_m.sum(axis=1)
+    outward: Floats = BOUND_EPS * EPS * scale
+    return outward
 
 
 def _states(worlds: Worlds, i: int) -> Floats:

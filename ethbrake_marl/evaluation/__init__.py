@@ -9,7 +9,7 @@ from ethbrake_marl.evaluation.per_world import write_per_world_csv
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.evaluation.rendering import markdown_table, rich_table
 from ethbrake_marl.evaluation.rescoring import Rescored, declared_objectives, rescored, rescored_table
-from ethbrake_marl.evaluation.rollout import Evaluation, Outcome, evaluate
+from ethbrake_marl.evaluation.rollout import Evaluation, LeftOut, Outcome, evaluate
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.evaluation.table import SummaryRow, summarise
 
@@ -17,6 +17,7 @@ __all__ = [
     "EpisodeRecord",
     "Estimate",
     "Evaluation",
+    "LeftOut",
     "Outcome",
     "Rescored",
     "SummaryRow",

@@ -81,7 +81,7 @@ def criticality_map(
     tell = on_progress or (lambda agent, done, total: None)
     evaluation = evaluate(
         worlds, agents, scenario=scenario, chunk=CHUNK, on_progress=lambda agent, done: tell(agent, done, worlds.n)
-    )
+    ).complete()
     proven = limits_do_not_apply(worlds, scenario, evaluation.vehicle) is None
     avoidable = avoidability(worlds, evaluation.vehicle).avoidable.reshape(cells, cells) if proven else None
     boundary = avoidability_boundary(scenario, *ranges)

@@ -40,6 +40,8 @@ def write_per_world_csv(
 ) -> None:
     """Write one row per agent and world; docs/evaluation.md lists the columns. ``objectives`` adds theirs.
 
+    A world that was left out has a row with nothing but its number and, in ``ended``, why.
+
     The file appears whole or not at all. Raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` without a folder.
     """
     check_target(path, force=force)
@@ -54,6 +56,9 @@ def write_per_world_csv(
         if number == 0:
             writer.writerow(columns)
         writer.writerows(zip(*columns.values(), strict=True))
+        for left in evaluation.left_out:
+            told = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
+            writer.writerow([told.get(name, "") for name in columns])
     write_output(path, text.getvalue().encode(), force=force)
 
 

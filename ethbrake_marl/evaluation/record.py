@@ -15,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.agents.driving import episode_engine
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.evaluation.travel import with_post_ahead
 from ethbrake_marl.harm import Ledger
@@ -68,6 +68,8 @@ def record_episode(
         step = engine.step({})
         segments.append((before, engine.wanted_mps2.copy(), float(engine.worlds.time_s[0])))
         at_rest = bool(step.terminated[0])
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
     samples = list(_samples(segments, sample_s))
     time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))
     return EpisodeRecord(

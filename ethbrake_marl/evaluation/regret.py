@@ -26,6 +26,7 @@ from ethbrake_marl.physics.events import stopping_distances
 from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.scenario import Scenario
 
+NO_HARM = 1e-3  # m2/s2: nobody is hurt by 0.03 m/s
 TOLERANCE = 1e-6  # m2/s2; less than this below the best known harm is rounding
 Source = Literal["witness", "table", "agents", "below_table"]
 
@@ -77,11 +78,22 @@ class Regrets:
 
 
 @dataclass(frozen=True, slots=True)
+class Between:
+    """The worlds with proven contact in which no impact is proven, and the least harm known there (m2/s2)."""
+
+    rate: float  # share of all worlds
+    mean_first: float | None  # None where there is no such world, or the least harm of none of them is known
+    mean_total: float | None
+    harmless_rate: float | None  # share of them whose best known total harm is below 1e-3
+
+
+@dataclass(frozen=True, slots=True)
 class Distance:
     """One agent's summary: what was avoidable, and how far it stayed from the best known; all None if unknown."""
 
     unavoidable_rate: Estimate | None = None  # worlds without any command that avoids contact, whoever drives
     impact_proven_rate: Estimate | None = None  # worlds without any command that avoids an impact
+    between: Between | None = None  # the worlds in which contact is proven and no impact
     avoidable_collision_rate: Estimate | None = None  # worlds that collided and need not have
     best_known_first: Estimate | None = None  # mean best known harm (m2/s2)
     best_known_total: Estimate | None = None
@@ -113,6 +125,16 @@ class Distance:
             "realised_share_first": self.realised_first,
             "realised_share_total": self.realised_total,
         }
+
+
+def between(contact: Bools, impact: Bools, first: Floats, total: Floats) -> Between:
+    """The worlds between the two proofs; ``first`` and ``total`` [n] are the least harms known, NaN where none is."""
+    there = contact & ~impact
+    known = there & np.isfinite(first) & np.isfinite(total)
+    if not known.any():
+        return Between(float(there.mean()), None, None, None)
+    harmless = float((total[known] < NO_HARM).mean())
+    return Between(float(there.mean()), float(first[known].mean()), float(total[known].mean()), harmless)
 
 
 def limits_do_not_apply(worlds: Worlds, scenario: Scenario, vehicle: int) -> str | None:
@@ -191,6 +213,9 @@ def distance(regrets: Regrets | None, outcome: Outcome, full_brake: Outcome | No
     return Distance(
         unavoidable_rate=rate(int((~avoidable).sum()), len(avoidable)),
         impact_proven_rate=None if certain is None else rate(int(certain.sum()), len(avoidable)),
+        between=None
+        if certain is None
+        else between(~avoidable, certain, regrets.first_impact_harm, regrets.total_harm),
         avoidable_collision_rate=rate(int((outcome.collided & avoidable).sum()), len(avoidable)),
         best_known_first=mean(regrets.first_impact_harm),
         best_known_total=mean(regrets.total_harm),

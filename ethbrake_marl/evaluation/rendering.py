@@ -13,7 +13,7 @@ from rich.text import Text
 from ethbrake_marl.agents.knowledge import Source, knowledge_text
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS, PAPER_ROWS, PaperRow
 from ethbrake_marl.evaluation.parameters import parameter_line
-from ethbrake_marl.evaluation.regret import Distance
+from ethbrake_marl.evaluation.regret import Between, Distance
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.evaluation.table import SummaryRow
 
@@ -35,6 +35,7 @@ _TERMINAL_HEADINGS = (
 )
 _ALL = tuple(range(len(_TERMINAL_HEADINGS)))
 _NARROW, _NARROW_WITHOUT = (0, 1, 2, 3, 4, 9, 10), (0, 1, 2, 3, 4, 6, 7)  # with and without a regret to show
+_NAMED = 10  # worlds left out that are named one by one; all stand in the JSON
 _WIDE = 120  # terminal columns that all of them need
 
 
@@ -197,10 +198,23 @@ def _conditions(rows: Sequence[SummaryRow]) -> str:
         f"Ours: {parameter_line(rows[0].parameters)}. Harms are means per world in m²/s²; in brackets or"
         " below a value: its 95 % interval; decreases are relative to full braking."
     ]
-    texts += limit_lines(rows) + knowledge_lines(rows)
+    texts += left_out_lines(rows) + limit_lines(rows) + knowledge_lines(rows)
     blocks = paper_blocks(rows)
     texts += [f"Paper, {name}: {PAPER_PARAMETERS[name]}." for name, _ in blocks]
     return "\n\n".join([*texts, *([PAPER_NOTE] if blocks else [])])
+
+
+def left_out_lines(rows: Sequence[SummaryRow]) -> list[str]:
+    """Which worlds no row counts, as a sentence; none where every world counts."""
+    left_out = rows[0].left_out if rows else ()
+    if not left_out:
+        return []
+    whole = rows[0].episodes + len(left_out)
+    named = [str(left) for left in left_out[:_NAMED]] + (["and so on"] if len(left_out) > _NAMED else [])
+    return [
+        f"LEFT OUT for every agent: {len(left_out):,} of {whole:,} worlds, which could not be advanced (a defect of the"
+        f" physics, please report it): {'; '.join(named)}."
+    ]
 
 
 def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
@@ -219,9 +233,9 @@ def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
     else:
         impact, proven = _bracketed(_percent(found.impact_proven_rate, 1)), found.proven_harm.value
         text += (
-            f", in {impact} none avoids an impact (both proven; in those between, vehicles may get away with leaning on"
-            f" each other). Best known harm: {first:.2f} first-impact, {total:.2f} total; proven: no less than"
-            f" {proven:.2f}; gap: {first - proven:.2f} and {total - proven:.2f}."
+            f", in {impact} none avoids an impact (both proven).{_between(found.between)} Best known harm: {first:.2f}"
+            f" first-impact, {total:.2f} total; proven: no less than {proven:.2f}; gap: {first - proven:.2f}"
+            f" ({_share(first - proven, first)}) and {total - proven:.2f} ({_share(total - proven, total)})."
         )
     if found.known_best_share is not None and found.known_best_share < 1.0:
         text += (
@@ -233,6 +247,23 @@ def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
         counts = ", ".join(f"{agent} in {count:,} worlds" for agent, count in below.items())
         text += f" Below what was known: {counts}."
     return [text]
+
+
+def _between(found: Between | None) -> str:
+    """What is known of the worlds with proven contact and no proven impact, as a sentence."""
+    if found is None or found.rate == 0.0:
+        return ""
+    text = f" In the {100 * found.rate:.1f} % between, whether an impact can be avoided is open"
+    if found.mean_first is None or found.harmless_rate is None:
+        return f"{text}."
+    return (
+        f"{text}: the best known do {found.mean_first:.2f} there on average, and next to none in"
+        f" {100 * found.harmless_rate:.0f} % of them."
+    )
+
+
+def _share(part: float, whole: float) -> str:
+    return f"{100 * part / whole:.1f} %" if whole > 0.0 else NONE
 
 
 def knowledge_lines(rows: Sequence[SummaryRow]) -> list[str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,11 @@ from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_of
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.team import Driver, Team, team_of
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
 from ethbrake_marl.evaluation.sampled_harm import SampledHarm
 from ethbrake_marl.evaluation.travel import ShovedFront
 from ethbrake_marl.harm import HarmCount, Ledger
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate, leaving_out_failed
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.starts import check_alert
 from ethbrake_marl.v2x import hidden_from
@@ -42,6 +42,13 @@ class Outcome:
     knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
     shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself, see ``travel``
     sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands, see ``sampled_harm``
+
+    def take(self, rows: Ints | Bools) -> Outcome:
+        """That of some of the worlds."""
+        ledger = Ledger(*(getattr(self.ledger, f.name)[rows] for f in fields(Ledger)))
+        names = ("predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")
+        columns = {name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in names}
+        return Outcome(ledger, self.final.take(rows), self.at_rest[rows], knows=self.knows, **columns)
 
     @property
     def collided(self) -> Bools:
@@ -73,6 +80,19 @@ class Outcome:
         return np.where(self.at_rest, "at_rest", "horizon")
 
 
+class LeftOut(NamedTuple):
+    """A world that is in no outcome, because it could not be advanced with one of the agents."""
+
+    world: int  # number in its list
+    seed: int | None  # of the list; None for worlds that were given
+    agent: str  # the first one that met it
+    reason: str
+
+    def __str__(self) -> str:
+        of = "" if self.seed is None else f" of seed {self.seed}"
+        return f"world {self.world}{of} ({self.agent}: {self.reason})"
+
+
 @dataclass(frozen=True, slots=True)
 class Evaluation:
     """Outcomes of agents that drove the same vehicles in the same worlds, row k of every array being world k."""
@@ -83,6 +103,7 @@ class Evaluation:
     index: Ints  # [n] number of each world in its list
     seed: int | None  # of the list; None for worlds that were given
     outcomes: dict[str, Outcome]
+    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
 
     @property
     def vehicle(self) -> int:
@@ -99,6 +120,12 @@ class Evaluation:
         for vehicle in self.vehicles:
             hidden |= hidden_from(self.worlds.vehicles, vehicle)
         return hidden
+
+    def complete(self) -> Evaluation:
+        """The evaluation itself, for who needs every world; raises ``PhysicsError`` if some were left out."""
+        if self.left_out:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
+        return self
 
     def outcome(self, agent: str) -> Outcome:
         """The outcome of one agent; raises ``InvalidInput`` naming those that were evaluated."""
@@ -124,7 +151,9 @@ def evaluate(
     ``vehicle``, a name (``vehicle_2``) or an index (0 = front). All others follow the scenario's scripts (see
     ``agents.driving``). A world's outcome depends neither on ``chunk`` nor on the other worlds, and the given agents
     are left as they are. ``seed`` is noted, not used. Without ``aftermath`` nobody looks how far Vehicle 1 was shoved
-    and what the paper's sum over samples is, which saves time where only the harm counts. Raises ``InvalidInput`` for
+    and what the paper's sum over samples is, which saves time where only the harm counts. A world that cannot be
+    advanced with one of the agents (a defect of the physics) is left out for all of them, and stands in ``left_out``;
+    all others are as if it were not in the list. Raises ``PhysicsError`` if no world is left, and ``InvalidInput`` for
     worlds that do not fit the scenario or are not at the alert, no agents, no vehicle to drive, a team of other
     vehicles, or a learner that nobody drives.
     """
@@ -132,16 +161,20 @@ def evaluate(
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
     driven = driven_vehicles(scenario, vehicle, agents)
-    outcomes = {}
+    parts: dict[str, list[_Part]] = {name: [] for name in agents}
+    lost: dict[int, LeftOut] = {}
     for name, agent in agents.items():
-        parts = []
+        chunk_of = _Chunk(sample.worlds, agent, driven, scenario, aftermath)
         for first in range(0, sample.worlds.n, chunk):
             rows = np.arange(first, min(first + chunk, sample.worlds.n))
-            parts.append(_roll_out(sample.worlds.take(rows), team_of(agent, driven), scenario, aftermath))
+            outcome, kept, failed = leaving_out_failed(chunk_of.roll_out, rows)
+            lost = {row: LeftOut(int(sample.index[row]), seed, name, why) for row, why in failed.items()} | lost
+            if outcome is not None:
+                parts[name].append(_Part(outcome, kept))
             if on_progress is not None:
                 on_progress(name, int(rows[-1]) + 1)
-        outcomes[name] = _joined(parts)
-    return Evaluation(scenario, driven, sample.worlds, sample.index, seed, outcomes)
+    whole = _Whole(sample, parts, tuple(lost[row] for row in sorted(lost)), np.array(sorted(lost), np.int64))
+    return whole.evaluation(scenario, driven, seed)
 
 
 def _check_request(worlds: object, agents: object, scenario: object, chunk: object) -> None:
@@ -196,6 +229,52 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
             " give the others a script"
         )
     return int(vehicle)
+
+
+class _Part(NamedTuple):
+    """What an agent achieved in some rows of the list."""
+
+    outcome: Outcome
+    rows: Ints
+
+    def among(self, good: Ints) -> Outcome:
+        """In those that are among these rows."""
+        kept = np.isin(self.rows, good)
+        return self.outcome if kept.all() else self.outcome.take(kept)
+
+
+class _Whole(NamedTuple):
+    """What all agents achieved in the whole list, and the rows where one of them failed."""
+
+    sample: Sample
+    parts: Mapping[str, list[_Part]]
+    left_out: tuple[LeftOut, ...]
+    lost: Ints
+
+    def evaluation(self, scenario: Scenario, driven: tuple[int, ...], seed: int | None) -> Evaluation:
+        """All outcomes over the same worlds; raises ``PhysicsError`` if there is none."""
+        worlds, index = self.sample.worlds, self.sample.index
+        good = np.setdiff1d(np.arange(worlds.n), self.lost)
+        if self.left_out and not good.size:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
+        outcomes = {name: _joined([part.among(good) for part in parts]) for name, parts in self.parts.items()}
+        if self.left_out:
+            worlds, index = worlds.take(good), index[good]
+        return Evaluation(scenario, driven, worlds, index, seed, outcomes, self.left_out)
+
+
+class _Chunk(NamedTuple):
+    """What drives in some worlds of a list."""
+
+    worlds: Worlds
+    agent: Driver
+    driven: tuple[int, ...]
+    scenario: Scenario
+    aftermath: bool
+
+    def roll_out(self, rows: Ints) -> Outcome:
+        """The outcome in these worlds alone, of a fresh team."""
+        return _roll_out(self.worlds.take(rows), team_of(self.agent, self.driven), self.scenario, self.aftermath)
 
 
 def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -> Outcome:

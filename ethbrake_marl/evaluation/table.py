@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_text, sees_through
 from ethbrake_marl.evaluation.paper import is_papers_test
 from ethbrake_marl.evaluation.parameters import parameters
 from ethbrake_marl.evaluation.regret import Distance, assess, distance
-from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
+from ethbrake_marl.evaluation.rollout import Evaluation, LeftOut, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, rate, relative_decrease
 
 BASELINE = "full_brake"
@@ -38,6 +38,7 @@ class SummaryRow:
     shoved_m: Estimate | None = None  # how far Vehicle 1 ends beyond where it would by itself
     shoved_far: Estimate | None = None  # share of worlds in which that is more than ``FAR_M``
     sampled_harm: Estimate | None = None  # the paper's sum over samples
+    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that no row counts: they could not be advanced
     beside_paper: bool = False  # these are results of the test that the paper's rows are about
     knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
     hidden_share: float = 0.0  # worlds in which the channel hides something from a driven vehicle, whoever drives
@@ -70,6 +71,7 @@ class SummaryRow:
             **(_named("predicted_harm", self.predicted_harm) if self.predicted_harm else {}),
             **({"policy_share": self.policy_share} if self.policy_share is not None else {}),
             **self._distance_to_json(),
+            "left_out": [left._asdict() for left in self.left_out],
             "parameters": self.parameters,
         }
 
@@ -81,6 +83,7 @@ class SummaryRow:
             **found,
             "known_best_share": self.distance.known_best_share,
             "below_best_known": self.distance.below_best_known,
+            "impact_unproven": None if self.distance.between is None else asdict(self.distance.between),
         }
 
 
@@ -95,6 +98,7 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> list[Summa
         replace(
             row,
             beside_paper=beside,
+            left_out=evaluation.left_out,
             distance=distance(regrets, evaluation.outcome(row.agent), braking),
             knows=evaluation.outcome(row.agent).knows,
             hidden_share=hidden,

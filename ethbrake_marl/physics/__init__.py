@@ -1,6 +1,7 @@
 """Exact physics of a line of vehicles: compiled and pure. No YAML, no random numbers, no torch."""
 
 from ethbrake_marl.physics.advance import ImpactRows, Impacts, advance
+from ethbrake_marl.physics.failed import leaving_out_failed
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.sampled import advance_sampled
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, assign, concatenate, make_worlds
@@ -18,5 +19,6 @@ __all__ = [
     "assign",
     "concatenate",
     "forecast",
+    "leaving_out_failed",
     "make_worlds",
 ]

@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
 from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle, without_obstacle
 from ethbrake_marl.physics.parallel import by_parts
@@ -27,9 +28,7 @@ from ethbrake_marl.physics.segment import (
     FIRST_HARM,
     HIT,
     LIMIT,
-    MOST_EVENTS,
     ONSET,
-    PENETRATED,
     ROW_CLOSING,
     ROW_FIRST,
     ROW_FRONT_CHANGE,
@@ -38,7 +37,6 @@ from ethbrake_marl.physics.segment import (
     ROW_TIME,
     ROW_WIDTH,
     ROW_WORLD,
-    STUCK,
     TABLE_ROWS,
     TOTAL_HARM,
     advance_table,
@@ -78,12 +76,13 @@ class Impacts:
 def advance_worlds(
     gaps: Floats, speeds: Floats, time: Floats, hit: Bools, in_force: Floats, command: Floats, until: Floats,
     braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats, restitution: Floats,
-    first_harm: Floats, total_harm: Floats, count: Ints, rows: Floats,
+    first_harm: Floats, total_harm: Floats, count: Ints, failed: Ints, rows: Floats,
 ) -> tuple[int, int, int]:  # fmt: skip
     """Advance every world to its ``until``, in place (the first five arrays and the harm).
 
-    ``rows`` [capacity, ROW_WIDTH] receives the impacts that fit. Returns their whole number, the world where a check
-    failed (or -1) and its status.
+    ``rows`` [capacity, ROW_WIDTH] receives the impacts that fit. Returns their whole number, the world whose end or
+    command is refused (or -1) and why. A world in which a check fails is marked with its status in ``failed`` [n] (else
+    DONE) and stays where it was; the others go on.
     """
     n, vehicles = speeds.shape
     table = np.zeros((TABLE_ROWS, vehicles))
@@ -106,8 +105,9 @@ def advance_worlds(
             table[GAP, p] = gaps[k, p]
             table[HIT, p] = 1.0 if hit[k, p] else 0.0
         recorded, status = advance_table(table, restitution[k], duration, time[k], k, rows, recorded)
+        failed[k] = status
         if status != DONE:
-            return recorded, k, status
+            continue
         time[k] = until[k]
         for i in range(vehicles):
             speeds[k, i] = table[SPEED, i]
@@ -137,7 +137,7 @@ def advance(
     pay from about 10,000 worlds on. Inputs are left alone.
 
     Raises ``InvalidInput`` for a command that is not finite or exceeds a vehicle's capacity, an end before the worlds'
-    time, or ``threads`` below 1; ``PhysicsError`` if a check inside the kernel fails.
+    time, or ``threads`` below 1; ``PhysicsError``, which names every world in which a check inside the kernel failed.
     """
     command = _shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
     if (duration_s is None) == (until_s is None):
@@ -164,15 +164,19 @@ def _advance(worlds: Worlds, command: Floats, until: Floats, record: bool, threa
         )  # fmt: skip
         shape = worlds.gaps_m.shape
         first_harm, total_harm, count = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
+        failed = np.empty(worlds.n, np.int64)
         arrays = (
             after.gaps_m, after.speeds_mps, after.time_s, after.pair_hit, after.command_mps2, command, until,
             vehicles.braking_capacity_mps2, vehicles.driving_capacity_mps2, vehicles.latency_s, vehicles.mass_t,
             vehicles.speed_limit_mps, vehicles.restitution, first_harm, total_harm, count,
+            failed,
         )  # fmt: skip
         parts = by_parts(partial(_advance_part, arrays, capacity), worlds.n, threads)
         for part in parts:
             if part.status != DONE:
-                raise _failure(worlds, command, until, part.world, part.status)
+                raise _refusal(worlds, command, until, part.world, part.status)
+        if (failed != DONE).any():
+            raise failure(failed, worlds.time_s, until)
         impacts = Impacts(first_harm, total_harm, count, *no_hazard_harm(worlds.n))
         if not record:
             return after, impacts
@@ -200,10 +204,10 @@ def _advance_mixed(
 ) -> tuple[Worlds, Impacts]:
     """``advance`` of worlds of which only those marked have an obstacle."""
     places = [np.flatnonzero(~hazard), np.flatnonzero(hazard)]
-    parts = [
-        run(worlds.take(at), command[at], until[at], record, threads)
-        for run, at in zip((_advance, _advance_with_obstacle), places, strict=True)
-    ]
+    parts = []
+    for run, at in zip((_advance, _advance_with_obstacle), places, strict=True):
+        with renumbered(at):
+            parts.append(run(worlds.take(at), command[at], until[at], record, threads))
     order = np.argsort(np.concatenate(places))
     after = concatenate([part for part, _ in parts]).take(order)
     found = [impacts for _, impacts in parts]
@@ -235,7 +239,7 @@ class _Part(NamedTuple):
     first: int  # world of the whole batch with which the part begins
     rows: Floats  # the impacts that fit; worlds are counted from ``first``
     recorded: int  # all impacts
-    world: int  # where a check failed, counted from the batch's first world
+    world: int  # whose end or command is refused, counted from the batch's first world
     status: int
 
 
@@ -260,16 +264,13 @@ def _shaped(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> Float
         raise InvalidInput(f"{name}: shape {given.shape} does not fit {shape}") from None
 
 
-def _failure(worlds: Worlds, command: Floats, until: Floats, k: int, status: int) -> Exception:
+def _refusal(worlds: Worlds, command: Floats, until: Floats, k: int, status: int) -> InvalidInput:
     """The error for the world where the kernel stopped."""
     if status == _BAD_END:
         return InvalidInput(f"advance: world {k} is at {worlds.time_s[k]:g} s and cannot be advanced to {until[k]:g} s")
-    if status == _BAD_COMMAND:
-        low, high = -worlds.vehicles.braking_capacity_mps2[k], worlds.vehicles.driving_capacity_mps2[k]
-        i = int(np.argmin((command[k] >= low) & (command[k] <= high)))
-        return InvalidInput(f"command_mps2[{k}, {i}] = {command[k, i]:g}: must be in [{low[i]:g}, {high[i]:g}] m/s2")
-    reason = {PENETRATED: "a contact was missed", STUCK: f"more than {MOST_EVENTS} events"}[status]
-    return PhysicsError(f"world {k}: {reason} between {worlds.time_s[k]:g} s and {until[k]:g} s")
+    low, high = -worlds.vehicles.braking_capacity_mps2[k], worlds.vehicles.driving_capacity_mps2[k]
+    i = int(np.argmin((command[k] >= low) & (command[k] <= high)))
+    return InvalidInput(f"command_mps2[{k}, {i}] = {command[k, i]:g}: must be in [{low[i]:g}, {high[i]:g}] m/s2")
 
 
 def _refuse_bad(worlds: Worlds, command: Floats, until: Floats) -> None:
@@ -280,7 +281,7 @@ def _refuse_bad(worlds: Worlds, command: Floats, until: Floats) -> None:
     good = in_time & in_range.all(axis=1)
     if not good.all():
         k = int(np.argmin(good))
-        raise _failure(worlds, command, until, k, _BAD_COMMAND if in_time[k] else _BAD_END)
+        raise _refusal(worlds, command, until, k, _BAD_COMMAND if in_time[k] else _BAD_END)
 
 
 def _impact_rows(parts: list[_Part]) -> ImpactRows:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.errors import InvalidInput, PhysicsError, renumbered
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
 from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle
@@ -34,7 +34,8 @@ def forecast(
     Harm is that of all pairs and of the obstacle ahead, if there is one.
     ``command_mps2`` [n, N] are the other vehicles' commands (the vehicle's own column is ignored);
     ``candidates_mps2`` [n, K]. Worlds at or beyond ``until_s`` have no harm left. Pairs hit before do not count
-    again in first-impact harm. Raises ``InvalidInput`` for shapes that do not fit or a candidate beyond capacity.
+    again in first-impact harm. Raises ``InvalidInput`` for shapes that do not fit or a candidate beyond capacity,
+    ``PhysicsError`` naming the worlds in which a check of the kernel failed.
     """
     n, N = worlds.speeds_mps.shape
     if command_mps2.shape != (n, N) or candidates_mps2.ndim != 2 or candidates_mps2.shape[0] != n:
@@ -57,10 +58,12 @@ def forecast(
     first, total = np.empty(candidates_mps2.shape), np.empty(candidates_mps2.shape)
     with_one, without = np.flatnonzero(hazard), np.flatnonzero(~hazard)
     lines, command = with_obstacle(worlds.take(with_one)), ahead(0.0, command_mps2[with_one])
-    first[with_one], total[with_one] = _forecast(lines, command, vehicle + 1, candidates_mps2[with_one], until_s)
-    first[without], total[without] = _forecast(
-        worlds.take(without), command_mps2[without], vehicle, candidates_mps2[without], until_s
-    )
+    with renumbered(with_one):
+        first[with_one], total[with_one] = _forecast(lines, command, vehicle + 1, candidates_mps2[with_one], until_s)
+    with renumbered(without):
+        first[without], total[without] = _forecast(
+            worlds.take(without), command_mps2[without], vehicle, candidates_mps2[without], until_s
+        )
     return first, total
 
 
@@ -70,13 +73,14 @@ def _forecast(
     """``forecast`` of worlds without an obstacle, or with one that is written out as a vehicle."""
     v = worlds.vehicles
     first, total = np.zeros(candidates_mps2.shape), np.zeros(candidates_mps2.shape)
-    failed = forecast_worlds(
+    failed = np.zeros(worlds.n, np.bool_)
+    forecast_worlds(
         worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, np.ascontiguousarray(command_mps2), vehicle,
         np.ascontiguousarray(candidates_mps2), until_s, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, first,
-        total,
+        total, failed,
     )  # fmt: skip
-    if failed >= 0:
-        raise PhysicsError(f"forecast: world {failed} could not be advanced to {until_s:g} s")
+    if failed.any():
+        raise PhysicsError({k: f"a forecast could not reach {until_s:g} s" for k in np.flatnonzero(failed).tolist()})
     return first, total
 
 
@@ -84,8 +88,9 @@ def _forecast(
 def forecast_worlds(
     gaps: Floats, speeds: Floats, time: Floats, hit: Bools, command: Floats, vehicle: int, candidates: Floats,
     until_s: float, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, first: Floats, total: Floats,
-) -> int:  # fmt: skip
-    """Fill ``first`` and ``total`` [n, K]; returns a world where a check failed, or -1."""
+    failed: Bools,
+) -> None:  # fmt: skip
+    """Fill ``first`` and ``total`` [n, K], and ``failed`` [n] where a check failed."""
     n, vehicles = speeds.shape
     table = np.zeros((TABLE_ROWS, vehicles))
     no_rows = np.empty((0, ROW_WIDTH))
@@ -104,8 +109,8 @@ def forecast_worlds(
                 table[GAP, p] = gaps[k, p]
                 table[HIT, p] = 1.0 if hit[k, p] else 0.0
             if advance_table(table, restitution[k], duration, 0.0, k, no_rows, 0)[1] != DONE:
-                return k
+                failed[k] = True
+                break
             for p in range(vehicles - 1):
                 first[k, c] += table[FIRST_HARM, p]
                 total[k, c] += table[TOTAL_HARM, p]
-    return -1

@@ -82,6 +82,10 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
     One restitution holds per world, so clusters never mix two; the cluster is plastic when its largest closing speed
     is below ``PLASTIC_SPEED_MPS``. A block's common speed is refined by the mean of what is left over, so the momentum
     error stays within 4 eps of ``sum(m |v|)`` whatever the masses; a vehicle that nobody strikes keeps its bits.
+
+    The exact blocks are ordered, their refined speeds only up to rounding. A plastic cluster is therefore put in order
+    at the end (front to rear, nobody faster than the one before): then no pair approaches any more, and the instant has
+    no further round. Without it two blocks can hand the last bit to and fro for ever.
     """
     largest = 0.0
     for p in range(first, last):
@@ -99,6 +103,9 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
         for i in range(head, end):
             table[SPEED, i] = pooled + bounce * (pooled - table[SPEED, i])
         end = head
+    if bounce == 0.0:
+        for i in range(first + 1, last + 1):
+            table[SPEED, i] = min(table[SPEED, i], table[SPEED, i - 1])
 
 
 @compiled

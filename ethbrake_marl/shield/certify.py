@@ -27,8 +27,7 @@ them, each member being advanced by the same actions: then the realised harm of 
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +48,6 @@ REASONS = (
     "assumption broken",  # the world did not do what was predicted: the fallback was applied
     "policy rollout",  # nothing else kept the budget, but the policy itself does, rolled out after the proposal
 )
-PER_ROW = ("start", "clock", "bounds", "command", "latency", "mass", "limit", "identity")  # arrays of a problem
 CONSTANTS = tuple(-k / 10 for k in range(11))  # actions that are tried as constants: coasting to full braking
 
 
@@ -102,9 +100,7 @@ class Running(NamedTuple):
         return self._select(np.arange(self.n) * self.members, np.arange(self.n))
 
     def _select(self, rows: Ints, worlds: Ints) -> Running:
-        problem = self.problem
-        arrays: dict[str, Any] = {name: getattr(problem, name)[rows] for name in PER_ROW}
-        return Running(replace(problem, **arrays), self.states[rows], self.steps[worlds], self.ended[rows])
+        return Running(self.problem.take(rows), self.states[rows], self.steps[worlds], self.ended[rows])
 
 
 class Backup(NamedTuple):
@@ -152,8 +148,7 @@ def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Fl
         running.states, running.steps, running.ended, problem.clock, _bounds(problem), problem.command,
         problem.latency, problem.mass, problem.limit, int(problem.vehicles[0]), constants, plans, value,
     )  # fmt: skip
-    if not np.isfinite(value).all():
-        raise PhysicsError(f"shield: world {int(np.argmin(np.isfinite(value)))} could not be advanced")
+    _raise_if_any(~np.isfinite(value))
     return plans, value
 
 
@@ -167,7 +162,7 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
 
     ``budget`` [n] is the harm that is guaranteed, at least the backup's. A proposal beyond [-1, 1] is clipped first;
     one that is no number is replaced. Nothing given is changed. Raises ``InvalidInput`` for shapes that do not fit or a
-    budget below the backup's harm, ``PhysicsError`` if a world cannot be advanced.
+    budget below the backup's harm, ``PhysicsError`` naming the worlds that cannot be advanced by what would be applied.
     """
     n, problem = running.n, running.problem
     _check_plan(running, backup.plan)
@@ -179,19 +174,23 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
     if not (budget >= backup.harm).all():
         raise InvalidInput("certify: a budget is below the backup's harm; nothing could be guaranteed")
     plans, after, out = backup.plan.copy(), np.empty_like(running.states), np.empty((n, 4))
-    over = np.zeros(problem.n, np.bool_)
-    failed = certify_worlds(
+    over, failed = np.zeros(problem.n, np.bool_), np.zeros(n, np.bool_)
+    certify_worlds(
         running.states, running.steps, running.ended, problem.clock, _bounds(problem), problem.command,
         problem.latency, problem.mass, problem.limit, int(problem.vehicles[0]), given, budget, backup.harm,
-        backup.constants, plans, after, out, over,
+        backup.constants, plans, after, out, over, failed,
     )  # fmt: skip
-    if failed >= 0:
-        raise PhysicsError(f"shield: world {failed} could not be advanced")
+    _raise_if_any(failed)
     applied, bound, margin = out[:, 0].copy(), out[:, 2].copy(), out[:, 3].copy()
     reason = out[:, 1].astype(np.int64)
     intervened = (reason == NO_CERTIFICATE) | (reason == NOT_A_NUMBER)
     later = running._replace(states=after, steps=running.steps + ~running.finished, ended=over)
     return Decision(applied, intervened, reason, bound, margin, later, backup._replace(plan=plans, harm=bound))
+
+
+def _raise_if_any(failed: Bools) -> None:
+    if failed.any():
+        raise PhysicsError({k: "the shield could not follow its plan" for k in np.flatnonzero(failed).tolist()})
 
 
 def _bounds(problem: ProfileProblem) -> Floats:

@@ -225,16 +225,15 @@ def decide_world(
     constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools, out: Floats,
 ) -> bool:  # fmt: skip
     """Decide in one world, see ``certify``: fills ``after``, ``over`` (by member) and ``out`` (applied, reason, bound,
-    margin); the plan is the one whose harm is ``out``'s bound. Returns whether the physics did not fail.
+    margin); the plan is the one whose harm is ``out``'s bound. A proposal from which the physics fails is not
+    certified. Returns whether the physics did not fail with what is applied.
     """
     usable = not math.isnan(proposed)
     proposal = min(max(proposed, -1.0), 1.0) if usable else plan[step]
     going = take_steps(world, states, ended, step, proposal, after, over)
-    if going < 0:
-        return False
-    value = worst_so_far(world, after)
+    value = worst_so_far(world, after) if going >= 0 else math.inf
     reason, least = PLAN_REMAINS, value
-    if proposal == plan[step]:
+    if proposal == plan[step] and going >= 0:
         reason, value = SAME_AS_PLAN if usable else NOT_A_NUMBER, certified
     elif going > 0:
         room[0, :] = plan
@@ -258,9 +257,9 @@ def decide_world(
 def certify_worlds(
     states: Floats, steps: Ints, ended: Bools, clock: Floats, bounds: Floats, command: Floats, latency: Floats,
     mass: Floats, limit: Floats, vehicle: int, proposed: Floats, budget: Floats, certified: Floats, constants: Floats,
-    plans: Floats, after: Floats, out: Floats, over: Bools,
-) -> int:  # fmt: skip
-    """``decide_world`` in every world whose episode runs; a world that failed, or -1. ``plans`` change in place.
+    plans: Floats, after: Floats, out: Floats, over: Bools, failed: Bools,
+) -> None:  # fmt: skip
+    """``decide_world`` in every world whose episode runs; ``failed`` [n] where it did. ``plans`` change in place.
 
     World k's members are the rows from k * M on, M of them.
     """
@@ -285,9 +284,7 @@ def certify_worlds(
             world, states[a:b], ended[a:b], steps[k], proposed[k], budget[k], certified[k], constants, plans[k], room,
             after[a:b], over[a:b], out[k],
         )  # fmt: skip
-        if not good:
-            return k
-    return -1
+        failed[k] = not good
 
 
 @compiled

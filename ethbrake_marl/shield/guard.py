@@ -14,14 +14,14 @@ from ethbrake_marl.actions import command_to_action
 from ethbrake_marl.agents.coupled import optimise_coupled
 from ethbrake_marl.agents.driving import scripted
 from ethbrake_marl.agents.others import fixed_commands
+from ethbrake_marl.agents.profile_problem import PER_WORLD as OF_PROBLEM
 from ethbrake_marl.agents.profile_problem import profile_problem
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.harm import HarmCount, check_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.certify import (
-    PER_ROW,
     Backup,
     Decision,
     Running,
@@ -145,10 +145,11 @@ class StepShield:
         best = optimise_coupled(
             worlds, vehicle, count=self.count, horizon_s=scenario.horizon_s, others_mps2=others[::members]
         ).deceleration_mps2
-        problem = profile_problem(
-            possible, [vehicle], count=self.count, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s,
-            others_mps2=others,
-        )  # fmt: skip
+        with renumbered(np.repeat(np.arange(worlds.n), members)):
+            problem = profile_problem(
+                possible, [vehicle], count=self.count, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s,
+                others_mps2=others,
+            )  # fmt: skip
         running = begin_running(problem, members)
         plan = np.repeat(command_to_action(-best, worlds.vehicles, vehicle)[:, np.newaxis], self._width, axis=1)
         if members > 1:
@@ -281,7 +282,7 @@ class StepShield:
             return
         at = old.rows_of(rows)
         arrays: dict[str, Any] = {
-            name: put(getattr(old.problem, name), at, getattr(running.problem, name)) for name in PER_ROW
+            name: put(getattr(old.problem, name), at, getattr(running.problem, name)) for name in OF_PROBLEM
         }
         self.running = Running(
             replace(old.problem, **arrays),
@@ -296,4 +297,5 @@ class StepShield:
 
 def _harm_of(running: Running, plan: Floats, rows: Ints) -> Floats:
     """Harm of the plans in some of the worlds."""
-    return plan_harm(running.take(rows), plan[rows])
+    with renumbered(rows):
+        return plan_harm(running.take(rows), plan[rows])

@@ -19,6 +19,7 @@ from ethbrake_marl.agents.profile_motion import HARM_IS_TOTAL, START, TIME_STEP
 from ethbrake_marl.agents.profile_problem import ProfileProblem, worlds_at
 from ethbrake_marl.agents.protocol import Agent, Divisible
 from ethbrake_marl.agents.rehearsed import Rehearsed
+from ethbrake_marl.errors import renumbered
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify, from_now, plan_harm
@@ -57,9 +58,10 @@ def certify_rollouts(
     """
     part, first, least = running.take(rows), np.clip(proposed[rows], -1.0, 1.0), budget[rows]
     plan = _later_plan(running.nominal(), first, rows, budget, held, proposer)
-    harm = plan_harm(part, plan)
-    kept = harm <= least
-    decision = certify(part, first, Backup(plan, harm), np.maximum(least, harm))
+    with renumbered(rows):
+        harm = plan_harm(part, plan)
+        kept = harm <= least
+        decision = certify(part, first, Backup(plan, harm), np.maximum(least, harm))
     return decision._replace(intervened=~kept, margin=least - harm)
 
 
@@ -82,7 +84,8 @@ def _later_plan(
     while True:
         going = np.flatnonzero(~episodes.ended)
         plan[going, episodes.steps[going]] = action[going]
-        episodes = certify(episodes, action, Backup(plan, nothing, no_constants), nothing).after
+        with renumbered(batch):
+            episodes = certify(episodes, action, Backup(plan, nothing, no_constants), nothing).after
         episodes = episodes._replace(ended=episodes.ended | (harm_so_far(episodes) > most))
         if episodes.ended.all():
             return plan[wanted]

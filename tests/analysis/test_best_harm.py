@@ -9,15 +9,16 @@ import pytest
 from ethbrake_marl.agents import make_agent, optimise_coupled
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.profile_problem import profile_problem
-from ethbrake_marl.agents.profiles import Profiles, constant_profiles, follow_profiles, search_profiles
+from ethbrake_marl.agents.profiles import Profiles, constant_profiles, even_grid, follow_profiles, search_profiles
 from ethbrake_marl.agents.replay import BestHarm
-from ethbrake_marl.analysis.best_harm import best_harm, realised_harm, search_list, world_identity
+from ethbrake_marl.analysis.best_harm import LEFT_OUT, best_harm, realised_harm, search_list, world_identity
 from ethbrake_marl.analysis.best_harm_shipped import TABLES, best_known, shipped_profiles, shipped_tables
 from ethbrake_marl.analysis.best_harm_table import BestHarmTable, load_table, save_table
-from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.harm import COUNTS
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
+from tests.failing_worlds import planted_list, without
 
 BUDGET = 800
 
@@ -298,3 +299,47 @@ def test_follow__phase_by_phase_agrees_with_advance_over_long_segments(worlds: W
     command[:, 1] = constants
     first, _ = follow_profiles(problem, constant_profiles(problem, constants[:, None, None]))
     assert first == pytest.approx(_realised(worlds, command), abs=1e-7)
+
+
+def test_even_grid__ends_at_the_capacities_to_the_bit() -> None:
+    low, high = -4.0, 1.2
+    assert low + (high - low) > high  # an ulp beyond what the vehicle has
+    worlds = replace_capacities(two_cars(), braking=-low, driving=high)
+    grid = even_grid(profile_problem(worlds, [1]), 5)
+    assert grid[0, [0, -1], 0].tolist() == [low, high]
+    assert grid[0, :, 0] == pytest.approx([-4.0, -2.7, -1.4, -0.1, 1.2])
+
+
+def replace_capacities(worlds: Worlds, *, braking: float, driving: float) -> Worlds:
+    full = np.ones(worlds.speeds_mps.shape)
+    vehicles = replace(worlds.vehicles, braking_capacity_mps2=braking * full, driving_capacity_mps2=driving * full)
+    return replace(worlds, vehicles=vehicles)
+
+
+@pytest.mark.parametrize("vehicles", [(1,), (0, 1)])
+def test_best_harm__searches_where_the_capacities_differ_by_an_ulp_too_much(
+    scenario: Scenario, worlds: Worlds, vehicles: tuple[int, ...]
+) -> None:
+    rounded = replace_capacities(worlds, braking=4.0, driving=1.2)
+    table = best_harm(scenario, rounded, counts=["first"], vehicles=vehicles, budget=100, threads=1)
+    assert np.isfinite(table.best["first"].harm).all()
+
+
+def test_planner__starts_from_capacities_that_differ_by_an_ulp_too_much(scenario: Scenario, worlds: Worlds) -> None:
+    rounded = replace_capacities(worlds, braking=4.0, driving=1.2)
+    assert np.isfinite(drive(rounded, make_agent("planner:8"), scenario, 1).ledger.world_harm("first")).all()
+
+
+def test_search_list__leaves_a_world_out_that_cannot_be_advanced(scenario: Scenario, tmp_path: Path) -> None:
+    sample = planted_list(scenario, 5, 11, [1, 3])
+    found = search_list(scenario, sample, budget=100, threads=1, chunks=tmp_path)
+    assert sorted(found.header[LEFT_OUT]) == ["1", "3"]
+    assert "a contact was missed" in found.header[LEFT_OUT]["3"]
+    rows = without(5, [1, 3])
+    alone = best_harm(scenario, sample.worlds.take(rows), budget=100, threads=1)
+    assert np.array_equal(found.identity, alone.identity)
+    assert np.array_equal(found.best["total"].harm, alone.best["total"].harm)
+    again = search_list(scenario, sample, budget=100, threads=1, chunks=tmp_path, known=None)
+    assert again.header == found.header and np.array_equal(again.best["first"].harm, found.best["first"].harm)
+    with pytest.raises(PhysicsError, match="world 1: a contact was missed"):
+        search_list(scenario, replace(sample, worlds=sample.worlds.take([1]), index=np.array([1])), budget=100)

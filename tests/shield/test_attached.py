@@ -1,4 +1,4 @@
-"""What the engine does is what was certified, to the last step; nobody gets between the two, and no bound outlives it."""
+"""What the engine does is what was certified; nobody gets between the two, and no bound outlives it."""
 
 from __future__ import annotations
 
@@ -185,7 +185,8 @@ def test_clone__between_certificate_and_step_goes_on_apart(clone):
     other = clone(env)
     assert other.attached.engine is other.venv.engine and other.attached.engine is not env.attached.engine
     told = [each.step_wait()[3] for each in (env, other)]
-    assert [[row["shield"] for row in rows] for rows in told][0] == [row["shield"] for row in told[1]]
+    first, second = ([row["shield"] for row in rows] for rows in told)
+    assert first == second
     assert env.attached.shield.running.steps.tolist() == other.attached.shield.running.steps.tolist()
 
 

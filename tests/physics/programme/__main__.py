@@ -6,10 +6,10 @@ import argparse
 import sys
 import time
 
-from tests.physics.programme import contacts, invariants, obstacles, sameness
+from tests.physics.programme import contacts, instants, invariants, obstacles, sameness
 from tests.physics.programme.gates import GATES
 
-PARTS = (invariants, contacts, obstacles, sameness)  # importing a part enters its gates
+PARTS = (invariants, contacts, obstacles, instants, sameness)  # importing a part enters its gates
 
 
 def main() -> int:

@@ -1,0 +1,150 @@
+"""Worlds that cannot be advanced: every layer names them by the rows of its own batch, and the others go on."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.coupled import optimise_coupled
+from ethbrake_marl.agents.profile_problem import profile_problem
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.errors import FailedWorld, PhysicsError
+from ethbrake_marl.physics import advance, concatenate, forecast, leaving_out_failed
+from ethbrake_marl.physics.packed import gap_at, speed_at
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.shield.certify import Backup, begin_running, certify
+from ethbrake_marl.shield.guard import StepShield
+from ethbrake_marl.snapshots import engine_snapshot, restore_engine
+from tests.failing_worlds import plant, planted_list, without
+
+PAPER = load_scenario("paper-random")
+N, PLANTED = 9, [2, 6]
+
+
+@pytest.fixture
+def worlds():
+    return planted_list(PAPER, N, 7, PLANTED).worlds
+
+
+def failed_rows(call):
+    with pytest.raises(PhysicsError) as raised:
+        call()
+    return sorted(raised.value.worlds)
+
+
+def braking(worlds):
+    return -worlds.vehicles.braking_capacity_mps2
+
+
+def test_every_search_and_forecast__names_all_of_them(worlds):
+    candidates = np.tile([-6.0, 0.0], (N, 1))
+    for call in (
+        lambda: advance(worlds, braking(worlds), until_s=8.0),
+        lambda: advance(worlds, braking(worlds), until_s=8.0, threads=3),
+        lambda: advance(worlds, braking(worlds), until_s=8.0, record=True),
+        lambda: forecast(worlds, braking(worlds), 1, candidates, 8.0),
+        lambda: optimise_coupled(worlds, 1),
+        lambda: profile_problem(worlds, [1]),
+        lambda: StepShield(PAPER, 1).begin(worlds, np.arange(N)),
+    ):
+        assert failed_rows(call) == PLANTED
+
+
+def test_mixed_batches__name_them_by_the_rows_of_the_whole(worlds):
+    hazard = np.full(N, np.inf)
+    hazard[[1, 2, 4]] = 300.0
+    mixed = replace(worlds, hazard_gap_m=hazard)
+    lost = failed_rows(lambda: advance(mixed, braking(mixed), until_s=8.0))
+    assert lost == [6]  # those without an obstacle go first
+    well, rows, failed = leaving_out_failed(
+        lambda at: advance(mixed.take(at), braking(mixed)[at], until_s=8.0)[0], np.arange(N)
+    )
+    assert sorted(failed) == PLANTED and rows.tolist() == without(N, PLANTED).tolist()
+    assert well.n == len(rows)
+
+
+def test_error__lists_a_few_and_counts_the_rest_and_travels_between_processes():
+    error = PhysicsError({k: "broke" for k in range(8)})
+    assert str(error).startswith("world 0: broke; world 1: broke;") and str(error).endswith("and 3 more worlds")
+    copy = pickle.loads(pickle.dumps(error))
+    assert copy.worlds == error.worlds and str(copy) == str(error)
+
+
+def engine(n=3, seed=5):
+    scripts = {i: make_agent("full_brake") for i in (0, 2)}
+    return Engine(PAPER, n, learners=(1,), scripts=scripts, seed=seed)
+
+
+def break_row(running, k):
+    """Put row k into a state that the next step cannot leave."""
+    state = running.packed.state
+    state[k, gap_at(3) : gap_at(3) + 2] = [0.5, -1.0]
+    state[k, speed_at(3) : speed_at(3) + 3] = [10.0, 20.0, 16.0]
+
+
+def test_engine__cuts_the_episode_off_names_the_world_and_steps_the_others():
+    running, twin = engine(), engine()
+    running.step(np.zeros((3, 1)))
+    twin.step(np.zeros((3, 1)))
+    break_row(running, 1)
+    before = running.packed.state[1].copy()
+    with pytest.warns(FailedWorld, match=r"^world 1 of seed 5: a contact was missed between 0.6 s and 0.7 s"):
+        step = running.step(np.full((3, 1), -0.5))
+    expected = twin.step(np.full((3, 1), -0.5))
+    assert step.truncated.tolist() == [False, True, False] and not step.terminated.any()
+    assert step.failed.nonzero()[0].tolist() == [1] and list(running.roster.failed) == [1]
+    assert step.reward[1].tolist() == [0.0, 0.0, 0.0]
+    assert np.array_equal(running.packed.state[[0, 2]], twin.packed.state[[0, 2]])
+    assert np.array_equal(step.reward[[0, 2]], expected.reward[[0, 2]])
+    kept = [0, *range(gap_at(3), before.size)]  # time, gaps, flags, harm
+    assert np.array_equal(running.packed.state[1, kept], before[kept])
+    assert running.ended.tolist() == [False, True, False]
+    running.renew(np.array([1]))  # the next world of the stream
+    assert running.roster.failed == {} and not running.ended.any()
+    break_row(running, 1)
+    with pytest.warns(FailedWorld, match=r"^world 3 of seed 5"):
+        running.step(np.zeros((3, 1)))
+
+
+def test_engine__after_a_snapshot_names_the_row():
+    running, other = engine(), engine(seed=9)
+    restore_engine(other, engine_snapshot(running))
+    break_row(other, 2)
+    with pytest.warns(FailedWorld, match=r"^the world of row 2: a contact was missed"):
+        other.step(np.zeros((3, 1)))
+
+
+def test_stream__a_world_that_never_reaches_its_first_decision_gives_its_place_to_the_next(monkeypatch):
+    well = engine(n=4)
+    drawn = Scenario.sample
+
+    def planted(self, n, seed, **options):
+        sample = drawn(self, n, seed, **options)
+        return replace(sample, worlds=plant(sample.worlds, [1]))
+
+    monkeypatch.setattr(Scenario, "sample", planted)
+    with pytest.warns(FailedWorld, match=r"^world 1 of seed 5: a contact was missed.*left out"):
+        running = engine(n=4)
+    assert np.array_equal(running.packed.state, well.packed.state[[0, 2, 2, 3]])
+
+
+def test_shield__a_proposal_that_cannot_be_advanced_is_not_certified():
+    worlds = PAPER.sample(3, 7).worlds
+    running = begin_running(profile_problem(worlds, [1]))
+    plan = np.full((3, 81), -1.0)
+    states = running.states.copy()
+    states[1, :5] = [10.0, 20.0, 16.0, 0.5, -1.0]
+    broken = running._replace(states=states)
+    harm = np.full(3, 1e3)
+    with pytest.raises(PhysicsError) as raised:
+        certify(broken, np.zeros(3), Backup(plan, harm), harm)
+    assert list(raised.value.worlds) == [1]  # the plan cannot be followed there either; the others are well
+
+
+def test_concatenated_batches__are_not_told_apart(worlds):
+    both = concatenate([worlds, worlds])
+    assert failed_rows(lambda: advance(both, braking(both), until_s=8.0)) == [2, 6, 11, 15]
