@@ -42,7 +42,7 @@ class Limits:
 
     @property
     def impact_proven(self) -> Bools:
-        """Worlds in which every command leads to an impact, not only to contact."""
+        """Worlds in which every command is proven to lead to an impact, not only to contact."""
         return self.proven_harm > 0.0
 
     @property
