@@ -26,7 +26,7 @@ help:
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, search, faces, bound (three quarters of an hour of one core)"
 	@echo "make shield-bugs      plant 14 bugs in copies of the shield; each must turn a test red"
-	@echo "make planted-bugs     plant 23 bugs in copies of the code; each must turn a test red"
+	@echo "make planted-bugs     plant 27 bugs in copies of the code; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of physics and harm (ARGS='--sample 100')"
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
 	@echo "make venv             the environment alone: $(VENV)"
