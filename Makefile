@@ -29,7 +29,7 @@ help:
 	@echo "make test-shield      try to break the step shield: speed, search, faces, bound (three quarters of an hour of one core)"
 	@echo "make shield-bugs      plant 14 bugs in copies of the shield; each must turn a test red"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
-	@echo "make planted-bugs     plant 23 bugs in copies of the physics, 44 in the rest; each must turn a test red"
+	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of the physics (ARGS='--modules rewards,v2x --sample 40': of others)"
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
 	@echo "make venv             the environment alone: $(VENV)"

@@ -58,7 +58,7 @@ class LowerBound:
 
     @property
     def impact_proven(self) -> Bools:
-        """Whether every profile has an impact, [n]; elsewhere vehicles may get away with leaning on each other."""
+        """Whether every profile has an impact, [n]; elsewhere none is proven, which need not mean that one can."""
         yes: Bools = self.harm > 0.0
         return yes
 

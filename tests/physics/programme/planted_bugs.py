@@ -1,7 +1,7 @@
-"""Twenty-three bugs that such a simulator could have: planted in a copy of the repository, each must turn a test red.
+"""Twenty-seven bugs that such a simulator could have: planted in a copy of the repository, each must turn a test red.
 
 ``make planted-bugs`` (or ``python -m tests.physics.programme.planted_bugs [--jobs J] [--only WORD]``). A bug is a
-textual patch of the kernel or the ledger. It is applied to a temporary copy, never to the working tree. There some test
+textual patch of the kernel, the ledger, the lower bound or the search. It is applied to a temporary copy, never to the working tree. There some test
 files run with compilation switched off (2 s), and where these stay green the whole suite of the physics, compiled;
 until the first failure. The first suite is tried without any bug before: it must be green. (The second one is what
 ``make test`` runs.) A patch that does not fit the code is an error.
@@ -24,7 +24,13 @@ from typing import NamedTuple
 from tests.programme.copies import KERNELS, copy_repository
 from tests.programme.suites import ROOT
 
-QUICK = tuple(
+BY_HAND = (
+    "tests/physics/test_instants.py::test_plastic_cluster__three_vehicles_do_not_hand_the_last_bit_to_and_fro",
+    "tests/analysis/test_lower_bound.py::test_front_pair__by_hand",
+    "tests/analysis/test_lower_bound_conditions.py",
+    "tests/analysis/test_best_harm.py::test_even_grid__ends_at_the_capacities_to_the_bit",
+)
+QUICK = BY_HAND + tuple(
     f"tests/{name}.py"
     for name in (
         "physics/test_advance",
@@ -42,6 +48,8 @@ EVENTS, IMPACT, SEGMENT, ADVANCE = (
     f"ethbrake_marl/physics/{name}.py" for name in ("events", "impact", "segment", "advance")
 )
 HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/obstacle.py"
+BOUNDS, LOWER_BOUND = (f"ethbrake_marl/analysis/{name}.py" for name in ("avoidability_bounds", "lower_bound"))
+PROFILES = "ethbrake_marl/agents/profiles.py"
 
 
 class Patch(NamedTuple):
@@ -151,6 +159,18 @@ BUGS: dict[str, tuple[Patch, ...]] = {
             "np.concatenate([worlds.hazard_hit[:, np.newaxis], worlds.pair_hit], axis=1)",
             "np.concatenate([False & worlds.hazard_hit[:, np.newaxis], worlds.pair_hit], axis=1)",
         ),
+    ),
+    "plastic cluster left out of order by a last digit": (
+        Patch(IMPACT, "    if bounce == 0.0:\n", "    if bounce == -1.0:\n"),
+    ),
+    "lower bound: combined bound claimed for a weak rear": (
+        Patch(BOUNDS, " and 0.5 * (at[A_F] + pooled) >= at[A_L]):", "):"),
+    ),
+    "lower bound not rounded outward": (
+        Patch(LOWER_BOUND, "np.maximum(part - rounding(worlds, vehicle), 0.0)", "np.maximum(part, 0.0)"),
+    ),
+    "search that starts an ulp beyond the capacity": (
+        Patch(PROFILES, "np.minimum(low + share * (high - low), high)", "low + share * (high - low)"),
     ),
 }
 

@@ -1,0 +1,83 @@
+"""Proven and best known harm beside each other, and the worlds between proven contact and proven impact."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.analysis.best_harm_shipped import shipped_tables
+from ethbrake_marl.analysis.best_harm_table import BestHarmTable
+from ethbrake_marl.evaluation import bounds
+from ethbrake_marl.evaluation.bounds import bounds_of, proven_of_table, shipped_bounds, shipped_lines
+from ethbrake_marl.evaluation.regret import between
+from ethbrake_marl.scenario import load_scenario
+
+
+def shipped(name: str) -> BestHarmTable:
+    (table,) = (table for table in shipped_tables() if table.header["scenario"] == name)
+    return table
+
+
+def test_between__by_hand() -> None:
+    nan = np.nan
+    contact, impact = np.array([0, 1, 1, 1, 1], bool), np.array([0, 1, 0, 0, 0], bool)
+    first, total = np.array([0, 9, 1e-4, 6, nan]), np.array([0, 9, 2e-4, 8, nan])
+    found = between(contact, impact, first, total)
+    assert (found.rate, found.harmless_rate) == (0.6, 0.5)
+    assert (found.mean_first, found.mean_total) == pytest.approx((3.00005, 4.0001))
+    nobody = between(contact, contact, first, total)
+    assert (nobody.rate, nobody.mean_first, nobody.harmless_rate) == (0.0, None, None)
+
+
+def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
+    found = bounds_of(shipped("stress-wide"))
+    assert found.proven is not None and (found.worlds, found.list_seed) == (5000, 7)
+    assert found.gap(found.best_known_first) == pytest.approx(0.146, abs=5e-4)
+    assert found.gap(found.best_known_total) == pytest.approx(0.206, abs=5e-4)
+    inside = found.proven.between
+    assert found.proven.contact_proven_rate - found.proven.impact_proven_rate == pytest.approx(inside.rate)
+    assert inside.mean_first is not None and inside.mean_first > 20.0  # nobody leans there
+    assert inside.harmless_rate is not None and inside.harmless_rate < 0.5
+    (_, _, line) = shipped_lines([found])
+    assert "| 14.6 % |" in line and "| 20.6 % |" in line
+    told = json.loads(json.dumps(found.to_json()))
+    assert told["gap_total"] == found.gap(found.best_known_total)
+    assert told["proven"]["between"]["rate"] == inside.rate
+
+
+def test_shipped__in_the_papers_lists_leaning_explains_what_is_between() -> None:
+    found = bounds_of(shipped("paper-delay-low"))
+    assert found.proven is not None
+    assert found.proven.between.mean_first is not None and found.proven.between.mean_first < 0.01
+
+
+def test_shipped__every_table_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = [replace_header(table, episodes=20) for table in shipped_tables()]
+    monkeypatch.setattr(bounds, "shipped_tables", lambda: few)
+    found = list(shipped_bounds())
+    assert [one.scenario for one in found] == [table.header["scenario"] for table in shipped_tables()]
+    assert len(shipped_lines(found)) == 2 + len(found)
+
+
+def replace_header(table: BestHarmTable, **changes: object) -> BestHarmTable:
+    return replace(table, header={**table.header, **changes})
+
+
+def test_shipped__where_nothing_is_proven_the_reason_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = replace_header(shipped("paper-delay-low"), episodes=5)
+    monkeypatch.setattr(bounds, "limits_do_not_apply", lambda *_: "an obstacle stands ahead of vehicle_1")
+    found = bounds_of(table)
+    assert found.proven is None and found.gap(found.best_known_first) is None
+    assert "an obstacle stands ahead" in shipped_lines([found])[2]
+    assert found.to_json()["gap_first"] is None
+
+
+def test_proven__of_a_table_leaves_out_what_cannot_be_advanced() -> None:
+    scenario, table = load_scenario("paper-delay-low"), shipped("paper-delay-low")
+    worlds = scenario.sample(6, 7).worlds
+    whole = proven_of_table(scenario, worlds.take([0, 1, 3, 4, 5]), table, 1)
+    worlds.gaps_m[2], worlds.speeds_mps[2] = [0.2, -1.0], [10.0, 20.0, 16.0]
+    assert whole is not None and proven_of_table(scenario, worlds, table, 1) == whole
