@@ -15,6 +15,7 @@ from ethbrake_marl.analysis.best_harm import LEFT_OUT, best_harm, realised_harm,
 from ethbrake_marl.analysis.best_harm_shipped import TABLES, best_known, shipped_profiles, shipped_tables
 from ethbrake_marl.analysis.best_harm_table import BestHarmTable, load_table, save_table
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
+from ethbrake_marl.evaluation.three_tests import TESTS
 from ethbrake_marl.harm import COUNTS
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -257,7 +258,8 @@ def test_table__a_damaged_file_is_refused(tmp_path: Path, content: bytes) -> Non
 
 def test_shipped_tables__hold_the_shipped_lists_and_their_profiles_do_the_stored_harm() -> None:
     assert shipped_tables(), f"no table in {TABLES}"
-    for name, n in [("paper-random", 10_000), ("paper-delay-low", 2000), ("paper-delay-high", 2000)]:
+    three = [(name, 10_000) for name in TESTS]
+    for name, n in [*three, ("paper-delay-low", 2000), ("paper-delay-high", 2000)]:
         scenario = load_scenario(name)
         for first in (0, n - 5):
             worlds = scenario.sample(5, seed=7, first=first).worlds

@@ -7,6 +7,9 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.evaluation.three_tests import TESTS
+from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.learning import shipped
 from ethbrake_marl.learning.bundle import Policy, save_policy
 from ethbrake_marl.learning.shipped import card, load_named_policy, shipped_name, shipped_policies
@@ -79,3 +82,18 @@ def test_shipped_policies__each_that_ships_is_small_and_has_a_card() -> None:
         assert load_named_policy(f"shipped/{name}").manifest.steps > 0
         assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 1_000_000
         assert card(name).startswith("# ")
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("test", list(TESTS))
+def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_shield(
+    test: str, count: HarmCount
+) -> None:
+    scenario = load_scenario(test)
+    name = shipped_name("ppo", test, count)
+    assert load_named_policy(f"shipped/{name}").manifest.scenario["name"] == test
+    lineup = make_lineup(["ppo@shipped", "hybrid@shipped"], scenario, count=count)
+    result = evaluate(scenario.sample(20, 7), lineup, scenario=scenario, seed=7)
+    alone, shielded = (result.outcome(spec).ledger.world_harm(count) for spec in lineup)
+    assert shielded.mean() <= alone.mean()
+    assert (shielded <= result.outcome("hybrid@shipped").predicted_harm + 1e-9).all()
