@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -76,6 +77,20 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> list[Summa
         replace(row, beside_paper=beside, distance=distance(regrets, evaluation.outcome(row.agent), braking))
         for row in rows
     ]
+
+
+def horizon_note(moving: Mapping[str, int], worlds: int, horizon_s: float) -> str:
+    """What must be said of shielded drivers: in how many worlds, by driver, something still ``moving`` was cut off.
+
+    Empty where there is nothing to say.
+    """
+    found = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
+    if not found:
+        return ""
+    return (
+        f"note: bounds of the shield end at the horizon ({horizon_s:g} s) and say nothing of what comes after;"
+        f" worlds, of {worlds}, that were not at rest then: {found}"
+    )
 
 
 def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: dict[str, Any]) -> SummaryRow:
