@@ -15,6 +15,7 @@ from ethbrake_marl.evaluation import (
     check_target,
     declared_objectives,
     evaluate,
+    horizon_note,
     rescored,
     rescored_table,
     rich_table,
@@ -97,7 +98,11 @@ def evaluate_command(
         write_per_world_csv(per_world, evaluation, objectives=objectives, force=force)
         say(f"every world: {per_world}")
     told = rescored(evaluation, objectives)
-    show_rows(summarise(evaluation), as_json, told)
+    rows = summarise(evaluation)
+    show_rows(rows, as_json, told)
+    moving = {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
+    if note := horizon_note(moving, sample.worlds.n, chosen.horizon_s):
+        say(note)
     if told and not as_json:
         result_console().print(rescored_table(told, count))
 

@@ -8,7 +8,8 @@ import typer
 
 from ethbrake_marl.command_options import ForceOption, JsonOption, ScenarioOption, VehicleOption
 from ethbrake_marl.evaluation.output_files import write_output
-from ethbrake_marl.evaluation.shield_modes import ModeRow, compare_modes, modes_table
+from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table
+from ethbrake_marl.evaluation.table import horizon_note
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.lineup import LIST_SEED, load_driven, make_proposers
 from ethbrake_marl.picture_commands import PictureOption, picture_app, picture_target
@@ -38,11 +39,15 @@ def shield_command(
     Each decision that step mode replaced is simulated again without it: needed (harm would have been higher), harmless
     (the same), costly (lower).
     """
-    rows = measured_modes(agents, load_driven(scenario, vehicle), episodes, count)
+    chosen = load_driven(scenario, vehicle)
+    rows = measured_modes(agents, chosen, episodes, count)
     if as_json:
         write_json([row.to_json() for row in rows])
     else:
         result_console().print(modes_table(rows))
+    moving = {f"{row.agent} ({row.mode})": row.horizon_ends for row in rows if row.mode != NONE}
+    if note := horizon_note(moving, episodes, chosen.horizon_s):
+        say(note)
 
 
 @picture_app.command("shield-modes", epilog="Example: ethbrake picture shield-modes --episodes 500 --output modes.png")

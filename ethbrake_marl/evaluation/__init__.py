@@ -11,7 +11,7 @@ from ethbrake_marl.evaluation.rendering import markdown_table, rich_table
 from ethbrake_marl.evaluation.rescoring import Rescored, declared_objectives, rescored, rescored_table
 from ethbrake_marl.evaluation.rollout import Evaluation, LeftOut, Outcome, evaluate
 from ethbrake_marl.evaluation.statistics import Estimate
-from ethbrake_marl.evaluation.table import SummaryRow, summarise
+from ethbrake_marl.evaluation.table import SummaryRow, horizon_note, summarise
 
 __all__ = [
     "EpisodeRecord",
@@ -24,6 +24,7 @@ __all__ = [
     "check_target",
     "declared_objectives",
     "evaluate",
+    "horizon_note",
     "markdown_table",
     "parameter_line",
     "parameters",

@@ -33,6 +33,7 @@ class ModeRow:
     agent: str
     mode: str
     harm: Estimate  # mean over worlds (m2/s2)
+    horizon_ends: int  # worlds that the horizon cut off before the line stood: no bound says what comes after
     against_episode: Estimate | None  # minus that of episode mode, paired by world; None: of episode mode itself
     replaced: float | None = None  # share of the decisions; of step mode alone, as all that follows
     verdicts: tuple[float, ...] | None = None  # shares of the replaced decisions, in the order of VERDICTS
@@ -46,6 +47,7 @@ class ModeRow:
             "mode": self.mode,
             "harm": self.harm.value,
             "harm_interval": _interval(self.harm),
+            "horizon_ends": self.horizon_ends,
             "against_episode": None if against is None else against.value,
             "against_episode_interval": _interval(against),
             "decisions_replaced": self.replaced,
@@ -108,8 +110,9 @@ def _measured(worlds: Worlds, agent: Agent, scenario: Scenario, vehicle: int, co
     for name, later in ((STEP, True), (STEP_ALERT, False)):
         drivers[name] = StepShieldAgent(copy.deepcopy(agent), scenario, count=count, logging=True, later_rollouts=later)
     for name, driver in drivers.items():
-        harm = drive(worlds, driver, scenario, vehicle).ledger.world_harm(count)
-        found[name] = harm
+        episodes = drive(worlds, driver, scenario, vehicle)
+        harm = episodes.ledger.world_harm(count)
+        found[name], found[f"{name} moving"] = harm, int((~episodes.at_rest).sum())
         if isinstance(driver, StepShieldAgent):
             shield = driver.shield
             assert shield is not None and shield.running is not None
@@ -124,16 +127,19 @@ def _rows(name: str, parts: list[dict[str, Any]]) -> list[ModeRow]:
     harm: dict[str, Floats] = {
         mode: np.concatenate([part[mode] for part in parts]) for mode in (NONE, EPISODE, STEP, STEP_ALERT)
     }
+    moving = {mode: sum(part[f"{mode} moving"] for part in parts) for mode in harm}
     rows = [
-        ModeRow(name, NONE, mean(harm[NONE]), paired_difference(harm[NONE], harm[EPISODE])),
-        ModeRow(name, EPISODE, mean(harm[EPISODE]), None),
+        ModeRow(name, NONE, mean(harm[NONE]), moving[NONE], paired_difference(harm[NONE], harm[EPISODE])),
+        ModeRow(name, EPISODE, mean(harm[EPISODE]), moving[EPISODE], None),
     ]
     for mode in (STEP, STEP_ALERT):
         decisions, above, *counted = np.sum([part[f"{mode} counts"] for part in parts], axis=0).tolist()
         replaced = sum(counted)
         shares = tuple(each / replaced for each in counted) if replaced else None
         difference = paired_difference(harm[mode], harm[EPISODE])
-        rows.append(ModeRow(name, mode, mean(harm[mode]), difference, replaced / decisions, shares, above))
+        rows.append(
+            ModeRow(name, mode, mean(harm[mode]), moving[mode], difference, replaced / decisions, shares, above)
+        )
     return rows
 
 

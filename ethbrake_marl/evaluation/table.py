@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+<<<<<<< HEAD
 from dataclasses import asdict, dataclass, field, replace
+=======
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+>>>>>>> h12-a
 from typing import Any
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_text, sees_through
@@ -105,6 +110,20 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> list[Summa
         )
         for row in rows
     ]
+
+
+def horizon_note(moving: Mapping[str, int], worlds: int, horizon_s: float) -> str:
+    """What must be said of shielded drivers: in how many worlds, by driver, something still ``moving`` was cut off.
+
+    Empty where there is nothing to say.
+    """
+    found = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
+    if not found:
+        return ""
+    return (
+        f"note: bounds of the shield end at the horizon ({horizon_s:g} s) and say nothing of what comes after;"
+        f" worlds, of {worlds}, that were not at rest then: {found}"
+    )
 
 
 def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: dict[str, Any]) -> SummaryRow:

@@ -11,6 +11,7 @@ from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.lineup import make_lineup
 from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.scenario.shipped_files import shipped_folder
 
 
 def test_shield__prints_its_rows_as_json_and_as_a_table(ethbrake):
@@ -62,3 +63,16 @@ def test_evaluate__a_team_behind_a_shield_is_refused(monkeypatch):
     assert list(make_lineup(["team@run"], scenario)) == ["team@run"]
     with pytest.raises(InvalidInput, match="agent 'team@run': is a team, and shield step is for one driven vehicle"):
         make_lineup(["team@run"], scenario, shield="step")
+
+
+def test_horizon__what_still_moves_then_is_told_by_both_commands(ethbrake, tmp_path):
+    short = tmp_path / "short.yaml"
+    long = (shipped_folder("scenarios", "scenarios") / "paper" / "paper-random.yaml").read_text("utf-8")
+    short.write_text(long.replace("horizon_s: 8", "horizon_s: 3").replace("name: paper-random", "name: short"), "utf-8")
+    note = "note: bounds of the shield end at the horizon (3 s) and say nothing of what comes after; worlds, of 20,"
+    told = ethbrake("shield", "--agents", "full_brake", "--episodes", "20", "--scenario", str(short), "--json")
+    assert note in told.err and all(row["horizon_ends"] > 10 for row in json.loads(told.out))
+    agents = "hybrid@shipped,full_brake"
+    evaluated = ethbrake("evaluate", "--agents", agents, "--episodes", "20", "--scenario", str(short))
+    assert note in evaluated.err and "full_brake" not in evaluated.err
+    assert "note: bounds" not in ethbrake("shield", "--agents", "full_brake", "--episodes", "5").err

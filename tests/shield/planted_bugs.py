@@ -1,4 +1,4 @@
-"""Fourteen bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
+"""Nineteen bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
 applied to a temporary copy. There ``test_certify``, ``test_guard`` and one test of ``test_robust`` run with compilation
@@ -15,9 +15,10 @@ from tests.physics.programme.planted_bugs import Patch, red_with
 
 BY_HAND = "test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner"
 QUICK = ("tests/shield/test_certify.py", "tests/shield/test_guard.py", f"tests/shield/test_robust.py::{BY_HAND}")
-WHOLE = ("tests/shield/test_step.py", "tests/shield/test_rollouts.py", "tests/shield/test_faces.py")
-KERNEL, CERTIFY, GUARD, ROLLOUTS = (
-    f"ethbrake_marl/shield/{name}.py" for name in ("certify_kernel", "certify", "guard", "rollouts")
+WHOLE = tuple(f"tests/shield/test_{name}.py" for name in ("attached", "step", "rollouts", "faces", "interference"))
+KERNEL, CERTIFY, GUARD, ROLLOUTS, ATTACHED, COMPARISON = (
+    f"ethbrake_marl/shield/{name}.py"
+    for name in ("certify_kernel", "certify", "guard", "rollouts", "attached", "comparison")
 )
 
 BUGS: dict[str, tuple[Patch, ...]] = {
@@ -52,9 +53,9 @@ BUGS: dict[str, tuple[Patch, ...]] = {
         ),
         Patch(
             GUARD,
-            "def as_predicted(",
+            "def _harm_of(",
             "def _at_once(worlds: Worlds) -> Worlds:\n    v = worlds.vehicles\n"
-            "    return replace(worlds, vehicles=replace(v, latency_s=0.0 * v.latency_s))\n\n\ndef as_predicted(",
+            "    return replace(worlds, vehicles=replace(v, latency_s=0.0 * v.latency_s))\n\n\ndef _harm_of(",
         ),
     ),
     "the rest of the plan begins one decision late": (
@@ -89,7 +90,7 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "a rollout writes another past into the plan": (
         Patch(ROLLOUTS, "from_now(held[batch], -1.0, episodes.steps)", "np.full_like(held[batch], -1.0)"),
         Patch(
-            GUARD,
+            ROLLOUTS,
             "    assert (plan == from_now(decision.backup.plan[rows], plan, found.after.steps - 1)).all()",
             "",
         ),
@@ -100,6 +101,27 @@ BUGS: dict[str, tuple[Patch, ...]] = {
             "m = (first + j) % ended.shape[0]\n        worst = max(worst, follow_plan",
             "m = 0\n        worst = max(worst, follow_plan",
         ),
+    ),
+    "what is seen of the harm so far is not compared": (
+        Patch(
+            COMPARISON, "return np.concatenate([state_columns(worlds), *harm], axis=1)", "return state_columns(worlds)"
+        ),
+    ),
+    "the shield goes on before the engine does": (
+        Patch(
+            ATTACHED,
+            "        applied = certified.decision.applied\n",
+            "        shield.commit(certified)\n        applied = certified.decision.applied\n",
+        ),
+    ),
+    "a second step on one certificate is let pass": (
+        Patch(ATTACHED, "if sent is None or sent.memory is not memory:", "if sent is None:"),
+    ),
+    "what a step led to is not compared": (
+        Patch(ATTACHED, "wanted & ~as_predicted(running, seen)", "wanted & (seen != seen).all(axis=1)"),
+    ),
+    "a step that was not made is not noticed": (
+        Patch(ATTACHED, "if self.engine.steps_made != self.sent.steps_made + 1:", "if self.engine.steps_made < 0:"),
     ),
     "a surprise is not flagged": (Patch(GUARD, "if not surprising.any():", "if surprising.any() or True:"),),
 }

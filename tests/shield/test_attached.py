@@ -1,4 +1,8 @@
+<<<<<<< HEAD
 """What the engine does is what was certified; nobody gets between the two, and no bound outlives it."""
+=======
+"""What the engine does is what was certified, to the last step, and what fails changes nothing."""
+>>>>>>> h12-a
 
 from __future__ import annotations
 
@@ -31,6 +35,7 @@ from ethbrake_marl.shield import (
 )
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from ethbrake_marl.stepping import STEP
+from tests.shield.beyond_horizon import above_later
 
 PAPER = load_scenario("paper-random")
 DRIVE = np.array([1.0])
@@ -184,9 +189,14 @@ def test_clone__between_certificate_and_step_goes_on_apart(clone):
     env.step_async(np.ones((4, 1), np.float32))
     other = clone(env)
     assert other.attached.engine is other.venv.engine and other.attached.engine is not env.attached.engine
+<<<<<<< HEAD
     told = [each.step_wait()[3] for each in (env, other)]
     first, second = ([row["shield"] for row in rows] for rows in told)
     assert first == second
+=======
+    told, again = ([row["shield"] for row in each.step_wait()[3]] for each in (env, other))
+    assert told == again
+>>>>>>> h12-a
     assert env.attached.shield.running.steps.tolist() == other.attached.shield.running.steps.tolist()
 
 
@@ -337,3 +347,8 @@ def test_horizon__settles_says_what_the_plan_comes_to_in_the_engine():
     episodes = drive(worlds, StepShieldAgent(make_agent("e_v2x_bm"), scenario), scenario, 1)
     rests = (episodes.final.speeds_mps == 0.0).all(axis=1)
     assert rests.tolist() == shield.settles.tolist() and 0 < rests.sum() < 60
+
+
+def test_horizon__beyond_it_the_bound_says_nothing():
+    now, later = above_later("coast", 200)
+    assert now == 0.0 and later > 0.5
