@@ -26,18 +26,11 @@ help:
 	@echo "make check            lint and test"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
-<<<<<<< HEAD
-	@echo "make test-shield      try to break the step shield: speed, search, faces, bound (three quarters of an hour of one core)"
-	@echo "make shield-bugs      plant 14 bugs in copies of the shield; each must turn a test red"
+	@echo "make test-shield      try to break the step shield: speed, interference, search, faces, bound (three quarters of an hour of one core)"
+	@echo "make shield-bugs      plant 19 bugs in copies of the shield; each must turn a test red"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
 	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of the physics (ARGS='--modules rewards,v2x --sample 40': of others)"
-=======
-	@echo "make test-shield      try to break the step shield: speed, interference, search, faces, bound (three quarters of an hour of one core)"
-	@echo "make shield-bugs      plant 19 bugs in copies of the shield; each must turn a test red"
-	@echo "make planted-bugs     plant 23 bugs in copies of the code; each must turn a test red"
-	@echo "make mutation [ARGS=] mutation testing of physics and harm (ARGS='--sample 100')"
->>>>>>> h12-a
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make clean            remove $(VENV), $(PEERS), caches and builds (runs/ stays)"

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-<<<<<<< HEAD
-from dataclasses import asdict, dataclass, field, replace
-=======
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
->>>>>>> h12-a
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_text, sees_through

@@ -1,8 +1,4 @@
-<<<<<<< HEAD
-"""What the engine does is what was certified; nobody gets between the two, and no bound outlives it."""
-=======
 """What the engine does is what was certified, to the last step, and what fails changes nothing."""
->>>>>>> h12-a
 
 from __future__ import annotations
 
@@ -189,14 +185,8 @@ def test_clone__between_certificate_and_step_goes_on_apart(clone):
     env.step_async(np.ones((4, 1), np.float32))
     other = clone(env)
     assert other.attached.engine is other.venv.engine and other.attached.engine is not env.attached.engine
-<<<<<<< HEAD
-    told = [each.step_wait()[3] for each in (env, other)]
-    first, second = ([row["shield"] for row in rows] for rows in told)
-    assert first == second
-=======
     told, again = ([row["shield"] for row in each.step_wait()[3]] for each in (env, other))
     assert told == again
->>>>>>> h12-a
     assert env.attached.shield.running.steps.tolist() == other.attached.shield.running.steps.tolist()
 
 
