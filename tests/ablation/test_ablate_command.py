@@ -227,7 +227,7 @@ def test_ablate__an_interruption_reaches_the_trainings_of_other_processes(tmp_pa
 
 
 def _wait_for(happened, process) -> None:
-    end = time.monotonic() + 240.0
+    end = time.monotonic() + 900.0  # two processes that may have to compile every kernel first
     while not happened():
         assert process.poll() is None and time.monotonic() < end
         time.sleep(0.1)

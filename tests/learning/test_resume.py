@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -152,23 +151,34 @@ def test_train__keeps_the_policy_of_least_harm_and_the_last_one(
     assert _harm(load_policy(folder))["first_impact_harm"] == min(harms)
 
 
-_TRAIN = """
-import sys
+_TRAIN_AND_DIE = """
+import os, signal, sys
+from pathlib import Path
 sys.path.insert(0, {root!r})
-from tests.learning.test_resume import RECIPES, SCENARIO, _harm, _measure
-from ethbrake_marl.learning.train import resume, train
-folder = sys.argv[2]
-if sys.argv[1] == "resume":
-    resume(folder, evaluate=_measure)
-else:
-    train(RECIPES[sys.argv[1]], SCENARIO, folder, evaluate=_harm)
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.learning.train import train
+from tests.learning.test_resume import RECIPES, SCENARIO, _harm
+recipe, folder = RECIPES[sys.argv[1]], Path(sys.argv[2])
+step, left = EthBrakeVecEnv.step_wait, [5]
+
+def step_wait(self):
+    left[0] -= bool(list(folder.glob("checkpoints/step_*")))
+    if left[0] == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return step(self)
+
+EthBrakeVecEnv.step_wait = step_wait
+train(recipe, SCENARIO, folder, evaluate=_harm)
 """
 
 
-def start_process(what: str, folder: Path) -> subprocess.Popen[bytes]:
-    """Another process that trains (``what`` is the recipe) or resumes."""
-    program = _TRAIN.format(root=str(Path(__file__).resolve().parents[2]))
-    return subprocess.Popen([sys.executable, "-c", program, what, str(folder)], stderr=subprocess.PIPE)
+def train_and_die(name: str, folder: Path) -> int:
+    """Another process that trains until it is killed (-9), in the fifth step after its first checkpoint.
+
+    It kills itself: from outside, on a busy machine, one may come too late.
+    """
+    program = _TRAIN_AND_DIE.format(root=str(Path(__file__).resolve().parents[2]))
+    return subprocess.run([sys.executable, "-c", program, name, str(folder)], timeout=600, check=False).returncode
 
 
 @pytest.mark.parametrize("name", ["ppo", "sac"])
@@ -177,13 +187,7 @@ def test_resume__after_kill_9_the_weights_are_the_same(
 ) -> None:
     reference, _ = whole(name)
     run = tmp_path / "run"
-    process = start_process(name, run)
-    deadline = time.monotonic() + 120.0
-    while not list(run.glob("checkpoints/step_*")):  # then it goes on for a moment
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.002)
-    process.kill()
-    process.communicate()
+    assert train_and_die(name, run) == -signal.SIGKILL
     assert json.loads((run / "run.json").read_text())["status"] == "running"
     resume(run, evaluate=_measure)
     for bundle in ("policy", "policy-last"):

@@ -68,7 +68,7 @@ def test_threads__that_are_no_number_of_threads_are_refused(threads: object) -> 
 
 
 def test_by_parts__covers_every_row_once_in_order_on_that_many_threads() -> None:
-    meet = threading.Barrier(3, timeout=10.0)  # passed only if three threads run at once
+    meet = threading.Barrier(3, timeout=120.0)  # passed only if three threads run at once
 
     def work(part: slice) -> tuple[range, int]:
         meet.wait()
