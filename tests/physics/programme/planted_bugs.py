@@ -2,7 +2,8 @@
 
 ``make planted-bugs`` (or ``python -m tests.physics.programme.planted_bugs [--jobs J] [--only WORD]``). A bug is a
 textual patch of the kernel, the ledger, the lower bound or the search. It is applied to a temporary copy, never to the
-working tree. There some test files run with compilation switched off (2 s), and where these stay green the whole suite of the physics, compiled;
+working tree. There some test files run with compilation switched off (2 s), and where these stay green the whole
+suite of the physics, compiled;
 until the first failure. The first suite is tried without any bug before: it must be green. (The second one is what
 ``make test`` runs.) A patch that does not fit the code is an error.
 """
