@@ -32,7 +32,7 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Flo
 def action_to_command(action: Floats, vehicles: Vehicles, vehicle: int) -> Floats:
     """Wanted signed acceleration of one vehicle, [n] m/s2, for its action [n] in [-1, 1]."""
     braking, driving = vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
-    return _commands(np.ascontiguousarray(action, np.float64), braking, driving)
+    return commands_of(np.ascontiguousarray(action, np.float64), braking, driving)
 
 
 def command_to_action(command_mps2: Floats, vehicles: Vehicles, vehicle: int) -> Floats:
@@ -55,7 +55,8 @@ def action_of(command: float, braking: float, driving: float) -> float:
 
 
 @compiled
-def _commands(action: Floats, braking: Floats, driving: Floats) -> Floats:
+def commands_of(action: Floats, braking: Floats, driving: Floats) -> Floats:
+    """``command_of`` in every world, [n] m/s2."""
     command = np.empty(action.shape[0])
     for k in range(action.shape[0]):
         command[k] = command_of(action[k], braking[k], driving[k])

@@ -121,7 +121,7 @@ class Engine:
         self._memories: dict[Watcher, Any] = {}
         self.steps_made = 0  # steps of the batch that watchers let pass
         self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
-        self._told = {i: s for i, s in self._remembering.items() if isinstance(s, Told)}
+        self._told = [script for script in self._remembering.values() if isinstance(script, Told)]
         self._learner_index = np.array(self.learners, np.int64)
         total = float(self.reward.harm_count == "total")
         times = scenario.time_step_s, scenario.horizon_s
@@ -278,8 +278,8 @@ class Engine:
             new._memories = {w: w.stepped(memory, self, new) for w, memory in self._memories.items()}
             new.steps_made += 1
             self.__dict__.update(new.__dict__)
-        for vehicle, script in self._told.items():
-            script.after_step(self.worlds, self.ledger, vehicle)
+        for script in self._told:
+            script.after_step(self.packed)
         return step
 
     def _advance(self, columns: Floats) -> Step:

@@ -9,7 +9,6 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from ethbrake_marl.errors import FailedWorld, InvalidInput, PhysicsError
-from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
 from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.packed import Packed, harm_at, has_hazard, pack, state_width
@@ -42,8 +41,8 @@ class Script(Protocol):
 class Told(Protocol):
     """A script with a memory that is told what came of each step, the last one included."""
 
-    def after_step(self, worlds: Worlds, ledger: Ledger, vehicle: int) -> None:
-        """The step was made: the worlds of the whole batch now, and their harm since the alert."""
+    def after_step(self, packed: Packed) -> None:
+        """The step was made: the worlds of the whole batch now, and their harm since the alert; to be read only."""
 
 
 class Start(NamedTuple):

@@ -21,13 +21,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.actions import action_to_command, command_to_action
+from ethbrake_marl.actions import command_to_action, commands_of
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.packed import params_at
 from ethbrake_marl.shield.certify import REASONS, Decision
 from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
 from ethbrake_marl.shield.episode import Bound, HybridAgent
@@ -97,7 +98,7 @@ class Attached(ABC):
                 f" one past the shield); step through the shield, or close() it first; {ADVICE}"
             )
         wanted = after.wanted_mps2[:, self.vehicle]
-        certified = action_to_command(sent.applied, before.worlds.vehicles, self.vehicle)
+        certified = self._commands(sent.applied)
         wrong = np.flatnonzero(sent.asked & ~(wanted == certified))
         if wrong.size:
             k = int(wrong[0])
@@ -106,6 +107,12 @@ class Attached(ABC):
                 f" {certified[k]:g} m/s2; {ADVICE}"
             )
         return self._carried_out(memory, sent, after)
+
+    def _commands(self, actions: Floats) -> Floats:
+        """Wanted signed accelerations of the shielded vehicle for its actions, to the bits of the engine, [n] m/s2."""
+        params, vehicles = self.engine.packed.params, self.engine.scenario.vehicles
+        braking, driving = (params[:, params_at(group, vehicles) + self.vehicle] for group in range(2))
+        return commands_of(actions, braking, driving)
 
     @abstractmethod
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
@@ -163,11 +170,8 @@ class AttachedShield(Attached):
     def decide(self, proposed: Floats) -> Floats:
         """The actions [n] to apply instead of those proposed. Nothing changes until the engine applies them."""
         engine, shield = self.engine, self.shield
-        worlds = engine.worlds
-        proposer = None if self.policy is None else Proposer(self.policy, worlds)
-        certified = shield.propose(
-            proposed, seen=seen_columns(worlds, engine.ledger), only=~engine.ended, proposer=proposer
-        )
+        proposer = None if self.policy is None else Proposer(self.policy, engine.worlds)
+        certified = shield.propose(proposed, seen=seen_columns(engine.packed), only=~engine.ended, proposer=proposer)
         applied = certified.decision.applied
         self.sent = Sent(shield, engine.steps_made, applied, certified.asked, certified)
         return applied
@@ -223,7 +227,7 @@ class AttachedShield(Attached):
                 f"shield: world {k} is at step {after.steps[k]} of its episode, certified was step"
                 f" {running.steps[k]}; {ADVICE}"
             )
-        seen = seen_columns(after.worlds, after.ledger)
+        seen = seen_columns(after.packed)
         if (wrong := np.flatnonzero(wanted & ~as_predicted(running, seen))).size:
             k = int(wrong[0])
             told = difference(running.nominal().states[k], seen[k])

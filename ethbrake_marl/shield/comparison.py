@@ -4,22 +4,32 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.agents.profile_problem import state_columns
-from ethbrake_marl.harm import COUNTS, Ledger
-from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.physics.obstacle import obstacle_ahead
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import Bools, Floats
+from ethbrake_marl.physics.packed import Packed, command_at, gap_at, has_hazard, speed_at, state_width, vehicles_in
 from ethbrake_marl.shield.certify import Running
 
 SLACK = 1e-9  # by more than this (m, m/s) a world lies outside what several members predict; one member is exact
 GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("total harm", " m2/s2"))  # of each pair
 
 
-def seen_columns(worlds: Worlds, ledger: Ledger) -> Floats:
-    """The worlds and their harm so far in the columns of ``Running.states``, [n, S]: to be compared with them."""
-    harm = [ledger.first_impact_harm, ledger.total_harm]
-    if obstacle_ahead(worlds).any():
-        harm = [np.column_stack([ledger.hazard_harm(c), ledger.pair_harm(c)]) for c in COUNTS]
-    return np.concatenate([state_columns(worlds), *harm], axis=1)
+def seen_columns(packed: Packed) -> Floats:
+    """Running worlds and their harm so far in the columns of ``Running.states``, [n, S]: to be compared with them.
+
+    Those are speeds, gaps, hit flags and both harms, with the obstacle first in each group where there is one. Raises
+    ``InvalidInput`` where only some of the worlds have one.
+    """
+    state = packed.state
+    N = vehicles_in(state)
+    speeds, first, pairs = state[:, speed_at(N) : command_at(N)], gap_at(N), N - 1
+    if has_hazard(state, N) and (ahead := np.isfinite(state[:, state_width(N)])).any():
+        if not ahead.all():
+            raise InvalidInput("shield: only some of the worlds have an obstacle ahead (hazard_gap_m), not all")
+        groups = [state[:, first + g * pairs : first + (g + 1) * pairs] for g in range(len(GROUPS))]
+        at = state_width(N)
+        whole = [part for g, group in enumerate(groups) for part in (state[:, at + g : at + g + 1], group)]
+        return np.concatenate([np.zeros((len(state), 1)), speeds, *whole], axis=1)
+    return np.concatenate([speeds, state[:, first : first + len(GROUPS) * pairs]], axis=1)
 
 
 def as_predicted(running: Running, seen: Floats) -> Bools:

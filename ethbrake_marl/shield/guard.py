@@ -235,13 +235,6 @@ class StepShield:
         rows = {name: getattr(self, name)[:n] for name in PER_WORLD}
         self.__dict__.update(rows | {"running": self.running.take(np.arange(n)), "backup": backup})
 
-    def commands(self, actions: Floats) -> Floats:
-        """Wanted signed accelerations of actions, to the bits of the engine, [n] m/s2."""
-        assert self.running is not None
-        bounds = self.running.nominal().problem.bounds
-        braking, driving = -bounds[:, 0, 0], bounds[:, 0, 1]
-        return np.where(actions < 0.0, actions * braking, actions * driving)
-
     def _compare(self, seen: Floats, asked: Bools) -> None:
         """Find the worlds that did not do what was predicted, and choose anew there from what is seen."""
         assert self.running is not None

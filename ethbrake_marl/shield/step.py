@@ -12,8 +12,9 @@ from ethbrake_marl.agents.knowledge import Knowledge, Source, combined
 from ethbrake_marl.agents.profile_problem import state_columns
 from ethbrake_marl.agents.protocol import Agent, check_agent, place
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
-from ethbrake_marl.harm import HarmCount, Ledger
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.packed import TIME, Packed
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
 from ethbrake_marl.shield.guard import Certified, StepShield
@@ -119,7 +120,7 @@ class StepShieldAgent:
             self.predicted_harm, self._wanted, self._first_s = (
                 values[: worlds.n] for values in (self.predicted_harm, self._wanted, self._first_s)
             )
-        self._follow(worlds)
+        self._follow(worlds.time_s)
         if self._asked is None:
             due = self._due(worlds)
             proposed = proposed_action(self.policy, worlds, vehicle)
@@ -129,19 +130,19 @@ class StepShieldAgent:
             self._asked = _Asked(worlds.time_s, certified, np.where(due, command, self._wanted))
         return self._asked.wanted.copy()
 
-    def after_step(self, worlds: Worlds, ledger: Ledger, vehicle: int) -> None:
+    def after_step(self, packed: Packed) -> None:
         """Follow the engine over a step, the last one included, and compare what came of it with what was certified.
 
         Where nothing else was ``believed`` than what was told, a difference raises ``UncertifiedStep``: another command
         was applied. Else the world is distrusted.
         """
-        asked, shield = self._asked, self.shield
-        self._follow(worlds)
+        asked, shield, time_s = self._asked, self.shield, packed.state[:, TIME]
+        self._follow(time_s)
         if asked is None or shield is None or self._asked is asked:
             return
         assert shield.running is not None
-        seen = seen_columns(worlds, ledger)
-        compared = asked.certified.asked & (worlds.time_s > asked.time_s) & ~shield.distrusted
+        seen = seen_columns(packed)
+        compared = asked.certified.asked & (time_s > asked.time_s) & ~shield.distrusted
         wrong = compared & ~as_predicted(shield.running, seen)
         if self._believed is None and wrong.any():
             k = int(np.argmax(wrong))
@@ -167,10 +168,10 @@ class StepShieldAgent:
         due: Bools = worlds.time_s == due_s
         return due
 
-    def _follow(self, worlds: Worlds) -> None:
+    def _follow(self, time_s: Floats) -> None:
         """Commit what was decided if the worlds have moved since: that step was made. Else it stays to be made."""
         asked = self._asked
-        if asked is not None and (worlds.time_s > asked.time_s).any():
+        if asked is not None and (time_s > asked.time_s).any():
             self._commit(asked)
 
     def _commit(self, asked: _Asked) -> None:

@@ -72,7 +72,7 @@ def test_horizon__what_still_moves_then_is_told_by_both_commands(ethbrake, tmp_p
     note = "note: bounds of the shield end at the horizon (3 s) and say nothing of what comes after; worlds, of 20,"
     told = ethbrake("shield", "--agents", "full_brake", "--episodes", "20", "--scenario", str(short), "--json")
     assert note in told.err and all(row["horizon_ends"] > 10 for row in json.loads(told.out))
-    agents = "hybrid@shipped,full_brake"
-    evaluated = ethbrake("evaluate", "--agents", agents, "--episodes", "20", "--scenario", str(short))
+    policy = "hybrid@ethbrake_marl/_policies/ppo"
+    evaluated = ethbrake("evaluate", "--agents", f"{policy},full_brake", "--episodes", "20", "--scenario", str(short))
     assert note in evaluated.err and "full_brake" not in evaluated.err
     assert "note: bounds" not in ethbrake("shield", "--agents", "full_brake", "--episodes", "5").err

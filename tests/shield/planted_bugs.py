@@ -103,9 +103,7 @@ BUGS: dict[str, tuple[Patch, ...]] = {
         ),
     ),
     "what is seen of the harm so far is not compared": (
-        Patch(
-            COMPARISON, "return np.concatenate([state_columns(worlds), *harm], axis=1)", "return state_columns(worlds)"
-        ),
+        Patch(COMPARISON, "first : first + len(GROUPS) * pairs]], axis=1)", "first : first + 2 * pairs]], axis=1)"),
     ),
     "the shield goes on before the engine does": (
         Patch(
