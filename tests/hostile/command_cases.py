@@ -1,0 +1,172 @@
+"""Options, agents and environment variables that bite, and results that are to go where they cannot."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.hostile.case import NASTY, OUTSIDE, PRECIOUS, Build, Case, write
+from tests.hostile.yaml_parts import SPECS
+
+FEW = ("--episodes", "3")
+NUMBERS = (
+    "",
+    "-1",
+    "0",
+    "1.5",
+    "1e3",
+    "nan",
+    "inf",
+    "9" * 5000,
+    "0x10",
+    "1_000",
+    "\u0663",
+    "1;2",
+    " 1 x",
+    "None",
+    "10000001",
+)
+WORDS = (
+    "",
+    "x" * 9000,
+    "/",
+    "..",
+    "a/../../b",
+    "a\0b",
+    "%s%n",
+    "{}",
+    "[/]",
+    "[bold]",
+    ":smile:",
+    "$(touch pwned)",
+    "`touch pwned`",
+    *NASTY,
+)
+VARIABLES = (
+    {"PYTHONWARNINGS": "error"},
+    {"COLUMNS": "1"},
+    {"COLUMNS": "9" * 30},
+    {"COLUMNS": "-5"},
+    {"LINES": "x"},
+    {"TERM": "\x1b[2J"},
+    {"LC_ALL": "\u202e"},
+    {"PYTHONIOENCODING": "ascii"},
+    {"NO_COLOR": ""},
+    {"FORCE_COLOR": "1"},
+    {"TTY_COMPATIBLE": "1"},
+    {"TMPDIR": "/nowhere"},
+    {"TMPDIR": "/dev/null"},
+    {"HOME": "/nowhere"},
+    {"NUMBA_CACHE_DIR": "/dev/null/x"},
+    {"MPLBACKEND": "nonsense"},
+    {"NUMBA_NUM_THREADS": "x"},
+    {"OMP_NUM_THREADS": "-1"},
+    {"MPLCONFIGDIR": "/dev/null"},
+    {"PWD": "/nowhere"},
+    {"TZ": "\x1b"},
+    {"_ETHBRAKE_COMPLETE": "bash_source"},
+    {"_TYPER_STANDARD_TRACEBACK": "1"},
+)
+
+
+def _taken(folder: Path) -> None:
+    write(folder / "file", "precious")
+    write(folder / "full" / "thesis.txt", "years of work")
+    (folder / "link").symlink_to(f"../../{OUTSIDE}/{PRECIOUS}")
+    (folder / "dangling").symlink_to("nowhere")
+    (folder / "loop").symlink_to("loop")
+
+
+TARGETS = (
+    "file",
+    "file/x",
+    "full",
+    "link",
+    "dangling",
+    "loop",
+    "/dev/null",
+    "/dev/null/x",
+    "/proc/x",
+    "/nowhere/x",
+    "x" * 300,
+    "a\0b",
+    "/",
+)
+WRITERS: dict[str, tuple[str, ...]] = {
+    "per world": ("evaluate", "--agents", "coast", *FEW, "--per-world"),
+    "table": ("best-harm", *FEW, "--budget", "1", "--output"),
+    "run": ("train", "--steps", "1", "--output"),
+    "new scenario": ("scenario", "new", "mine", "--output"),
+    "picture": ("picture", "criticality", "--output"),
+}
+
+
+def commands(rng: random.Random) -> Iterator[Case]:
+    """Command lines; those of agents and numbers are met by several commands."""
+    for spec in (*SPECS, *(f"ppo@{word}" for word in WORDS), *(f"{word}:1" for word in WORDS if word)):
+        yield _case(
+            "agent",
+            ("evaluate", *FEW, "--agents", spec),
+            certain=spec not in ("ppo@shipped", "hybrid@shipped", "ladder"),
+        )
+    for number in NUMBERS:
+        for option in ("--episodes", "--seed"):
+            yield _case(
+                "number",
+                ("evaluate", "--agents", "coast", option, number),
+                certain=number not in ("0", "0x10", "\u0663", "10000001", "1e3", "1_000"),
+            )
+        yield _case("number", ("best-harm", *FEW, "--budget", number), certain=number in ("", "-1", "0", "1.5", "nan"))
+    for word in WORDS:
+        for command in (
+            ("scenario", "show", word),
+            ("scenario", "new", word),
+            ("evaluate", *FEW, "--vehicle", word),
+            ("resume", word),
+            (word,),
+            ("evaluate", f"--{word}"),
+            ("train", "--name", word),
+            ("train", "--recipe", word),
+            ("evaluate", *FEW, "--objective", word),
+            ("shield", *FEW, "--agents", word),
+            ("evaluate", *FEW, "--shield", word),
+            ("export", word, "--onnx", "x.onnx"),
+            ("learning-curves", "--output", "o", "--scenario", word),
+            ("ablate", "--levels", word, "--output", "o"),
+            ("generalise", "--runs", word, "--vehicles", "3"),
+            ("generalise", "--runs", "x", "--vehicles", word),
+        ):
+            yield _case("word", command)
+    for what, command in WRITERS.items():
+        for target in TARGETS:
+            yield _case(f"output taken: {what}", (*command, target), _taken)
+            if what not in ("run", "new scenario"):
+                yield _case(f"output taken: {what}", (*command, target, "--force"), _taken, certain=target != "file")
+    for variables in VARIABLES:
+        yield Case(
+            "command",
+            "environment",
+            ("evaluate", "--agents", "coast,full_brake", *FEW),
+            lambda folder: None,
+            certain=False,
+            environment=variables,
+        )
+        yield Case(
+            "command",
+            "environment, error",
+            ("evaluate", "--agents", "ppo@\x1b[2J"),
+            lambda folder: None,
+            environment=variables,
+        )
+
+
+def _case(category: str, command: tuple[str, ...], build: Build = lambda folder: None, *, certain: bool = True) -> Case:
+    return Case(
+        "command",
+        category,
+        command,
+        build,
+        certain=certain,
+        may_change=("file", "t.npz") if "--force" in command else (),
+    )
