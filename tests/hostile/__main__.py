@@ -65,7 +65,10 @@ def main() -> int:
                     print(f"  {verdict.status} {verdict.cpu_s:.2f} {verdict.message!r:.400}")
                 if verdict.faults:
                     broken += 1
-                    print(f"BROKEN {kind}, {case.category}, case {number}: {'; '.join(verdict.faults)}", flush=True)
+                    print(
+                        f"BROKEN {kind}, {case.category}, case {number}, {' '.join(case.command)!a:.120}:", flush=True
+                    )
+                    print("".join(f"    {fault!a:.400}\n" for fault in verdict.faults), end="", flush=True)
             for category, verdicts in found.items():
                 print(row(kind, category, verdicts), flush=True)
             totals[kind] = list(itertools.chain(*found.values()))

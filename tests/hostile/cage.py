@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import errno
 import hashlib
 import inspect
 import json
@@ -18,6 +19,7 @@ import traceback
 import typing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ethbrake_marl.cli import run_command
 from ethbrake_marl.errors import EthBrakeError
@@ -50,6 +52,12 @@ _EXECUTING = (
     "webbrowser.open",
     "builtins.input",
 )
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+_CHANGING = {  # which of its arguments an event changes
+    "os.mkdir": (0,), "os.remove": (0,), "os.rmdir": (0,), "os.truncate": (0,), "os.chmod": (0,), "os.chown": (0,),
+    "os.link": (1,), "os.symlink": (1,), "os.rename": (0, 1), "os.utime": (0,), "shutil.rmtree": (0,),
+}  # fmt: skip
+_BY_FOLDER = {"os.mkdir": 2, "os.remove": 1, "os.rmdir": 1}
 _READ_ANNOTATIONS = {inspect.__file__, typing.__file__, dataclasses.__file__, collections.__file__}
 
 
@@ -110,7 +118,9 @@ def _fork(case: Case, inside: Path, streams: list[Path]) -> int:
         os.chdir(inside)
         os.environ.update(case.environment)
         _limit()
+        own = os.path.realpath(inside) + os.sep
         sys.addaudithook(lambda event, arguments: _watch(event, arguments, seen))
+        sys.addaudithook(lambda event, arguments: _keep_inside(event, arguments, own, seen))
         if case.reader is not None:
             _read(case, seen)
         status = run_command(list(case.command))
@@ -152,8 +162,31 @@ def _read(case: Case, seen: int) -> None:
 
 def _watch(event: str, arguments: tuple[object, ...], seen: int) -> None:
     """Called by the interpreter for everything that touches the world."""
+    if event.startswith("marshal.") and sys._getframe(2).f_code.co_filename.startswith("<frozen importlib"):
+        return
     if event in _EXECUTING or (event == "exec" and not _of_a_module(arguments[0])):
         _tell(seen, f"executed: {event} {arguments!r:.60} by {_callers()}")
+
+
+def _keep_inside(event: str, arguments: tuple[Any, ...], own: str, seen: int) -> None:
+    """Refuse, and tell, whatever would change something outside the case's own folder, whoever runs the attack."""
+    if event == "open":
+        writes = isinstance(arguments[2], int) and arguments[2] & _WRITING
+        places = [os.path.realpath(os.fsdecode(arguments[0]))] if writes and not isinstance(arguments[0], int) else []
+    else:
+        given = [arguments[k] for k in _CHANGING.get(event, ()) if not isinstance(arguments[k], int)]
+        inside_a_folder = event in _BY_FOLDER and arguments[_BY_FOLDER[event]] != -1  # where its name is relative to
+        places = [] if inside_a_folder else [_entry(os.fsdecode(path)) for path in given]
+    for place in places:
+        if place != os.devnull and not f"{place}{os.sep}".startswith(own):
+            if not place.startswith(("/dev/", "/proc/")):  # asked for, and impossible for everybody
+                _tell(seen, f"would have changed what is outside: {event} {place}"[:300])
+            raise PermissionError(errno.EPERM, "outside the case's folder", place)
+
+
+def _entry(path: str) -> str:
+    """A path whose last part is not followed."""
+    return os.path.join(os.path.realpath(os.path.dirname(path) or "."), os.path.basename(path))
 
 
 def _callers() -> str:

@@ -48,6 +48,12 @@ def warm_up(folder: Path) -> None:
         for algorithm in ("ppo", "sac"):
             shutil.copytree(stopped(algorithm), folder / algorithm)
             run_command(["resume", str(folder / algorithm)])
+        for late in (["generalise", "--runs", "x", "--vehicles", "3"], ["ablate", "--levels", "x", "--output", "x"]):
+            run_command(late)
+        run_command(["learning-curves", "--scenario", "x", "--output", "x"])
+        run_command(["export", "x", "--onnx", "x"])
+        run_command(["picture", "criticality", "--output", str(folder / "mine.yaml")])
+        run_command(["shield", "--agents", "x"])
         write(folder / "t.npz", good_bytes())
         write(folder / "bad" / "t.npz", b"")
         write(folder / "worlds.csv", f"{HEADER}\n{ROW}\n")
