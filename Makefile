@@ -15,7 +15,7 @@ ARGS ?=
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield planted-bugs shield-bugs mutation bench-peers
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile planted-bugs shield-bugs mutation bench-peers
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -25,6 +25,7 @@ help:
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, search, faces, bound (three quarters of an hour of one core)"
+	@echo "make test-hostile     6,000 files and command lines of strangers: each refused in one line, or in order"
 	@echo "make shield-bugs      plant 14 bugs in copies of the shield; each must turn a test red"
 	@echo "make planted-bugs     plant 23 bugs in copies of the code; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of physics and harm (ARGS='--sample 100')"
@@ -99,6 +100,10 @@ test-resume: $(STAMP)
 test-shield: $(STAMP)
 	@echo "== trying to break the step shield"
 	@$(BIN)/python -m tests.shield.programme $(ARGS)
+
+test-hostile: $(STAMP)
+	@echo "== files that a stranger wrote or a disk damaged"
+	@$(BIN)/python -m tests.hostile $(ARGS)
 
 shield-bugs: $(STAMP)
 	@echo "== planted shield bugs"

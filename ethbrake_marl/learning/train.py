@@ -191,7 +191,7 @@ def _run(
             policy_now = policy_maker(recipe, scenario, observation_for(scenario))
             found = None if other_versions is None else _newest(run, other_versions)
             if found is not None and found[0] is not None:
-                check_fits(found[0], model, policy_now(model))
+                check_fits(run.checkpoints, found[0], model, policy_now(model))
             session = Session(run, model, recipe)
             between = BetweenUpdates(
                 recipe,

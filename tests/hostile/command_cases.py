@@ -102,7 +102,14 @@ WRITERS: dict[str, tuple[str, ...]] = {
 
 
 def commands(rng: random.Random) -> Iterator[Case]:
-    """Command lines; those of agents and numbers are met by several commands."""
+    """Command lines, the places where their results are to go, and the variables around them."""
+    yield from _values()
+    yield from _words()
+    yield from _outputs()
+    yield from _variables()
+
+
+def _values() -> Iterator[Case]:
     for spec in (*SPECS, *(f"ppo@{word}" for word in WORDS), *(f"{word}:1" for word in WORDS if word)):
         yield _case(
             "agent",
@@ -117,9 +124,11 @@ def commands(rng: random.Random) -> Iterator[Case]:
                 certain=number not in ("0", "0x10", "\u0663", "10000001", "1e3", "1_000"),
             )
         if number != "10000001":  # a budget that takes its time is the user's own wish
-            yield _case(
-                "number", ("best-harm", *FEW, "--budget", number), certain=number in ("", "-1", "0", "1.5", "nan")
-            )
+            wrong = number in ("", "-1", "0", "1.5", "nan")
+            yield _case("number", ("best-harm", *FEW, "--budget", number), certain=wrong)
+
+
+def _words() -> Iterator[Case]:
     for word in WORDS:
         for command in (
             ("scenario", "show", word),
@@ -140,12 +149,18 @@ def commands(rng: random.Random) -> Iterator[Case]:
             ("generalise", "--runs", "x", "--vehicles", word),
         ):
             yield _case("word", command)
+
+
+def _outputs() -> Iterator[Case]:
     for what, command in WRITERS.items():
         for target in TARGETS:
             good = what == "new scenario" and target == "full"
             yield _case(f"output taken: {what}", (*command, target), _taken, certain=not good)
             if what not in ("run", "new scenario"):
                 yield _case(f"output taken: {what}", (*command, target, "--force"), _taken, certain=target != "file")
+
+
+def _variables() -> Iterator[Case]:
     for variables in VARIABLES:
         yield Case(
             "command",

@@ -35,7 +35,7 @@ CERTAIN: dict[str, Change] = {
     "key twice": lambda r, t: with_line(r, t, r.choice(lines_of(t))),
     "not finite": lambda r, t: with_value(r, t, r.choice(NOT_FINITE), numeric=True),
     "not a number": lambda r, t: with_value(r, t, r.choice(NOT_NUMBERS), numeric=True),
-    "out of range": lambda r, t: with_value(r, t, r.choice(("-1", "-1e300", "1e300", "-0.5", "1e-300")), numeric=True),
+    "out of range": lambda r, t: with_value(r, t, r.choice(("-1", "-1e300", "-0.5", "-1e-9")), numeric=True),
     "null": lambda r, t: with_value(r, t, r.choice(("null", "~", "")), numeric=True),
     "tag": lambda r, t: with_value(r, t, r.choice(TAGS)),
     "tag on the document": lambda r, t: f"{r.choice(TAGS).split(' ')[0]}\n{t}",
