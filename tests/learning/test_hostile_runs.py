@@ -60,7 +60,7 @@ def test_resume__a_listing_that_agrees_does_not_make_a_checkpoint(
         (
             "environment.engine.stream",
             np.array([0, 2**60], np.uint64),
-            r"'environment.engine.stream' is \[0, \d+\]; must be",
+            r"'environment.engine.stream' is",
         ),
     ],
 )
