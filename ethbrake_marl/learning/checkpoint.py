@@ -24,6 +24,7 @@ from ethbrake_marl.durable_files import new_folder, remove_folder, write_file
 from ethbrake_marl.errors import CorruptBundle, EthBrakeError
 from ethbrake_marl.learning.checkpoint_schema import Listing, Numbers, checked_json
 from ethbrake_marl.learning.policy_team import Trained, read_trained, save_trained
+from ethbrake_marl.learning.progress_table import parse_progress
 from ethbrake_marl.plain_files import open_plain, read_plain
 from ethbrake_marl.snapshots import Arrays
 
@@ -98,6 +99,8 @@ def read_checkpoint(folder: Path) -> TrainingState:
         for place in sorted(folder.glob(f"{_MEMORY}-*.npy")):
             with open_plain(place, _SIZE_LIMIT_BYTES, refusal=CorruptBundle, follow_links=False) as stream:
                 replay[place.stem.removeprefix(f"{_MEMORY}-")] = map_npy(stream, place.stem)
+        place = folder / _TABLE
+        parse_progress(data[_TABLE])
         place = folder / _POLICY
         return TrainingState(
             steps=listing["steps"],
@@ -107,7 +110,7 @@ def read_checkpoint(folder: Path) -> TrainingState:
             replay=replay,
             policy=read_trained(folder / _POLICY),
             best=read_trained(folder / _BEST) if (folder / _BEST).is_dir() else None,
-            table=_text(data[_TABLE]),
+            table=data[_TABLE],
             versions=listing["versions"],
         )
     except EthBrakeError as error:
@@ -123,14 +126,6 @@ def _arrays(data: bytes) -> Arrays:
         if header.dtype not in _DTYPES:
             raise ValueError(f"array {name!r} is {header.dtype}; must be one of {', '.join(sorted(_DTYPES))}")
     return dict(safetensors.numpy.load(data))
-
-
-def _text(table: bytes) -> bytes:
-    """The progress table, if it is one: text with a column ``steps``, or empty."""
-    names = table.decode("utf-8").partition("\n")[0].split(",")
-    if table and names[0] != "steps":
-        raise ValueError("the first column of the progress table must be steps")
-    return table
 
 
 def checkpoint_folders(folder: Path) -> list[Path]:

@@ -6,6 +6,7 @@ A listing whose hashes agree says that a checkpoint was not damaged, not that it
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,8 +27,10 @@ _STREAM = "environment.engine.stream"
 _DRAWN_LIMIT = 1 << 53  # worlds
 
 
-def check_fits(state: TrainingState, model: Model, policy: Trained) -> None:
+def check_fits(folder: Path, state: TrainingState, model: Model, policy: Trained) -> None:
     """Raise ``CorruptBundle`` unless ``state`` is one of this freshly built ``model``, whose policy is ``policy``.
+
+    ``folder`` is where the checkpoints stand, for the message.
 
     Resets the model's environment, which the state is going to replace.
     """
@@ -40,7 +43,10 @@ def check_fits(state: TrainingState, model: Model, policy: Trained) -> None:
             if trained is not None:
                 _check_policy(name, trained, policy)
     except ValueError as error:
-        raise CorruptBundle(f"checkpoint of step {state.steps}: is not of this training: {error}") from None
+        raise CorruptBundle(
+            f"{folder}: the checkpoint of step {state.steps} is not of this training: {error}; delete it to go on from"
+            " the one before"
+        ) from None
 
 
 def _check_arrays(arrays: Arrays, model: Model) -> None:

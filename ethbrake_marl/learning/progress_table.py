@@ -40,14 +40,29 @@ class ProgressTable(KVWriter):
 
     def restore(self, content: bytes) -> None:
         """Go back to an earlier ``content``, in the file too."""
-        text = content.decode("utf-8")
-        reader = csv.DictReader(io.StringIO(text))
-        self._columns = list(reader.fieldnames or ())
-        self._rows = [{name: value for name, value in row.items() if value != ""} for row in reader]
+        self._columns, self._rows = parse_progress(content)
         write_file(self._path, content)
 
     def close(self) -> None:
         """Nothing is held open between rows."""
+
+
+def parse_progress(content: bytes) -> tuple[list[str], list[dict[str, Any]]]:
+    """Columns and rows of a progress table, whose first column is ``steps``; what is empty is not there.
+
+    Raises ``ValueError`` for anything that no ``ProgressTable`` has written.
+    """
+    try:
+        lines = list(csv.reader(io.StringIO(content.decode("utf-8"), newline=""), strict=True))
+    except csv.Error as error:
+        raise ValueError(f"the progress table is no CSV ({error})") from None
+    columns, rows = (lines[0], lines[1:]) if lines else ([], [])
+    if columns and (columns[0] != "steps" or len(set(columns)) < len(columns)):
+        raise ValueError("the progress table must have the column steps first, and no column twice")
+    for number, row in enumerate(rows, start=1):
+        if len(row) != len(columns) or not row[0].isdecimal():
+            raise ValueError(f"row {number} of the progress table must have {len(columns)} values, the first one steps")
+    return columns, [{n: value for n, value in zip(columns, row, strict=True) if value != ""} for row in rows]
 
 
 def _lines(rows: list[dict[str, Any]], columns: list[str]) -> str:

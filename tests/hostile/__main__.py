@@ -1,0 +1,91 @@
+"""The attack: thousands of files that a stranger wrote or a disk damaged, each met by the command that reads it.
+
+    python -m tests.hostile [--only KIND] [--sample N] [--seed 0] [--jobs 1]
+
+Every case must end within 10 s of processor time and 2 GiB of memory, with exit status 2 and one line of error of at
+most 2,000 characters without control characters (or, where that cannot be said beforehand, in order), and through
+Python with an exception of the project's family; nothing may be executed, and nothing written but what the command is
+for. Prints one row per category and exits with status 1 when a rule was broken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import random
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+
+from tests.hostile.cage import Verdict, judge
+from tests.hostile.case import Case, Generator
+from tests.hostile.kinds import KINDS, warm_up
+
+HEADING = f"{'kind':12} {'category':34} {'cases':>6} {'refused':>8} {'in order':>9} {'broken':>7} {'CPU s':>6}  longest"
+
+
+def cases_of(kind: str, generator: Generator, seed: int, sample: int | None) -> list[Case]:
+    """The cases of a kind, or ``sample`` of them: as many categories as there are, in turn."""
+    every = list(generator(random.Random(f"{seed} {kind}")))
+    if sample is None or sample >= len(every):
+        return every
+    grouped: dict[str, list[Case]] = defaultdict(list)
+    for case in every:
+        grouped[case.category].append(case)
+    for group in grouped.values():
+        random.Random(f"{seed} {kind} sample").shuffle(group)
+    in_turn = (case for row in itertools.zip_longest(*grouped.values()) for case in row if case is not None)
+    return list(itertools.islice(in_turn, sample))
+
+
+def main() -> int:
+    """Run the cases."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--only", choices=KINDS, action="append", help="this kind alone; repeatable")
+    parser.add_argument("--category", help="categories whose name contains this")
+    parser.add_argument("--sample", type=int, help="so many cases of each kind")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--verbose", action="store_true", help="also print each case's message")
+    arguments = parser.parse_args()
+    started, broken = time.monotonic(), 0
+    with tempfile.TemporaryDirectory(prefix="hostile-") as name:
+        warm_up(Path(name))
+        print(HEADING)
+        totals: dict[str, list[Verdict]] = {}
+        for kind in arguments.only or KINDS:
+            found: dict[str, list[Verdict]] = defaultdict(list)
+            for number, case in enumerate(cases_of(kind, KINDS[kind], arguments.seed, arguments.sample)):
+                if arguments.category and arguments.category not in case.category:
+                    continue
+                verdict = judge(case, Path(name) / f"{kind}-{number}".replace(" ", "-"))
+                found[case.category].append(verdict)
+                if arguments.verbose:
+                    print(f"  {verdict.status} {verdict.cpu_s:.2f} {verdict.message!r:.400}")
+                if verdict.faults:
+                    broken += 1
+                    print(
+                        f"BROKEN {kind}, {case.category}, case {number}, {' '.join(case.command)!a:.120}:", flush=True
+                    )
+                    print("".join(f"    {fault!a:.400}\n" for fault in verdict.faults), end="", flush=True)
+            for category, verdicts in found.items():
+                print(row(kind, category, verdicts), flush=True)
+            totals[kind] = list(itertools.chain(*found.values()))
+        for kind, verdicts in totals.items():
+            print(row(kind, "in all", verdicts))
+        count = sum(map(len, totals.values()))
+    print(f"{count} cases, {broken} broke a rule; {time.monotonic() - started:.0f} s")
+    return 1 if broken or not count else 0
+
+
+def row(kind: str, category: str, verdicts: list[Verdict]) -> str:
+    """One line of the table."""
+    refused, faulty = sum(v.refused for v in verdicts), sum(bool(v.faults) for v in verdicts)
+    orderly = sum(v.status == 0 for v in verdicts)
+    slowest, longest = max((v.cpu_s for v in verdicts), default=0.0), max((v.longest for v in verdicts), default=0)
+    return f"{kind:12} {category:34} {len(verdicts):6} {refused:8} {orderly:9} {faulty:7} {slowest:6.2f}  {longest}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

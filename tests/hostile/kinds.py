@@ -1,0 +1,62 @@
+"""The kinds of hostile cases, and what must have happened once before one of them is judged."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import torch
+
+from ethbrake_marl.cli import run_command
+from tests.hostile.archives import good_bytes
+from tests.hostile.bundle_cases import bundles
+from tests.hostile.case import Generator, write
+from tests.hostile.command_cases import commands
+from tests.hostile.csv_cases import HEADER, ROW, tables_of_states
+from tests.hostile.place_cases import places
+from tests.hostile.run_cases import checkpoints, runs
+from tests.hostile.stopped_runs import stopped
+from tests.hostile.table_cases import COMMAND, best_harm_tables
+from tests.hostile.yaml_cases import recipes, scenarios
+from tests.hostile.yaml_parts import RECIPE, SCENARIO
+
+KINDS: dict[str, Generator] = {
+    "scenario": scenarios,
+    "recipe": recipes,
+    "CSV": tables_of_states,
+    "table": best_harm_tables,
+    "place": places,
+    "bundle": bundles,
+    "run": runs,
+    "checkpoint": checkpoints,
+    "command": commands,
+}
+
+
+def warm_up(folder: Path) -> None:
+    """Import what commands import late and compile the kernels, so that only what a case does itself is seen."""
+    torch.set_num_threads(1)
+    write(folder / "mine.yaml", SCENARIO)
+    write(folder / "bad" / "mine.yaml", RECIPE)
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        for name in ("mine.yaml", "bad/mine.yaml"):
+            run_command(["scenario", "validate", str(folder / name)])
+            run_command(["train", "--recipe", str(folder / name), "--output", str(folder / "mine.yaml")])
+        run_command(["nonsense"])
+        for algorithm in ("ppo", "sac"):
+            shutil.copytree(stopped(algorithm), folder / algorithm)
+            run_command(["resume", str(folder / algorithm)])
+        for late in (["generalise", "--runs", "x", "--vehicles", "3"], ["ablate", "--levels", "x", "--output", "x"]):
+            run_command(late)
+        run_command(["learning-curves", "--scenario", "x", "--output", "x"])
+        run_command(["export", "x", "--onnx", "x"])
+        run_command(["picture", "criticality", "--output", str(folder / "mine.yaml")])
+        run_command(["shield", "--agents", "x"])
+        write(folder / "t.npz", good_bytes())
+        write(folder / "bad" / "t.npz", b"")
+        write(folder / "worlds.csv", f"{HEADER}\n{ROW}\n")
+        for place in (".", "bad"):
+            run_command([*COMMAND[:-2], str(folder / place / "t.npz"), "--json"])
+            run_command(["evaluate", "--agents", "ppo@shipped", "--initial-states", str(folder / place / "worlds.csv")])

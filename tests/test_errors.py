@@ -1,0 +1,49 @@
+"""What a message may hold: one line, of bounded length, that commands no terminal."""
+
+from __future__ import annotations
+
+import pytest
+
+from ethbrake_marl.errors import (
+    LINE_LIMIT,
+    AlreadyExists,
+    CorruptBundle,
+    InvalidInput,
+    UnknownName,
+    one_line,
+    plain_text,
+)
+from ethbrake_marl.terminal import result_console, say, show
+
+
+@pytest.mark.parametrize("family", [InvalidInput, UnknownName, AlreadyExists, CorruptBundle])
+def test_message__shows_what_would_command_the_terminal(family: type[Exception]) -> None:
+    assert str(family("a\x1b[2J \u202egnp\n\x9b b\u2028\ud800")) == r"a\x1b[2J \u202egnp\n\x9b b\u2028\ud800"
+    assert str(family("vehicle_2: 7 m/s² is too fast – «mine»")) == "vehicle_2: 7 m/s² is too fast – «mine»"
+
+
+@pytest.mark.parametrize("long", ["x" * 100_000, "\x1b" * 100_000, "\u202e" * (LINE_LIMIT - 1), "é" * (2 * LINE_LIMIT)])
+def test_message__keeps_beginning_and_end_of_what_is_long(long: str) -> None:
+    text = str(InvalidInput(f"mine.yaml, line 3: gaps_m = {long}: must be a number"))
+    assert text.startswith("mine.yaml, line 3: gaps_m = ") and text.endswith(": must be a number")
+    assert f"({len(long) + 46:,} characters)" in text
+    assert len(text) <= LINE_LIMIT and text.isprintable()
+
+
+def test_one_line__is_the_same_the_second_time() -> None:
+    for text in ("plain", "\x1b[2J", "x" * 5000, "a" * LINE_LIMIT):
+        assert one_line(one_line(text)) == one_line(text)
+    assert one_line("a" * LINE_LIMIT) == "a" * LINE_LIMIT
+
+
+def test_plain_text__keeps_only_what_it_is_told_to() -> None:
+    assert plain_text("a\tb\nc\r", keep="\n\t") == "a\tb\nc\\r"
+
+
+def test_terminal__every_way_to_it_is_clean(capsys: pytest.CaptureFixture[str]) -> None:
+    say("runs/\x1b[2J\nx")
+    show("# \u202egnp\n")
+    result_console().print("[/] ppo@\x1b[31m :smile:")
+    captured = capsys.readouterr()
+    assert captured.err == "runs/\\x1b[2J\\nx\n"
+    assert captured.out == "# \\u202egnp\n\n[/] ppo@\\x1b[31m :smile:\n"
