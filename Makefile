@@ -17,11 +17,7 @@ WORKERS ?= 2
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-<<<<<<< HEAD
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-order planted-bugs shield-bugs mutation bench-peers
-=======
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile planted-bugs shield-bugs mutation bench-peers
->>>>>>> h12-c
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-order planted-bugs shield-bugs mutation bench-peers
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -30,19 +26,12 @@ help:
 	@echo "make check            lint and test"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
-<<<<<<< HEAD
 	@echo "make test-shield      try to break the step shield: speed, interference, search, faces, bound (three quarters of an hour of one core)"
+	@echo "make test-hostile     6,000 files and command lines of strangers: each refused in one line, or in order"
 	@echo "make shield-bugs      plant 19 bugs in copies of the shield; each must turn a test red"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
 	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of the physics (ARGS='--modules rewards,v2x --sample 40': of others)"
-=======
-	@echo "make test-shield      try to break the step shield: speed, search, faces, bound (three quarters of an hour of one core)"
-	@echo "make test-hostile     6,000 files and command lines of strangers: each refused in one line, or in order"
-	@echo "make shield-bugs      plant 14 bugs in copies of the shield; each must turn a test red"
-	@echo "make planted-bugs     plant 23 bugs in copies of the code; each must turn a test red"
-	@echo "make mutation [ARGS=] mutation testing of physics and harm (ARGS='--sample 100')"
->>>>>>> h12-c
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make clean            remove $(VENV), $(PEERS), caches and builds (runs/ stays)"
@@ -115,15 +104,13 @@ test-shield: $(STAMP)
 	@echo "== trying to break the step shield"
 	@$(BIN)/python -m tests.shield.programme $(ARGS)
 
-<<<<<<< HEAD
 test-order: $(STAMP)
 	@echo "== the suite in random orders"
 	@$(BIN)/python -m tests.programme.order $(ARGS)
-=======
+
 test-hostile: $(STAMP)
 	@echo "== files that a stranger wrote or a disk damaged"
 	@$(BIN)/python -m tests.hostile $(ARGS)
->>>>>>> h12-c
 
 shield-bugs: $(STAMP)
 	@echo "== planted shield bugs"

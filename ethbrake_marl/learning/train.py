@@ -177,13 +177,8 @@ def _run(
             policy_now = policy_maker(recipe, scenario, observation_for(scenario))
             found = None if other_versions is None else _newest(run, fingerprint(recipe, scenario), other_versions)
             if found is not None and found[0] is not None:
-<<<<<<< HEAD
-                check_fits(found[0], model, policy_now(model))
-            session = Session(run, model, recipe, scenario)
-=======
                 check_fits(run.checkpoints, found[0], model, policy_now(model))
-            session = Session(run, model, recipe)
->>>>>>> h12-c
+            session = Session(run, model, recipe, scenario)
             between = BetweenUpdates(
                 recipe,
                 policy_now,
