@@ -13,7 +13,15 @@ from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.build import make_engine
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics import advance, forecast, make_worlds
-from ethbrake_marl.rewards import RewardParams, StepOutcome, potential, reward_params, reward_terms, weighted_sum
+from ethbrake_marl.rewards import (
+    REWARDS,
+    RewardParams,
+    StepOutcome,
+    potential,
+    reward_params,
+    reward_terms,
+    weighted_sum,
+)
 from ethbrake_marl.scenario import load_scenario
 from tests.envs.lines import CRASH, REST
 
@@ -82,6 +90,30 @@ def test_risk__of_a_closing_pair_adds_the_time_to_collision():
     after, impacts = advance(before, [0.0, 0.0], 0.5)
     terms = reward_terms(params, outcome(before, after, impacts, False))
     assert terms["risk"][0, 1] == pytest.approx(-sigmoid(-((5.0 - 1.0) / 4.0) / 2.0) - sigmoid(3.0 - 5.0))
+
+
+def test_risk__is_most_urgent_within_the_safety_buffer():
+    params = RewardParams(harm=0.0, risk=1.0)
+    before = make_worlds([3.0], [0.0, 4.0], braking_capacity_mps2=1.0, driving_capacity_mps2=1.0, latency_s=0.0,
+                         mass_t=1.0, restitution=0.0)  # fmt: skip
+    after, impacts = advance(before, [0.0, 0.0], 0.625)
+    terms = reward_terms(params, outcome(before, after, impacts, False))
+    assert after.gaps_m.tolist() == [[0.5]]
+    assert terms["risk"][0, 1] == pytest.approx(-0.5 - sigmoid(3.0 - 0.5))
+
+
+def test_settings__are_those_of_the_page():
+    usual = {
+        "harm": 1.0, "harm_count": "first", "objective": None, "collision": 0.0, "risk": 0.0, "jerk": 0.0,
+        "terminal": 0.0, "shaping": 0.0, "shaping_discount": 1.0, "k_energy": 1.0, "ttc_scale_s": 1.0,
+        "safety_buffer_m": 1.0, "target_gap_m": 3.0, "distance_slope_per_m": 1.0,
+    }  # fmt: skip
+    paper = {"harm": 0.0, "collision": 1.0, "risk": 0.1, "jerk": 1e-5, "terminal": 10.0}
+    assert {name: reward.model_dump() for name, reward in REWARDS.items()} == {
+        "harm": usual,
+        "total-harm": usual | {"harm_count": "total"},
+        "paper": usual | paper,
+    }
 
 
 def test_jerk__is_the_squared_rate_of_the_own_command():
@@ -167,6 +199,30 @@ def test_potential__of_two_learners_lets_each_choose_given_the_other():
     assert (every.min(axis=1) <= pair).all() and (pair <= alone).all()
     assert (alone > 1.0).sum() > 10
     assert pair.mean() < 0.1 * alone.mean()  # Vehicle 1 simply does not brake
+
+
+def potential_in_rounds(worlds, rounds: int) -> np.ndarray:
+    """Of learners 0 and 1, who choose one after the other, this often."""
+    braking = worlds.vehicles.braking_capacity_mps2
+    command, best = -braking.copy(), np.empty(worlds.n)
+    for _ in range(rounds):
+        for vehicle in (0, 1):
+            harms = []
+            for share in range(9):
+                tried = command.copy()
+                tried[:, vehicle] = -braking[:, vehicle] * (share / 8.0)
+                harms.append(forecast(worlds, tried, vehicle, tried[:, [vehicle]], 8.0)[0][:, 0])
+            choice = np.array(harms).argmin(axis=0)
+            command[:, vehicle] = -braking[:, vehicle] * (choice / 8.0)
+            best = np.array(harms).min(axis=0)
+    return -best
+
+
+def test_potential__of_two_learners_goes_twice_round():
+    worlds = load_scenario("cooperation-3-pair").sample(300, seed=3).worlds
+    found = potential(RewardParams(), worlds, (0, 1), 8.0)
+    assert found == pytest.approx(potential_in_rounds(worlds, 2), abs=1e-12)
+    assert (potential_in_rounds(worlds, 1) < found - 1.0).any()
 
 
 def test_bad_input__is_refused():

@@ -5,4 +5,10 @@ The number in brackets tells apart the places of one file where the same change 
 
 from __future__ import annotations
 
-EQUIVALENT: dict[str, str] = {}
+NOT_LOST = "a uniform number of 1 or more is a link that is not lost, and the hop is not a part of the delay"
+
+EQUIVALENT: dict[str, str] = {
+    "v2x.py: 1.0 -> 2.0 in `1.0` (3)": NOT_LOST,
+    "v2x.py: 1.0 -> 2.0 in `1.0` (4)": NOT_LOST,
+    "rewards.py: 1 -> 2 in `1` (10)": "one learner that chooses again, the others as before, chooses the same",
+}
