@@ -19,7 +19,7 @@ from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.shield import MovingAtHorizon
 from tests.shield.plays import PLAYS, Evaluation, Failure, Play
 
-LINES = 1_500  # an interrupt comes at one of the first lines of a call, if it has so many
+LINES = (50, 200, 800)  # an interrupt comes at one of the first so many lines of a call, if it has so many
 
 
 class Tally(NamedTuple):
@@ -79,7 +79,7 @@ def disturbed(name: str, episodes: int, seed: int) -> Tally:
                 play.raises, refused = None, refused + 1
             elif kind == 2:
                 try:
-                    with interrupt_at(int(play.rng.integers(1, LINES))):
+                    with interrupt_at(int(play.rng.integers(1, play.rng.choice(LINES)))):
                         play.step()
                 except KeyboardInterrupt:
                     interrupted += 1
