@@ -212,8 +212,8 @@ def left_out_lines(rows: Sequence[SummaryRow]) -> list[str]:
     whole = rows[0].episodes + len(left_out)
     named = [str(left) for left in left_out[:_NAMED]] + (["and so on"] if len(left_out) > _NAMED else [])
     return [
-        f"LEFT OUT for every agent: {len(left_out):,} of {whole:,} worlds, which could not be advanced (a defect of the"
-        f" physics, please report it): {'; '.join(named)}."
+        f"LEFT OUT for every agent: {len(left_out):,} of {whole:,} worlds, which the physics could not advance"
+        f" (please report them): {'; '.join(named)}."
     ]
 
 

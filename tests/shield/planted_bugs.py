@@ -48,8 +48,8 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "latency ignored": (
         Patch(
             GUARD,
-            "problem = profile_problem(\n            possible,",
-            "problem = profile_problem(\n            _at_once(possible),",
+            "problem = profile_problem(\n                possible,",
+            "problem = profile_problem(\n                _at_once(possible),",
         ),
         Patch(
             GUARD,

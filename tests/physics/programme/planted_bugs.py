@@ -2,10 +2,9 @@
 
 ``make planted-bugs`` (or ``python -m tests.physics.programme.planted_bugs [--jobs J] [--only WORD]``). A bug is a
 textual patch of the kernel, the ledger, the lower bound or the search. It is applied to a temporary copy, never to the
-working tree. There some test files run with compilation switched off (2 s), and where these stay green the whole
-suite of the physics, compiled;
-until the first failure. The first suite is tried without any bug before: it must be green. (The second one is what
-``make test`` runs.) A patch that does not fit the code is an error.
+working tree. There some test files run with compilation switched off (10 s), and where these stay green the whole
+suite of the physics, compiled; until the first failure. The first suite is tried without any bug before: it must be
+green. (The second one is what ``make test`` runs.) A patch that does not fit the code is an error.
 """
 
 from __future__ import annotations
@@ -31,15 +30,13 @@ BY_HAND = (
     "tests/analysis/test_lower_bound_conditions.py",
     "tests/analysis/test_best_harm.py::test_even_grid__ends_at_the_capacities_to_the_bit",
 )
-QUICK = BY_HAND + tuple(
-    f"tests/{name}.py"
-    for name in (
-        "physics/test_advance",
-        "physics/test_ties",
-        "physics/test_against_exact",
-        "test_harm",
-        "physics/test_obstacle",
-    )
+QUICK = (
+    "tests/physics/test_advance.py",
+    "tests/physics/test_ties.py",
+    "tests/physics/test_against_exact.py",
+    "tests/test_harm.py",
+    "tests/physics/test_obstacle.py",
+    *BY_HAND,
 )
 WHOLE = ("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py")
 LIMIT_S = 900.0
