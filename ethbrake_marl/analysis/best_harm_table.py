@@ -7,11 +7,11 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ethbrake_marl.agents.profile_motion import Words
 from ethbrake_marl.agents.profile_problem import ProfileProblem
@@ -192,7 +192,7 @@ class _Header(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="allow")
 
-    format: Literal[1]
+    format: Annotated[int, Field(ge=TABLE_FORMAT, le=TABLE_FORMAT)]  # neither true nor 1.0
     scenario: str = ""
     vehicles: list[str] = []
     budget: int = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +49,7 @@ def scenario_path(name_or_path: str | Path) -> Path:
     """
     text = str(name_or_path)
     path = Path(text)
-    if path.suffix in _SUFFIXES or "\\" in text or ("/" in text and path.exists()):
+    if path.suffix in _SUFFIXES or "\\" in text or ("/" in text and os.path.exists(path)):
         return path
     paths = _shipped_paths()
     if "/" in text:

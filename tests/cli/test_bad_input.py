@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from ethbrake_marl.agents.profiles import search_profiles
+
 
 def refused(answer, *fragments: str) -> None:
     assert answer.status == 2
@@ -66,6 +68,29 @@ def test_scenario__a_script_with_a_state_is_in_order_when_early_impacts_are_kept
     path = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: e_v2x_bm\n")
     path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
     assert ethbrake("scenario", "validate", path).out.startswith("OK  mine: 3 vehicles, learners: vehicle_2;")
+
+
+@pytest.mark.parametrize("script", ["planner:1000001", "planner:60001ms", "best_harm:1000001", "planner:1e9"])
+def test_scenario__a_search_without_bounds_is_refused(ethbrake, scenario_file, script):
+    path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
+    path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
+    refused(ethbrake("scenario", "validate", path), f"roles.vehicle_3 = {script}", "at most 1,000,000")
+
+
+@pytest.mark.parametrize("script", ["planner", "planner:1000000", "planner:60000ms", "best_harm", "best_harm:1000000"])
+def test_scenario__trying_a_search_has_a_budget(ethbrake, scenario_file, monkeypatch, script):
+    budgets = []
+
+    def watched(*args, budget, **kwargs):
+        budgets.append(budget)
+        return search_profiles(*args, budget=budget, **kwargs)
+
+    monkeypatch.setattr("ethbrake_marl.agents.planner.search_profiles", watched)
+    monkeypatch.setattr("ethbrake_marl.agents.replay.search_profiles", watched)
+    path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
+    path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
+    assert ethbrake("scenario", "validate", path).status == 0
+    assert budgets and max(budgets) <= 16 and len(budgets) <= 2
 
 
 @pytest.mark.parametrize("command", ["run", "train", "evaluate"])
