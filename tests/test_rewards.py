@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from ethbrake_marl import rewards
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.build import make_engine
@@ -90,6 +91,15 @@ def test_risk__of_a_closing_pair_adds_the_time_to_collision():
     after, impacts = advance(before, [0.0, 0.0], 0.5)
     terms = reward_terms(params, outcome(before, after, impacts, False))
     assert terms["risk"][0, 1] == pytest.approx(-sigmoid(-((5.0 - 1.0) / 4.0) / 2.0) - sigmoid(3.0 - 5.0))
+
+
+def test_risk__of_a_pair_that_closes_slowly_has_a_time_to_collision_too():
+    params = RewardParams(harm=0.0, risk=1.0, ttc_scale_s=10.0)
+    before = make_worlds([7.0], [0.0, 0.5], braking_capacity_mps2=1.0, driving_capacity_mps2=1.0, latency_s=0.0,
+                         mass_t=1.0, restitution=0.0)  # fmt: skip
+    after, impacts = advance(before, [0.0, 0.0], 2.0)
+    terms = reward_terms(params, outcome(before, after, impacts, False))
+    assert terms["risk"][0, 1] == pytest.approx(-sigmoid(-((6.0 - 1.0) / 0.5) / 10.0) - sigmoid(3.0 - 6.0))
 
 
 def test_risk__is_most_urgent_within_the_safety_buffer():
@@ -216,6 +226,19 @@ def potential_in_rounds(worlds, rounds: int) -> np.ndarray:
             command[:, vehicle] = -braking[:, vehicle] * (choice / 8.0)
             best = np.array(harms).min(axis=0)
     return -best
+
+
+@pytest.mark.parametrize(("learners", "asked"), [((1,), [1]), ((1, 2), [1, 2, 1, 2])])
+def test_potential__asks_one_learner_once_and_several_twice(learners, asked, monkeypatch):
+    told = []
+
+    def watched(worlds, command, vehicle, candidates, horizon_s):
+        told.append(vehicle)
+        return forecast(worlds, command, vehicle, candidates, horizon_s)
+
+    monkeypatch.setattr(rewards, "forecast", watched)
+    potential(RewardParams(), load_scenario("paper-random").sample(2, seed=3).worlds, learners, 8.0)
+    assert told == asked
 
 
 def test_potential__of_two_learners_goes_twice_round():

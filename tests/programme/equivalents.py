@@ -7,8 +7,10 @@ from __future__ import annotations
 
 NOT_LOST = "a uniform number of 1 or more is a link that is not lost, and the hop is not a part of the delay"
 
+ONLY_TYPES = "only the type checker, which finds it, uses the name"
+
 EQUIVALENT: dict[str, str] = {
     "v2x.py: 1.0 -> 2.0 in `1.0` (3)": NOT_LOST,
     "v2x.py: 1.0 -> 2.0 in `1.0` (4)": NOT_LOST,
-    "rewards.py: 1 -> 2 in `1` (10)": "one learner that chooses again, the others as before, chooses the same",
+    "rewards.py: `Value = TypeVar('Value', float, Floats)` removed (1)": ONLY_TYPES,
 }
