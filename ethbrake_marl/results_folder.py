@@ -65,7 +65,7 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
             stem = name.removesuffix("_interval")
             line[f"{stem}_low"], line[f"{stem}_high"] = value or (None, None)
         elif name != "parameters":
-            line[name] = value
+            line[name] = json.dumps(value, allow_nan=False) if isinstance(value, list | dict) else value
     return line
 
 

@@ -18,7 +18,7 @@ from ethbrake_marl.analysis.best_harm import world_identity
 from ethbrake_marl.analysis.best_harm_shipped import shipped_tables
 from ethbrake_marl.analysis.best_harm_table import BestHarmTable
 from ethbrake_marl.analysis.lower_bound import lower_bound
-from ethbrake_marl.evaluation.regret import Between, between, limits_do_not_apply
+from ethbrake_marl.evaluation.regret import Between, between, harm_is_bounded, limits_do_not_apply
 from ethbrake_marl.harm import COUNTS
 from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -36,7 +36,7 @@ class Proven:
 
 def proven_of(scenario: Scenario, worlds: Worlds, vehicle: int, first: Floats, total: Floats) -> Proven | None:
     """What is proven about worlds at the alert, ``first`` and ``total`` [n] being the least harms known; or None."""
-    if limits_do_not_apply(worlds, scenario, vehicle) is not None:
+    if limits_do_not_apply(worlds, scenario, vehicle) is not None or not harm_is_bounded(worlds):
         return None
     bound = lower_bound(worlds, vehicle, horizon_s=scenario.horizon_s)
     contact = ~avoidability(worlds, vehicle).avoidable
@@ -101,6 +101,7 @@ def bounds_of(table: BestHarmTable) -> ShippedBounds:
     first, total = (float(table.best[count].harm.mean()) if count in table.best else None for count in COUNTS)
     why = f"{len(names)} vehicles are driven; it is proven for one" if len(vehicles) != 1 else None
     why = why or limits_do_not_apply(worlds, scenario, vehicles[0])
+    why = why or (None if harm_is_bounded(worlds) else "an obstacle stands ahead; no least harm is proven")
     proven = None if why is not None else proven_of_table(scenario, worlds, table, vehicles[0])
     return ShippedBounds(scenario.name, names, seed, len(table.identity), first, total, proven, why)
 

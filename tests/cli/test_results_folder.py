@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import csv
 from types import SimpleNamespace
 
 import numpy as np
@@ -30,7 +31,7 @@ def test_telling_world__is_the_median_saving_among_harmful_worlds(before, after,
 def test_results_csv__an_interval_becomes_two_columns_and_nothing_an_empty_cell():
     scenario = load_scenario("paper-random")
     rows = summarise(evaluate(scenario.sample(3, 1), make_lineup(["coast", "e_v2x_bm"], scenario), scenario=scenario))
-    head, coast, bm = (line.split(",") for line in results_csv(rows).splitlines())
+    head, coast, bm = csv.reader(results_csv(rows).splitlines())
     column = {name: k for k, name in enumerate(head)}
     assert "parameters" not in column
     assert float(coast[column["first_impact_harm_low"]]) == rows[0].first_impact_harm.interval[0]

@@ -49,7 +49,7 @@ def clear() -> Evaluation:
 
 
 def terminal(result: Evaluation) -> str:
-    console = Console(width=120, file=io.StringIO(), color_system=None)
+    console = Console(width=160, file=io.StringIO(), color_system=None)
     console.print(rich_table(summarise(result)))
     return " ".join(console.file.getvalue().split())
 
