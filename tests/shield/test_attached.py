@@ -342,3 +342,34 @@ def test_horizon__settles_says_what_the_plan_comes_to_in_the_engine():
 def test_horizon__beyond_it_the_bound_says_nothing():
     now, later = above_later("coast", 200)
     assert now == 0.0 and later > 0.5
+
+
+class Counting:
+    """Brakes harder with every decision that it was asked for: a memory that a refused call must not move."""
+
+    name = "counting"
+
+    def begin(self, worlds, vehicle, rows):
+        self.asked = 0
+
+    def act(self, worlds, vehicle):
+        self.asked += 1
+        return -min(0.3 * self.asked, 7.0) * np.ones(worlds.n)
+
+
+@pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
+def test_episode_mode__a_refused_call_does_not_ask_the_policy_again():
+    harms = []
+    for refused in (0, 3):
+        env = HybridShield(parallel_env(), Counting())
+        env.reset(seed=4)
+        while env.agents:
+            for _ in range(refused):
+                with pytest.raises(InvalidInput, match="unknown agent"):
+                    env.step({"vehicle_9": np.zeros(1)})
+            *_, infos = env.step({})
+        harms.append(infos["vehicle_2"]["world_first_impact_harm"])
+    assert harms[0] == harms[1]
+    with pytest.raises(UncertifiedStep, match="nothing was certified"):
+        env.reset(seed=4)
+        env.unwrapped.step({"vehicle_2": np.zeros(1)})
