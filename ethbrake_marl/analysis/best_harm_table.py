@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -161,7 +162,7 @@ def load_table(path: Path) -> BestHarmTable:
     Names, types, shapes and sizes are checked from the headers before anything is unpacked. What a table says of a
     world is believed; that its profiles fit a problem is for ``check_fits`` to say.
     """
-    if not path.exists():
+    if not os.path.exists(path):
         raise InvalidInput(f"{path}: there is no such table of best known harm")
     data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
     try:

@@ -23,6 +23,7 @@ from ethbrake_marl.learning.policy_team import Trained, drivers_of
 from ethbrake_marl.snapshots import Arrays
 
 _SCRIPT = "environment.engine.script."
+_MAY_BE_INFINITE = ("environment.engine.state", "environment.engine.params")  # no obstacle; news that never comes
 _STREAM = "environment.engine.stream"
 _DRAWN_LIMIT = 1 << 53  # worlds
 
@@ -74,8 +75,10 @@ def _check_arrays(arrays: Arrays, model: Model) -> None:
     if seed != right or drawn > _DRAWN_LIMIT:
         raise ValueError(f"array {_STREAM!r} is [{seed}, {drawn}]; must be [{right}, worlds drawn so far]")
     for name in sorted(arrays):
-        if name.startswith(("policy.", "optimizer.", "log_ent_coef")) and not np.isfinite(arrays[name]).all():
-            raise ValueError(f"array {name!r} holds a number that is not finite")
+        if not name.startswith(_SCRIPT) and arrays[name].dtype.kind == "f":
+            wrong = np.isnan(arrays[name]) if name in _MAY_BE_INFINITE else ~np.isfinite(arrays[name])
+            if wrong.any():
+                raise ValueError(f"array {name!r} holds a number that is not finite")
 
 
 def _optimizer_rows(prefix: str, optimizer: torch.optim.Optimizer, arrays: Arrays) -> Iterator[ArrayRow]:

@@ -55,6 +55,7 @@ def test_resume__a_listing_that_agrees_does_not_make_a_checkpoint(
     [
         ("policy.log_std", np.zeros(2, np.float32), r"'policy.log_std' is <f4 \[2\], should be <f4 \[1\]"),
         ("policy.log_std", np.full(1, np.nan, np.float32), r"'policy.log_std' holds a number that is not finite"),
+        ("environment.begun", np.nan, r"'environment.begun' holds a number that is not finite"),
         ("environment.engine.script.1.act", np.zeros(3), r"'environment.engine.script.1.act' does not belong here"),
         ("random.python", np.full(625, 2**40, np.uint64), r"'random.python' is no state"),
         (
@@ -66,7 +67,8 @@ def test_resume__a_listing_that_agrees_does_not_make_a_checkpoint(
 )
 def test_resume__arrays_must_be_those_of_this_training(run: Path, name: str, array: object, reason: str) -> None:
     path = newest(run) / "arrays.safetensors"
-    arrays = {**safetensors.numpy.load(path.read_bytes()), name: array}
+    arrays = safetensors.numpy.load(path.read_bytes())
+    arrays[name] = np.full_like(arrays[name], array) if isinstance(array, float) else array
     path.write_bytes(safetensors.numpy.save(arrays))  # type: ignore[arg-type]
     listed_anew(newest(run))
     before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file() and file.name != "run.lock"}
