@@ -12,7 +12,7 @@ from pathlib import Path
 from tests.programme.suites import ROOT
 
 KERNELS = "numba"  # folder of a copy: what was compiled there
-PARTS = ("ethbrake_marl", "tests", "scenarios", "train")
+PARTS = ("ethbrake_marl", "tests", "scenarios", "train", "docs")
 _KEPT = ROOT / ".pytest_cache" / "copies"
 
 

@@ -112,6 +112,7 @@ ABLATION = Suite(
         "ablation/comparison.py": ("tests/ablation/test_comparison.py",),
         "ablation/joint_optimum.py": ("tests/ablation/test_joint_optimum.py",),
         "ablation/longer_lines.py": ("tests/ablation/test_longer_lines.py",),
+        "ablation/tables.py": ("tests/ablation/test_comparison.py",),
         "ablation/measurement.py": ("tests/ablation/test_measurement.py", "tests/ablation/test_comparison.py"),
     },
     otherwise=("tests/ablation/test_comparison.py", "tests/ablation/test_ablate_command.py"),

@@ -31,6 +31,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -193,8 +194,9 @@ def try_all(module: str, chosen: list[Mutant], jobs: int, *, whole: bool, journa
     old = {mutant: known[mutant.digest] for mutant in chosen if mutant.digest in known}
     fresh = [mutant for mutant in chosen if mutant not in old]
     shares = [fresh[k::jobs] for k in range(jobs)]
-    with get_context("fork").Pool(jobs) as pool:
-        verdicts = pool.starmap(try_share, [(module, share, whole, journal) for share in shares], chunksize=1)
+    with ProcessPoolExecutor(jobs, mp_context=get_context("fork")) as pool:  # its processes may have children
+        futures = [pool.submit(try_share, module, share, whole, journal) for share in shares]
+        verdicts = [future.result() for future in futures]
     found = {m: v for share, many in zip(shares, verdicts, strict=True) for m, v in zip(share, many, strict=True)}
     return old | found
 
