@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from ethbrake_marl.envs.registration import register_environments
 
 if TYPE_CHECKING:
-    from ethbrake_marl.engine import Engine as Engine
+    from ethbrake_marl.engine.engine import Engine as Engine
     from ethbrake_marl.envs.parallel import EthBrakeParallelEnv as EthBrakeParallelEnv
     from ethbrake_marl.envs.parallel import env as env
     from ethbrake_marl.envs.parallel import parallel_env as parallel_env
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from ethbrake_marl.envs.vector import EthBrakeVectorEnv as EthBrakeVectorEnv
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError
     from ethbrake_marl.evaluation import evaluate as evaluate
-    from ethbrake_marl.learning.bundle import load_policy as load_policy
     from ethbrake_marl.lineup import make_agent as make_agent
     from ethbrake_marl.observations import ObservationSpec as ObservationSpec
     from ethbrake_marl.observations import observation_for as observation_for
     from ethbrake_marl.physics import Worlds as Worlds
     from ethbrake_marl.physics import advance as advance
     from ethbrake_marl.physics import make_worlds as make_worlds
+    from ethbrake_marl.policies.policy import load_policy as load_policy
     from ethbrake_marl.rewards import RewardParams as RewardParams
     from ethbrake_marl.scenario import Scenario as Scenario
     from ethbrake_marl.scenario import list_scenarios as list_scenarios
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "Engine": "engine",
+    "Engine": "engine.engine",
     "EthBrakeEnv": "envs.single",
     "EthBrakeError": "errors",
     "EthBrakeParallelEnv": "envs.parallel",
@@ -54,7 +54,7 @@ _HOME = {
     "env": "envs.parallel",
     "evaluate": "evaluation",
     "list_scenarios": "scenario",
-    "load_policy": "learning.bundle",
+    "load_policy": "policies.policy",
     "load_scenario": "scenario",
     "make_agent": "lineup",  # above the registry: best_harm and trained policies are registered there
     "make_sb3_vec_env": "envs.sb3",

@@ -9,23 +9,22 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import introduce, scripted
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.refined import Rehearsed
 from ethbrake_marl.agents.registry import Factory, agent_names, register_agent
 from ethbrake_marl.agents.registry import make_agent as make_agent  # the public one: here all agents are registered
-from ethbrake_marl.agents.rehearsed import Rehearsed
+from ethbrake_marl.agents.rollout import introduce, scripted
 from ethbrake_marl.agents.team import Driver, Team, team_of
-from ethbrake_marl.analysis.best_harm_shipped import make_best_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.bundle import Policy
-from ethbrake_marl.learning.shipped import SHIPPED, PolicyKind, load_named_policy
 from ethbrake_marl.learning.team_file import is_team, load_driver, load_team
+from ethbrake_marl.limits.shipped import make_best_harm
 from ethbrake_marl.physics import Worlds
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.shipped import SHIPPED, PolicyKind, load_named_policy
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
-from ethbrake_marl.shield.episode import HybridAgent
-from ethbrake_marl.shield.step import StepShieldAgent
+from ethbrake_marl.shield.agents import HybridAgent, StepShieldAgent
 from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
 
 EPISODES = 10_000
@@ -139,7 +138,7 @@ def make_lineup(
 
     Every spec of ``make_agent``, and ``ppo@PATH`` or ``sac@PATH`` (the policy of a run, or a bundle), ``hybrid@PATH``
     (Algorithm 1: that policy or coupled E-V2X-BM, whichever harms less), ``hybrid:pairwise@PATH`` (with the paper's
-    closed form instead), ``rehearsed@PATH`` (``agents.rehearsed``), ``hybrid:rehearsed@PATH``, and ``step@PATH`` or
+    closed form instead), ``rehearsed@PATH`` (``agents.refined``), ``hybrid:rehearsed@PATH``, and ``step@PATH`` or
     ``step:rehearsed@PATH`` (the step shield); ``team@PATH`` is the team of a run, as ``ppo@PATH`` and ``sac@PATH`` are
     where each learner has its own policy. PATH may be
     ``shipped``, the policy that comes with the package for this scenario and count (PPO's for all but sac@shipped), or

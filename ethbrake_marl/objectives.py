@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.harm import HarmCount, Ledger
-from ethbrake_marl.numerals import parse_numeral
 from ethbrake_marl.physics.worlds import Floats
 
 KINDS = ("total", "own", "social", "maximin", "mass-weighted", "weighted")

@@ -24,7 +24,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.events import stopping_distance
-from ethbrake_marl.physics.packed import (
+from ethbrake_marl.physics.rows import (
     RESTITUTION,
     TIME,
     command_at,
@@ -178,7 +178,7 @@ def scaling(spec: ObservationSpec) -> Scaling:
 
 
 def observe_packed(state: Floats, params: Floats, vehicles: Ints, scale: Scaling) -> Observations:
-    """Observations of several vehicles in worlds given as rows of ``physics.packed``, [n, len(vehicles), F]."""
+    """Observations of several vehicles in worlds given as rows of ``physics.rows``, [n, len(vehicles), F]."""
     observation = np.empty((len(state), len(vehicles), scale.features.shape[1]), np.float32)
     _observe_rows(state, params, vehicles, *scale, observation)
     return observation

@@ -24,6 +24,8 @@ _worker = os.environ.get("PYTEST_XDIST_WORKER")
 if _worker is not None:
     os.environ["NUMBA_CACHE_DIR"] = str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "numba" / _worker)
 
+pytest_plugins = ["tests.fixtures.evaluation", "tests.fixtures.policies"]
+
 # A shell's background job ignores Ctrl-C, and so would all processes that it starts; the tests send it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

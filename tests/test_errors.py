@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from ethbrake_marl.cli.terminal import result_console, say, show
 from ethbrake_marl.errors import (
     LINE_LIMIT,
     AlreadyExists,
@@ -13,7 +14,6 @@ from ethbrake_marl.errors import (
     one_line,
     plain_text,
 )
-from ethbrake_marl.terminal import result_console, say, show
 
 
 @pytest.mark.parametrize("family", [InvalidInput, UnknownName, AlreadyExists, CorruptBundle])

@@ -1,4 +1,4 @@
-"""The rooms import one way, and importing the package stays light."""
+"""The package imports one way, without a circle, and importing it stays light."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -15,40 +16,26 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "ethbrake_marl"
 
-# From the bottom up. A room imports lower levels; inside a level one room may import another, but not both ways.
+# From the bottom up. A module imports what stands on lower levels, or in its own folder; folders of one level do not
+# import each other.
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("errors", "numerals"),
-    ("durable_files", "plain_files", "strict_json", "array_files"),
-    ("physics",),
-    ("harm",),
+    ("errors",),
+    ("files", "physics"),
+    ("harm", "actions"),
     ("objectives",),
-    ("scenario", "v2x"),
-    ("actions", "observations", "rewards"),
-    ("stepping", "starts", "engine"),
-    ("snapshots",),
+    ("scenario",),
+    ("observations", "rewards"),
+    ("engine",),
+    ("search",),
     ("agents",),
-    ("envs",),
+    ("limits", "envs"),
     ("ethbrake_v0",),
-    ("analysis", "shield"),
-    ("learning", "evaluation"),
-    ("viewer",),
-    ("lineup", "results_folder"),
-    ("experiment",),
-    ("learning_curves",),
-    ("ablation",),
+    ("shield", "policies"),
+    ("evaluation",),
+    ("learning", "figures"),
+    ("lineup",),
+    ("studies",),
     ("__init__",),
-    ("doctor", "terminal", "command_options", "machine", "benchmark", "scaling"),
-    (
-        "evaluate_command",
-        "equal_time_command",
-        "picture_commands",
-        "search_commands",
-        "bench_commands",
-        "training_commands",
-        "policy_commands",
-        "ablation_commands",
-        "shield_commands",
-    ),
     ("cli", "__main__"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
@@ -109,14 +96,37 @@ def arrows(package: Path) -> list[Arrow]:
 
 
 def upward(found: list[Arrow]) -> list[str]:
-    """The arrows that point up, or both ways inside one level."""
+    """The arrows that point up, or sideways to another folder of the same level."""
     inside = [(a, a.target_room) for a in found if a.target_room is not None and a.target_room != a.room]
-    pairs = {(a.room, target) for a, target in inside}
     return [
         f"{arrow.where}: {arrow.room} imports {arrow.target}"
         for arrow, target in inside
-        if LEVEL[target] > LEVEL[arrow.room] or (LEVEL[target] == LEVEL[arrow.room] and (target, arrow.room) in pairs)
+        if LEVEL[target] >= LEVEL[arrow.room]
     ]
+
+
+def circles(package: Path) -> list[tuple[str, ...]]:
+    """Modules that import each other in a circle, those inside one folder too, imports for types included."""
+    files = {module_name(package, path): path for _, path in modules(package)}
+    graph: dict[str, set[str]] = {name: set() for name in files}
+    for name, path in files.items():
+        parent = (PACKAGE, *path.relative_to(package).parent.parts)
+        for _, module, names in imported_names(ast.parse(path.read_text("utf-8")), parent):
+            for target in [f"{module}.{each}" for each in names] or [module]:
+                found = target if target in files else module
+                if found in files and found != name:
+                    graph[name].add(found)
+    try:
+        tuple(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        return [tuple(error.args[1])]
+    return []
+
+
+def module_name(package: Path, path: Path) -> str:
+    """The dotted name of a file of the package; of a folder for its ``__init__``."""
+    parts = (PACKAGE, *path.relative_to(package).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
 def misplaced_torch(found: list[Arrow]) -> list[str]:
@@ -151,6 +161,22 @@ def test_import_order__no_arrow_points_up() -> None:
     assert upward(found) == []
 
 
+def test_import_order__has_no_circle() -> None:
+    assert circles(ROOT / PACKAGE) == []
+
+
+def test_import_order__finds_a_planted_circle_inside_a_folder(tmp_path: Path) -> None:
+    files = {
+        "physics/__init__.py": "",
+        "physics/worlds.py": "if TYPE_CHECKING:\n    from ethbrake_marl.physics.advance import advance",
+        "physics/advance.py": "from ethbrake_marl.physics import impact",
+        "physics/impact.py": "def later():\n    from ethbrake_marl.physics.worlds import Worlds",
+    }
+    planted(tmp_path, files)
+    (found,) = circles(tmp_path / PACKAGE)
+    assert {name.split(".")[-1] for name in found} == {"worlds", "advance", "impact"}
+
+
 def test_torch__is_imported_only_where_policies_live() -> None:
     assert misplaced_torch(arrows(ROOT / PACKAGE)) == []
 
@@ -171,11 +197,11 @@ def test_torch__is_imported_only_where_policies_live() -> None:
         ("physics/advance.py", "if TYPE_CHECKING:\n    from ethbrake_marl.harm import Ledger"),
         ("physics/advance.py", "importlib.import_module('ethbrake_marl.harm')"),
         ("errors.py", "from ethbrake_marl.physics import advance"),
-        ("engine.py", "from ethbrake_marl.cli import main"),
+        ("engine/engine.py", "from ethbrake_marl.cli.app import main"),
     ],
 )
 def test_import_order__finds_a_planted_upward_arrow(tmp_path: Path, name: str, source: str) -> None:
-    found = planted(tmp_path, {"harm.py": "", "cli.py": "", name: source})
+    found = planted(tmp_path, {"harm.py": "", "cli/app.py": "", name: source})
     assert len(upward(found)) == 1
     assert upward(found)[0].startswith(f"{name}:")
 
@@ -184,28 +210,25 @@ def test_import_order__accepts_what_points_down_or_stays_in_the_room(tmp_path: P
     files = {
         "harm.py": "import numpy\nfrom ethbrake_marl.physics.worlds import Worlds\nfrom ethbrake_marl import physics",
         "physics/advance.py": "from ethbrake_marl.physics.worlds import Worlds\nfrom .impact import collide",
-        "evaluation/rollout.py": "from ethbrake_marl.learning import policy",
-        "cli.py": "from ethbrake_marl import load_scenario",
+        "learning/train.py": "from ethbrake_marl.evaluation import evaluate",
+        "cli/app.py": "from ethbrake_marl import load_scenario",
     }
     assert upward(planted(tmp_path, files)) == []
 
 
-def test_import_order__one_level_may_not_import_itself_both_ways(tmp_path: Path) -> None:
-    files = {
-        "evaluation/rollout.py": "from ethbrake_marl.learning import policy",
-        "learning/ppo.py": "from ethbrake_marl import evaluation",
-    }
-    assert len(upward(planted(tmp_path, files))) == 2
+def test_import_order__folders_of_one_level_do_not_import_each_other(tmp_path: Path) -> None:
+    files = {"learning/ppo.py": "from ethbrake_marl.figures import style", "figures/style.py": ""}
+    assert len(upward(planted(tmp_path, files))) == 1
 
 
 @pytest.mark.parametrize(
     ("name", "source", "misplaced"),
     [
-        ("engine.py", "import torch", True),
+        ("engine/engine.py", "import torch", True),
         ("envs/sb3.py", "def step():\n    from torch.nn import Linear", True),
         ("agents/constant.py", "from safetensors import torch", True),
         ("agents/constant.py", "from safetensors.numpy import load_file", False),
-        ("engine.py", "import torchlight", False),
+        ("engine/engine.py", "import torchlight", False),
         ("learning/ppo.py", "import torch", False),
         ("agents/learned.py", "import torch.nn as nn", False),
     ],
@@ -220,7 +243,7 @@ def test_torch__a_planted_import_is_judged_by_its_place(
     ("module", "heavy"),
     [
         ("ethbrake_marl", ("torch", "matplotlib", "stable_baselines3")),
-        ("ethbrake_marl.cli", ("torch", "stable_baselines3")),
+        ("ethbrake_marl.cli.app", ("torch", "stable_baselines3")),
     ],
 )
 def test_import__loads_nothing_heavy_and_says_nothing(module: str, heavy: tuple[str, ...]) -> None:

@@ -10,8 +10,8 @@ from pydantic import ValidationError
 
 from ethbrake_marl import rewards
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine import Engine
-from ethbrake_marl.envs.build import make_engine
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.envs.setup import make_engine
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics import advance, forecast, make_worlds
 from ethbrake_marl.rewards import (

@@ -24,7 +24,7 @@ def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> No
     if not isinstance(plan, PpoRecipe):
         raise InvalidInput(f"recipe {plan.name!r}: is for {plan.algorithm.upper()}; MAPPO needs one for PPO")
     try:
-        from ethbrake_marl.learning.benchmarl_task import train_mappo  # only here: an extra
+        from ethbrake_marl.learning.benchmarl import train_mappo  # only here: an extra
     except ModuleNotFoundError as error:
         raise InvalidInput(f"needs BenchMARL: {sys.executable} -m pip install benchmarl ({error})") from None
     train_mappo(plan, line, output)

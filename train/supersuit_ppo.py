@@ -21,15 +21,13 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
 import ethbrake_marl as eb
-from ethbrake_marl.durable_files import new_folder
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.learning.bundle import Policy, make_policy, save_policy
-from ethbrake_marl.learning.manifest import observation_schema
-from ethbrake_marl.learning.networks import NetworkSpec
+from ethbrake_marl.files.durable import new_folder
+from ethbrake_marl.learning.models import tensors_of
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.sb3_policy import tensors_of
 from ethbrake_marl.learning.schemes import scheme_of
-from ethbrake_marl.learning.versions import installed_versions
+from ethbrake_marl.policies.manifest import NetworkSpec, installed_versions, observation_schema
+from ethbrake_marl.policies.policy import Policy, make_policy, save_policy
 from ethbrake_marl.rewards import reward_params
 
 # 1. What to train: the same settings as train/ppo.yaml, in smaller networks.

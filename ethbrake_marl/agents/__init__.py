@@ -1,8 +1,8 @@
 """Who drives a vehicle: one protocol, the scripts and the baselines. See docs/baselines.md."""
 
-from ethbrake_marl.agents.coupled import CoupledOptimum, optimise_coupled
-from ethbrake_marl.agents.e_v2x_bm import EV2XBM
-from ethbrake_marl.agents.pairwise import PairwiseOptimum, optimise_pairwise, pairwise_harm
+from ethbrake_marl.agents.e_v2x_bm.agent import EV2XBM
+from ethbrake_marl.agents.e_v2x_bm.coupled import CoupledOptimum, optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm.pairwise import PairwiseOptimum, optimise_pairwise, pairwise_harm
 from ethbrake_marl.agents.protocol import Agent, PredictingAgent
 from ethbrake_marl.agents.registry import AgentSettings, agent_names, make_agent, register_agent
 

@@ -15,7 +15,7 @@ from ethbrake_marl.physics import Floats, Ints, Worlds
 
 
 class LearnedPolicy(Protocol):
-    """What an agent needs of a policy; ``ethbrake_marl.learning.bundle.Policy`` is one."""
+    """What an agent needs of a policy; ``ethbrake_marl.policies.policy.Policy`` is one."""
 
     @property
     def observation(self) -> ObservationSpec:

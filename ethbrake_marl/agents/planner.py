@@ -8,17 +8,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.others import fixed_commands
-from ethbrake_marl.agents.pairwise import optimise_pairwise
-from ethbrake_marl.agents.profile_problem import TIME_STEP_S, ProfileProblem, profile_problem
-from ethbrake_marl.agents.profile_search import MOST_PHASES
-from ethbrake_marl.agents.profiles import Profiles, constant_profiles, even_grid, search_profiles
-from ethbrake_marl.agents.protocol import place
+from ethbrake_marl.agents.protocol import fixed_commands, place
+from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.starts import Script
+from ethbrake_marl.search.kernel import MOST_PHASES
+from ethbrake_marl.search.problem import TIME_STEP_S, ProfileProblem, profile_problem
+from ethbrake_marl.search.profiles import Profiles, constant_profiles, even_grid, search_profiles
 
 CANDIDATES = 256  # per world and decision
 ROUND = 256  # candidates between two looks at the clock

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Callable, Mapping
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from ethbrake_marl.engine.stream import Script, is_state_free
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Floats, Ints
-from ethbrake_marl.starts import Script
+from ethbrake_marl.physics import Floats, Ints, Worlds
 
 
 @runtime_checkable
@@ -70,3 +71,35 @@ def recall(stored: Floats, n: int, name: str) -> Floats:
     if len(values) < n or not np.all(np.isfinite(values)):
         raise InvalidInput(f"agent {name!r}: act on {n} worlds, but begin was not called for each of them")
     return values
+
+
+ADVICE = "; looking ahead needs full_brake, coast, constant:a, copy_leader or gentlest_front"
+
+
+def fixed_commands(
+    others: Mapping[int, Script],
+    worlds: Worlds,
+    who: str,
+    *,
+    vehicle: int | None = None,
+    is_fixed: Callable[[Script], bool] = is_state_free,
+    advice: str = ADVICE,
+) -> Floats:
+    """The command of every vehicle from the alert on, [n, N] m/s2; those without an entry in ``others`` brake fully.
+
+    ``worlds`` are at the alert. ``who`` looks ahead and drives ``vehicle``, which is left out. Raises ``InvalidInput``
+    (first ``who``, at its end ``advice``) for a script whose command is not fixed at the alert, as ``is_fixed`` says.
+    """
+    command = -worlds.vehicles.braking_capacity_mps2
+    for i, script in others.items():
+        if i == vehicle:
+            continue
+        if not is_fixed(script):
+            name = getattr(script, "name", type(script).__name__)
+            raise InvalidInput(
+                f"{who}: vehicle_{i + 1} is driven by {name!r}, whose command is not fixed at the alert{advice}"
+            )
+        asked = copy.deepcopy(script)  # what it remembers of running episodes is not disturbed
+        asked.begin(worlds, i, np.arange(worlds.n))
+        command[:, i] = asked.act(worlds, i)
+    return command

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ethbrake_marl.agents.e_v2x_bm import EV2XBM
+from ethbrake_marl.agents.e_v2x_bm.agent import EV2XBM
 from ethbrake_marl.agents.planner import Planner
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.scripts import CopyLeader, GentlestFront, StateFree
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount, check_count
-from ethbrake_marl.scenario.scripts import parse_agent_spec
+from ethbrake_marl.scenario.roles import parse_agent_spec
 
 
 @dataclass(frozen=True, slots=True)

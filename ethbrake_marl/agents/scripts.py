@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.pairwise import optimise_pairwise
 from ethbrake_marl.agents.protocol import place, recall
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.scenario.scripts import constant_command, is_state_free
+from ethbrake_marl.scenario.roles import constant_command, is_state_free
 
 
 class StateFree:

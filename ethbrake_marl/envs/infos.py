@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_of
-from ethbrake_marl.engine import Engine
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.step import Step
 from ethbrake_marl.harm import front_share
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.packed import TIME, command_at, harm_at, params_at, state_width
-from ethbrake_marl.stepping import Step
-from ethbrake_marl.v2x import news_of
+from ethbrake_marl.physics.rows import TIME, command_at, harm_at, params_at, state_width
+from ethbrake_marl.scenario.v2x import news_of
 
 AT_ANY_TIME = (
     "time_s",

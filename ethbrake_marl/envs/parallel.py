@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
-from ethbrake_marl.envs.build import check_render_mode, learner_columns, make_engine
 from ethbrake_marl.envs.infos import Report, plain_infos, report
-from ethbrake_marl.envs.restart import fresh_seed, restart
-from ethbrake_marl.envs.spaces import action_box, feature_box
+from ethbrake_marl.envs.setup import (
+    action_box,
+    check_render_mode,
+    feature_box,
+    fresh_seed,
+    learner_columns,
+    make_engine,
+    restart,
+)
 from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.observations import Observations, ObservationSpec
@@ -69,7 +75,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
-        """Start an episode; see ``envs.restart``."""
+        """Start an episode; see ``envs.setup``."""
         restart(self.engine, fresh_seed() if seed is None and not self._seeded else seed, options)
         self._seeded = self._started = True
         self.agents = self.possible_agents[:]

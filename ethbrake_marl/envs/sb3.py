@@ -12,20 +12,27 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from ethbrake_marl.engine import Engine
-from ethbrake_marl.envs.build import make_engine
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.snapshot import Arrays, engine_snapshot, restore_engine
+from ethbrake_marl.engine.step import Step
 from ethbrake_marl.envs.infos import Report, plain_infos, report
-from ethbrake_marl.envs.restart import INITIAL_STATE, check_seed, fresh_seed, restart_from, warn_of_unknown
-from ethbrake_marl.envs.spaces import action_box, feature_box
+from ethbrake_marl.envs.setup import (
+    INITIAL_STATE,
+    action_box,
+    check_seed,
+    feature_box,
+    fresh_seed,
+    make_engine,
+    restart_from,
+    warn_of_unknown,
+)
 from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Feature, Observations, ObservationSpec
 from ethbrake_marl.physics import Bools, Ints, Worlds, concatenate
-from ethbrake_marl.physics.packed import Packed, unpack
+from ethbrake_marl.physics.rows import Packed, unpack
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario, initial_state_worlds
-from ethbrake_marl.snapshots import Arrays, engine_snapshot, restore_engine
-from ethbrake_marl.stepping import Step
 
 Rewards = NDArray[np.float32]
 Appended = Literal["number", "state"]

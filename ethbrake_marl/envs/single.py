@@ -10,10 +10,17 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.envs.build import check_render_mode, learner_columns, make_engine, only_learner
 from ethbrake_marl.envs.infos import plain_infos, report
-from ethbrake_marl.envs.restart import check_seed, restart
-from ethbrake_marl.envs.spaces import action_box, feature_box
+from ethbrake_marl.envs.setup import (
+    action_box,
+    check_render_mode,
+    check_seed,
+    feature_box,
+    learner_columns,
+    make_engine,
+    only_learner,
+    restart,
+)
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations, ObservationSpec
 from ethbrake_marl.rewards import Reward
@@ -54,7 +61,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; see ``envs.restart``."""
+        """Start an episode; see ``envs.setup``."""
         check_seed(seed)
         if seed is None and self._np_random_seed is None:
             seed = self.np_random_seed  # fresh entropy, kept by Gymnasium: reset(seed=env.np_random_seed) repeats it

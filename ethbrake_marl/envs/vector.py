@@ -11,16 +11,22 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ethbrake_marl.envs.build import check_render_mode, make_engine, only_learner
+from ethbrake_marl.engine.step import Step
 from ethbrake_marl.envs.infos import batch_info, report
-from ethbrake_marl.envs.restart import check_seed, restart
-from ethbrake_marl.envs.spaces import action_box, feature_box
+from ethbrake_marl.envs.setup import (
+    action_box,
+    check_render_mode,
+    check_seed,
+    feature_box,
+    make_engine,
+    only_learner,
+    restart,
+)
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations, ObservationSpec
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.stepping import Step
 
 _MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 
@@ -61,7 +67,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every world; see ``envs.restart``."""
+        """Start an episode in every world; see ``envs.setup``."""
         check_seed(seed)
         if seed is None and self._np_random_seed is None:
             seed = self.np_random_seed  # fresh entropy, kept by Gymnasium

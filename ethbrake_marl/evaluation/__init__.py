@@ -3,15 +3,21 @@
 ``figures``, ``trajectories`` and ``report`` load matplotlib and Jinja2; import those modules where they are used.
 """
 
-from ethbrake_marl.evaluation.output_files import check_target
-from ethbrake_marl.evaluation.parameters import parameter_line, parameters
-from ethbrake_marl.evaluation.per_world import write_per_world_csv
+from ethbrake_marl.evaluation.conditions import parameter_line, parameters
+from ethbrake_marl.evaluation.per_world import check_target, write_per_world_csv
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
-from ethbrake_marl.evaluation.rendering import markdown_table, rich_table
-from ethbrake_marl.evaluation.rescoring import Rescored, declared_objectives, rescored, rescored_table
 from ethbrake_marl.evaluation.rollout import Evaluation, LeftOut, Outcome, evaluate
 from ethbrake_marl.evaluation.statistics import Estimate
-from ethbrake_marl.evaluation.table import SummaryRow, horizon_note, summarise
+from ethbrake_marl.evaluation.table import (
+    Rescored,
+    SummaryRow,
+    declared_objectives,
+    horizon_note,
+    rescored,
+    rescored_table,
+    summarise,
+)
+from ethbrake_marl.evaluation.text import markdown_table, rich_table
 
 __all__ = [
     "EpisodeRecord",

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.analysis.avoidability import avoidability
-from ethbrake_marl.analysis.best_harm import world_identity
-from ethbrake_marl.analysis.best_harm_shipped import shipped_tables
-from ethbrake_marl.analysis.best_harm_table import BestHarmTable
-from ethbrake_marl.analysis.lower_bound import lower_bound
 from ethbrake_marl.evaluation.regret import Between, between, harm_is_bounded, limits_do_not_apply
 from ethbrake_marl.harm import COUNTS
+from ethbrake_marl.limits.avoidability import avoidability
+from ethbrake_marl.limits.best_harm import world_identity
+from ethbrake_marl.limits.best_harm_table import BestHarmTable
+from ethbrake_marl.limits.lower_bound import lower_bound
+from ethbrake_marl.limits.shipped import shipped_tables
 from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
 from ethbrake_marl.scenario import Scenario, load_scenario
 

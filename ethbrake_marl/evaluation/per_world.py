@@ -1,9 +1,10 @@
-"""One row per world and agent as CSV; every number reads back as the same bits."""
+"""Where results go: nothing is overwritten by accident, and a file is there whole or not at all."""
 
 from __future__ import annotations
 
 import csv
 import io
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,50 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agents.knowledge import knowledge_text
-from ethbrake_marl.evaluation.output_files import check_target, write_output
-from ethbrake_marl.evaluation.parameters import quantity, quantity_rules
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.evaluation.conditions import quantity, quantity_rules
 from ethbrake_marl.evaluation.regret import Regrets, assess
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
+from ethbrake_marl.files.durable import check_writable, write_file
 from ethbrake_marl.harm import COUNTS
 from ethbrake_marl.objectives import Declared, scored
+
+
+def check_target(path: str | Path, *, force: bool = False) -> Path:
+    """Refuse a file that exists (``AlreadyExists``, unless ``force``) or cannot be written (``InvalidInput``).
+
+    Even ``force`` replaces plain files only: no folder, device, pipe or symbolic link. Call it before long work whose
+    result goes there.
+    """
+    target = Path(path)
+    try:
+        _check_place(target)
+        if os.path.lexists(target) and not force:
+            raise AlreadyExists(f"{target}: is there already; give another name or use force (--force)")
+        check_writable(target.parent)
+    except (InvalidInput, AlreadyExists):
+        raise
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InvalidInput(f"{target!s:.200}: cannot be written ({reason})") from None
+    return target
+
+
+def _check_place(target: Path) -> None:
+    if target.is_symlink():
+        raise InvalidInput(f"{target}: is a symbolic link; give the file it points to")
+    if target.is_dir():
+        raise InvalidInput(f"{target}: is a folder; give the name of a file")
+    if target.exists() and not target.is_file():
+        raise InvalidInput(f"{target}: is a device or a pipe, not a plain file; give another name")
+    if not target.parent.is_dir():
+        raise InvalidInput(f"{target}: there is no folder {target.parent}; make it first")
+
+
+def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
+    """Write ``data`` in one step; raises as ``check_target``."""
+    write_file(check_target(path, force=force), data)
+
 
 Columns = dict[str, list[Any]]
 

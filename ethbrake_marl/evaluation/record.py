@@ -13,11 +13,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import episode_engine
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.rollout import episode_engine
 from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.evaluation.aftermath import with_post_ahead
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
-from ethbrake_marl.evaluation.travel import with_post_ahead
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
 from ethbrake_marl.scenario import Scenario

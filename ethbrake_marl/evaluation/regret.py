@@ -1,8 +1,8 @@
 """How far each agent stays from the best that is known: which collisions nobody avoids, and regret world by world.
 
 Three vehicles, Vehicle 2 driven, the others braking fully: for these it is proven world by world whether some command
-avoids all contact (``analysis.avoidability``) and which harm no command undercuts (``analysis.lower_bound``). The least
-harm known is the first proof's witness (harm 0), or the result of a search (``analysis.best_harm``), or what an agent
+avoids all contact (``limits.avoidability``) and which harm no command undercuts (``limits.lower_bound``). The least
+harm known is the first proof's witness (harm 0), or the result of a search (``limits.best_harm``), or what an agent
 of the same evaluation achieved, whichever is least. An obstacle that Vehicle 1 does not reach by itself leaves the
 first proof as it is (only a push brings it there); the second knows none.
 """
@@ -15,12 +15,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.analysis.avoidability import avoidability
-from ethbrake_marl.analysis.best_harm_shipped import best_known
-from ethbrake_marl.analysis.lower_bound import lower_bound
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate, relative_decrease
 from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.limits.avoidability import avoidability
+from ethbrake_marl.limits.lower_bound import lower_bound
+from ethbrake_marl.limits.shipped import best_known
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.physics.events import stopping_distances
 from ethbrake_marl.physics.obstacle import obstacle_ahead

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from ethbrake_marl.evaluation.output_files import write_output
+from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
-from ethbrake_marl.evaluation.parameters import parameter_line
-from ethbrake_marl.evaluation.rendering import (
+from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.evaluation.table import SummaryRow
+from ethbrake_marl.evaluation.text import (
     COLUMNS,
     MEANINGS,
     Line,
@@ -22,7 +23,6 @@ from ethbrake_marl.evaluation.rendering import (
     our_lines,
     paper_blocks,
 )
-from ethbrake_marl.evaluation.table import SummaryRow
 
 _TEMPLATE = "report.html.j2"
 

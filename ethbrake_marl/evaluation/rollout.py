@@ -12,18 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_of
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.agents.team import Driver, Team, team_of
+from ethbrake_marl.engine.stream import check_alert
 from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
-from ethbrake_marl.evaluation.sampled_harm import SampledHarm
-from ethbrake_marl.evaluation.travel import ShovedFront
+from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
 from ethbrake_marl.harm import HarmCount, Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate, leaving_out_failed
 from ethbrake_marl.scenario import Sample, Scenario
-from ethbrake_marl.starts import check_alert
-from ethbrake_marl.v2x import hidden_from
+from ethbrake_marl.scenario.v2x import hidden_from
 
 CHUNK = 10_000  # worlds advanced together: bounds memory, changes no result
 
@@ -149,7 +148,7 @@ def evaluate(
 
     The scenario's learners are driven, each by its own copy of the agent, or by its driver in a ``Team``; or just
     ``vehicle``, a name (``vehicle_2``) or an index (0 = front). All others follow the scenario's scripts (see
-    ``agents.driving``). A world's outcome depends neither on ``chunk`` nor on the other worlds, and the given agents
+    ``agents.rollout``). A world's outcome depends neither on ``chunk`` nor on the other worlds, and the given agents
     are left as they are. ``seed`` is noted, not used. Without ``aftermath`` nobody looks how far Vehicle 1 was shoved
     and what the paper's sum over samples is, which saves time where only the harm counts. A world that cannot be
     advanced with one of the agents (a defect of the physics) is left out for all of them, and stands in ``left_out``;

@@ -11,14 +11,14 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
-from ethbrake_marl.shield.forensics import VERDICTS, review
+from ethbrake_marl.shield.review import VERDICTS, review
 
 NONE, EPISODE, STEP, STEP_ALERT = "none", "episode", "step", "step-alert"  # the last: rollout at the alert only
 CHUNK = 500  # worlds advanced together: bounds memory, changes no result
@@ -67,7 +67,7 @@ def compare_modes(
 ) -> list[ModeRow]:
     """Let every agent drive ``vehicle`` alone, in episode mode and in step mode, through every world; see ``ModeRow``.
 
-    Each replaced decision of step mode is simulated again without the shield (``shield.forensics.review``). The given
+    Each replaced decision of step mode is simulated again without the shield (``shield.review.review``). The given
     agents are left as they are. Raises ``InvalidInput`` where a shield refuses the scenario.
     """
     rows = []

@@ -19,14 +19,14 @@ import safetensors.numpy
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
-from ethbrake_marl.array_files import map_npy, safetensors_headers
-from ethbrake_marl.durable_files import new_folder, remove_folder, write_file
+from ethbrake_marl.engine.snapshot import Arrays
 from ethbrake_marl.errors import CorruptBundle, EthBrakeError
+from ethbrake_marl.files.arrays import map_npy, safetensors_headers
+from ethbrake_marl.files.durable import new_folder, remove_folder, write_file
+from ethbrake_marl.files.plain import open_plain, read_plain
 from ethbrake_marl.learning.checkpoint_schema import Listing, Numbers, checked_json
-from ethbrake_marl.learning.policy_team import Trained, read_trained, save_trained
-from ethbrake_marl.learning.progress_table import parse_progress
-from ethbrake_marl.plain_files import open_plain, read_plain
-from ethbrake_marl.snapshots import Arrays
+from ethbrake_marl.learning.run_folder import parse_progress
+from ethbrake_marl.policies.team import Trained, read_trained, save_trained
 
 FORMAT_VERSION = 1
 LISTING = "checkpoint.json"

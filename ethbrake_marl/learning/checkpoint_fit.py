@@ -14,13 +14,13 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import SAC
 
-from ethbrake_marl.array_files import ArrayHeader, ArrayRow, check_arrays
+from ethbrake_marl.engine.snapshot import Arrays
 from ethbrake_marl.errors import CorruptBundle
-from ethbrake_marl.learning.bundle import Policy
+from ethbrake_marl.files.arrays import ArrayHeader, ArrayRow, check_arrays
 from ethbrake_marl.learning.checkpoint import TrainingState
 from ethbrake_marl.learning.model_state import REPLAY, Model, optimizers_of
-from ethbrake_marl.learning.policy_team import Trained, drivers_of
-from ethbrake_marl.snapshots import Arrays
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.team import Trained, drivers_of
 
 _SCRIPT = "environment.engine.script."
 _MAY_BE_INFINITE = ("environment.engine.state", "environment.engine.params")  # no obstacle; news that never comes

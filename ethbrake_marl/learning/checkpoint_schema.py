@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from typing_extensions import TypedDict
 
-from ethbrake_marl.learning.bundle import first_line
-from ethbrake_marl.learning.callback import EPISODE_COLUMNS
-from ethbrake_marl.learning.manifest import Sha256
-from ethbrake_marl.strict_json import parse_strict_json
+from ethbrake_marl.files.json import parse_strict_json
+from ethbrake_marl.learning.loop import EPISODE_COLUMNS
+from ethbrake_marl.policies.manifest import Sha256
+from ethbrake_marl.policies.policy import first_line
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Number = Annotated[int | float, Field(ge=-1e300, le=1e300)]

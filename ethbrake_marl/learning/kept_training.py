@@ -17,9 +17,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.bundle import first_line
 from ethbrake_marl.learning.recipe import WORDS, TrainingRecipe, recipe_of
-from ethbrake_marl.learning.run_directory import RunDirectory, read_object
+from ethbrake_marl.learning.run_folder import RunDirectory, read_object
+from ethbrake_marl.policies.policy import first_line
 from ethbrake_marl.scenario import Scenario
 
 Content = dict[str, dict[str, Any]]

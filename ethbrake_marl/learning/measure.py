@@ -5,10 +5,10 @@ from __future__ import annotations
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.team import Driver, Team
 from ethbrake_marl.evaluation import evaluate, summarise
-from ethbrake_marl.learning.bundle import Policy
-from ethbrake_marl.learning.callback import Evaluate
-from ethbrake_marl.learning.policy_team import Trained
+from ethbrake_marl.learning.loop import Evaluate
 from ethbrake_marl.learning.recipe import TrainingRecipe
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.team import Trained
 from ethbrake_marl.scenario import Scenario
 
 METRICS = ("first_impact_harm", "total_harm", "collision_rate")

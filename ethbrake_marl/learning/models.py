@@ -1,28 +1,91 @@
-"""From a recipe to a model of Stable-Baselines3, fresh and ready to learn, and from its weights to policies."""
+"""Central training, decentral driving (MAPPO): all learners share an actor, and the critic sees the whole line.
+
+A row of the environment is a vehicle's own observation and behind it the full state
+(``make_sb3_vec_env(..., appended="state")``). The actor sees the first part alone, which is all that a vehicle has when
+it drives; the critic sees both: the state, and whose place it judges.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
+from torch import Tensor, nn
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.bundle import Policy, make_policy
-from ethbrake_marl.learning.central_critic import CentralCriticPolicy
-from ethbrake_marl.learning.divergence import watch_gradients
 from ethbrake_marl.learning.independent import IndependentPPO
-from ethbrake_marl.learning.manifest import observation_schema
 from ethbrake_marl.learning.model_state import Model
-from ethbrake_marl.learning.policy_team import PolicyTeam, Trained
-from ethbrake_marl.learning.recipe import PpoRecipe, SacRecipe, Scheme, TrainingRecipe
-from ethbrake_marl.learning.sb3_policy import ppo_arguments, sac_arguments, tensors_of
+from ethbrake_marl.learning.progress import watch_gradients
+from ethbrake_marl.learning.recipe import NetworkShape, PpoRecipe, SacRecipe, Scheme, SquashedShape, TrainingRecipe
 from ethbrake_marl.learning.schemes import scheme_of
-from ethbrake_marl.learning.versions import installed_versions
 from ethbrake_marl.observations import ObservationSpec
+from ethbrake_marl.policies.actor import Float32s
+from ethbrake_marl.policies.manifest import (
+    Activation,
+    NetworkSpec,
+    installed_versions,
+    observation_schema,
+    tensor_table,
+)
+from ethbrake_marl.policies.policy import Policy, make_policy
+from ethbrake_marl.policies.team import PolicyTeam, Trained
 from ethbrake_marl.scenario import Scenario
+
+
+class CentralCriticPolicy(ActorCriticPolicy):
+    """PPO's policy with an actor on the first ``own`` numbers of a row and a critic on all of them."""
+
+    def __init__(self, *arguments: Any, own: int, **settings: Any) -> None:
+        self._own = own  # before the networks are built
+        super().__init__(*arguments, **settings)
+
+    def _build_mlp_extractor(self) -> None:
+        self.mlp_extractor = _OwnPartForTheActor(self._own, self.features_dim, self.net_arch, self.activation_fn)
+
+
+class _OwnPartForTheActor(MlpExtractor):
+    """The hidden layers of both."""
+
+    def __init__(self, own: int, whole: int, net_arch: Any, activation_fn: Any) -> None:
+        super().__init__(own, net_arch, activation_fn, device="cpu")
+        self.value_net = MlpExtractor(whole, net_arch, activation_fn, device="cpu").value_net
+        self._own = own
+
+    def forward_actor(self, features: Tensor) -> Tensor:
+        """The actor's last hidden layer."""
+        return super().forward_actor(features[:, : self._own])
+
+
+_ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
+
+
+def ppo_arguments(shape: NetworkShape) -> dict[str, Any]:
+    """Arguments of PPO's policy: separate actor and critic, orthogonal initial weights."""
+    return {
+        "net_arch": {"pi": list(shape.policy), "vf": list(shape.value)},
+        "activation_fn": _ACTIVATIONS[shape.activation],
+        "ortho_init": True,
+        "log_std_init": shape.initial_log_std,
+    }
+
+
+def sac_arguments(shape: SquashedShape) -> dict[str, Any]:
+    """Arguments of SAC's policy: an actor and two critics."""
+    return {
+        "net_arch": {"pi": list(shape.policy), "qf": list(shape.value)},
+        "activation_fn": _ACTIVATIONS[shape.activation],
+    }
+
+
+def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
+    """Copy the policy's weights under the names of our table."""
+    state = policy.state_dict()
+    return {row.name: state[row.sb3_name].detach().cpu().numpy().astype(np.float32) for row in tensor_table(spec)}
 
 
 def make_model(recipe: TrainingRecipe, environment: EthBrakeVecEnv) -> Model:

@@ -10,13 +10,12 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.learning.networks import Activation, NetworkSpec, Width
+from ethbrake_marl.files.messages import explain
+from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
+from ethbrake_marl.policies.manifest import Activation, NetworkSpec, Width
 from ethbrake_marl.rewards import RewardParams
-from ethbrake_marl.scenario.consistency import refuse
-from ethbrake_marl.scenario.flow_text import flow_text
-from ethbrake_marl.scenario.shipped_files import shipped_folder
-from ethbrake_marl.scenario.validation_messages import explain
-from ethbrake_marl.scenario.yaml_loading import Document, YamlPath, read_yaml
+from ethbrake_marl.scenario.catalogue import shipped_folder
+from ethbrake_marl.scenario.checks import refuse
 
 ROLLOUT_LIMIT = 2**24  # decisions held in memory between two updates
 

@@ -6,12 +6,10 @@ from typing import Any, Literal
 
 from stable_baselines3.common.logger import Logger
 
-from ethbrake_marl.durable_files import remove_folder
-from ethbrake_marl.learning.callback import BetweenUpdates, StopRequested
+from ethbrake_marl.files.durable import remove_folder
 from ethbrake_marl.learning.checkpoint import TrainingState, prune, write_checkpoint
-from ethbrake_marl.learning.divergence import TrainingDiverged, weights_are_finite
-from ethbrake_marl.learning.event_files import EventFile, cut_back, event_sizes
 from ethbrake_marl.learning.kept_training import fingerprint
+from ethbrake_marl.learning.loop import BetweenUpdates, StopRequested
 from ethbrake_marl.learning.model_state import (
     Model,
     capture_model,
@@ -20,11 +18,19 @@ from ethbrake_marl.learning.model_state import (
     restore_model,
     restore_replay,
 )
-from ethbrake_marl.learning.policy_team import Trained, save_trained, steps_of
-from ethbrake_marl.learning.progress_table import ProgressTable
+from ethbrake_marl.learning.progress import TrainingDiverged, weights_are_finite
 from ethbrake_marl.learning.recipe import TrainingRecipe
-from ethbrake_marl.learning.run_directory import RunDirectory, RunRecord, RunStatus
-from ethbrake_marl.learning.versions import installed_versions
+from ethbrake_marl.learning.run_folder import (
+    EventFile,
+    ProgressTable,
+    RunDirectory,
+    RunRecord,
+    RunStatus,
+    cut_back,
+    event_sizes,
+)
+from ethbrake_marl.policies.manifest import installed_versions
+from ethbrake_marl.policies.team import Trained, save_trained, steps_of
 from ethbrake_marl.scenario import Scenario
 
 Ended = Literal["finished", "interrupted"]

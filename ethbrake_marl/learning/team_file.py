@@ -12,15 +12,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
-from ethbrake_marl.learning.bundle import Policy, load_policy
+from ethbrake_marl.files.json import parse_strict_json
+from ethbrake_marl.files.messages import explain
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.yaml import Document, YamlPath
 from ethbrake_marl.learning.recipe import Scheme
 from ethbrake_marl.learning.schemes import driver, drivers
-from ethbrake_marl.plain_files import read_plain
+from ethbrake_marl.policies.policy import Policy, load_policy
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.scenario.consistency import refuse
-from ethbrake_marl.scenario.validation_messages import explain
-from ethbrake_marl.scenario.yaml_loading import Document, YamlPath
-from ethbrake_marl.strict_json import parse_strict_json
+from ethbrake_marl.scenario.checks import refuse
 
 TEAM = "team.json"
 _LIMIT_BYTES = 1 << 20

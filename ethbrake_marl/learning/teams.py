@@ -10,17 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ethbrake_marl.learning.bundle import Policy
-from ethbrake_marl.learning.policy_team import drivers_of
 from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.learning.schemes import drivers
 from ethbrake_marl.learning.team_file import is_team as is_team
 from ethbrake_marl.learning.team_file import load_driver as load_driver
 from ethbrake_marl.learning.team_file import load_team as load_team
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.team import drivers_of
 from ethbrake_marl.scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
-    from ethbrake_marl.learning.callback import Progress
+    from ethbrake_marl.learning.loop import Progress
     from ethbrake_marl.learning.train import Training
 
 

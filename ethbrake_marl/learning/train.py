@@ -8,25 +8,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.durable_files import remove_unfinished
 from ethbrake_marl.envs.sb3 import Appended, EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.bundle import Policy
-from ethbrake_marl.learning.callback import BetweenUpdates, Evaluate, Progress
+from ethbrake_marl.files.durable import remove_unfinished
 from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
 from ethbrake_marl.learning.checkpoint_fit import check_fits
-from ethbrake_marl.learning.course import Course
 from ethbrake_marl.learning.kept_training import asked_for, fingerprint
+from ethbrake_marl.learning.loop import BetweenUpdates, Evaluate, Progress
+from ethbrake_marl.learning.model_state import own_random_state
 from ethbrake_marl.learning.models import make_model, policy_maker
-from ethbrake_marl.learning.random_state import own_random_state
+from ethbrake_marl.learning.progress import Course
 from ethbrake_marl.learning.recipe import SacRecipe, Scheme, TrainingRecipe, load_recipe
-from ethbrake_marl.learning.run_directory import RunDirectory, create_run, has_finished, only_process, open_run
+from ethbrake_marl.learning.run_folder import RunDirectory, create_run, has_finished, only_process, open_run
 from ethbrake_marl.learning.schemes import scheme_of
 from ethbrake_marl.learning.session import Ended, Session
 from ethbrake_marl.learning.stop_signal import stop_on_signal
 from ethbrake_marl.learning.team_file import team_content
-from ethbrake_marl.learning.versions import installed_versions
 from ethbrake_marl.observations import observation_for
+from ethbrake_marl.policies.manifest import installed_versions
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.scenario import Scenario, load_scenario
 
 _APPENDED: dict[Scheme, Appended] = {"independent": "number", "centralised": "state"}

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ethbrake_marl.errors import InvalidInput, renumbered
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import by_parts, compiled
 from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
 from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle, without_obstacle
-from ethbrake_marl.physics.parallel import by_parts
 from ethbrake_marl.physics.segment import (
     COMMAND,
     COUNT,

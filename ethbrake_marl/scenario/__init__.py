@@ -1,9 +1,11 @@
 """Scenarios: strict YAML files that describe families of worlds, and the reproducible lists drawn from them."""
 
+from ethbrake_marl.files.yaml import Document, parse_yaml, read_yaml
 from ethbrake_marl.scenario.catalogue import (
     CatalogueEntry,
     list_scenarios,
     load_scenario,
+    new_scenario_text,
     scenario_folder,
     scenario_path,
 )
@@ -14,11 +16,9 @@ from ethbrake_marl.scenario.initial_states import (
     table_columns,
     worlds_from_table,
 )
+from ethbrake_marl.scenario.roles import constant_command, is_state_free, parse_agent_spec
 from ethbrake_marl.scenario.sampling import Channel, Sample
 from ethbrake_marl.scenario.schema import Scenario, scenario_json_schema
-from ethbrake_marl.scenario.scripts import constant_command, is_state_free, parse_agent_spec
-from ethbrake_marl.scenario.template import new_scenario_text
-from ethbrake_marl.scenario.yaml_loading import Document, parse_yaml, read_yaml
 
 __all__ = [
     "CatalogueEntry",

@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_val
 from pydantic_core import PydanticCustomError
 from scipy.special import ndtr, ndtri
 
+from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.physics.worlds import Floats
-from ethbrake_marl.scenario.flow_text import flow_text
 
 LEAST_MASS = 1e-6  # of a normal distribution inside its bounds; below it the inverse loses its digits
 

@@ -11,7 +11,9 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core.core_schema import NullableSchema, ValidationInfo, WithDefaultSchema
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.scenario.consistency import (
+from ethbrake_marl.files.messages import explain
+from ethbrake_marl.files.yaml import Document
+from ethbrake_marl.scenario.checks import (
     check_alternatives,
     check_entries,
     check_objective,
@@ -20,15 +22,12 @@ from ethbrake_marl.scenario.consistency import (
     complete_roles,
     refuse,
 )
-from ethbrake_marl.scenario.derivation import quantity_bounds
 from ethbrake_marl.scenario.distributions import Choice, LogUniform, Normal, Quantity, Uniform
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OPTIONAL
-from ethbrake_marl.scenario.sampling import Channel, Sample, draw_list
-from ethbrake_marl.scenario.scenario_wording import ScenarioWording
-from ethbrake_marl.scenario.scripts import LEARNER
-from ethbrake_marl.scenario.validation_messages import explain
-from ethbrake_marl.scenario.yaml_loading import Document
-from ethbrake_marl.v2x import V2X
+from ethbrake_marl.scenario.roles import LEARNER
+from ethbrake_marl.scenario.sampling import Channel, Sample, draw_list, quantity_bounds
+from ethbrake_marl.scenario.v2x import V2X
+from ethbrake_marl.scenario.wording import ScenarioWording
 
 AnyQuantity = float | Uniform | LogUniform | Normal | Choice
 

@@ -1,12 +1,11 @@
 """Shields: what stands between a proposed action and the applied one."""
 
-from ethbrake_marl.shield.attached import MovingAtHorizon
+from ethbrake_marl.shield.agents import HybridAgent, StepShieldAgent
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
-from ethbrake_marl.shield.episode import HybridAgent
-from ethbrake_marl.shield.guard import Certified, StepShield
+from ethbrake_marl.shield.engine_shield import MovingAtHorizon
 from ethbrake_marl.shield.parallel import HybridShield, shielded_aec
 from ethbrake_marl.shield.single import ShieldedEnv
-from ethbrake_marl.shield.step import StepShieldAgent
+from ethbrake_marl.shield.step_shield import Certified, StepShield
 from ethbrake_marl.shield.uncertainty import Interval, Uncertainty, parse_uncertainty
 from ethbrake_marl.shield.vector import ShieldedVectorEnv
 

@@ -32,10 +32,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.profile_motion import START, TIME_STEP
-from ethbrake_marl.agents.profile_problem import ProfileProblem
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.search.motion import START, TIME_STEP
+from ethbrake_marl.search.problem import ProfileProblem
 from ethbrake_marl.shield.certify_kernel import NO_CERTIFICATE, NOT_A_NUMBER, certify_worlds, harm_of_plans
 
 REASONS = (

@@ -1,7 +1,7 @@
 """The compiled decisions of the step shield.
 
 Everything that is certified is advanced decision by decision with the very operations of the engine's step
-(``run_segment``, ``time_of`` and ``at_rest`` of ``agents.profile_motion``): what was certified is what will be
+(``run_segment``, ``time_of`` and ``at_rest`` of ``search.motion``): what was certified is what will be
 executed, to the same bits. Only the search for a promising constant runs in one segment to the horizon; what it finds
 is certified step by step before it counts.
 
@@ -16,7 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.actions import command_of
-from ethbrake_marl.agents.profile_motion import (
+from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
+from ethbrake_marl.physics.impact import MASS
+from ethbrake_marl.physics.segment import COMMAND, DONE, LIMIT, ROW_WIDTH, TABLE_ROWS
+from ethbrake_marl.search.motion import (
     HARM_IS_TOTAL,
     LAST_STEP,
     RESTITUTION,
@@ -26,10 +30,6 @@ from ethbrake_marl.agents.profile_motion import (
     save,
     time_of,
 )
-from ethbrake_marl.physics import Bools, Floats, Ints
-from ethbrake_marl.physics.compiled import compiled, compiled_apart
-from ethbrake_marl.physics.impact import MASS
-from ethbrake_marl.physics.segment import COMMAND, DONE, LIMIT, ROW_WIDTH, TABLE_ROWS
 
 # reasons of a decision, in the order of REASONS of shield.certify
 SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED = range(6)

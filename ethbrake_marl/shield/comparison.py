@@ -6,7 +6,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Bools, Floats
-from ethbrake_marl.physics.packed import Packed, command_at, gap_at, has_hazard, speed_at, state_width, vehicles_in
+from ethbrake_marl.physics.rows import Packed, command_at, gap_at, has_hazard, speed_at, state_width, vehicles_in
 from ethbrake_marl.shield.certify import Running
 
 SLACK = 1e-9  # by more than this (m, m/s) a world lies outside what several members predict; one member is exact

@@ -17,8 +17,8 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
-from ethbrake_marl.shield.attached import AttachedHybrid, AttachedShield
-from ethbrake_marl.shield.episode import Bound, HybridAgent
+from ethbrake_marl.shield.agents import Bound, HybridAgent
+from ethbrake_marl.shield.engine_shield import AttachedHybrid, AttachedShield
 from ethbrake_marl.shield.settings import engine_of, only_shielded
 from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
 

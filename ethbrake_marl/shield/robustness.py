@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.shield.step import StepShieldAgent
+from ethbrake_marl.shield.agents import StepShieldAgent
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 WIDTHS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of a curve, in units of the intervals that are given

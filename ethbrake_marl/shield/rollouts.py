@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command, command_to_action
-from ethbrake_marl.agents.driving import drive, introduce, scripted
-from ethbrake_marl.agents.profile_motion import HARM_IS_TOTAL, START, TIME_STEP
-from ethbrake_marl.agents.profile_problem import ProfileProblem, worlds_at
 from ethbrake_marl.agents.protocol import Agent, Divisible
-from ethbrake_marl.agents.rehearsed import Rehearsed
+from ethbrake_marl.agents.refined import Rehearsed
+from ethbrake_marl.agents.rollout import drive, introduce, scripted
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.search.motion import HARM_IS_TOTAL, START, TIME_STEP
+from ethbrake_marl.search.problem import ProfileProblem, worlds_at
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify, from_now, plan_harm
 from ethbrake_marl.shield.certify_kernel import ENDED
 

@@ -16,7 +16,7 @@ from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, Rewards
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
-from ethbrake_marl.shield.attached import AttachedShield
+from ethbrake_marl.shield.engine_shield import AttachedShield
 from ethbrake_marl.shield.settings import check_amount, engine_of
 from ethbrake_marl.shield.uncertainty import Uncertainty
 

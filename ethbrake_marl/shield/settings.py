@@ -8,7 +8,7 @@ import numpy as np
 
 from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.engine import Engine
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.scenario import Scenario

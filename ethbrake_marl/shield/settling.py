@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from ethbrake_marl.agents.profile_motion import at_rest
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.segment import ROW_WIDTH, TABLE_ROWS
+from ethbrake_marl.search.motion import at_rest
 from ethbrake_marl.shield.certify import Running
 from ethbrake_marl.shield.certify_kernel import Members, follow_plan
 

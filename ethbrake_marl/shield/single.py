@@ -13,7 +13,7 @@ from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
-from ethbrake_marl.shield.attached import AttachedShield
+from ethbrake_marl.shield.engine_shield import AttachedShield
 from ethbrake_marl.shield.settings import check_amount, engine_of
 from ethbrake_marl.shield.uncertainty import Uncertainty
 

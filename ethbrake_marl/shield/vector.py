@@ -15,7 +15,7 @@ from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
-from ethbrake_marl.shield.attached import AttachedShield
+from ethbrake_marl.shield.engine_shield import AttachedShield
 from ethbrake_marl.shield.settings import check_amount, engine_of
 from ethbrake_marl.shield.uncertainty import Uncertainty
 

@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.driving import introduce, scripted
 from ethbrake_marl.agents.knowledge import Source, combined, knowledge_of, knowledge_text, sees_through
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import agent_names
+from ethbrake_marl.agents.rollout import introduce, scripted
 from ethbrake_marl.agents.team import Team
-from ethbrake_marl.engine import Engine
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.lineup import make_lineup
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.v2x import hidden_from, known_from
+from ethbrake_marl.scenario.v2x import hidden_from, known_from
 
 PAPER = load_scenario("paper-random")
 BLOCKED = load_scenario("cooperation-2-blocked")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents import make_agent, optimise_coupled
-from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.planner import Planner
+from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.physics import Worlds

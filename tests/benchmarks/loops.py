@@ -40,21 +40,21 @@ def rates(work: Work, repetitions: int = REPETITIONS, seconds: float = SECONDS) 
 
 def our_parallel() -> Work:
     """This project: one world through PettingZoo's parallel API."""
-    from ethbrake_marl import benchmark
+    from ethbrake_marl.studies import speed as benchmark
 
     return benchmark.parallel(1)
 
 
 def our_vec_env() -> Work:
     """This project: 512 worlds through the Stable-Baselines3 ``VecEnv``."""
-    from ethbrake_marl import benchmark
+    from ethbrake_marl.studies import speed as benchmark
 
     return benchmark.vec_env(512)
 
 
 def our_engine() -> Work:
     """This project: 4,096 worlds in the engine."""
-    from ethbrake_marl import benchmark
+    from ethbrake_marl.studies import speed as benchmark
 
     return benchmark.stepping(4096)
 

@@ -11,8 +11,8 @@ import os
 import statistics
 import time
 
-from ethbrake_marl.benchmark import first_decisions
 from ethbrake_marl.physics import advance
+from ethbrake_marl.studies.speed import first_decisions
 
 COUNTS = (1000, 3000, 10_000, 30_000, 100_000)
 REPETITIONS, WORLD_STEPS = 15, 200_000

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from ethbrake_marl.cli import run_command
+from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.scenario import new_scenario_text
 
 TINY_RECIPE = {

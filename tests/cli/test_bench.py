@@ -1,4 +1,4 @@
-"""``ethbrake bench``: the table, the JSON, the picture; measuring itself is tested in tests/test_benchmark.py."""
+"""``ethbrake bench``: the table, the JSON, the picture; measuring itself is tested in tests/studies/test_speed.py."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ethbrake_marl import bench_commands, benchmark, scaling
-from ethbrake_marl.benchmark import Benchmark, Effort, Speed
-from ethbrake_marl.machine import this_machine
+from ethbrake_marl.cli import bench as bench_commands
+from ethbrake_marl.cli.machine import this_machine
+from ethbrake_marl.studies import scaling
+from ethbrake_marl.studies import speed as benchmark
+from ethbrake_marl.studies.speed import Benchmark, Effort, Speed
 
 SPEEDS = (
     Speed("engine step", "of a test", 1024, 3, "world-steps/s", 9_876_543.0, 9_000_000.0, 10_000_000.0, 8e6),

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from ethbrake_marl import doctor
-from ethbrake_marl.doctor import Check, diagnose
+from ethbrake_marl.cli import doctor
+from ethbrake_marl.cli.doctor import Check, diagnose
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -38,7 +38,7 @@ def test_doctor_json__is_pure(ethbrake):
 
 @pytest.mark.parametrize("form", [[], ["--json"]])
 def test_doctor__one_failure_gives_exit_status_1(ethbrake, monkeypatch, form):
-    monkeypatch.setattr("ethbrake_marl.cli.diagnose", lambda: [Check("a", True, "x"), Check("b", False, "y")])
+    monkeypatch.setattr("ethbrake_marl.cli.app.diagnose", lambda: [Check("a", True, "x"), Check("b", False, "y")])
     answer = ethbrake("doctor", *form)
     assert answer.status == 1
     assert ("FAIL  b  y" in answer.out) == (not form)
@@ -100,7 +100,7 @@ def test_scenarios__a_damaged_folder_is_a_finding_and_no_crash(monkeypatch):
 def test_kernel_cache__a_folder_that_cannot_be_written_is_mentioned(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
-    program = "from ethbrake_marl.doctor import _kernel_cache; print(_kernel_cache()[1])"
+    program = "from ethbrake_marl.cli.doctor import _kernel_cache; print(_kernel_cache()[1])"
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(blocked)}
     environment["TMPDIR"] = str(tmp_path)
     result = subprocess.run(

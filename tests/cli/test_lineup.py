@@ -7,11 +7,11 @@ import pytest
 
 from ethbrake_marl.agents.registry import agent_names
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.experiment import run_folder
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.lineup import LADDER, check_agents, choose_worlds, make_lineup
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
+from ethbrake_marl.studies.experiment import run_folder
 
 SCENARIO = load_scenario("paper-random")
 

@@ -16,15 +16,15 @@ from typing import Any
 
 import pytest
 
-from ethbrake_marl import results_folder
 from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.cli.terminal import Bars
 from ethbrake_marl.evaluation import evaluate, summarise
-from ethbrake_marl.evaluation.figures import learning_curve
-from ethbrake_marl.learning.bundle import load_policy
+from ethbrake_marl.figures.run import learning_curve
 from ethbrake_marl.lineup import make_lineup
-from ethbrake_marl.results_folder import write_figures
+from ethbrake_marl.policies.policy import load_policy
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.terminal import Bars
+from ethbrake_marl.studies import results as results_folder
+from ethbrake_marl.studies.results import write_figures
 
 ROOT = Path(__file__).resolve().parents[2]
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo", "hybrid"]
@@ -192,7 +192,7 @@ def ctrl_c_when(monkeypatch: pytest.MonkeyPatch, *moments: Callable[[dict[str, A
                 waiting.pop(0)
                 signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("ethbrake_marl.terminal.Bars", Pressing)
+    monkeypatch.setattr("ethbrake_marl.cli.terminal.Bars", Pressing)
 
 
 def test_run_interrupted__the_policy_so_far_is_evaluated(ethbrake, tiny_recipe, tmp_path, monkeypatch):
@@ -241,7 +241,7 @@ def test_run_failed__the_status_says_so(ethbrake, tiny_recipe, tmp_path, monkeyp
     def broken(*args: object, **kwargs: object) -> None:
         raise RuntimeError("no space left")
 
-    monkeypatch.setattr("ethbrake_marl.experiment.write_results", broken)
+    monkeypatch.setattr("ethbrake_marl.studies.experiment.write_results", broken)
     folder = tmp_path / "failed"
     with pytest.raises(RuntimeError, match="no space left"):
         ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", folder)
@@ -251,7 +251,7 @@ def test_run_failed__the_status_says_so(ethbrake, tiny_recipe, tmp_path, monkeyp
 
 
 def test_command_line__exit_status_and_streams_of_the_program():
-    process = program("import sys; from ethbrake_marl.cli import main; sys.argv[1:] = ['evalute']; main()")
+    process = program("import sys; from ethbrake_marl.cli.app import main; sys.argv[1:] = ['evalute']; main()")
     assert (process.returncode, process.stdout, process.stderr.count("\n")) == (2, "", 1)
 
 
@@ -267,7 +267,7 @@ def test_kernels__a_temporary_cache_is_removed_at_the_end(tmp_path):
 
 def test_command_line__a_full_disk_behind_stdout_is_one_line():
     process = program(
-        "import os, sys; from ethbrake_marl.cli import main; sys.argv[1:] = ['scenario', 'list'];"
+        "import os, sys; from ethbrake_marl.cli.app import main; sys.argv[1:] = ['scenario', 'list'];"
         "os.dup2(os.open('/dev/full', os.O_WRONLY), 1); main()"
     )
     assert (process.returncode, process.stderr) == (2, "ethbrake: error: output: No space left on device\n")
@@ -276,7 +276,7 @@ def test_command_line__a_full_disk_behind_stdout_is_one_line():
 @pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
 def test_command_line__a_table_on_a_narrow_stdout_is_still_printed(encoding):
     process = program(
-        "import sys; from ethbrake_marl.cli import main;"
+        "import sys; from ethbrake_marl.cli.app import main;"
         "sys.argv[1:] = ['evaluate', '--episodes', '5', '--agents', 'coast']; main()",
         PYTHONIOENCODING=encoding,
     )
@@ -286,7 +286,7 @@ def test_command_line__a_table_on_a_narrow_stdout_is_still_printed(encoding):
 
 def test_evaluate__needs_no_torch_and_help_neither():
     process = program(
-        "import sys; from ethbrake_marl.cli import run_command;"
+        "import sys; from ethbrake_marl.cli.app import run_command;"
         "assert run_command(['--help']) == 0;"
         "assert run_command(['evaluate', '--episodes', '5', '--agents', 'coast']) == 0;"
         "sys.exit(', '.join(sorted({'torch', 'stable_baselines3', 'matplotlib'} & set(sys.modules))) or None)"

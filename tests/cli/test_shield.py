@@ -11,7 +11,7 @@ from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.lineup import make_lineup
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.scenario.shipped_files import shipped_folder
+from ethbrake_marl.scenario.catalogue import shipped_folder
 
 
 def test_shield__prints_its_rows_as_json_and_as_a_table(ethbrake):

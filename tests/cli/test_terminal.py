@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from ethbrake_marl.terminal import Bars, interruptible
+from ethbrake_marl.cli.terminal import Bars, interruptible
 
 
 def test_bars__without_a_terminal_news_are_lines(capsys):

@@ -13,7 +13,7 @@ import yaml
 from stable_baselines3 import PPO
 
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.learning.bundle import load_policy
+from ethbrake_marl.policies.policy import load_policy
 from tests.cli.conftest import TINY_RECIPE
 from tests.cli.test_bad_input import refused
 from tests.cli.test_run import ctrl_c_when, run_json

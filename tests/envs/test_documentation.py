@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.envs.single import EthBrakeEnv
-from ethbrake_marl.envs.tables import environment_tables, feature_table
 from ethbrake_marl.observations import Feature
 from tests.envs.lines import REST
+from tests.reference.docs_tables import environment_tables, feature_table
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "environment.md").read_text("utf-8")
 

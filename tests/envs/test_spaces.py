@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.envs.spaces import action_box, feature_box
+from ethbrake_marl.envs.setup import action_box, feature_box
 from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.observations import Feature, ObservationSpec
 from ethbrake_marl.physics import make_worlds

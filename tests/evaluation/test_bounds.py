@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.analysis.best_harm_shipped import shipped_tables
-from ethbrake_marl.analysis.best_harm_table import BestHarmTable
 from ethbrake_marl.evaluation import bounds
 from ethbrake_marl.evaluation.bounds import bounds_of, proven_of_table, shipped_bounds, shipped_lines
 from ethbrake_marl.evaluation.regret import between
+from ethbrake_marl.limits.best_harm_table import BestHarmTable
+from ethbrake_marl.limits.shipped import shipped_tables
 from ethbrake_marl.scenario import load_scenario
 
 

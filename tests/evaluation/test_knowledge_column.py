@@ -14,8 +14,8 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, rich_table, summarise, write_per_world_csv
 from ethbrake_marl.evaluation.report import Report, render_report
 from ethbrake_marl.lineup import make_lineup
-from ethbrake_marl.results_folder import results_csv
 from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.studies.results import results_csv
 
 SPECS = ("full_brake", "ppo@shipped/ppo", "hybrid@shipped/ppo", "e_v2x_bm:pairwise")
 KNOWN = ("own sensors", "messages", "messages + true model", "true state")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine import Engine
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, Outcome, evaluate
 from ethbrake_marl.physics import advance

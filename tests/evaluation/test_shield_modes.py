@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.shield_modes import ModeRow, compare_modes, modes_table
-from ethbrake_marl.evaluation.shield_modes_figure import shield_modes_figure
 from ethbrake_marl.evaluation.statistics import paired_difference
+from ethbrake_marl.figures.shield import shield_modes_figure
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
 

@@ -9,8 +9,8 @@ from rich.console import Console
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, regret, rich_table, summarise
+from ethbrake_marl.evaluation.conditions import parameter_line, parameters
 from ethbrake_marl.evaluation.paper import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST
-from ethbrake_marl.evaluation.parameters import parameter_line, parameters
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
 
 ALWAYS = {

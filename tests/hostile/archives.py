@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.analysis.best_harm import best_harm
-from ethbrake_marl.analysis.best_harm_table import table_bytes
+from ethbrake_marl.limits.best_harm import best_harm
+from ethbrake_marl.limits.best_harm_table import table_bytes
 from ethbrake_marl.scenario import load_scenario
 
 SHAPE_TEXTS = (

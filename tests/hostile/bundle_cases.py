@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.learning.bundle import load_policy
-from ethbrake_marl.learning.manifest import content_sha256
-from ethbrake_marl.learning.shipped import shipped_policies
+from ethbrake_marl.policies.manifest import content_sha256
+from ethbrake_marl.policies.policy import load_policy
+from ethbrake_marl.policies.shipped import shipped_policies
 from tests.hostile.case import NASTY, Case, damaged, write
 
 MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.cli import run_command
+from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import EthBrakeError
 from tests.hostile.case import INSIDE, OUTSIDE, PRECIOUS, Case, write
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from ethbrake_marl.cli import run_command
+from ethbrake_marl.cli.app import run_command
 from tests.hostile.archives import good_bytes
 from tests.hostile.bundle_cases import bundles
 from tests.hostile.case import Generator, write

@@ -25,7 +25,7 @@ def test_line_env__keeps_torchrls_contract_and_shows_the_native_worlds() -> None
     import torch
     from torchrl.envs.utils import check_env_specs
 
-    from ethbrake_marl.learning.benchmarl_task import LineEnv
+    from ethbrake_marl.learning.benchmarl import LineEnv
 
     check_env_specs(LineEnv(PAIR, 4, 0, RECIPE.reward))
     env = LineEnv(PAIR, 4, 5, RECIPE.reward)
@@ -61,7 +61,7 @@ def test_policy_of__acts_as_benchmarls_own_policy_does(tmp_path: Path) -> None:
     from tensordict import TensorDict
     from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-    from ethbrake_marl.learning import benchmarl_task
+    from ethbrake_marl.learning import benchmarl as benchmarl_task
 
     recipe = RECIPE.replace(total_steps=2 * 16 * 16 * 2, scheme="centralised")
     experiment = benchmarl_task._experiment(recipe, PAIR, str(tmp_path))
@@ -77,7 +77,7 @@ def test_policy_of__acts_as_benchmarls_own_policy_does(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_mappo__learns_to_beat_full_braking(tmp_path: Path) -> None:
-    from ethbrake_marl.learning.benchmarl_task import train_mappo
+    from ethbrake_marl.learning.benchmarl import train_mappo
 
     train_mappo(load_recipe("cooperation").replace(total_steps=300_000), PAIR, tmp_path / "run")
     agents = {"full_brake": eb.make_agent("full_brake"), "team": load_team(tmp_path / "run", PAIR)}

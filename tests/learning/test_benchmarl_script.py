@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 SCRIPT = Path(__file__).resolve().parents[2] / "train" / "benchmarl_mappo.py"
-TASK = "ethbrake_marl.learning.benchmarl_task"
+TASK = "ethbrake_marl.learning.benchmarl"
 
 
 @pytest.mark.parametrize(

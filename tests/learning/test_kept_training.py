@@ -10,7 +10,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.kept_training import check_same, fingerprint
-from ethbrake_marl.learning.run_directory import create_run
+from ethbrake_marl.learning.run_folder import create_run
 from ethbrake_marl.scenario import Scenario, load_scenario
 from tests.learning.tiny import TINY_PPO
 

@@ -20,10 +20,10 @@ from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning import session as session_module
 from ethbrake_marl.learning import train as train_module
-from ethbrake_marl.learning.bundle import Policy, load_policy
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.learning.run_directory import create_run
+from ethbrake_marl.learning.run_folder import create_run
 from ethbrake_marl.learning.train import TrainResult, resume, train
+from ethbrake_marl.policies.policy import Policy, load_policy
 from ethbrake_marl.scenario import Scenario, load_scenario
 from tests.learning.tiny import TINY_PPO
 

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ethbrake_marl.durable_files import new_folder, write_file
 from ethbrake_marl.errors import AlreadyExists
-from ethbrake_marl.learning.progress_table import ProgressTable
-from ethbrake_marl.learning.run_directory import create_run
+from ethbrake_marl.files.durable import new_folder, write_file
+from ethbrake_marl.learning.run_folder import ProgressTable, create_run
 
 
 def test_write_file__replaces_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,10 +7,10 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import SACPolicy
 
-from ethbrake_marl.learning.forward import Actor
-from ethbrake_marl.learning.networks import NetworkSpec
+from ethbrake_marl.learning.models import ppo_arguments, sac_arguments, tensors_of
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.sb3_policy import ppo_arguments, sac_arguments, tensors_of
+from ethbrake_marl.policies.actor import Actor
+from ethbrake_marl.policies.manifest import NetworkSpec
 
 SHAPE = load_recipe("ppo-paper").network
 

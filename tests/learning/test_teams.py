@@ -20,13 +20,13 @@ import ethbrake_marl as eb
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, UnknownName
 from ethbrake_marl.learning import train as train_module
-from ethbrake_marl.learning.bundle import load_policy
 from ethbrake_marl.learning.models import make_model
-from ethbrake_marl.learning.policy_team import PolicyTeam
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.schemes import check_scheme, drivers, scheme_of, who_drives_what
 from ethbrake_marl.learning.teams import is_team, load_team, resume_team, train_team
 from ethbrake_marl.learning.train import resume, run_training, train
+from ethbrake_marl.policies.policy import load_policy
+from ethbrake_marl.policies.team import PolicyTeam
 from tests.learning.tiny import TINY_PPO
 
 PAIR = eb.load_scenario("cooperation-3-pair")
@@ -197,7 +197,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from tests.learning.test_teams import TINY, PAIR
-from ethbrake_marl.learning.callback import BetweenUpdates
+from ethbrake_marl.learning.loop import BetweenUpdates
 from ethbrake_marl.learning.teams import train_team
 def tell(progress):
     if progress.updates == 5:

@@ -16,11 +16,11 @@ import torch
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.learning import train as train_module
-from ethbrake_marl.learning.bundle import Policy, load_policy
-from ethbrake_marl.learning.callback import Progress
-from ethbrake_marl.learning.divergence import TrainingDiverged
+from ethbrake_marl.learning.loop import Progress
+from ethbrake_marl.learning.progress import TrainingDiverged
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of, shipped_recipes
 from ethbrake_marl.learning.train import train
+from ethbrake_marl.policies.policy import Policy, load_policy
 from ethbrake_marl.scenario import load_scenario
 
 SCENARIO = load_scenario("paper-random")

@@ -6,7 +6,7 @@ import numpy as np
 
 from ethbrake_marl.physics import Floats, Impacts, Worlds
 from ethbrake_marl.physics.events import PLASTIC_SPEED_MPS
-from ethbrake_marl.physics.tolerances import EPS
+from tests.reference.tolerances import EPS
 
 Wide = np.longdouble
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.physics import Bools, Floats, Impacts, Worlds, advance
-from ethbrake_marl.physics.tolerances import FEW_IMPACTS
 from tests.physics.random_worlds import Batch, driving_lines
+from tests.reference.tolerances import FEW_IMPACTS
 
 HORIZON_S = 6.0
 HARMS = [f.name for f in fields(Impacts) if f.name != "rows"]

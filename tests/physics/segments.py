@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, make_worlds
 from ethbrake_marl.physics.events import TOUCH_SPEED_MPS
-from ethbrake_marl.physics.tolerances import DISCRIMINANT_EPS, END_EPS, EPS, GAP_M
 from tests.physics.exact_simulator import Outcome, line_of, simulate
+from tests.reference.tolerances import DISCRIMINANT_EPS, END_EPS, EPS, GAP_M
 
 CAPACITY_MPS2 = 9.0
 A_LITTLE_S = 1e-8  # by which a borderline segment is made longer

@@ -12,7 +12,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics import Worlds, advance, make_worlds, segment
-from ethbrake_marl.physics.parallel import by_parts
+from ethbrake_marl.physics.compiled import by_parts
 
 
 def line(gaps, speeds, *, mass=1.0, e=0.0, latency=0.0, limit=100.0, braking=10.0, driving=10.0) -> Worlds:

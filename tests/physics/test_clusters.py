@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
-from ethbrake_marl.physics.tolerances import CLUSTER_EPS, EPS
 from tests.physics.exact_simulator import line_of, regression, simulate
 from tests.physics.random_worlds import Draws, touching_lines
+from tests.reference.tolerances import CLUSTER_EPS, EPS
 
 
 def law_error_eps(before: Worlds, after: Worlds, k: int, rounds: int) -> float:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.physics import advance, make_worlds
-from ethbrake_marl.physics.tolerances import MOMENTUM_EPS
 from tests.physics.measures import momentum_eps
 from tests.physics.nearly_joined import nearly_joined, thrown_lines
+from tests.reference.tolerances import MOMENTUM_EPS
 
 
 def test_plastic_cluster__three_vehicles_do_not_hand_the_last_bit_to_and_fro():

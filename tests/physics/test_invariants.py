@@ -1,4 +1,4 @@
-"""What always holds, with the tolerances published in ``ethbrake_marl/physics/tolerances.py``."""
+"""What always holds, with the tolerances published in ``tests/reference/tolerances.py``."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ethbrake_marl.physics import Worlds, advance, make_worlds
-from ethbrake_marl.physics.tolerances import ENERGY_EPS, EPS, GAP_M, MOMENTUM_EPS, RESTITUTION_EPS, SMALLEST
 from tests.physics.measures import energy_rise_eps, momentum_eps, restitution_eps, rounds
 from tests.physics.random_worlds import driving_lines, touching_lines
 from tests.physics.watched import Watched
+from tests.reference.tolerances import ENERGY_EPS, EPS, GAP_M, MOMENTUM_EPS, RESTITUTION_EPS, SMALLEST
 
 SPEED = st.just(0.0) | st.floats(SMALLEST, 40.0)
 MASS = st.floats(1e-2, 1e4)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from ethbrake_marl.harm import empty_ledger, injury_probability, split
 from ethbrake_marl.physics import advance, make_worlds
-from ethbrake_marl.physics.tolerances import EPS
 from tests.physics.random_worlds import driving_lines
+from tests.reference.tolerances import EPS
 
 MASS = st.floats(1e-2, 1e4)
 

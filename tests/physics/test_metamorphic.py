@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.physics import Impacts, advance, concatenate, make_worlds
-from ethbrake_marl.physics.tolerances import SPLIT, SPLIT_CASCADE
 from tests.physics.random_worlds import Batch, driving_lines
 from tests.physics.runs import HARMS, HORIZON_S, last_digit_errors, once, split_errors, state_bytes
+from tests.reference.tolerances import SPLIT, SPLIT_CASCADE
 
 # ---------------------------------------------------------------- cutting a segment
 

@@ -12,10 +12,10 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import Worlds, advance, advance_sampled, concatenate, forecast, make_worlds
 from ethbrake_marl.physics.obstacle import obstacle_ahead, with_obstacle
-from ethbrake_marl.physics.tolerances import CLUSTER_EPS, ENERGY_EPS, EPS, SPLIT
 from tests.physics.exact_simulator import line_of, simulate
 from tests.physics.random_worlds import Batch, Draws, driving_lines, touching_lines
 from tests.physics.runs import HARMS, HORIZON_S, state_bytes
+from tests.reference.tolerances import CLUSTER_EPS, ENERGY_EPS, EPS, SPLIT
 
 
 def line(hazard_gap_m, gaps, speeds, restitution=0.5, mass_t=1.0) -> Worlds:

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Worlds, advance, make_worlds, parallel
-from ethbrake_marl.physics.parallel import by_parts
+from ethbrake_marl.physics import Worlds, advance, make_worlds
+from ethbrake_marl.physics import compiled as parallel
+from ethbrake_marl.physics.compiled import by_parts
 from ethbrake_marl.scenario import load_scenario
 
 

@@ -7,9 +7,9 @@ from itertools import pairwise
 import numpy as np
 
 from ethbrake_marl.physics import Bools, Worlds, advance
-from ethbrake_marl.physics.tolerances import ENERGY_EPS
 from tests.physics.measures import energy_rise_eps
 from tests.physics.random_worlds import driving_lines
+from tests.reference.tolerances import ENERGY_EPS
 
 STEADY_MPS = 1e-12  # a step is steady when the speed at its middle is this near to the mean of its ends
 

@@ -10,7 +10,7 @@ NOT_LOST = "a uniform number of 1 or more is a link that is not lost, and the ho
 ONLY_TYPES = "only the type checker, which finds it, uses the name"
 
 EQUIVALENT: dict[str, str] = {
-    "v2x.py: 1.0 -> 2.0 in `1.0` (3)": NOT_LOST,
-    "v2x.py: 1.0 -> 2.0 in `1.0` (4)": NOT_LOST,
+    "scenario/v2x.py: 1.0 -> 2.0 in `1.0` (3)": NOT_LOST,
+    "scenario/v2x.py: 1.0 -> 2.0 in `1.0` (4)": NOT_LOST,
     "rewards.py: `Value = TypeVar('Value', float, Floats)` removed (1)": ONLY_TYPES,
 }

@@ -49,13 +49,13 @@ class Bug(NamedTuple):
 
 
 OF_REWARDS = ("tests/test_rewards.py", "tests/test_objectives.py")
-OF_V2X = ("tests/test_v2x.py",)
-OF_ENGINE = ("tests/test_engine.py", "tests/test_rewards.py", "tests/envs/test_sb3.py")
-OF_ABLATION = ("tests/ablation/test_levels.py", "tests/ablation/test_comparison.py")
-OF_OPTIMUM = ("tests/ablation/test_joint_optimum.py",)
+OF_V2X = ("tests/scenario/test_v2x.py",)
+OF_ENGINE = ("tests/engine/test_engine.py", "tests/test_rewards.py", "tests/envs/test_sb3.py")
+OF_ABLATION = ("tests/studies/ablation/test_levels.py", "tests/studies/ablation/test_comparison.py")
+OF_OPTIMUM = ("tests/studies/ablation/test_joint_optimum.py",)
 OF_STATISTICS = ("tests/evaluation/test_statistics.py", "tests/evaluation/test_seed_statistics.py")
 OF_TABLES = ("tests/evaluation/test_table.py", "tests/evaluation/test_regret.py", "tests/evaluation/test_rollout.py")
-OF_LEARNING = ("tests/learning/test_course.py", "tests/learning/test_recipe.py", "tests/learning/test_train.py")
+OF_LEARNING = ("tests/learning/test_progress.py", "tests/learning/test_recipe.py", "tests/learning/test_train.py")
 OF_FILES = ("tests/learning/test_kept_training.py", "tests/learning/test_event_files.py")
 
 BUGS: dict[str, Bug] = {

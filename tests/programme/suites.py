@@ -52,10 +52,11 @@ PHYSICS = Suite(
     files=("physics/*.py", "harm.py"),
     quick={
         "physics/worlds.py": ("tests/physics/test_worlds.py", "tests/physics/test_advance.py"),
-        "physics/compiled.py": ("tests/physics/test_compiled.py",),
-        "physics/obstacle.py": ("tests/physics/test_obstacle.py", "tests/test_engine_hazard.py"),
-        "physics/packed.py": ("tests/physics/test_packed.py", "tests/test_engine.py", "tests/test_engine_hazard.py"),
-        "physics/parallel.py": ("tests/physics/test_parallel.py",),
+        "physics/obstacle.py": ("tests/physics/test_obstacle.py", "tests/engine/test_obstacle.py"),
+        "physics/rows.py": (
+            "tests/physics/test_rows.py", "tests/engine/test_engine.py", "tests/engine/test_obstacle.py",
+        ),
+        "physics/compiled.py": ("tests/physics/test_compiled.py", "tests/physics/test_parallel.py"),
         "physics/sampled.py": (
             "tests/physics/test_sampled_edges.py", "tests/physics/test_sampled.py",
             "tests/physics/test_sampled_input.py", "tests/physics/test_obstacle.py",
@@ -71,7 +72,6 @@ PHYSICS = Suite(
     },
     otherwise=KERNEL,
     whole=("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py"),
-    left_out=frozenset({"__init__.py", "tolerances.py"}),  # the tolerances are the yardstick
     interpreted=None,
 )  # fmt: skip
 
@@ -84,100 +84,109 @@ REWARDS = Suite(
 )
 
 V2X = Suite(
-    files=("v2x.py",),
+    files=("scenario/v2x.py",),
     quick={},
-    otherwise=("tests/test_v2x.py", "tests/scenario/test_schema.py"),
-    whole=("tests/test_v2x.py", "tests/scenario", "tests/contract"),
+    otherwise=("tests/scenario/test_v2x.py", "tests/scenario/test_schema.py"),
+    whole=("tests/scenario/test_v2x.py", "tests/scenario", "tests/contract"),
     preloaded=SCIENCE,
 )
 
-STEPS = ("tests/test_rewards.py", "tests/test_engine.py", "tests/envs/test_single.py", "tests/test_engine_hazard.py")
+STEPS = (
+    "tests/test_rewards.py",
+    "tests/engine/test_engine.py",
+    "tests/envs/test_single.py",
+    "tests/engine/test_obstacle.py",
+)
 ENGINE = Suite(
-    files=("engine.py", "starts.py", "stepping.py", "actions.py", "snapshots.py"),
+    files=("engine/engine.py", "engine/stream.py", "engine/step.py", "actions.py", "engine/snapshot.py"),
     quick={
-        "stepping.py": STEPS,
+        "engine/step.py": STEPS,
         "actions.py": ("tests/test_actions.py", *STEPS[2:3]),
-        "snapshots.py": ("tests/test_snapshots.py",),
+        "engine/snapshot.py": ("tests/engine/test_snapshot.py",),
     },
     otherwise=(*STEPS, "tests/envs/test_parallel.py", "tests/envs/test_sb3.py", "tests/envs/test_vector.py"),
-    whole=("tests/test_engine.py", "tests/test_actions.py", "tests/test_snapshots.py", "tests/envs", "tests/contract"),
-    interpreted=frozenset({"stepping.py", "actions.py"}),
+    whole=(
+        "tests/engine/test_engine.py",
+        "tests/test_actions.py",
+        "tests/engine/test_snapshot.py",
+        "tests/envs",
+        "tests/contract",
+    ),
+    interpreted=frozenset({"engine/step.py", "actions.py"}),
     preloaded=(*SCIENCE, *TORCH),
 )
 
 ABLATION = Suite(
-    files=("ablation/*.py",),
+    files=("studies/ablation/*.py",),
     quick={
-        "ablation/levels.py": ("tests/ablation/test_levels.py",),
-        "ablation/comparison.py": ("tests/ablation/test_comparison.py",),
-        "ablation/joint_optimum.py": ("tests/ablation/test_joint_optimum.py",),
-        "ablation/longer_lines.py": ("tests/ablation/test_longer_lines.py",),
-        "ablation/tables.py": ("tests/ablation/test_comparison.py",),
-        "ablation/measurement.py": ("tests/ablation/test_measurement.py", "tests/ablation/test_comparison.py"),
+        "studies/ablation/plan.py": ("tests/studies/ablation/test_levels.py",),
+        "studies/ablation/comparison.py": ("tests/studies/ablation/test_comparison.py",),
+        "studies/ablation/joint_optimum.py": ("tests/studies/ablation/test_joint_optimum.py",),
+        "studies/ablation/longer_lines.py": ("tests/studies/ablation/test_longer_lines.py",),
+        "studies/ablation/report.py": ("tests/studies/ablation/test_comparison.py",),
+        "studies/ablation/run.py": (
+            "tests/studies/ablation/test_measurement.py",
+            "tests/studies/ablation/test_comparison.py",
+        ),
     },
-    otherwise=("tests/ablation/test_comparison.py", "tests/ablation/test_ablate_command.py"),
-    whole=("tests/ablation", "tests/test_cooperation_page.py"),
-    left_out=frozenset({"__init__.py", "figures.py"}),  # what a figure looks like is judged by eye
+    otherwise=("tests/studies/ablation/test_comparison.py", "tests/studies/ablation/test_ablate_command.py"),
+    whole=("tests/studies/ablation",),
     preloaded=(*SCIENCE, *TORCH),
 )
 
 TABLES = ("tests/evaluation/test_table.py", "tests/evaluation/test_rollout.py")
 EVALUATION = Suite(
-    files=("evaluation/*.py",),
+    files=(
+        "evaluation/*.py", "figures/learning_curves.py", "figures/criticality.py", "figures/deceleration.py",
+        "studies/sampling.py",
+    ),
     quick={
         "evaluation/statistics.py": ("tests/evaluation/test_statistics.py",),
         "evaluation/seed_statistics.py": ("tests/evaluation/test_seed_statistics.py",),
-        "evaluation/seed_curves.py": ("tests/evaluation/test_seed_curves.py",),
+        "figures/learning_curves.py": ("tests/figures/test_learning_curves.py",),
         "evaluation/rollout.py": ("tests/evaluation/test_rollout.py",),
         "evaluation/regret.py": ("tests/evaluation/test_regret.py",),
         "evaluation/record.py": ("tests/evaluation/test_record.py",),
-        "evaluation/rescoring.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
-        "evaluation/per_world.py": ("tests/evaluation/test_per_world.py",),
-        "evaluation/criticality.py": ("tests/evaluation/test_criticality.py",),
-        "evaluation/deceleration_curve.py": ("tests/evaluation/test_deceleration_curve.py",),
+        "evaluation/table.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
+        "figures/criticality.py": ("tests/figures/test_criticality.py",),
+        "figures/deceleration.py": ("tests/figures/test_deceleration.py",),
         "evaluation/shield_modes.py": ("tests/evaluation/test_shield_modes.py",),
-        "evaluation/sampling_study.py": ("tests/evaluation/test_sampling_study.py",),
-        "evaluation/output_files.py": ("tests/evaluation/test_report.py", "tests/evaluation/test_per_world.py"),
+        "studies/sampling.py": ("tests/studies/test_sampling.py",),
+        "evaluation/per_world.py": ("tests/evaluation/test_report.py", "tests/evaluation/test_per_world.py"),
     },
     otherwise=TABLES,
     whole=("tests/evaluation", "tests/cli/test_commands.py"),
     left_out=frozenset({
-        "__init__.py", "figures.py", "figure_style.py", "operating_figure.py", "robustness_figure.py",
-        "shield_modes_figure.py", "trajectories.py", "rendering.py", "report.py",
+        "__init__.py", "text.py", "report.py",
     }),  # what a figure or a page looks like is judged by eye
     preloaded=SCIENCE,
 )  # fmt: skip
 
 TRAINED = ("tests/learning/test_train.py", "tests/learning/test_teams.py", "tests/learning/test_resume.py")
 LEARNING = Suite(
-    files=("learning/*.py",),
+    files=("learning/*.py", "policies/*.py", "files/json.py"),
     quick={
-        "learning/course.py": ("tests/learning/test_course.py",),
+        "learning/progress.py": ("tests/learning/test_progress.py",),
         "learning/recipe.py": ("tests/learning/test_recipe.py",),
-        "learning/bundle.py": ("tests/learning/test_bundle.py",),
-        "learning/manifest.py": ("tests/learning/test_bundle.py",),
-        "learning/networks.py": ("tests/learning/test_bundle.py", "tests/learning/test_forward.py"),
-        "learning/forward.py": ("tests/learning/test_forward.py",),
-        "learning/squash.py": ("tests/learning/test_forward.py",),
-        "learning/strict_json.py": ("tests/learning/test_bundle.py", "tests/learning/test_run_files.py"),
-        "learning/event_files.py": ("tests/learning/test_event_files.py", "tests/learning/test_resume.py"),
+        "policies/policy.py": ("tests/policies/test_policy.py",),
+        "policies/manifest.py": ("tests/policies/test_policy.py", "tests/policies/test_actor.py"),
+        "policies/actor.py": ("tests/policies/test_actor.py",),
+        "files/json.py": ("tests/policies/test_policy.py", "tests/learning/test_run_files.py"),
         "learning/kept_training.py": ("tests/learning/test_kept_training.py", "tests/learning/test_teams.py"),
-        "learning/progress_table.py": ("tests/learning/test_run_files.py", *TRAINED),
-        "learning/run_directory.py": ("tests/learning/test_run_files.py", *TRAINED),
+        "learning/run_folder.py": ("tests/learning/test_run_files.py", "tests/learning/test_event_files.py", *TRAINED),
         "learning/independent.py": ("tests/learning/test_teams.py",),
-        "learning/central_critic.py": ("tests/learning/test_teams.py",),
         "learning/schemes.py": ("tests/learning/test_teams.py", "tests/learning/test_recipe.py"),
         "learning/team_file.py": ("tests/learning/test_teams.py",),
-        "learning/policy_team.py": ("tests/learning/test_teams.py",),
-        "learning/sb3_policy.py": ("tests/learning/test_sb3_policy.py", *TRAINED),
-        "learning/shipped.py": ("tests/learning/test_shipped.py",),
+        "policies/team.py": ("tests/learning/test_teams.py",),
+        "learning/models.py": ("tests/learning/test_sb3_policy.py", *TRAINED),
+        "policies/shipped.py": ("tests/policies/test_shipped.py",),
         "learning/checkpoint.py": ("tests/learning/test_resume.py",),
         "learning/stop_signal.py": ("tests/learning/test_resume.py",),
     },
     otherwise=TRAINED,
     whole=("tests/learning", "tests/cli/test_training_commands.py"),
-    left_out=frozenset({"__init__.py", "benchmarl_task.py", "legacy_import.py", "onnx_export.py"}),  # of other formats
-    interpreted=frozenset({"learning/forward.py", "learning/squash.py"}),
+    left_out=frozenset({"__init__.py", "benchmarl.py", "legacy.py", "onnx.py"}),  # of other formats
+    interpreted=frozenset({"policies/actor.py"}),
     preloaded=(*SCIENCE, *TORCH),
 )
 

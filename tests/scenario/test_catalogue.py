@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.learning.recipe import shipped_recipes
 from ethbrake_marl.scenario import (
     Scenario,
@@ -16,9 +17,8 @@ from ethbrake_marl.scenario import (
     parse_yaml,
     scenario_folder,
     scenario_json_schema,
-    shipped_files,
 )
-from ethbrake_marl.scenario.flow_text import flow_text
+from ethbrake_marl.scenario import catalogue as shipped_files
 
 SHIPPED = [entry.path for entry in list_scenarios()]
 ROOT = Path(__file__).resolve().parents[2]

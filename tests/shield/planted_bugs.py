@@ -14,7 +14,7 @@ from tests.physics.programme.mutation import ROOT
 from tests.physics.programme.planted_bugs import Patch, red_with
 
 BY_HAND = "test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner"
-QUICK = ("tests/shield/test_certify.py", "tests/shield/test_guard.py", f"tests/shield/test_robust.py::{BY_HAND}")
+QUICK = ("tests/shield/test_certify.py", "tests/shield/test_step_shield.py", f"tests/shield/test_robust.py::{BY_HAND}")
 WHOLE = tuple(f"tests/shield/test_{name}.py" for name in ("attached", "step", "rollouts", "faces", "interference"))
 KERNEL, CERTIFY, GUARD, ROLLOUTS, ATTACHED, COMPARISON = (
     f"ethbrake_marl/shield/{name}.py"

@@ -27,13 +27,13 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.driving import episode_engine
-from ethbrake_marl.durable_files import write_file
+from ethbrake_marl.agents.rollout import episode_engine
+from ethbrake_marl.files.durable import write_file
 from ethbrake_marl.lineup import make_agents
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import StepShieldAgent
 from ethbrake_marl.shield.certify import certify
-from ethbrake_marl.shield.guard import StepShield
+from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.shield.face_attack import FACES
 from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped

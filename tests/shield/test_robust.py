@@ -6,12 +6,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.profile_problem import profile_problem
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.search.problem import profile_problem
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, StepShield, StepShieldAgent, parse_uncertainty
 from ethbrake_marl.shield.certify import REASONS, Backup, begin_running, certify, plan_harm
 from tests.shield.lines import line

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.robustness_figure import robustness_figure, robustness_table
+from ethbrake_marl.figures.shield import robustness_figure, robustness_table
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield.robustness import MODES, TRUTHS, robustness
 from ethbrake_marl.shield.uncertainty import parse_uncertainty

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.refined import Rehearsed
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rehearsed import Rehearsed
+from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.coupled import optimise_coupled
-from ethbrake_marl.agents.driving import drive
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.operating_figure import operating_figure
+from ethbrake_marl.figures.shield import operating_figure
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent, StepShield, StepShieldAgent, parse_uncertainty
 from ethbrake_marl.shield.certify import REASONS
-from ethbrake_marl.shield.forensics import operating_curve, review
+from ethbrake_marl.shield.review import operating_curve, review
 from tests.shield.lines import ADVERSARIES, attack, line
 
 pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")

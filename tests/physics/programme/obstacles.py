@@ -9,13 +9,13 @@ from functools import cache
 import numpy as np
 
 from ethbrake_marl.physics import Floats, Worlds, advance
-from ethbrake_marl.physics.tolerances import CLUSTER_EPS, EXACT_RUN
 from tests.physics.exact_simulator import line_of, simulate
 from tests.physics.programme.gates import Figure, gate
 from tests.physics.random_worlds import driving_lines, touching_lines
 from tests.physics.runs import HORIZON_S, state_bytes
 from tests.physics.test_clusters import law_error_eps
 from tests.physics.test_obstacle import with_hazard
+from tests.reference.tolerances import CLUSTER_EPS, EXACT_RUN
 
 
 @gate("obstacle: cluster law [eps of the largest speed, per round]")

@@ -26,9 +26,9 @@ from tests.programme.suites import ROOT
 
 BY_HAND = (
     "tests/physics/test_instants.py::test_plastic_cluster__three_vehicles_do_not_hand_the_last_bit_to_and_fro",
-    "tests/analysis/test_lower_bound.py::test_front_pair__by_hand",
-    "tests/analysis/test_lower_bound_conditions.py",
-    "tests/analysis/test_best_harm.py::test_even_grid__ends_at_the_capacities_to_the_bit",
+    "tests/limits/test_lower_bound.py::test_front_pair__by_hand",
+    "tests/limits/test_lower_bound_conditions.py",
+    "tests/limits/test_best_harm.py::test_even_grid__ends_at_the_capacities_to_the_bit",
 )
 QUICK = (
     "tests/physics/test_advance.py",
@@ -47,7 +47,7 @@ EVENTS, IMPACT, SEGMENT, ADVANCE = (
 )
 HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/obstacle.py"
 BOUNDS, LOWER_BOUND = (f"ethbrake_marl/analysis/{name}.py" for name in ("avoidability_bounds", "lower_bound"))
-PROFILES = "ethbrake_marl/agents/profiles.py"
+PROFILES = "ethbrake_marl/search/profiles.py"
 
 
 class Patch(NamedTuple):

@@ -1,0 +1,114 @@
+"""Letting agents drive through whole episodes: the loop of every evaluation and of every prediction."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Agent, LookingAhead
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.team import Team
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.stream import Script
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.harm import Ledger
+from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.scenario import Scenario
+
+
+@dataclass(frozen=True, slots=True)
+class Episodes:
+    """How the episodes of a batch went."""
+
+    ledger: Ledger
+    final: Worlds  # each world as its episode left it
+    at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
+
+
+class Watch(Protocol):
+    """Sees every step of a batch of episodes."""
+
+    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
+        """``before`` moved to the times ``until_s`` [n] under ``command_mps2`` [n, N]; ended worlds stay at theirs.
+
+        The first step is from the alert to the first decision. Nothing of what is given may be changed.
+        """
+        ...
+
+
+def scripted(scenario: Scenario, *, but: int | Collection[int] | None = None) -> dict[int, Agent]:
+    """Fresh agents for the scenario's scripts, by vehicle, ``but`` some; those that look ahead know the others."""
+    left_out = () if but is None else (but,) if isinstance(but, int) else but
+    specs = {i: spec for i, spec in scenario.scripts.items() if i not in left_out}
+    scripts = {i: make_agent(spec, horizon_s=scenario.horizon_s) for i, spec in specs.items()}
+    for vehicle, script in scripts.items():
+        introduce(script, vehicle, scripts)
+    return scripts
+
+
+def introduce(agent: Agent, vehicle: int, scripts: Mapping[int, Script]) -> None:
+    """Tell an agent that looks ahead, and will drive ``vehicle``, who drives the others."""
+    if isinstance(agent, LookingAhead):
+        agent.others = {i: script for i, script in scripts.items() if i != vehicle}
+
+
+def episode_engine(worlds: Worlds, agent: Agent | Team, scenario: Scenario, vehicle: int | None = None) -> Engine:
+    """An engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team its vehicles; the others are scripted.
+
+    They decide when their first vehicle's latency has elapsed and every time step from then on, as learners do; their
+    commands are applied unrounded. An agent that looks ahead knows the scripts, and takes the other driven vehicles to
+    brake fully. Raises ``InvalidInput`` for a learner that nobody drives.
+    """
+    team = agent if isinstance(agent, Team) else Team({} if vehicle is None else {vehicle: agent}, agent.name)
+    drivers = team.drivers
+    undriven = [scenario.vehicle_names[i] for i in scenario.learners if i not in drivers]
+    if undriven:
+        raise InvalidInput(
+            f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
+            f" {', '.join(undriven)} of scenario {scenario.name!r} must be driven too. An agent that rolls itself out"
+            " (hybrid, rehearsed, step) can drive one learner, the others need scripts: --vehicle NAME"
+        )
+    scripts = scripted(scenario, but=drivers)
+    for i, driver in drivers.items():
+        introduce(driver, i, scripts)
+    engine = Engine(
+        scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, deciders=tuple(drivers), worlds=worlds
+    )
+    engine.roster.warns = False  # who drives looks
+    return engine
+
+
+def drive(
+    worlds: Worlds,
+    agent: Agent | Team,
+    scenario: Scenario,
+    vehicle: int | None = None,
+    *,
+    watched_by: Sequence[Watch] = (),
+) -> Episodes:
+    """Let ``agent`` drive ``vehicle``, or a team its vehicles, through every world (at t = 0) to its episode's end.
+
+    Raises ``PhysicsError`` naming all worlds that could not be advanced; the others are well without them.
+    """
+    engine = episode_engine(worlds, agent, scenario, vehicle)
+    at_rest = np.zeros(worlds.n, np.bool_)
+    now = _show(watched_by, worlds, engine, engine.worlds.command_mps2)
+    while not engine.ended.all():
+        at_rest |= engine.step({}).terminated
+        now = _show(watched_by, now, engine, engine.wanted_mps2.copy())
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
+    return Episodes(engine.ledger, engine.worlds, at_rest)
+
+
+def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:
+    """Show the step that the engine has just made; gives the worlds as they are now."""
+    if not watched_by:
+        return before
+    now = engine.worlds
+    for watch in watched_by:
+        watch.see(before, command_mps2, now.time_s)
+    return now

@@ -1,0 +1,1 @@
+"""The command ``ethbrake``: parse, call, print."""

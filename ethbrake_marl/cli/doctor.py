@@ -1,0 +1,150 @@
+"""Is this installation in order? Versions, folders, and the physics on worlds whose answer is known."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+
+import numpy as np
+from packaging.requirements import Requirement
+from packaging.version import Version
+
+from ethbrake_marl import __version__
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.physics import Worlds, advance, make_worlds
+from ethbrake_marl.physics.compiled import cache_folder
+from ethbrake_marl.scenario import list_scenarios, scenario_folder
+
+DISTRIBUTION = "ethbrake-marl"
+OLDEST_PYTHON = (3, 11)
+_PACKAGE = Path(__file__).resolve().parents[1]
+_CHECKOUT = _PACKAGE.parent  # or the folder of installed packages, where there is no pyproject.toml
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One finding: what was looked at, whether it is in order, and what was found."""
+
+    name: str
+    ok: bool
+    detail: str
+
+
+def diagnose() -> list[Check]:
+    """All checks, in the order in which they should be repaired; none of them raises."""
+    return [
+        Check("ethbrake_marl", True, f"{__version__} in {_PACKAGE}"),
+        _checked("python", _python),
+        *_dependencies(),
+        _checked("processor", _processor),
+        _checked("kernel cache", _kernel_cache),
+        _checked("scenarios", _scenarios),
+        _checked("physics", _golden_impact),
+        _checked("baseline", _golden_baseline),
+    ]
+
+
+def _checked(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
+    """The finding of ``look``; whatever it raises is a finding too, so that the other checks are still made."""
+    try:
+        return Check(name, *look())
+    except Exception as error:
+        return Check(name, False, f"{type(error).__name__}: {error}")
+
+
+def _python() -> tuple[bool, str]:
+    oldest = ".".join(map(str, OLDEST_PYTHON))
+    found = f"{platform.python_version()} at {sys.executable}"
+    return (True, found) if sys.version_info >= OLDEST_PYTHON else (False, f"{found}; needs {oldest} or newer")
+
+
+def _dependencies() -> Iterator[Check]:
+    """One check per dependency of the package: installed, and not older than the oldest version that was tried."""
+    pinned = _pinned_versions(_CHECKOUT / "constraints.txt")
+    for requirement in _requirements():
+        name = requirement.name
+        wanted = f"needs {requirement.specifier}"
+        try:
+            found = version(name)
+        except PackageNotFoundError:
+            yield Check(name, False, f"is not installed; {wanted}")
+            continue
+        tested = pinned.get(name.lower())
+        note = f" (tested with {tested})" if tested and Version(found).public != Version(tested).public else ""
+        fits = requirement.specifier.contains(found, prereleases=True)
+        yield Check(name, fits, f"{found}{note}" if fits else f"{found}; {wanted}{note}")
+
+
+def _requirements() -> list[Requirement]:
+    """What the package needs without its extras: from the checkout that it runs in, else from its metadata."""
+    project = _CHECKOUT / "pyproject.toml"
+    if project.is_file():
+        lines = tomllib.loads(project.read_text("utf-8"))["project"]["dependencies"]
+    else:
+        lines = requires(DISTRIBUTION) or []
+    requirements = [Requirement(line) for line in lines]
+    return [r for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
+
+
+def _pinned_versions(constraints: Path) -> dict[str, str]:
+    """Lower-case name -> version of every ``name==version`` line; empty outside a checkout."""
+    if not constraints.is_file():
+        return {}
+    lines = [line.split("#")[0].strip() for line in constraints.read_text("utf-8").splitlines()]
+    return {name.lower(): pin for name, _, pin in (line.partition("==") for line in lines) if pin}
+
+
+def _processor() -> tuple[bool, str]:
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads = os.environ.get("OMP_NUM_THREADS", "not set")
+    return True, f"{usable} of {os.cpu_count()} cores usable; OMP_NUM_THREADS {threads}; training uses one torch thread"
+
+
+def _kernel_cache() -> tuple[bool, str]:
+    folder = cache_folder()
+    temporary = folder.name.startswith("ethbrake_marl-")
+    note = "temporary: kernels are compiled anew in every process; set NUMBA_CACHE_DIR to a writable folder"
+    return True, f"{folder} ({note})" if temporary else str(folder)
+
+
+def _scenarios() -> tuple[bool, str]:
+    found = list_scenarios()
+    return len(found) > 0, f"{len(found)} in {scenario_folder()}"
+
+
+def _golden_impact() -> tuple[bool, str]:
+    """A car at 10 m/s brakes with 5 m/s2, 8 m behind a standing one: harm ``10^2 - 2 * 5 * 8 = 20``."""
+    world = _world([8.0], [0.0, 10.0], capacity_mps2=5.0, latency_s=0.0)
+    _, impacts = advance(world, np.array([[0.0, -5.0]]), 4.0)
+    harm = float(impacts.total_harm[0, 0])
+    return abs(harm - 20.0) < 1e-9, f"8 m behind a standing car, 10 m/s, braking 5 m/s2: harm {harm:.9g} (exact: 20)"
+
+
+def _golden_baseline() -> tuple[bool, str]:
+    """The paper's distance scenario at 7 m and 7 m: E-V2X-BM brakes with 5.17021 m/s2 and expects harm 4.03447."""
+    capacity, latency = np.array([6.0, 7.0, 6.0]), np.array([0.0, 0.5, 0.8])
+    world = _world([7.0, 7.0], [20.0, 18.0, 20.0], capacity_mps2=capacity, latency_s=latency)
+    best = optimise_pairwise(world, 1)
+    found = f"{float(best.deceleration_mps2[0]):.6g} m/s2, harm {float(best.harm[0]):.6g}"
+    wanted = "5.17021 m/s2, harm 4.03447"
+    return found == wanted, f"E-V2X-BM at gaps 7 and 7 m: {found} (known: {wanted})"
+
+
+def _world(
+    gaps_m: list[float], speeds_mps: list[float], *, capacity_mps2: float | np.ndarray, latency_s: float | np.ndarray
+) -> Worlds:
+    return make_worlds(
+        gaps_m,
+        speeds_mps,
+        braking_capacity_mps2=capacity_mps2,
+        driving_capacity_mps2=capacity_mps2,
+        latency_s=latency_s,
+        mass_t=5.0,
+        restitution=0.1,
+    )

@@ -1,0 +1,206 @@
+"""The command ``ethbrake evaluate``: parse, let the agents drive, print."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, VehicleOption
+from ethbrake_marl.cli.picture import PictureOption, picture_app, picture_target
+from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
+from ethbrake_marl.evaluation import (
+    Rescored,
+    SummaryRow,
+    check_target,
+    declared_objectives,
+    evaluate,
+    horizon_note,
+    rescored,
+    rescored_table,
+    rich_table,
+    summarise,
+    write_per_world_csv,
+)
+from ethbrake_marl.evaluation.paper import TESTS
+from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.lineup import (
+    EPISODES,
+    LIST_SEED,
+    PROGRESS_EVERY,
+    SHIELDS,
+    check_agents,
+    choose_worlds,
+    load_driven,
+    load_evaluated,
+    make_lineup,
+    make_proposers,
+)
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty
+
+
+def evaluate_command(
+    scenario: ScenarioOption = "paper-random",
+    agents: Annotated[
+        str, typer.Option(metavar="A,B,...", help="Who drives, with commas between them.")
+    ] = "full_brake,e_v2x_bm,e_v2x_bm:pairwise",
+    episodes: Annotated[int | None, typer.Option(help="Worlds of the list.", show_default=str(EPISODES))] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the list.", show_default=str(LIST_SEED))] = None,
+    count: Annotated[HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")] = "first",
+    shield: Annotated[
+        str, typer.Option(metavar="|".join(SHIELDS), help="Put around every learned agent that has none.")
+    ] = "none",
+    uncertainty: Annotated[
+        str | None,
+        typer.Option(metavar="QUANTITY=WIDTH,...", help=f"What the robust shield does not know, such as {EXAMPLE}."),
+    ] = None,
+    initial_states: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Your own worlds, one per row, instead of the list.")
+    ] = None,
+    vehicle: VehicleOption = None,
+    per_world: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Also write one row per world and agent to this file.")
+    ] = None,
+    objective: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Also tell the results under this objective; standard: under all usual ones. Repeatable.",
+        ),
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare agents on the same fixed list of worlds.
+
+    Agents: full_brake, coast, constant:A (deceleration in m/s2), copy_leader, gentlest_front, e_v2x_bm,
+    e_v2x_bm:pairwise, planner, best_harm; ladder: all of these but constant; of a run: team@PATH; and of a run or a
+    policy bundle: ppo@PATH, sac@PATH, rehearsed@PATH, hybrid@PATH, hybrid:pairwise@PATH, hybrid:rehearsed@PATH,
+    step@PATH, step:rehearsed@PATH, robust@PATH, robust:rehearsed@PATH. PATH may be shipped.
+    """
+    if per_world is not None:
+        check_target(per_world, force=force)
+    chosen = load_evaluated(scenario, vehicle)
+    objectives = declared_objectives(objective or (), chosen.vehicles)
+    sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
+    intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
+    lineup = make_lineup(agents.split(","), chosen, count=count, shield=shield, uncertainty=intervals)
+    check_agents(lineup, sample.worlds, chosen)
+    with interruptible("nothing was written"), progress_bars() as bars:
+        evaluation = evaluate(
+            sample,
+            lineup,
+            scenario=chosen,
+            seed=list_seed,
+            chunk=PROGRESS_EVERY,
+            on_progress=lambda agent, done: bars.show(agent, done, sample.worlds.n),
+        )
+    if per_world is not None:
+        write_per_world_csv(per_world, evaluation, objectives=objectives, force=force)
+        say(f"every world: {per_world}")
+    told = rescored(evaluation, objectives)
+    rows = summarise(evaluation)
+    show_rows(rows, as_json, told)
+    moving = {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
+    if note := horizon_note(moving, sample.worlds.n, chosen.horizon_s):
+        say(note)
+    if told and not as_json:
+        result_console().print(rescored_table(told, count))
+
+
+def show_rows(rows: Sequence[SummaryRow], as_json: bool, told: Sequence[Rescored] = ()) -> None:
+    """The rows as a table, or as JSON with what was ``told`` under other objectives."""
+    if not as_json:
+        result_console().print(rich_table(rows))
+        return
+    found = [row.to_json() for row in rows]
+    if told:
+        found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
+    write_json(found)
+
+
+def show_beside(beside: Mapping[str, Sequence[SummaryRow]]) -> None:
+    """The rows of the other tests, each below what its test asks."""
+    for test, rows in beside.items():
+        result_console().print(f"\n{TESTS[test]}\n", highlight=False, markup=False)
+        result_console().print(rich_table(rows))
+
+
+SHIELD_EPISODES = 2_000
+
+ProposersOption = Annotated[
+    str,
+    typer.Option("--agents", metavar="A,B,...", help="Who proposes; agents of `ethbrake evaluate` without a shield."),
+]
+EpisodesOption = Annotated[int, typer.Option("--episodes", help="Worlds of the list.", min=1)]
+CountOption = Annotated[HarmCount, typer.Option("--count", help="Harm that is guaranteed.")]
+
+
+def shield_command(
+    agents: ProposersOption = "ppo@shipped,full_brake,constant:3",
+    scenario: ScenarioOption = "paper-random",
+    episodes: EpisodesOption = SHIELD_EPISODES,
+    count: CountOption = "first",
+    vehicle: VehicleOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare no shield, episode mode and step mode on the same worlds.
+
+    Each decision that step mode replaced is simulated again without it: needed (harm would have been higher), harmless
+    (the same), costly (lower).
+    """
+    chosen = load_driven(scenario, vehicle)
+    rows = measured_modes(agents, chosen, episodes, count)
+    if as_json:
+        write_json([row.to_json() for row in rows])
+    else:
+        result_console().print(modes_table(rows))
+    moving = {f"{row.agent} ({row.mode})": row.horizon_ends for row in rows if row.mode != NONE}
+    if note := horizon_note(moving, episodes, chosen.horizon_s):
+        say(note)
+
+
+@picture_app.command("shield-modes", epilog="Example: ethbrake picture shield-modes --episodes 500 --output modes.png")
+def picture_shield_modes(
+    output: PictureOption,
+    agents: ProposersOption = "ppo@shipped,full_brake,constant:3",
+    scenario: ScenarioOption = "paper-random",
+    episodes: EpisodesOption = SHIELD_EPISODES,
+    count: CountOption = "first",
+    vehicle: VehicleOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Harm without a shield and in step mode beside episode mode, as ``ethbrake shield`` measures it."""
+    target = picture_target(output, force=force)
+    # Here: matplotlib takes a second to load, and most commands draw nothing.
+    from ethbrake_marl.figures.shield import shield_modes_figure
+    from ethbrake_marl.figures.style import png_bytes
+
+    chosen = load_driven(scenario, vehicle)
+    rows = measured_modes(agents, chosen, episodes, count)
+    caption = (
+        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}, {count} harm; mean and 95 % interval of the"
+        " difference, paired by world."
+    )
+    write_output(target, png_bytes(shield_modes_figure(rows, caption=caption)), force=force)
+    say(f"picture: {target}")
+
+
+def measured_modes(agents: str, scenario: Scenario, episodes: int, count: HarmCount) -> list[ModeRow]:
+    """The rows of these agents, with progress on stderr."""
+    worlds = scenario.sample(episodes, LIST_SEED).worlds
+    lineup = make_proposers(agents.split(","), scenario, count=count)
+    with interruptible("nothing was written"), progress_bars() as bars:
+        return compare_modes(
+            lineup,
+            worlds,
+            scenario,
+            scenario.learners[0],
+            count=count,
+            on_progress=lambda name, done: bars.show(name, done, episodes),
+        )

@@ -1,0 +1,179 @@
+"""The commands ``ethbrake picture ...``: parse, draw, write a PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, VehicleOption
+from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import check_target
+from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.lineup import LIST_SEED, load_driven, make_agents, make_proposers
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
+
+PICTURE_ENDING = ".png"
+
+picture_app = typer.Typer(
+    rich_markup_mode=None,
+    help="Draw what is critical in a scenario, or what one world asks for.",
+    epilog="Example: ethbrake picture criticality --output map.png",
+)
+
+PictureOption = Annotated[Path, typer.Option("--output", metavar="FILE.png", help="The picture to write.")]
+
+
+@picture_app.command(
+    "criticality",
+    epilog="Example: ethbrake picture criticality --scenario paper-distance --agent e_v2x_bm --output map.png",
+)
+def picture_criticality(
+    output: PictureOption,
+    scenario: ScenarioOption = "paper-distance",
+    agent: Annotated[str, typer.Option(help="Who drives; any agent of `ethbrake evaluate`.")] = "e_v2x_bm",
+    count: Annotated[HarmCount, typer.Option(help="Harm that the agent minimises, if it does.")] = "first",
+    cells: Annotated[int | None, typer.Option(help="Worlds along each gap.", show_default="81")] = None,
+    gaps: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="LOW HIGH", help="Range of both gaps (m).", show_default="the scenario's"),
+    ] = None,
+    force: ForceOption = False,
+) -> None:
+    """Harm of an agent over both gaps, with the boundary of what is avoidable.
+
+    Everything else must be a fixed number in the scenario.
+    """
+    target = picture_target(output, force=force)
+    # Here and below: matplotlib takes a second to load, and most commands draw nothing.
+    from ethbrake_marl.figures.criticality import CELLS, criticality_figure, criticality_map
+    from ethbrake_marl.figures.style import png_bytes
+
+    chosen = load_driven(scenario, None)
+    lineup = make_agents([agent], chosen, count=count)
+    with interruptible("nothing was written"), progress_bars() as bars:
+        found = criticality_map(
+            chosen,
+            lineup,
+            cells=CELLS if cells is None else cells,
+            gap_range_m=gaps,
+            on_progress=lambda name, done, total: bars.show(name, done, total),
+        )
+    write_output(target, png_bytes(criticality_figure(found)), force=force)
+    say(f"picture: {target}")
+
+
+@picture_app.command(
+    "deceleration",
+    epilog="Example: ethbrake picture deceleration --scenario paper-scenario-1 --world 0 --output curve.png",
+)
+def picture_deceleration(
+    output: PictureOption,
+    scenario: ScenarioOption = "paper-scenario-1",
+    world: Annotated[int, typer.Option(help="Number of the world in the list.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the list.")] = LIST_SEED,
+    vehicle: VehicleOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Harm of one world against the constant deceleration of one vehicle: predicted, realised, and the best known."""
+    target = picture_target(output, force=force)
+    from ethbrake_marl.figures.deceleration import deceleration_figure
+    from ethbrake_marl.figures.style import png_bytes
+
+    chosen = load_driven(scenario, vehicle)
+    sample = chosen.sample(1, seed, first=world)
+    figure = deceleration_figure(
+        chosen, sample.worlds, chosen.learners[0], title=f"{chosen.name}, world {world} of the list of seed {seed}"
+    )
+    write_output(target, png_bytes(figure), force=force)
+    say(f"picture: {target}")
+
+
+@picture_app.command(
+    "shield", epilog="Example: ethbrake picture shield --agents ppo@shipped,full_brake --output shield.png"
+)
+def picture_shield(
+    output: PictureOption,
+    agents: Annotated[str, typer.Option(metavar="A,B,...", help="Who proposes.")] = "full_brake,constant:3",
+    scenario: ScenarioOption = "paper-random",
+    episodes: Annotated[int, typer.Option(help="Worlds of the list.", min=1)] = 500,
+    count: Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")] = "first",
+    vehicle: VehicleOption = None,
+    force: ForceOption = False,
+) -> None:
+    """How often the step shield intervenes against the harm that remains, from no allowance to any."""
+    target = picture_target(output, force=force)
+    from ethbrake_marl.figures.shield import operating_figure
+    from ethbrake_marl.figures.style import png_bytes
+    from ethbrake_marl.shield.review import ALLOWANCES, operating_curve
+
+    chosen = load_driven(scenario, vehicle)
+    worlds = chosen.sample(episodes, LIST_SEED).worlds
+    curves = []
+    with interruptible("nothing was written"), progress_bars() as bars:
+        for name, agent in make_proposers(agents.split(","), chosen, count=count).items():
+            curves.append((name, operating_curve(worlds, agent, chosen, chosen.learners[0], ALLOWANCES, count=count)))
+            bars.show(name, episodes, episodes)
+    caption = (
+        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; step shield, {count} harm. Beside the"
+        " points: what certificates may reach above the bound (m²/s²)."
+    )
+    write_output(target, png_bytes(operating_figure(curves, caption=caption)), force=force)
+    say(f"picture: {target}")
+
+
+@picture_app.command(
+    "robustness", epilog="Example: ethbrake picture robustness --agent ppo@shipped --episodes 100 --output robust.png"
+)
+def picture_robustness(
+    output: PictureOption,
+    agent: Annotated[
+        str, typer.Option(help="Who proposes; an agent of `ethbrake evaluate` without a shield.")
+    ] = "full_brake",
+    uncertainty: Annotated[
+        str, typer.Option(metavar="QUANTITY=WIDTH,...", help="The intervals; drawn at 0 to 2 times their width.")
+    ] = "braking_capacity_mps2=10%,gaps_m=0.5",
+    scenario: ScenarioOption = "paper-random",
+    episodes: Annotated[int, typer.Option(help="Worlds of the list.", min=1)] = 200,
+    count: Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")] = "first",
+    vehicle: VehicleOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """What it costs not to know a world: the robust shield's price, and both shields where the truth differs.
+
+    Prints the figures, too.
+    """
+    target, intervals = picture_target(output, force=force), parse_uncertainty(uncertainty)
+    from ethbrake_marl.figures.shield import robustness_figure, robustness_table
+    from ethbrake_marl.figures.style import png_bytes
+    from ethbrake_marl.shield.robustness import robustness
+
+    chosen = load_driven(scenario, vehicle)
+    worlds = chosen.sample(episodes, LIST_SEED).worlds
+    (policy,) = make_proposers([agent], chosen, count=count).values()
+    with interruptible("nothing was written"), progress_bars() as bars:
+        points = robustness(
+            worlds, policy, chosen, chosen.learners[0], intervals, count=count,
+            on_progress=lambda what, done: bars.show(what, done, episodes),
+        )  # fmt: skip
+    caption = (
+        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; {agent} proposes; {count} harm."
+        f" Intervals of width 1: {intervals}."
+    )
+    write_output(target, png_bytes(robustness_figure(points, caption=caption)), force=force)
+    if as_json:
+        write_json([point._asdict() for point in points])
+    else:
+        result_console().print(robustness_table(points))
+    say(f"picture: {target}")
+
+
+def picture_target(output: Path, *, force: bool) -> Path:
+    """The file to write, checked before any work; only PNG is written."""
+    if output.suffix.lower() != PICTURE_ENDING:
+        raise InvalidInput(f"{output}: pictures are written as PNG; give a name that ends in {PICTURE_ENDING}")
+    return check_target(output, force=force)

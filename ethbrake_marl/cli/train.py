@@ -1,0 +1,191 @@
+"""The commands that train and that go on with a training: parse, call, print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from ethbrake_marl.cli.options import (
+    ForceOption,
+    JsonOption,
+    NameOption,
+    OutputOption,
+    RecipeOption,
+    ScenarioOption,
+    SchemeOption,
+    StepsOption,
+    TrainingSeedOption,
+)
+from ethbrake_marl.cli.terminal import INTERRUPTED, Bars, interruptible, progress_bars, say, write_json
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.evaluation.per_world import check_target, write_output
+from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.schemes import check_scheme, drivers, scheme_of, who_drives_what
+from ethbrake_marl.lineup import load_runnable
+from ethbrake_marl.policies.onnx import onnx_model
+from ethbrake_marl.policies.policy import save_policy
+from ethbrake_marl.policies.shipped import load_named_policy
+
+if TYPE_CHECKING:
+    from ethbrake_marl.learning.loop import Progress
+    from ethbrake_marl.learning.teams import TeamResult
+
+
+KEPT = "if the training had begun, the run's folder keeps the last good policy, and ethbrake resume FOLDER goes on"
+
+
+def train_command(
+    scenario: ScenarioOption = "paper-random",
+    recipe: RecipeOption = "ppo",
+    scheme: SchemeOption = None,
+    steps: StepsOption = None,
+    seed: TrainingSeedOption = None,
+    name: NameOption = None,
+    output: OutputOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Train a policy, or the policies of several learners, into a run's folder.
+
+    Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,hybrid@FOLDER`; of several learners: `team@FOLDER`.
+    Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake resume FOLDER` goes on.
+    """
+    with interruptible(KEPT):
+        # Here and in other commands that learn: torch takes seconds to load, and no other command needs it.
+        from ethbrake_marl.learning.teams import train_team
+        from ethbrake_marl.studies.experiment import run_folder
+
+        chosen, plan = load_runnable(scenario), load_recipe(recipe)
+        if scheme is not None:
+            plan = plan.replace(scheme=check_scheme(scheme))
+        used = scheme_of(plan, chosen)
+        folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
+        begun = [f"scheme {used}: {who_drives_what(drivers(used, chosen))}"]  # said once all input is known to be good
+        with progress_bars() as bars:
+
+            def tell(progress: Progress) -> None:
+                if begun:
+                    bars.tell(begun.pop())
+                show_progress(bars, progress)
+
+            result = train_team(plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell)
+    _show_result(result, as_json)
+
+
+def resume_command(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the run.")],
+    other_versions: Annotated[
+        bool, typer.Option("--other-versions", help="Go on although other versions trained it; the numbers may differ.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Go on with a training that was stopped or killed.
+
+    The policy is the one that the training would have come to without the stop, bit for bit.
+    """
+    with interruptible(KEPT):
+        from ethbrake_marl.learning.teams import resume_team
+
+        with progress_bars() as bars:
+            result = resume_team(folder, on_progress=lambda p: show_progress(bars, p), other_versions=other_versions)
+    _show_result(result, as_json)
+
+
+def learning_curves_command(
+    output: Annotated[
+        Path, typer.Option("--output", metavar="FOLDER", help="Folder of all trainings, of the figure and the table.")
+    ],
+    scenario: ScenarioOption = "paper-random",
+    recipes: Annotated[
+        str, typer.Option(metavar="RECIPE:SEEDS,...", help="Recipes, each with its number of seeds (0, 1, ...).")
+    ] = "ppo:5,sac:3",
+    steps: StepsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Train several seeds of several recipes, and draw their learning curves in one figure.
+
+    The same command goes on after an interruption: finished trainings are kept, begun ones go on.
+    """
+    with interruptible(KEPT):
+        from ethbrake_marl.studies.learning_curves import FIGURE, parse_trainings, train_all, write_curves
+
+        chosen, plan = load_runnable(scenario), parse_trainings(recipes)
+        if len(chosen.learners) != 1:
+            raise InvalidInput(
+                f"scenario {chosen.name!r}: has {len(chosen.learners)} learners; curves need exactly one"
+            )
+        with progress_bars() as bars:
+            finished = train_all(
+                chosen,
+                plan,
+                output,
+                steps=steps,
+                tell=lambda name, p: bars.show(name, p.steps, p.total_steps, p.metrics, p.note),
+            )
+        if not finished:
+            say(f"interrupted; the same command goes on with what is in {output}")
+            raise typer.Exit(INTERRUPTED)
+        summary = write_curves(chosen, plan, output)
+    if as_json:
+        write_json(summary)
+    say(f"figure: {output / FIGURE}")
+
+
+def show_progress(bars: Bars, progress: Progress) -> None:
+    """How far a training is, and what it has to say."""
+    bars.show("training", progress.steps, progress.total_steps, progress.metrics, progress.note)
+
+
+def end_of_training(status: str, steps: int, folder: Path) -> None:
+    """Say what a training left; an interrupted one ends with that status."""
+    if status == "interrupted":
+        say(f"interrupted after {steps:,} training steps; go on with: ethbrake resume {folder} (its policy is there)")
+        raise typer.Exit(INTERRUPTED)
+    say(f"{status} after {steps:,} training steps: {folder}")
+
+
+def _show_result(result: TeamResult, as_json: bool) -> None:
+    if as_json:
+        last = result.evaluations[-1] if result.evaluations else None
+        content = {"directory": str(result.directory), "status": result.status, "steps": result.steps}
+        best = next(iter(result.policies.values())).manifest.steps
+        team = {"scheme": result.scheme, "drivers": dict(result.drivers)}
+        write_json({**content, **team, "evaluation": last, "policy_steps": best, "alarms": list(result.alarms)})
+    end_of_training(result.status, result.steps, result.directory)
+
+
+def export_command(
+    policy: Annotated[str, typer.Argument(metavar="FOLDER", help="A run, a policy bundle, or shipped/NAME.")],
+    onnx: Annotated[Path, typer.Option("--onnx", metavar="FILE", help="The ONNX model to write.")],
+    force: ForceOption = False,
+) -> None:
+    """Write a policy as an ONNX model: observation in, acceleration out.
+
+    Needs the package onnx, which the extra `export` brings.
+    """
+    check_target(onnx, force=force)
+    write_output(onnx, onnx_model(load_named_policy(policy)), force=force)
+    say(f"written: {onnx}")
+
+
+def import_legacy_command(
+    file: Annotated[Path, typer.Argument(metavar="FILE.zip", help="What Stable-Baselines3's save() wrote.")],
+    output: Annotated[Path, typer.Option("--output", metavar="FOLDER", help="The new policy bundle.")],
+    scenario: ScenarioOption = "paper-random",
+    algorithm: Annotated[Literal["ppo", "sac"], typer.Option(help="Which algorithm saved it.")] = "ppo",
+    trusted: Annotated[
+        bool, typer.Option("--i-trust-this-file", help="Reading the file runs the code inside it: I know who wrote it.")
+    ] = False,
+) -> None:
+    """Make a policy bundle from a .zip of Stable-Baselines3.
+
+    Such a file can do anything that you can, when it is read. A bundle cannot: share those instead.
+    """
+    if output.exists() or output.is_symlink():
+        raise AlreadyExists(f"{output}: is there already; give another name")
+    from ethbrake_marl.learning.legacy import import_legacy  # torch takes seconds to load
+
+    save_policy(import_legacy(file, load_runnable(scenario), algorithm=algorithm, trusted=trusted), output)
+    say(f"written: {output}; use it as {algorithm}@{output}")

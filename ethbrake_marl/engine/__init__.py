@@ -1,0 +1,1 @@
+"""The engine: reset and step for n worlds, their stream, their snapshots."""

@@ -1,0 +1,407 @@
+"""Episodes of ``n`` worlds at once: reset, step, roles, latency gates, episode ends.
+
+Every face of the environment, every evaluation and every search is a thin layer on this. An episode starts at t = 0,
+when Vehicle 1 brakes; ``reset`` moves exactly to the first moment at which a learner's latency has elapsed.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.actions import checked_action
+from ethbrake_marl.engine.step import BAD_ACTION, ENDED, OUTCOME_ROWS, START, STEP, Step, step_worlds
+from ethbrake_marl.engine.stream import (
+    Roster,
+    Script,
+    Start,
+    Stream,
+    Told,
+    check_alert,
+    is_state_free,
+    moved,
+    within_capacity,
+)
+from ethbrake_marl.errors import InvalidInput, renumbered
+from ethbrake_marl.harm import Ledger
+from ethbrake_marl.objectives import objective_harm
+from ethbrake_marl.observations import Observations, ObservationSpec, observation_for, observe_packed, scaling
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.rows import (
+    NO_ROWS,
+    Packed,
+    command_at,
+    gap_at,
+    has_hazard,
+    hazard_ledger_columns,
+    ledger_columns,
+    pack,
+    params_at,
+    previous_at,
+    speed_at,
+    unpack,
+    with_hazard_columns,
+)
+from ethbrake_marl.physics.segment import DONE
+from ethbrake_marl.rewards import (
+    Reward,
+    StepOutcome,
+    further_terms,
+    potential,
+    resolved_objective,
+    reward_params,
+    weighted_sum,
+)
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario.v2x import known_from, told_by_link
+
+Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
+
+_RUNNING = ("_state", "_params", "_clock", "_wanted", "_potential")
+
+
+class Watcher(Protocol):
+    """Follows an engine's episodes (a shield does), and refuses what must not happen by raising.
+
+    What it remembers is kept by the engine beside the worlds (``Engine.memory``): both change in one piece, or, where
+    anything fails or is interrupted, neither does. A memory is therefore never changed in place.
+    """
+
+    def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
+        """The memory once episodes start in these rows; ``alert`` holds those worlds only, at t = 0."""
+
+    def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
+        """The memory once the engine, as it was ``before`` this step, is as ``after``."""
+
+
+class Engine:
+    """A batch of ``n`` running episodes of one scenario.
+
+    ``learners`` are vehicle indices (0 = front); every other vehicle needs an entry in ``scripts``. Worlds come from
+    the scenario's training stream of ``seed`` unless they are given (``worlds``, at t = 0, here or in ``reset``).
+    Steps start when the first of the ``deciders`` may act: the learners, or the scripted vehicles named instead (an
+    evaluated agent drives its vehicle as a script, on a learner's grid of decisions). With none, they start at t = 0.
+    Whoever must see each episode's start and each step (a shield) follows it as a ``Watcher``. A world that the physics
+    cannot advance takes no other with it: its episode is cut off (truncated), and the ``roster`` names it.
+    """
+
+    roster: Roster  # who runs in which row, and which worlds failed
+    _state: Floats  # of the running episodes, as rows of ``physics.rows``
+    _params: Floats
+    _clock: Floats  # [n, CLOCK_WIDTH]
+    _wanted: Floats  # [n, N] m/s2
+    _potential: Floats  # [n, N]
+    _hazard: bool  # the rows have columns of an obstacle
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        n: int,
+        *,
+        learners: Sequence[int],
+        scripts: Mapping[int, Script],
+        reward: Reward = "harm",
+        observation: ObservationSpec | None = None,
+        seed: int = 0,
+        deciders: Sequence[int] | None = None,
+        worlds: Worlds | None = None,
+    ) -> None:
+        if not n >= 1:
+            raise InvalidInput(f"engine: n = {n} worlds; at least 1 is needed")
+        self.scenario = scenario
+        self.n = n
+        self.learners = tuple(learners)
+        self.scripts = dict(scripts)
+        unassigned = set(range(scenario.vehicles)) - set(self.learners) - set(self.scripts)
+        if unassigned or set(self.learners) & set(self.scripts):
+            raise InvalidInput(
+                f"engine: learners {self.learners} and scripts {tuple(self.scripts)} must name each of the"
+                f" {scenario.vehicles} vehicles exactly once"
+            )
+        self.deciders = self.learners if deciders is None else tuple(deciders)
+        if not set(self.deciders) <= set(range(scenario.vehicles)):
+            raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
+        self.reward, self._objectives = resolved_objective(reward_params(reward), scenario.objective, scenario.vehicles)
+        self.observation = observation or observation_for(scenario)
+        self._scaling = scaling(self.observation)
+        self._memories: dict[Watcher, Any] = {}
+        self.steps_made = 0  # steps of the batch that watchers let pass
+        self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
+        self._told = [script for script in self._remembering.values() if isinstance(script, Told)]
+        self._learner_index = np.array(self.learners, np.int64)
+        total = float(self.reward.harm_count == "total")
+        times = scenario.time_step_s, scenario.horizon_s
+        shared_harm = 0.0 if self._objectives else self.reward.harm
+        self._settings = np.array([*times, shared_harm, total, self.reward.terminal])
+        self._moves_reward = self.reward.collision + self.reward.risk + self.reward.jerk > 0.0
+        self._more_terms = self._moves_reward or self.reward.shaping > 0.0 or bool(self._objectives)
+        self._stream = Stream(scenario, self.deciders, self.scripts, seed)
+        self.reset(worlds=worlds)
+
+    @property
+    def seed(self) -> int:
+        """Seed of the training stream."""
+        return self._stream.seed
+
+    @property
+    def packed(self) -> Packed:
+        """The running worlds themselves, as rows of ``physics.rows``: for kernels to read, not to be changed."""
+        return Packed(self._state, self._params)
+
+    @property
+    def wanted_mps2(self) -> Floats:
+        """What each vehicle wanted in the last step, [n, N]: for kernels to read, not to be changed."""
+        return self._wanted
+
+    @property
+    def worlds(self) -> Worlds:
+        """The worlds as they are now, in their own memory."""
+        return unpack(self.packed)
+
+    @property
+    def ledger(self) -> Ledger:
+        """Harm of the running episodes so far, in its own memory."""
+        vehicles = self.scenario.vehicles
+        first, total, count = ledger_columns(self._state, vehicles)
+        mass = self._params[:, params_at(3, vehicles) : params_at(4, vehicles)].copy()
+        return Ledger(first, total, count, *hazard_ledger_columns(self._state, vehicles), mass)
+
+    @property
+    def known_from_s(self) -> Floats:
+        """When vehicle i has (had, or will have) the news of vehicle j, [n, N, N]; see ``v2x.known_from``."""
+        return known_from(self.worlds.vehicles)
+
+    @property
+    def ended(self) -> Bools:
+        """Episodes that have ended, [n]."""
+        ended: Bools = self._clock[:, ENDED] == 1.0
+        return ended
+
+    @property
+    def steps(self) -> Ints:
+        """Steps that the running episodes have taken, [n]."""
+        return self._clock[:, STEP].astype(np.int64)
+
+    @property
+    def watchers(self) -> tuple[Watcher, ...]:
+        """Who follows this engine."""
+        return tuple(self._memories)
+
+    def memory(self, watcher: Watcher) -> Any:
+        """What a watcher remembers of the running episodes."""
+        return self._memories[watcher]
+
+    def watch(self, watcher: Watcher, memory: Any) -> None:
+        """Let a watcher follow, from ``memory`` on."""
+        self._memories = {**self._memories, watcher: memory}
+
+    def unwatch(self, watcher: Watcher) -> None:
+        """Let go of a watcher, if it follows."""
+        self._memories = {w: memory for w, memory in self._memories.items() if w is not watcher}
+
+    def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
+        """Start new episodes in all rows: the given worlds (at t = 0), or the next ones of the training stream.
+
+        With ``seed`` the stream starts again from its beginning. Whatever fails, the running episodes go on.
+        """
+        if worlds is not None:
+            check_alert(worlds, self.n, self.scenario.vehicles)
+            worlds = told_by_link(worlds) if self.scenario.v2x.by_link else worlds
+        stream = copy.copy(self._stream)
+        if seed is not None:
+            stream.restart(seed)
+        first = None if worlds is not None else stream.position
+        start = stream.take(self.n) if worlds is None else stream.prepare(worlds)
+        new = copy.copy(self)
+        new._stream, new.roster = stream, Roster(self.n, stream.seed, first)
+        new._hazard = self.scenario.has_obstacle or has_hazard(start.packed.state, self.scenario.vehicles)
+        new._state, new._params = new._kept(start.packed.state).copy(), start.packed.params.copy()
+        new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
+        new._potential = np.zeros(start.wanted.shape)
+        new._begin(np.arange(self.n), start)
+        self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
+
+    def renew(self, rows: Ints) -> None:
+        """Start new episodes of the training stream in these rows (autoreset). Whatever fails, nothing is changed."""
+        if len(rows) == 0:
+            return
+        if not (self._memories or self._remembering):
+            self._renew(rows)
+            return
+        new = self._apart()
+        new._stream = copy.copy(self._stream)
+        new._renew(rows)
+        self.__dict__.update(new.__dict__)
+
+    def _apart(self) -> Engine:
+        """An engine that goes on from here without changing this one (scripts that remember are shared)."""
+        new = copy.copy(self)
+        new.__dict__.update({name: getattr(self, name).copy() for name in _RUNNING})
+        new.roster = copy.deepcopy(self.roster)
+        return new
+
+    def _renew(self, rows: Ints) -> None:
+        position = self._stream.position
+        start = self._stream.take(len(rows))
+        self.roster.renew(rows, position)
+        state, params = start.packed
+        if params.shape[1] < self._params.shape[1]:  # worlds that were given have news by link, those of the stream not
+            params = pack(told_by_link(unpack(start.packed))).params
+        self._state[rows], self._params[rows] = self._kept(state), params
+        self._clock[rows], self._wanted[rows] = start.clock, start.wanted
+        self._begin(rows, start)
+
+    def _kept(self, state: Floats) -> Floats:
+        """Rows as wide as they are kept: with an obstacle's columns if the stream or the given worlds have one."""
+        return with_hazard_columns(state, self.scenario.vehicles) if self._hazard else state
+
+    def observe(self, vehicle: int) -> Observations:
+        """Current observation of one vehicle, [n, F]."""
+        if not 0 <= vehicle < self.scenario.vehicles:
+            raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{self.scenario.vehicles - 1}")
+        return self.observe_all(np.array([vehicle]))[:, 0]
+
+    def observe_all(self, vehicles: Ints, rows: Ints | None = None) -> Observations:
+        """Current observations of several vehicles, [n, len(vehicles), F]; only of the worlds ``rows`` if given."""
+        state, params = self._state, self._params
+        if rows is not None:
+            state, params = state.take(rows, axis=0), params.take(rows, axis=0)
+        return observe_packed(state, params, vehicles, self._scaling)
+
+    def step(self, actions: Actions) -> Step:
+        """Advance every running episode by one time step.
+
+        ``actions``: for each learner (by vehicle index, or as columns [n, L] in the order of ``learners``) a number in
+        [-1, 1] per world. Rows whose episode has ended stay as they are until ``renew`` or ``reset``. What a watcher
+        refuses does not happen: the worlds stay as they are.
+        """
+        columns = self._columns(actions)
+        if not self._memories:
+            step = self._advance(columns)
+        else:
+            new = self._apart()
+            step = new._advance(columns)
+            new._memories = {w: w.stepped(memory, self, new) for w, memory in self._memories.items()}
+            new.steps_made += 1
+            self.__dict__.update(new.__dict__)
+        for script in self._told:
+            script.after_step(self.packed)
+        return step
+
+    def _advance(self, columns: Floats) -> Step:
+        """Advance every running episode by one time step, in place."""
+        if self._remembering:
+            worlds = self.worlds
+            for vehicle, script in self._remembering.items():
+                self._wanted[:, vehicle] = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
+        before = self._objective_harm() if self._objectives else None
+        reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
+        world, status = step_worlds(
+            self._state, self._params, self._clock, columns, self._learner_index, self._settings, NO_ROWS,
+            self._wanted, reward, outcome,
+        )  # fmt: skip
+        if status == BAD_ACTION:
+            self._refuse(world, columns)
+        step = Step(reward, outcome, self.reward, {})
+        if status != DONE:
+            times = self._state[:, 0]
+            self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
+        if before is not None and self.reward.harm > 0.0:
+            step.further["harm"] = before - self._objective_harm()
+        if self._more_terms:
+            self._add_further_terms(step)
+        return step
+
+    def _columns(self, actions: Actions) -> Floats:
+        """The learners' actions as [n, L]; their range is checked where they are used."""
+        shape = (self.n, len(self.learners))
+        if isinstance(actions, np.ndarray) or not isinstance(actions, Mapping):
+            given = np.asarray(actions)
+            if given.shape != shape or given.dtype.kind not in "fiu":
+                return checked_action(actions, shape, "the learners")
+            return np.ascontiguousarray(given, np.float64)
+        columns = np.empty(shape)
+        for c, vehicle in enumerate(self.learners):
+            if vehicle not in actions:
+                raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
+            columns[:, c] = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
+        return columns
+
+    def _refuse(self, world: int, actions: Floats) -> None:
+        for c, vehicle in enumerate(self.learners):
+            checked_action(actions[:, c], (self.n,), f"vehicle_{vehicle + 1}")
+        raise AssertionError(f"world {world}: an action was refused, and then not")
+
+    def _objective_harm(self) -> Floats:
+        """What the objective of each vehicle makes of the harm so far, [n, N]."""
+        return objective_harm(self.ledger, self.reward.harm_count, self._objectives)
+
+    def _add_further_terms(self, step: Step) -> None:
+        """Add the terms that need the motion, or the future, to a step's reward; nothing for rows that stood still."""
+        vehicles, state = self.scenario.vehicles, self._state
+        gaps = gap_at(vehicles)
+        if self._moves_reward:
+            outcome = StepOutcome(
+                step.first_impact_harm,
+                step.total_harm,
+                step.safe_end,
+                state[:, gaps : gaps + vehicles - 1],
+                state[:, speed_at(vehicles) : command_at(vehicles)],
+                state[:, command_at(vehicles) : previous_at(vehicles)],
+                state[:, previous_at(vehicles) : gaps],
+                self.scenario.time_step_s,
+            )
+            step.further.update(further_terms(self.reward, outcome))
+        if self.reward.shaping > 0.0:
+            step.further["shaping"] = self._shaping(step.terminated)
+        extra = weighted_sum(self.reward, step.further, step.reward.shape)
+        extra[self.ended & ~step.ended] = 0.0
+        step.reward[:] += extra
+
+    def _shaping(self, terminated: Bools) -> Floats:
+        """The shaping term [n, N] of this step; keeps the new potentials, which are 0 where an episode terminated."""
+        before = self._potential
+        self._potential = self._potentials(self.worlds)
+        self._potential[terminated] = 0.0
+        shaping: Floats = self.reward.shaping_discount * self._potential - before
+        return shaping
+
+    def _potentials(self, worlds: Worlds) -> Floats:
+        """Potential of every learner, 0 for other vehicles, [n, N]."""
+        potentials = np.zeros(worlds.speeds_mps.shape)
+        shared = potential(self.reward, worlds, self.learners, self.scenario.horizon_s)
+        potentials[:, self._learner_index] = shared[:, np.newaxis]
+        return potentials
+
+    def _begin(self, rows: Ints, start: Start) -> None:
+        """Tell those who must know that episodes start in ``rows``, and move what depends on them."""
+        if self._memories or self._remembering:
+            alert = start.alert
+            with renumbered(rows):
+                self._memories = {w: w.begun(memory, alert, rows) for w, memory in self._memories.items()}
+                for vehicle, script in self._remembering.items():
+                    script.begin(alert, vehicle, rows)
+            if self._remembering:
+                self._begin_with_memory(rows, alert, start.clock[:, START])
+        if self.reward.shaping > 0.0:
+            self._potential[rows] = self._potentials(unpack(Packed(self._state[rows], self._params[rows])))
+
+    def _begin_with_memory(self, rows: Ints, alert: Worlds, start_s: Floats) -> None:
+        """Scripts with a memory act at the alert on the whole batch; then the new worlds move to the first decision.
+
+        Deciders do not: like a learner they coast, and are seen to coast, until their first decision.
+        """
+        early = {i: script for i, script in self._remembering.items() if i not in self.deciders}
+        if not early:
+            return
+        self._state[rows] = self._kept(pack(alert).state)
+        worlds = self.worlds
+        for vehicle, script in early.items():
+            wanted = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
+            self._wanted[rows, vehicle] = wanted[rows]
+        with renumbered(rows):
+            self._state[rows] = self._kept(moved(alert, self._wanted[rows], start_s).state)

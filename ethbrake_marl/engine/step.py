@@ -1,0 +1,231 @@
+"""The compiled step of the engine: actions to commands, motion, episode ends, the terms of reward that all share.
+
+Worlds are rows of ``physics.rows``; ``clock`` [n, 4] holds what an episode needs beside them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.actions import command_of
+from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.impact import GAP, MASS, SPEED
+from ethbrake_marl.physics.obstacle import FAR_AWAY_M, place_obstacle
+from ethbrake_marl.physics.rows import (
+    RESTITUTION,
+    TIME,
+    command_at,
+    gap_at,
+    harm_at,
+    params_at,
+    previous_at,
+    speed_at,
+    state_width,
+)
+from ethbrake_marl.physics.segment import (
+    COMMAND,
+    COUNT,
+    DONE,
+    FIRST_HARM,
+    HIT,
+    LIMIT,
+    ONSET,
+    TABLE_ROWS,
+    TOTAL_HARM,
+    advance_table,
+)
+from ethbrake_marl.rewards import RewardParams, shared_terms
+
+# columns of clock
+START = 0  # time of the first decision (s)
+STEP = 1  # steps taken
+LAST_STEP = 2  # the step that ends at the horizon
+ENDED = 3  # 1 once the episode has ended
+CLOCK_WIDTH = 4
+# rows of outcome: what the step brought to each world
+STEP_FIRST_HARM = 0
+STEP_TOTAL_HARM = 1
+TERMINATED = 2  # 1 if the step ended the episode in this way, else 0
+TRUNCATED = 3
+SAFE_END = 4  # without any collision
+FAILED = 5  # what went wrong (a status of the kernel) where the world could not be advanced, else 0
+OUTCOME_ROWS = 6
+# places in settings
+TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT = range(5)
+BAD_ACTION = -1
+
+
+class Step(NamedTuple):
+    """What one step brought, for every world of the batch."""
+
+    reward: Floats  # [n, N]
+    outcome: Floats  # [OUTCOME_ROWS, n] as the kernel tells it; read it through the properties
+    params: RewardParams
+    further: dict[str, Floats]  # unweighted reward terms that differ between vehicles or need the motion, each [n, N]
+
+    @property
+    def terminated(self) -> Bools:
+        """Episodes that ended with this step with everything at rest and no command that would move it, [n]."""
+        return self._is(TERMINATED)
+
+    @property
+    def truncated(self) -> Bools:
+        """Episodes that reached the horizon with this step, [n]."""
+        return self._is(TRUNCATED)
+
+    @property
+    def ended(self) -> Bools:
+        """Episodes that ended with this step, [n]."""
+        return self.terminated | self.truncated
+
+    @property
+    def failed(self) -> Ints:
+        """What went wrong in the worlds that could not be advanced (a status of the kernel), 0 elsewhere, [n]."""
+        status: Ints = self.outcome[FAILED].astype(np.int64)
+        return status
+
+    @property
+    def safe_end(self) -> Bools:
+        """Episodes that ended with this step without any collision, [n]."""
+        return self._is(SAFE_END)
+
+    @property
+    def first_impact_harm(self) -> Floats:
+        """Of the whole line in this step, [n]."""
+        harm: Floats = self.outcome[STEP_FIRST_HARM]
+        return harm
+
+    @property
+    def total_harm(self) -> Floats:
+        """Likewise, every impact counted, [n]."""
+        harm: Floats = self.outcome[STEP_TOTAL_HARM]
+        return harm
+
+    @property
+    def shared(self) -> dict[str, Floats]:
+        """Unweighted reward terms that are the same for all vehicles of a world, each [n]."""
+        return shared_terms(self.params, self.outcome[self._counted], self.outcome[SAFE_END])
+
+    def shared_in(self, world: int) -> dict[str, float]:
+        """The same of one world, as plain numbers."""
+        tell = self.outcome.item
+        return shared_terms(self.params, tell(self._counted, world), tell(SAFE_END, world))
+
+    @property
+    def _counted(self) -> int:
+        return STEP_FIRST_HARM if self.params.harm_count == "first" else STEP_TOTAL_HARM
+
+    def ending(self, world: int) -> tuple[bool, bool]:
+        """Whether this step terminated the episode of one world, and whether it truncated it."""
+        return self.outcome.item(TERMINATED, world) == 1.0, self.outcome.item(TRUNCATED, world) == 1.0
+
+    def _is(self, row: int) -> Bools:
+        truth: Bools = self.outcome[row] == 1.0
+        return truth
+
+
+@compiled
+def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to functions costs more than the work
+    state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
+    wanted: Floats, reward: Floats, outcome: Floats,
+) -> tuple[int, int]:  # fmt: skip
+    """Advance every running world by one step, in place (state, clock, wanted); fills the last two arrays.
+
+    ``actions`` [n, L] become the learners' commands in ``wanted`` [n, N]; nothing is moved if one of them is not in
+    [-1, 1]. A world that cannot be advanced stays where it was; its episode is cut off there, without a reward, and
+    marked in ``outcome``. Returns a world and what went wrong there (BAD_ACTION, or the status of one that could not be
+    advanced), or (-1, DONE).
+    """
+    n, N = wanted.shape
+    for k in range(n):
+        for c in range(learners.shape[0]):
+            if not -1.0 <= actions[k, c] <= 1.0:
+                return k, BAD_ACTION
+    speed, command, previous, gap, harm = speed_at(N), command_at(N), previous_at(N), gap_at(N), harm_at(N)
+    braking, driving, latency, mass, limit = (
+        params_at(0, N), params_at(1, N), params_at(2, N), params_at(3, N), params_at(4, N),
+    )  # fmt: skip
+    P, hazard = N - 1, state_width(N)
+    worst, worst_status = -1, DONE
+    at = 1 if state.shape[1] > hazard else 0  # vehicle i stands in column at + i, behind an obstacle
+    table = np.zeros((TABLE_ROWS, N + at))
+    for k in range(n):
+        if clock[k, ENDED] == 1.0:
+            for f in range(OUTCOME_ROWS):
+                outcome[f, k] = 0.0
+            for i in range(N):
+                reward[k, i] = 0.0
+            continue
+        for c in range(learners.shape[0]):
+            i = learners[c]
+            wanted[k, i] = command_of(actions[k, c], params[k, braking + i], params[k, driving + i])
+        clock[k, STEP] += 1.0
+        at_horizon = clock[k, STEP] >= clock[k, LAST_STEP]
+        time = state[k, TIME]
+        until = settings[HORIZON] if at_horizon else clock[k, START] + clock[k, STEP] * settings[TIME_STEP]
+        if at == 1:
+            place_obstacle(table, min(state[k, hazard], FAR_AWAY_M), state[k, hazard + 1])
+        for i in range(N):
+            table[SPEED, at + i] = state[k, speed + i]
+            table[COMMAND, at + i] = wanted[k, i]
+            table[MASS, at + i] = params[k, mass + i]
+            table[LIMIT, at + i] = params[k, limit + i]
+            table[ONSET, at + i] = params[k, latency + i] - time
+            state[k, previous + i] = state[k, command + i]
+            state[k, command + i] = wanted[k, i] if params[k, latency + i] <= until else 0.0
+        for p in range(P):
+            table[GAP, at + p] = state[k, gap + p]
+            table[HIT, at + p] = state[k, gap + P + p]
+        status = advance_table(table, params[k, RESTITUTION], until - time, time, k, no_rows, 0)[1]
+        outcome[FAILED, k] = 0.0
+        if status != DONE:
+            worst, worst_status = k, status
+            for f in range(OUTCOME_ROWS):
+                outcome[f, k] = 0.0
+            outcome[TRUNCATED, k], outcome[FAILED, k] = 1.0, status
+            clock[k, ENDED] = 1.0
+            clock[k, STEP] -= 1.0
+            for i in range(N):
+                state[k, command + i] = state[k, previous + i]
+                reward[k, i] = 0.0
+            continue
+        state[k, TIME] = until
+        at_rest = True
+        for i in range(N):
+            state[k, speed + i] = table[SPEED, at + i]
+            at_rest = at_rest and table[SPEED, at + i] == 0.0 and wanted[k, i] <= 0.0
+        impacts, first_harm, total_harm = 0.0, 0.0, 0.0
+        if at == 1 and state[k, hazard] < math.inf:
+            state[k, hazard] = table[GAP, 0]
+            state[k, hazard + 1] = table[HIT, 0]
+            state[k, hazard + 2] += table[FIRST_HARM, 0]
+            state[k, hazard + 3] += table[TOTAL_HARM, 0]
+            state[k, hazard + 4] += table[COUNT, 0]
+            first_harm = table[FIRST_HARM, 0]
+            total_harm = table[TOTAL_HARM, 0]
+            impacts = state[k, hazard + 4]
+        for p in range(P):
+            state[k, gap + p] = table[GAP, at + p]
+            state[k, gap + P + p] = table[HIT, at + p]
+            state[k, harm + p] += table[FIRST_HARM, at + p]
+            state[k, harm + P + p] += table[TOTAL_HARM, at + p]
+            state[k, harm + 2 * P + p] += table[COUNT, at + p]
+            first_harm += table[FIRST_HARM, at + p]
+            total_harm += table[TOTAL_HARM, at + p]
+            impacts += state[k, harm + 2 * P + p]
+        outcome[STEP_FIRST_HARM, k] = first_harm
+        outcome[STEP_TOTAL_HARM, k] = total_harm
+        over = at_rest or at_horizon
+        clock[k, ENDED] = 1.0 if over else 0.0
+        outcome[TERMINATED, k] = 1.0 if at_rest else 0.0
+        outcome[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
+        outcome[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
+        shared = settings[TERMINAL_WEIGHT] if outcome[SAFE_END, k] == 1.0 else 0.0
+        shared -= settings[HARM_WEIGHT] * (total_harm if settings[HARM_IS_TOTAL] == 1.0 else first_harm)
+        for i in range(N):
+            reward[k, i] = shared
+    return worst, worst_status

@@ -1,0 +1,212 @@
+"""Where episodes come from: worlds at the alert, made ready for their first decision, and the stream of training."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from ethbrake_marl.engine.step import CLOCK_WIDTH, LAST_STEP, START
+from ethbrake_marl.errors import FailedWorld, InvalidInput, PhysicsError
+from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
+from ethbrake_marl.physics.failed import failure
+from ethbrake_marl.physics.rows import Packed, harm_at, has_hazard, pack, state_width
+from ethbrake_marl.physics.segment import DONE
+from ethbrake_marl.scenario import Scenario
+
+_SAMPLED_AT_ONCE = 1024  # training worlds are drawn in blocks of at least this many
+
+
+class Script(Protocol):
+    """Drives one vehicle in every world of a batch of ``n``; one object per vehicle. An ``Agent`` is one with a name.
+
+    With an attribute ``state_free = True`` it is asked only once per episode, right after ``begin``: its command is
+    fixed at the alert and never changes.
+    """
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """New episodes start in these rows of the batch.
+
+        ``worlds`` holds those rows only (``len(rows)`` worlds), in their state at the alert. The first call of a
+        batch has ``rows = 0..n-1``; later ones, after an automatic reset, any subset.
+        """
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Wanted signed acceleration of ``vehicle`` (index from 0) in every world of the batch, [n] m/s2."""
+
+
+@runtime_checkable
+class Told(Protocol):
+    """A script with a memory that is told what came of each step, the last one included."""
+
+    def after_step(self, packed: Packed) -> None:
+        """The step was made: the worlds of the whole batch now, and their harm since the alert; to be read only."""
+
+
+class Start(NamedTuple):
+    """Worlds ready for their first decision."""
+
+    origin: Worlds  # at t = 0: these worlds are its ``first``, ``first + 1``, ...
+    first: int
+    packed: Packed  # at the first decision
+    clock: Floats  # [n, CLOCK_WIDTH]
+    wanted: Floats  # [n, N] commands of the state-free scripts, 0 for all others
+
+    @property
+    def alert(self) -> Worlds:
+        """These worlds at the alert, t = 0."""
+        return self.origin.take(np.arange(self.first, self.first + len(self.clock)))
+
+    def part(self, first: int, count: int) -> Start:
+        """``count`` worlds of these, from ``first`` on."""
+        rows = slice(first, first + count)
+        packed = Packed(self.packed.state[rows], self.packed.params[rows])
+        return Start(self.origin, self.first + first, packed, self.clock[rows], self.wanted[rows])
+
+
+class Roster:
+    """Which world of the stream stands in each row of a batch, and which of them could not be advanced.
+
+    ``first`` is the number of row 0's world, the others follow; None: the worlds were given, and have no number.
+    """
+
+    def __init__(self, n: int, seed: int, first: int | None) -> None:
+        self.failed: dict[int, str] = {}  # by row, and why; until a new episode begins there
+        self.warns = True  # with a ``FailedWorld`` that names the world; off: the caller looks at ``failed``
+        self._seed = seed
+        self._numbers = np.full(n, -1, np.int64) if first is None else first + np.arange(n)
+
+    def renew(self, rows: Ints, first: int) -> None:
+        """World ``first`` of the stream and those after it now stand in these rows."""
+        self._numbers[rows] = first + np.arange(len(rows))
+        for row in self.failed.keys() & rows.tolist() if self.failed else ():
+            del self.failed[row]
+
+    def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
+        """Enter the worlds with a ``status``: a step from ``from_s`` to ``until_s`` [n] could not advance them."""
+        new = failure(np.where(status == 0, DONE, status), from_s, until_s).worlds
+        self.failed |= new
+        for row, reason in new.items() if self.warns else ():
+            number = int(self._numbers[row])
+            name = f"world {number} of seed {self._seed}" if number >= 0 else f"the world of row {row}"
+            warnings.warn(FailedWorld(f"{name}: {reason}; its episode was cut off there"), stacklevel=4)
+
+
+class Stream:
+    """The training worlds of a seed, one after the other, each ready for its first decision.
+
+    Learners and scripts with a memory coast until then: whoever uses them moves their worlds anew (``moved``).
+    """
+
+    def __init__(self, scenario: Scenario, deciders: Sequence[int], scripts: Mapping[int, Script], seed: int) -> None:
+        self._scenario = scenario
+        self._deciders = list(deciders)
+        self._state_free = {i: script for i, script in scripts.items() if is_state_free(script)}
+        self.restart(seed)
+
+    def restart(self, seed: int) -> None:
+        """Go back to the first world of ``seed``."""
+        self.seed = seed
+        self._drawn = 0
+        self._pool: Start | None = None
+        self._next = 0
+
+    @property
+    def position(self) -> int:
+        """Number of the next world in the stream."""
+        return self._drawn - (0 if self._pool is None else len(self._pool.clock) - self._next)
+
+    def take(self, count: int) -> Start:
+        """The next ``count`` worlds."""
+        if self._pool is None or self._next + count > len(self._pool.clock):
+            self._fill(count)
+        assert self._pool is not None
+        taken = self._pool.part(self._next, count)
+        self._next += count
+        return taken
+
+    def _fill(self, count: int) -> None:
+        left = None
+        if self._pool is not None:
+            left = self._pool.part(self._next, len(self._pool.clock) - self._next).alert
+        size = max(4 * count, _SAMPLED_AT_ONCE)
+        sample = self._scenario.sample(size, self.seed, first=self._drawn, channel="training")
+        self._pool = self._prepare_all(sample.worlds if left is None else concatenate([left, sample.worlds]))
+        self._drawn += size
+        self._next = 0
+
+    def _prepare_all(self, alert: Worlds) -> Start:
+        """``prepare``; a world that cannot be advanced to its first decision gives its place to the next one that can.
+
+        A ``FailedWorld`` warning names it. So worlds keep their places in the stream, and a training goes on.
+        """
+        start, kept, failed = leaving_out_failed(lambda rows: self.prepare(alert.take(rows)), np.arange(alert.n))
+        if start is None:
+            raise PhysicsError(failed)
+        if not failed:
+            return start
+        first = self.position
+        for row, reason in failed.items():
+            warnings.warn(FailedWorld(f"world {first + row} of seed {self.seed}: {reason}; left out"), stacklevel=2)
+        later = np.searchsorted(kept, np.arange(alert.n)) % len(kept)
+        return self.prepare(alert.take(kept[later]))
+
+    def prepare(self, alert: Worlds) -> Start:
+        """Worlds at t = 0, made ready for their first decision. Raises ``InvalidInput`` if nobody may ever decide."""
+        clock = np.zeros((alert.n, CLOCK_WIDTH))
+        if self._deciders:
+            clock[:, START] = alert.vehicles.latency_s[:, self._deciders].min(axis=1)
+        step, horizon = self._scenario.time_step_s, self._scenario.horizon_s
+        if not (clock[:, START] < horizon).all():
+            late = float(clock[:, START].max())
+            raise InvalidInput(f"reset: nobody decides before the horizon ({late:g} s >= {horizon:g} s)")
+        clock[:, LAST_STEP] = np.ceil((horizon - clock[:, START]) / step - 1e-9)
+        wanted = np.zeros(alert.speeds_mps.shape)
+        for vehicle, script in self._state_free.items():
+            script.begin(alert, vehicle, np.arange(alert.n))
+            wanted[:, vehicle] = within_capacity(script.act(alert, vehicle), alert, vehicle)
+        return Start(alert, 0, moved(alert, wanted, clock[:, START]), clock, wanted)
+
+
+def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
+    """Refuse worlds, with ``InvalidInput``, that are not ``n`` lines of ``vehicles`` at the alert: t = 0, no impact."""
+    if (worlds.n, worlds.N) != (n, vehicles):
+        raise InvalidInput(f"reset: {worlds.n} worlds of {worlds.N} vehicles given; {n} of {vehicles} needed")
+    at_alert = (worlds.time_s == 0.0) & ~worlds.pair_hit.any(axis=1) & ~worlds.hazard_hit
+    if not at_alert.all():
+        k = int(np.argmin(at_alert))
+        what = "after an impact" if worlds.time_s[k] == 0.0 else f"at {worlds.time_s[k]:g} s"
+        raise InvalidInput(f"reset: world {k} is {what}; episodes start at the alert, t = 0, without any impact")
+
+
+def is_state_free(script: Script) -> bool:
+    """Whether the script's command never changes during an episode."""
+    return bool(getattr(script, "state_free", False))
+
+
+def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
+    """Worlds at t = 0 moved to their first decision, harm on the way included."""
+    after, impacts = advance(alert, wanted, until_s=start_s)
+    packed = pack(after)
+    at, pairs = harm_at(alert.N), alert.N - 1
+    for group, harm in enumerate((impacts.first_impact_harm, impacts.total_harm, impacts.count)):
+        packed.state[:, at + group * pairs : at + (group + 1) * pairs] = harm
+    if has_hazard(packed.state, alert.N):
+        hazard = (impacts.hazard_first_harm, impacts.hazard_total_harm, impacts.hazard_count)
+        packed.state[:, state_width(alert.N) + 2 :] = np.column_stack(hazard)
+    return packed
+
+
+def within_capacity(command_mps2: Floats, worlds: Worlds, vehicle: int) -> Floats:
+    """A script's command [n], refused with ``InvalidInput`` where it is not within the vehicle's capacities."""
+    low, high = -worlds.vehicles.braking_capacity_mps2[:, vehicle], worlds.vehicles.driving_capacity_mps2[:, vehicle]
+    good = (command_mps2 >= low) & (command_mps2 <= high)
+    if not good.all():
+        k = int(np.argmin(good))
+        raise InvalidInput(
+            f"script of vehicle_{vehicle + 1}, world {k}: command {command_mps2[k]:g} m/s2; must be in"
+            f" [{low[k]:g}, {high[k]:g}]"
+        )
+    return command_mps2

@@ -1,0 +1,156 @@
+"""Spaces of observations, states and actions."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from ethbrake_marl.actions import checked_action
+from ethbrake_marl.agents.rollout import scripted
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.observations import Feature, ObservationSpec
+from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.rewards import Reward
+from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
+
+
+def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
+    """Float32 box [F] with the features' bounds, which are finite."""
+    low, high = (np.array([getattr(f, side) for f in features], np.float32) for side in ("low", "high"))
+    return Box(low, high, dtype=np.float32)
+
+
+def action_box() -> Box[np.float32]:
+    """Float32 box [1]: -1 full braking capacity, 0 coasts, +1 full driving capacity."""
+    return Box(-1.0, 1.0, (1,), dtype=np.float32)
+
+
+def make_engine(
+    scenario: str | Path | Scenario,
+    n: int,
+    *,
+    learners: Sequence[str | int] | None = None,
+    reward: Reward = "harm",
+    observation: ObservationSpec | None = None,
+    seed: int = 0,
+) -> Engine:
+    """Build ``n`` running worlds of a scenario (a shipped name, a path to a YAML file, or a ``Scenario``).
+
+    ``learners`` (names such as ``vehicle_2``, or indices from 0) replace the scenario's own; a vehicle that learned
+    and is not listed brakes fully. Scripts come from the scenario's roles.
+    """
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or not n >= 1:
+        raise InvalidInput(f"number of worlds = {n!r}: must be a whole number, at least 1")
+    loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    if observation is not None and not isinstance(observation, ObservationSpec):
+        raise InvalidInput(
+            f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1)"
+        )
+    if learners is not None and not isinstance(learners, Iterable):
+        raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
+    if learners is not None:
+        loaded = loaded.with_learners(learners)
+    return Engine(
+        loaded,
+        int(n),
+        learners=loaded.learners,
+        scripts=scripted(loaded),
+        reward=reward,
+        observation=observation,
+        seed=seed,
+    )
+
+
+def only_learner(engine: Engine) -> int:
+    """Index of the one learner; ``InvalidInput`` when there is none or more than one."""
+    if len(engine.learners) != 1:
+        names = ", ".join(engine.scenario.vehicle_names[i] for i in engine.learners) or "none"
+        raise InvalidInput(
+            f"scenario {engine.scenario.name!r} has {len(engine.learners)} learners ({names}), this environment needs"
+            " exactly one: pass learners=['vehicle_2'], or use parallel_env or make_sb3_vec_env"
+        )
+    return engine.learners[0]
+
+
+def learner_columns(learners: Sequence[str], actions: Mapping[str, Any]) -> Floats:
+    """The learners' actions of one world as [1, L], from an action [1] for each by name.
+
+    Raises ``InvalidInput`` naming the vehicle whose action is missing or misshapen; the engine checks the range.
+    """
+    columns = np.empty((1, len(learners)))
+    for c, name in enumerate(learners):
+        if name not in actions:
+            raise InvalidInput(f"step: no action for the learner {name}")
+        action = np.asarray(actions[name])
+        if action.shape != (1,) or action.dtype.kind not in "fiu":
+            action = checked_action(actions[name], (1,), name)
+        columns[0, c] = action.item()
+    return columns
+
+
+def check_render_mode(render_mode: str | None) -> None:
+    """Refuse every render mode: there is no drawing yet."""
+    if render_mode is not None:
+        raise InvalidInput(f"render_mode = {render_mode!r}: must be None; this environment draws nothing")
+
+
+INITIAL_STATE = "initial_state"
+
+
+class UnknownResetOption(UserWarning):
+    """A key of ``reset``'s options is not known to this environment; it is ignored."""
+
+
+def fresh_seed() -> int:
+    """A seed from the operating system's entropy, for an environment that was never given one."""
+    entropy = np.random.SeedSequence().entropy
+    assert isinstance(entropy, int)  # always, when SeedSequence chooses it itself
+    return entropy
+
+
+def restart(engine: Engine, seed: int | None, options: Mapping[str, Any] | None) -> None:
+    """Start new episodes in all worlds: the stream of ``seed`` from its start, or where the stream stands.
+
+    ``options["initial_state"]`` (see ``scenario.initial_state_worlds``) is the start of every world instead; with
+    autoreset, later episodes come from the stream. Other options warn with ``UnknownResetOption`` and are ignored.
+    Raises ``InvalidInput``, with nothing changed, for a seed that is not a whole number >= 0, or a bad initial state.
+    """
+    check_seed(seed)
+    if not (options is None or isinstance(options, Mapping)):
+        raise InvalidInput(
+            f"reset: options = {options!r}: must be None or a mapping, for instance {{'{INITIAL_STATE}': ...}}"
+        )
+    warn_of_unknown(options or ())
+    worlds = None
+    if options and INITIAL_STATE in options:
+        worlds = initial_state_worlds(options[INITIAL_STATE], engine.scenario).take(np.zeros(engine.n, np.int64))
+    restart_from(engine, seed, worlds)
+
+
+def restart_from(engine: Engine, seed: int | None, worlds: Worlds | None) -> None:
+    """Start new episodes from ``worlds`` (None: from the stream)."""
+    engine.reset(seed=None if seed is None else int(seed), worlds=worlds)
+
+
+def check_seed(seed: int | None) -> None:
+    """Refuse a seed that is neither None nor a whole number >= 0."""
+    if seed is None:
+        return
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:
+        raise InvalidInput(f"reset: seed = {seed!r}: must be None or a whole number, at least 0")
+
+
+def warn_of_unknown(options: Iterable[str]) -> None:
+    """One warning for all option names that are not known."""
+    unknown = sorted({str(name) for name in options} - {INITIAL_STATE})
+    if unknown:
+        names = ", ".join(unknown)
+        warnings.warn(
+            f"reset: unknown option {names}, ignored; known: {INITIAL_STATE}", UnknownResetOption, stacklevel=4
+        )

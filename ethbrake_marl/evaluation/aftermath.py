@@ -1,0 +1,121 @@
+"""Where Vehicle 1 ends: how far it travels, and how much of that others pushed it.
+
+Worlds know gaps and speeds, no places. A post far ahead, out of reach, makes the way of Vehicle 1 the change of one
+more gap; it changes no motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ethbrake_marl.physics import Floats, Worlds, advance, advance_sampled
+from ethbrake_marl.physics.events import solo_motion
+from ethbrake_marl.physics.obstacle import obstacle_ahead
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario.roles import constant_command
+
+
+class ShovedFront:
+    """Watches episodes: how far Vehicle 1 ends beyond where it would by itself, following its script undisturbed.
+
+    ``shoved = way - solo way to the horizon``. At rest, that is the distance from its own stopping point; where the
+    horizon cuts an episode off, from where it would be by then. Negative where Vehicle 1 ends short of it, as by an
+    obstacle that throws it back. See ``of`` for whom it exists.
+    """
+
+    def __init__(self, worlds: Worlds, own_way_m: Floats) -> None:
+        self._own_way_m = own_way_m
+        self._way_m = np.zeros(worlds.n)
+
+    @classmethod
+    def of(cls, worlds: Worlds, scenario: Scenario, driven: tuple[int, ...]) -> ShovedFront | None:
+        """What watches these worlds (at the alert); None where Vehicle 1 is driven, or its script needs the state."""
+        script = None if 0 in driven else scenario.scripts.get(0)
+        vehicles = worlds.vehicles
+        command = None if script is None else constant_command(script, vehicles.braking_capacity_mps2[:, 0])
+        if command is None:
+            return None
+        columns = (worlds.speeds_mps, vehicles.latency_s, vehicles.speed_limit_mps)
+        speed, latency, limit = (column[:, 0] for column in columns)
+        alone = zip(speed, command, latency, limit, strict=True)
+        return cls(worlds, np.array([solo_motion(v, u, tau, most, scenario.horizon_s)[1] for v, u, tau, most in alone]))
+
+    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
+        """Add the way of one step."""
+        moving = np.flatnonzero(until_s > before.time_s)
+        post = with_post_ahead(before.take(moving), until_s[moving] - before.time_s[moving])
+        after, _ = advance(post, command_mps2[moving], until_s=until_s[moving])
+        self._way_m[moving] += post.hazard_gap_m - after.hazard_gap_m
+
+    @property
+    def metres(self) -> Floats:
+        """How far Vehicle 1 was shoved in each world so far, [n]."""
+        shoved: Floats = self._way_m - self._own_way_m
+        return shoved
+
+
+def with_post_ahead(worlds: Worlds, duration_s: Floats) -> Worlds:
+    """These worlds, each with an obstacle ahead: its own, or one that Vehicle 1 cannot reach in ``duration_s`` [n]."""
+    out_of_reach = _farthest(worlds, duration_s) + 1.0
+    return replace(worlds, hazard_gap_m=np.where(obstacle_ahead(worlds), worlds.hazard_gap_m, out_of_reach))
+
+
+def _farthest(worlds: Worlds, duration_s: Floats) -> Floats:
+    """More than Vehicle 1 can travel, [n] m: ``T sqrt(2 E / m_1)``, had it all the energy E the line can ever have.
+
+    Impacts and brakes only take energy; driving adds at most ``m a v`` per second, and never above the speed limit.
+    """
+    vehicles = worlds.vehicles
+    driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
+    energy = (vehicles.mass_t * (worlds.speeds_mps**2 / 2.0 + driving)).sum(axis=1)
+    farthest: Floats = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
+    return farthest
+
+
+VEHICLE_2 = 1  # the map's samples begin with its latency
+
+
+class SampledHarm:
+    """Watches episodes and replays their commands, step by step, through ``advance_sampled`` at the time step.
+
+    Each world goes to the horizon; after the end of its exact episode the last commands are held. The agent decided on
+    the exact motion; nobody decides anew. See ``of`` for whom it exists.
+    """
+
+    def __init__(self, worlds: Worlds, scenario: Scenario) -> None:
+        self._worlds = worlds
+        self._command = np.zeros(worlds.speeds_mps.shape)
+        self._harm = np.zeros(worlds.n)
+        self._start_s = worlds.vehicles.latency_s[:, VEHICLE_2]
+        self._step_s, self._horizon_s = scenario.time_step_s, scenario.horizon_s
+        self._samples = -1  # steps of the map so far; the time before its first sample is the first
+
+    @classmethod
+    def of(cls, worlds: Worlds, scenario: Scenario, driven: tuple[int, ...]) -> SampledHarm | None:
+        """What watches these worlds (at the alert); None with an obstacle, or if not just Vehicle 2 is driven.
+
+        The map knows no obstacle, and its samples are the decisions of Vehicle 2.
+        """
+        return None if driven != (VEHICLE_2,) or obstacle_ahead(worlds).any() else cls(worlds, scenario)
+
+    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
+        """Replay one step; the commands of a world whose episode has ended stay what they were."""
+        running = until_s > before.time_s
+        self._command = np.where(running[:, np.newaxis] | (self._samples < 0), command_mps2, self._command)
+        self._move()
+
+    def _move(self) -> None:
+        """Go on by one step: every world to its next sample, none beyond its first one at or after the horizon."""
+        self._samples += 1
+        next_s = np.minimum(self._start_s + self._samples * self._step_s, self._horizon_s)
+        until_s = np.maximum(next_s, self._worlds.time_s)
+        self._worlds, impacts = advance_sampled(self._worlds, self._command, until_s=until_s, step_s=self._step_s)
+        self._harm += impacts.total_harm.sum(axis=1)
+
+    def finish(self) -> Floats:
+        """Go on to the horizon; gives the sum of each world, [n] m2/s2."""
+        while (self._worlds.time_s < self._horizon_s - 1e-6 * self._step_s).any():
+            self._move()
+        return self._harm

@@ -1,0 +1,1 @@
+"""Files: strict reading, durable writing. Nothing else knows a format."""

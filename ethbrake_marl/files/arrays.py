@@ -1,0 +1,193 @@
+"""Arrays from files of other people: names, types, shapes and sizes are checked before any of them is unpacked.
+
+Two formats: ``.npz`` (a zip archive of ``.npy``) and safetensors. Nothing in either is evaluated or unpickled: the
+header of a ``.npy`` is a Python expression, and only the one form that numpy writes is recognised, by its letters.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.files.json import parse_strict_json
+
+HEADER_LIMIT_BYTES = 1 << 20  # of a safetensors file
+_NPY_HEADER_LIMIT_BYTES = 4096
+_DIRECTORY_LIMIT_BYTES = 1 << 16  # of a zip archive
+_MEMBERS_LIMIT = 64
+
+_NPY = re.compile(
+    rb"\{'descr': '([<|][a-z][0-9]{1,2})', 'fortran_order': False, 'shape': \(([0-9, ]{0,200})\), \} *\n", re.ASCII
+)
+_SHAPE = re.compile(r"|[0-9]{1,18},|[0-9]{1,18}(, [0-9]{1,18}){1,7}", re.ASCII)
+_HARMLESS_FLAGS = 0x808  # of a zip member: sizes behind the data, name in UTF-8
+
+
+class ArrayHeader(NamedTuple):
+    """What a file says about an array: its type, as its format calls it, and its shape."""
+
+    dtype: str
+    shape: tuple[int, ...]
+
+
+class ArrayRow(NamedTuple):
+    """An array as it should be. A letter in ``shape`` is a length that is the same wherever that letter stands."""
+
+    name: str
+    dtype: str
+    shape: tuple[int | str, ...]
+
+
+def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], word: str = "array") -> dict[str, int]:
+    """The length that each letter stands for; raises ``ValueError`` naming the first array that is not as ``wanted``.
+
+    No array may be missing, and none may be more.
+    """
+    names = {row.name for row in wanted}
+    for name in sorted(names - found.keys()):
+        raise ValueError(f"{word} {name!r} is missing")
+    for name in sorted(found.keys() - names):
+        raise ValueError(f"{word} {name!r} does not belong here; there should be {', '.join(sorted(names))}")
+    lengths: dict[str, int] = {}
+    for row in wanted:
+        header = found[row.name]
+        if len(header.shape) == len(row.shape):
+            for length, letter in zip(header.shape, row.shape, strict=True):
+                if isinstance(letter, str):
+                    lengths.setdefault(letter, length)
+        right = [lengths.get(each, each) if isinstance(each, str) else each for each in row.shape]
+        if header.dtype != row.dtype or list(header.shape) != right:
+            raise ValueError(
+                f"{word} {row.name!r} is {header.dtype} {list(header.shape)}, should be {row.dtype}"
+                f" [{', '.join(map(str, right))}]"
+            )
+    return lengths
+
+
+def safetensors_headers(data: bytes) -> dict[str, ArrayHeader]:
+    """What a safetensors file holds by its header; raises ``ValueError`` where that is none."""
+    length = int.from_bytes(data[:8], "little")
+    if not 2 <= length <= min(len(data) - 8, HEADER_LIMIT_BYTES):
+        raise ValueError(f"not a safetensors file (a header of {length} bytes in a file of {len(data)})")
+    table = parse_strict_json(data[8 : 8 + length])
+    if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
+        raise ValueError("not a safetensors file (the header is not a table of tensors)")
+    return {name: ArrayHeader(str(entry.get("dtype")), _lengths(entry.get("shape"))) for name, entry in table.items()}
+
+
+def _lengths(shape: object) -> tuple[int, ...]:
+    """A shape from JSON; what is no length is -1, which is never right."""
+    return tuple(each if type(each) is int else -1 for each in (shape if isinstance(shape, list) else [None]))
+
+
+class ArrayArchive:
+    """An ``.npz`` in memory whose headers have been read; at most ``limit_bytes`` when unpacked.
+
+    Plain archives as ``numpy.savez`` and ``numpy.savez_compressed`` write them: no comment, no second disk, nothing
+    encrypted, deflated or stored, every name once. Raises ``ValueError`` for anything else.
+    """
+
+    def __init__(self, data: bytes, limit_bytes: int) -> None:
+        _check_directory(data)
+        with _damage():
+            self._zip = zipfile.ZipFile(io.BytesIO(data))
+            self._members = self._zip.infolist()
+        self._starts: dict[str, int] = {}  # of each array's numbers
+        self.headers: dict[str, ArrayHeader] = {}
+        size = sum(member.file_size for member in self._members)
+        if size > limit_bytes:
+            raise ValueError(f"would be {size:,} bytes when unpacked; {limit_bytes:,} is the limit")
+        for member in self._members:
+            self._read_header(member)
+
+    def unpack(self, wanted: Sequence[ArrayRow]) -> dict[str, NDArray[Any]]:
+        """The arrays by name, read-only, once ``check_arrays`` has found them to be as ``wanted``."""
+        check_arrays(self.headers, wanted)
+        arrays = {}
+        for member in self._members:
+            name = _name(member)
+            with _damage(), self._zip.open(member) as stream:
+                data = stream.read(member.file_size)
+                stream.read(1)  # the checksum is compared at the end
+            header = self.headers[name]
+            arrays[name] = np.frombuffer(data, header.dtype, offset=self._starts[name]).reshape(header.shape)
+        return arrays
+
+    def _read_header(self, member: zipfile.ZipInfo) -> None:
+        name = _name(member)
+        if name in self.headers:
+            raise ValueError(f"array {name!r} is there twice")
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ValueError(f"array {name!r} is packed by method {member.compress_type}; deflate is right")
+        if member.flag_bits & ~_HARMLESS_FLAGS:
+            raise ValueError(f"array {name!r} is encrypted or patched")
+        with _damage(), self._zip.open(member) as stream:
+            beginning = stream.read(10 + _NPY_HEADER_LIMIT_BYTES)
+        header, start = _npy_header(name, beginning)
+        size = start + math.prod(header.shape) * np.dtype(header.dtype).itemsize
+        if member.file_size != size:
+            raise ValueError(
+                f"array {name!r} is {header.dtype} {list(header.shape)}, {size:,} bytes, in {member.file_size:,}"
+            )
+        self.headers[name], self._starts[name] = header, start
+
+
+def _name(member: zipfile.ZipInfo) -> str:
+    return member.filename.removesuffix(".npy")
+
+
+def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
+    """Type and shape of a ``.npy``, and where its numbers begin."""
+    length = int.from_bytes(beginning[8:10], "little")
+    text = beginning[10 : 10 + length]
+    match = _NPY.fullmatch(text)
+    if beginning[:8] != b"\x93NUMPY\x01\x00" or length > _NPY_HEADER_LIMIT_BYTES or match is None:
+        raise ValueError(f"array {name!r}: is not a plain .npy of format 1.0, in the order of C")
+    dtype, shape = match[1].decode(), match[2].decode()
+    if dtype[1:] not in ("b1", "f4", "f8", "i4", "i8", "u1", "u2", "u4", "u8"):
+        raise ValueError(f"array {name!r}: holds {dtype}, which is no number that is stored here")
+    if _SHAPE.fullmatch(shape) is None:
+        raise ValueError(f"array {name!r}: has the shape ({shape:.60}), which is none")
+    return ArrayHeader(dtype, tuple(int(each) for each in shape.split(",") if each.strip())), 10 + length
+
+
+def map_npy(stream: BinaryIO, name: str) -> NDArray[Any]:
+    """The array of an open ``.npy`` file, read-only and not in memory until it is used; raises ``ValueError``."""
+    header, start = _npy_header(name, stream.read(10 + _NPY_HEADER_LIMIT_BYTES))
+    size = os.fstat(stream.fileno()).st_size
+    if math.prod(header.shape) * np.dtype(header.dtype).itemsize != size - start:
+        raise ValueError(f"array {name!r} is {header.dtype} {list(header.shape)}, in a file of {size:,} bytes")
+    if not math.prod(header.shape):
+        return np.empty(header.shape, header.dtype)
+    return np.memmap(stream, header.dtype, "r", start, header.shape)
+
+
+def _check_directory(data: bytes) -> None:
+    """Look at the end of a zip archive, before a reader makes an object of everything that its directory lists."""
+    if len(data) < 22 or data[-22:-18] != b"PK\x05\x06":
+        raise ValueError("not a plain .npz archive")
+    disk, first_disk, here, members, size, start, comment = struct.unpack("<4H2LH", data[-18:])
+    if disk or first_disk or comment or here != members or data[-42:-38] == b"PK\x06\x07":
+        raise ValueError("not a plain .npz archive (of several disks, with a comment, or zip64)")
+    if members > _MEMBERS_LIMIT or size > _DIRECTORY_LIMIT_BYTES or start + size != len(data) - 22:
+        raise ValueError(f"not a plain .npz archive (a directory of {members} members in {size:,} bytes)")
+
+
+@contextmanager
+def _damage() -> Iterator[None]:
+    """Whatever the zip reader meets in a damaged archive is a ``ValueError``."""
+    try:
+        yield
+    except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, OverflowError) as error:
+        raise ValueError(f"the archive is damaged ({error})") from None

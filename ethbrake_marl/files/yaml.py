@@ -1,0 +1,248 @@
+"""How a number is written in every file and option: digits, a point, an exponent; no blanks inside, no underscores."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn
+
+import yaml
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.plain import read_plain
+
+_NUMERAL = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+
+
+def parse_numeral(text: str) -> float | None:
+    """The number that ``text`` writes, infinite when it is too large; None when it writes none."""
+    return float(text) if _NUMERAL.fullmatch(text) else None
+
+
+_PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_@./-]*(:[A-Za-z0-9_@./+-]+)*")
+_RESERVED = {"null", "true", "false"}
+
+
+def flow_text(value: Any, longest: int | None = None) -> str:
+    """Write ``value`` in YAML's flow style; reading it back with ``yaml_loading`` gives an equal value
+    (of printable text, lists, mappings with text keys, finite or infinite numbers, true, false, null).
+
+    A text longer than ``longest`` characters is cut (for messages only).
+    """
+    text = _flow(value)
+    return text if longest is None or len(text) <= longest else f"{text[: longest - 3]}..."
+
+
+def _flow(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_flow(key)}: {_flow(entry)}" for key, entry in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_flow(entry) for entry in value) + "]"
+    if isinstance(value, bool) or value is None:
+        return {True: "true", False: "false", None: "null"}[value]
+    if isinstance(value, str):
+        plain = _PLAIN.fullmatch(value) and value.lower() not in _RESERVED
+        return value if plain else json.dumps(value, ensure_ascii=False)
+    return _number(value) if isinstance(value, int | float) else repr(value)
+
+
+def _number(value: int | float) -> str:
+    if value != value:
+        return ".nan"
+    if value in (float("inf"), float("-inf")):
+        return ".inf" if value > 0 else "-.inf"
+    if isinstance(value, int):
+        return str(int(value)) if abs(value) < 2**63 else f"{str(value)[:24]}..."
+    return str(int(value)) if abs(value) < 1e15 and value == int(value) else repr(float(value))
+
+
+SIZE_LIMIT = 64 * 1024  # bytes
+DEPTH_LIMIT = 16  # mappings and lists inside each other
+
+YamlPath = tuple[str | int, ...]
+
+_NULL = {"", "~", "null", "Null", "NULL"}
+_BOOLEAN = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
+_INTEGER = re.compile(r"(?P<decimal>[-+]?[0-9]+)|0o(?P<octal>[0-7]+)|0x(?P<hexadecimal>[0-9a-fA-F]+)")
+_BASES = {"decimal": 10, "octal": 8, "hexadecimal": 16}
+_NOT_FINITE = re.compile(r"(?P<sign>[-+]?)\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
+_LARGEST_INTEGER = 2**63
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """What a file says, and on which line each of its values stands."""
+
+    file: str
+    content: Any  # dict, list, str, int, float, bool or None, nested
+    lines: Mapping[YamlPath, int]  # from 1
+
+    def line_of(self, path: YamlPath) -> int | None:
+        """Line of the value at ``path``, or of the innermost value around it that the file has."""
+        for length in range(len(path), -1, -1):
+            if path[:length] in self.lines:
+                return self.lines[path[:length]]
+        return None
+
+
+@dataclass(slots=True)
+class _Open:
+    """A mapping or list whose end has not been seen; ``key`` waits for its value."""
+
+    container: dict[str, Any] | list[Any]
+    path: YamlPath
+    key: str | None = None
+
+
+def read_yaml(path: str | Path) -> Document:
+    """Read one YAML file; raises ``InvalidInput`` with file, line, column and reason for every defect."""
+    return parse_yaml(read_plain(path, SIZE_LIMIT), str(Path(path)))
+
+
+def parse_yaml(text: str | bytes, file: str = "<text>") -> Document:
+    """Parse one YAML document; ``file`` is how messages call it. Raises as ``read_yaml``."""
+    data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
+    if len(data) > SIZE_LIMIT:
+        _fail(file, None, f"larger than {SIZE_LIMIT // 1024} KiB, the limit for these files")
+    try:
+        decoded = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        before = data[: error.start]
+        at = (before.count(b"\n"), error.start - before.rfind(b"\n") - 1)
+        _fail(file, at, f"not UTF-8 text (byte 0x{data[error.start]:02x})")
+    return _parse(decoded, file)
+
+
+def _parse(text: str, file: str) -> Document:
+    builder = _Builder(file)
+    try:
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            builder.take(event)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        at = (mark.line, mark.column) if mark is not None else None
+        _fail(file, at, f"not valid YAML: {error.problem or error.context}")
+    except yaml.reader.ReaderError as error:
+        before = text[: error.position]
+        at = (before.count("\n"), error.position - before.rfind("\n") - 1)
+        _fail(file, at, f"not valid YAML: character #x{ord(text[error.position]):04x} is not allowed")
+    except InvalidInput:
+        raise
+    except (yaml.YAMLError, RecursionError, ValueError, LookupError, AttributeError, TypeError) as error:
+        _fail(file, builder.at, f"not valid YAML: {error}")
+    return Document(file, builder.content, builder.lines)
+
+
+def _fail(file: str, at: tuple[int, int] | None, reason: str) -> NoReturn:
+    where = file if at is None else f"{file}, line {at[0] + 1}, column {at[1] + 1}"
+    raise InvalidInput(f"{where}: {reason}") from None
+
+
+@dataclass(slots=True)
+class _Builder:
+    """Builds the content from the events of one document."""
+
+    file: str
+    content: Any = None
+    lines: dict[YamlPath, int] = field(default_factory=dict)
+    at: tuple[int, int] = (0, 0)  # line and column of the event in hand, from 0
+    _stack: list[_Open] = field(default_factory=list)
+    _documents: int = 0
+
+    def take(self, event: yaml.Event) -> None:
+        if event.start_mark is not None:
+            self.at = (event.start_mark.line, event.start_mark.column)
+        if isinstance(event, yaml.DocumentStartEvent):
+            self._start_document(event)
+        elif isinstance(event, yaml.NodeEvent):
+            self._take_node(event)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            self._stack.pop()
+
+    def fail(self, reason: str) -> NoReturn:
+        _fail(self.file, self.at, reason)
+
+    def _start_document(self, event: yaml.DocumentStartEvent) -> None:
+        self._documents += 1
+        if self._documents > 1:
+            self.fail("a second document starts here; one file holds one document")
+        if event.tags or (event.version or (1, 2)) != (1, 2):
+            self.fail("directives are not supported here")
+
+    def _take_node(self, event: yaml.NodeEvent) -> None:
+        if isinstance(event, yaml.AliasEvent):
+            self.fail(f"alias *{event.anchor} is not supported; write the value out")
+        if event.anchor is not None:
+            self.fail(f"anchor &{event.anchor} is not supported; write the value out where it is needed")
+        if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag is not None:
+            self.fail(f"tag {event.tag} is not supported; write a plain value")
+        inside = self._stack[-1] if self._stack else None
+        if inside is not None and isinstance(inside.container, dict) and inside.key is None:
+            inside.key = self._key(event, inside)
+            self.lines[(*inside.path, inside.key)] = self.at[0] + 1
+            return
+        path = self._attach(event, inside)
+        self.lines.setdefault(path, self.at[0] + 1)
+
+    def _key(self, event: yaml.NodeEvent, inside: _Open) -> str:
+        if not isinstance(event, yaml.ScalarEvent):
+            self.fail("a key must be text, not a list or a mapping")
+        key = self._scalar(event)
+        if event.implicit[0] and event.value == "<<":
+            self.fail("merge key << is not supported; write the values out")
+        if not isinstance(key, str):
+            self.fail(f"key {event.value!r} must be text; quote it if that is what is meant")
+        if key in inside.container:
+            self.fail(f"key {key!r} is given twice, first on line {self.lines[(*inside.path, key)]}")
+        return key
+
+    def _attach(self, event: yaml.NodeEvent, inside: _Open | None) -> YamlPath:
+        """Put the event's value where it belongs and return its path."""
+        value: Any = {} if isinstance(event, yaml.MappingStartEvent) else []
+        if isinstance(event, yaml.ScalarEvent):
+            value = self._scalar(event)
+        path: YamlPath = ()
+        if inside is None:
+            self.content = value
+        elif isinstance(inside.container, list):
+            path = (*inside.path, len(inside.container))
+            inside.container.append(value)
+        else:
+            key = str(inside.key)
+            path = (*inside.path, key)
+            inside.container[key] = value
+            inside.key = None
+        if isinstance(event, yaml.CollectionStartEvent):
+            if len(self._stack) >= DEPTH_LIMIT:
+                self.fail(f"nested deeper than {DEPTH_LIMIT} levels")
+            self._stack.append(_Open(value, path))
+        return path
+
+    def _scalar(self, event: yaml.ScalarEvent) -> str | int | float | bool | None:
+        """Core schema of YAML 1.2; a quoted or block scalar is always text."""
+        text = str(event.value)
+        if not event.implicit[0]:
+            return text
+        if text in _NULL:
+            return None
+        if text in _BOOLEAN:
+            return _BOOLEAN[text]
+        if integer := _INTEGER.fullmatch(text):
+            return self._integer(integer)
+        if (number := parse_numeral(text)) is not None:
+            return number
+        if special := _NOT_FINITE.fullmatch(text):
+            sign = special["sign"]
+            return float("nan") if sign is None else float(f"{sign}inf")
+        return text
+
+    def _integer(self, match: re.Match[str]) -> int:
+        base = str(match.lastgroup)
+        digits = match[base]
+        value = int(digits, _BASES[base]) if len(digits) <= 64 else _LARGEST_INTEGER
+        if not -_LARGEST_INTEGER < value < _LARGEST_INTEGER:
+            self.fail(f"integer {digits[:24]}{'...' if len(digits) > 24 else ''} does not fit into 64 bits")
+        return value

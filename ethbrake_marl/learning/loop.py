@@ -1,0 +1,182 @@
+"""What happens between two updates: measure, log, save, report, and stop when asked to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+
+from ethbrake_marl.learning.model_state import Model
+from ethbrake_marl.learning.progress import RETURN, Course, check_losses, check_rollout, check_step, check_weights
+from ethbrake_marl.learning.recipe import TrainingRecipe
+from ethbrake_marl.policies.team import Trained
+
+# Column of the log -> info of an episode's end; means over the episodes since the last row, exploration included.
+EPISODE_COLUMNS = {
+    "rollout/first_impact_harm": "world_first_impact_harm",
+    "rollout/total_harm": "world_total_harm",
+    "rollout/collision_rate": "collided",
+}
+
+Evaluate = Callable[[Any], Mapping[str, float]]  # of what is trained: a ``Policy``, or a ``PolicyTeam``
+
+
+class StopRequested(Exception):
+    """Raised inside the training loop to leave it between two updates; never seen outside this room."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a training is."""
+
+    steps: int
+    total_steps: int  # at the end: the wanted ones, rounded up to whole updates
+    updates: int
+    wall_s: float
+    metrics: Mapping[str, float]  # of the last evaluation, and the mean return of recent episodes
+    note: str = ""  # to be told once
+
+
+class Save(Protocol):
+    """Writes a checkpoint of the training at rest."""
+
+    def __call__(self, between: BetweenUpdates) -> None:
+        """Write one."""
+
+
+class BetweenUpdates(BaseCallback):
+    """Runs before the first rollout and after each update.
+
+    ``stop`` is asked before every rollout; ``StopRequested`` is raised when it says yes, with everything saved.
+    """
+
+    model: Model
+
+    def __init__(
+        self,
+        recipe: TrainingRecipe,
+        policy_now: Callable[[Model], Trained],
+        *,
+        save: Save,
+        stop: Callable[[], bool],
+        evaluate: Evaluate | None,
+        on_progress: Callable[[Progress], None] | None,
+    ) -> None:
+        super().__init__()
+        self.recipe, self._policy_now, self._save = recipe, policy_now, save
+        self._stop, self._evaluate, self._on_progress = stop, evaluate, on_progress
+        self.updates = 0
+        self.course = Course(recipe.reward.harm_count)
+        self.notes: list[str] = []  # to be told when the training begins
+        self._ended: dict[str, list[float]] = {column: [] for column in EPISODE_COLUMNS}
+        self._resumed = False  # what is due at this rest was done before the checkpoint was written
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint must hold of this object."""
+        return {"updates": self.updates, "ended": self._ended, "course": self.course.to_json()}
+
+    def restore(self, content: Mapping[str, Any], steps: int, policy: Trained, best: Trained | None) -> None:
+        """Go on from a checkpoint."""
+        self.updates = self.course.updates = int(content["updates"])
+        self._ended = {column: list(content["ended"][column]) for column in EPISODE_COLUMNS}
+        self.course.restore(content["course"])
+        self.course.steps, self.course.policy, self.course.best = steps, policy, best
+        self._resumed = True
+
+    @property
+    def planned_steps(self) -> int:
+        """Decisions at the end: whole rollouts."""
+        rollout = self.model.n_envs * self.recipe.rounds
+        return -(-self.recipe.total_steps // rollout) * rollout
+
+    def tell(self, note: str = "") -> None:
+        """Report how far the training is."""
+        if self._on_progress is None:
+            return
+        course = self.course
+        metrics = dict(course.evaluations[-1]) if course.evaluations else {}
+        recent = self._recent_return()
+        if recent is not None:
+            metrics[RETURN] = recent
+        self._on_progress(Progress(course.steps, self.planned_steps, course.updates, course.wall_s, metrics, note))
+
+    def _on_rollout_start(self) -> None:
+        while self.notes:
+            self.tell(self.notes.pop(0))
+        if not self._resumed:
+            self._after_update()
+        self._resumed = False
+        if self._stop():
+            self._rest()
+            self._save(self)
+            raise StopRequested
+
+    def _on_step(self) -> bool:
+        infos = self.locals["infos"]
+        if not isinstance(self.model, PPO):
+            check_step(self.model, self.locals["rewards"], self.locals["new_obs"])
+        for row in np.flatnonzero(self.locals["dones"]):
+            for column, name in EPISODE_COLUMNS.items():
+                self._ended[column].append(float(infos[row][name]))
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if isinstance(self.model, PPO):
+            check_rollout(self.model)
+        self.updates += 1
+
+    def _on_training_end(self) -> None:
+        self._after_update(last=True)
+
+    def _after_update(self, *, last: bool = False) -> None:
+        """Do what is due at this rest, the checkpoint after all the rest of it."""
+        check_losses(self.model)
+        updates, recipe = self.updates, self.recipe
+        measure = self._evaluate is not None and (last or updates % recipe.evaluation.every_updates == 0)
+        if last or measure or updates % recipe.logged_updates == 0:
+            self._rest()
+            if measure:
+                self._measure()
+            self._log()
+        if not last and updates and updates % recipe.checkpoint_every_updates == 0:
+            self._rest()
+            self._save(self)
+
+    def _rest(self) -> None:
+        """Bring the course to this moment."""
+        course = self.course
+        if course.policy is None or (course.steps, course.updates) != (self.model.num_timesteps, self.updates):
+            check_weights(self.model)
+            course.policy = self._policy_now(self.model)
+            course.steps, course.updates = self.model.num_timesteps, self.updates
+
+    def _measure(self) -> None:
+        assert self.course.policy is not None and self._evaluate is not None
+        metrics = {name: float(value) for name, value in self._evaluate(self.course.policy).items()}
+        alarm = self.course.measured(self.course.policy, metrics, self._recent_return())
+        for name, value in metrics.items():
+            self.logger.record(f"eval/{name}", value)
+        self.logger.record("eval/alarm", int(alarm is not None))
+        if alarm is not None:
+            self.tell(f"alarm: {alarm}")
+
+    def _recent_return(self) -> float | None:
+        episodes = self.model.ep_info_buffer or ()
+        return sum(float(e["r"]) for e in episodes) / len(episodes) if episodes else None
+
+    def _log(self) -> None:
+        if any(self._ended.values()):
+            for column, values in self._ended.items():
+                self.logger.record(column, float(np.mean(values)))
+        self._ended = {column: [] for column in EPISODE_COLUMNS}
+        if self.updates and isinstance(self.model, PPO):
+            self.model.dump_logs(self.updates)
+        elif self.updates:
+            self.model.dump_logs()
+        elif self.course.evaluations:
+            self.logger.dump(step=0)
+        self.tell()

@@ -1,0 +1,187 @@
+"""What a training has reached: its policies, its evaluations, and an alarm when the return misleads."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+
+from ethbrake_marl.errors import EthBrakeError
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.learning.model_state import Model, optimizers_of
+from ethbrake_marl.policies.team import Trained
+
+HARM_METRIC: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
+RETURN = "episode_return"
+
+ALARM_AFTER = 5  # evaluations that are looked at
+RISEN = 0.05  # by this share of its size the return must have grown to count as risen
+
+
+@dataclass
+class Course:
+    """The last good policy, the best one, and the evaluations on the way.
+
+    The best is that of least harm on the fixed list, in the ``count`` that the reward is about, not that of highest
+    return; where no harm is measured there is none.
+    """
+
+    count: HarmCount = "first"
+    policy: Trained | None = None  # none until the first weights were checked
+    best: Trained | None = None
+    best_harm: float = math.inf
+    steps: int = 0
+    updates: int = 0
+    evaluations: list[dict[str, float]] = field(default_factory=list)  # steps, updates and what ``evaluate`` gave
+    alarms: list[str] = field(default_factory=list)
+    wall_before_s: float = 0.0  # of the parts of this training that other processes did
+    started: float = field(default_factory=time.monotonic)
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds of training, the time between a kill and the resume left out."""
+        return self.wall_before_s + time.monotonic() - self.started
+
+    @property
+    def kept(self) -> Trained | None:
+        """The policy to use: the best, or the last where nothing was measured."""
+        return self.best or self.policy
+
+    def measured(self, policy: Trained, metrics: Mapping[str, float], episode_return: float | None) -> str | None:
+        """Take in an evaluation of ``policy``; gives the alarm, if this one raises it."""
+        extra = {} if episode_return is None else {RETURN: episode_return}
+        self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **extra})
+        name = HARM_METRIC[self.count]
+        if name in metrics and metrics[name] < self.best_harm:
+            self.best, self.best_harm = policy, metrics[name]
+        alarm = misleading_return(self.evaluations, name)
+        if alarm is not None:
+            self.alarms.append(alarm)
+        return alarm
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything but the policies."""
+        return {
+            "evaluations": self.evaluations,
+            "alarms": self.alarms,
+            "best_harm": None if math.isinf(self.best_harm) else self.best_harm,
+            "wall_s": self.wall_s,
+        }
+
+    def restore(self, content: Mapping[str, Any]) -> None:
+        """Take back what ``to_json`` gave."""
+        self.evaluations = [dict(entry) for entry in content["evaluations"]]
+        self.alarms = list(content["alarms"])
+        self.best_harm = math.inf if content["best_harm"] is None else float(content["best_harm"])
+        self.wall_before_s = float(content["wall_s"])
+
+
+def misleading_return(evaluations: Sequence[Mapping[str, float]], harm: str) -> str | None:
+    """The alarm if the return has risen over the last evaluations while none of them has less harm than the first.
+
+    The return is the mean of the training's recent episodes, exploration included; its rise counts from a twentieth
+    of its size on. A policy that learns to please the reward instead of sparing people looks like this.
+    """
+    last = [entry for entry in evaluations if RETURN in entry and harm in entry][-ALARM_AFTER:]
+    if len(last) < ALARM_AFTER:
+        return None
+    first = last[0]
+    risen = last[-1][RETURN] - first[RETURN]
+    lowest = min(entry[harm] for entry in last[1:])
+    if not (risen > RISEN * abs(first[RETURN]) and lowest >= first[harm]):
+        return None
+    return (
+        f"step {int(last[-1]['steps']):,}: since step {int(first['steps']):,} the return rose from {first[RETURN]:.4g}"
+        f" to {last[-1][RETURN]:.4g}, but {harm} did not fall ({first[harm]:.4g}, since then at best {lowest:.4g});"
+        " does the reward say what you mean?"
+    )
+
+
+_LOSSES = (
+    "loss",
+    "value_loss",
+    "policy_gradient_loss",
+    "actor_loss",
+    "critic_loss",
+    "ent_coef_loss",
+)
+
+
+class TrainingDiverged(EthBrakeError, ArithmeticError):
+    """A reward, a loss or a weight is no longer a finite number; the last good policy was kept."""
+
+
+def watch_gradients(model: Model) -> None:
+    """Refuse every optimiser step whose gradients are not finite, so that the weights stay as they were."""
+    hint = "learning_rate or max_grad_norm" if isinstance(model, PPO) else "learning_rate"
+
+    def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
+        sums = [p.grad.sum() for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+        if not torch.isfinite(torch.stack(sums)).all():
+            raise TrainingDiverged(
+                f"training: the gradient of the loss is not finite at step {model.num_timesteps}; try a smaller {hint}"
+            )
+
+    for optimizer in optimizers_of(model).values():
+        optimizer.register_step_pre_hook(check)
+
+
+def check_losses(model: Model) -> None:
+    """Refuse an update whose losses are not finite; an infinite loss may well leave finite weights."""
+    logged = model.logger.name_to_value  # train/loss, or vehicle_2/loss where learners are independent
+    found = ((name, float(logged[name])) for loss in _LOSSES for name in logged if name.rpartition("/")[2] == loss)
+    for name, value in found:
+        if not np.isfinite(value):
+            raise TrainingDiverged(
+                f"training: {name} = {value} after step {model.num_timesteps}: must be finite;"
+                " try a smaller learning_rate, or smaller weights of the reward"
+            )
+
+
+def check_weights(model: Model) -> None:
+    """Refuse weights that are not finite."""
+    if not weights_are_finite(model):
+        raise TrainingDiverged(f"training: a weight is not finite after step {model.num_timesteps}")
+
+
+def check_step(model: Model, rewards: Any, observations: Any) -> None:
+    """Refuse a step with a reward or observation that is not finite; names which."""
+    for name, entries in (("observations", observations), ("rewards", rewards)):
+        good = np.isfinite(entries)
+        if not good.all():
+            row = np.argwhere(~good)[0][0]
+            raise TrainingDiverged(
+                f"training: {name}[row {row}] = {entries[~good][0]} at step {model.num_timesteps}: must be finite;"
+                " the environment or its reward is at fault"
+            )
+
+
+def check_rollout(model: PPO) -> None:
+    """Refuse a rollout that holds a reward or observation that is not finite; names which."""
+    for name in ("observations", "rewards"):
+        entries = getattr(model.rollout_buffer, name)
+        good = np.isfinite(entries)
+        if not good.all():
+            step, row = np.argwhere(~good)[0][:2]
+            raise TrainingDiverged(
+                f"training: {name}[step {step}, row {row}] = {entries[~good][0]} in the rollout that ends at step"
+                f" {model.num_timesteps}: must be finite; the environment or its reward is at fault"
+            )
+
+
+def weights_are_finite(model: Model) -> bool:
+    """Whether every weight is finite, and the exploration noise a usable one."""
+    numbers = [*model.policy.parameters()]
+    spread = None
+    if isinstance(model, PPO):
+        spread = torch.exp(model.policy.log_std.detach())
+    elif model.log_ent_coef is not None:
+        spread = torch.exp(model.log_ent_coef.detach())
+    finite = all(bool(torch.isfinite(p).all()) for p in numbers)
+    return finite and (spread is None or bool((torch.isfinite(spread) & (spread > 0.0)).all()))

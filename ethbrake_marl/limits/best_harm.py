@@ -1,0 +1,280 @@
+"""The least harm known in each world: search over whole profiles of the controlled vehicles, in the engine's physics.
+
+What is found is realised harm: an upper bound of the true minimum, never below it. See docs/best-harm.md.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.protocol import fixed_commands
+from ethbrake_marl.agents.rollout import scripted
+from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
+from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.limits.best_harm_table import Best, BestHarmTable, join_tables, load_table, save_table
+from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
+from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.search.kernel import MOST_PHASES
+from ethbrake_marl.search.motion import Words
+from ethbrake_marl.search.problem import ProfileProblem, profile_problem
+from ethbrake_marl.search.profiles import (
+    Found,
+    Profiles,
+    constant_profiles,
+    even_grid,
+    follow_profiles,
+    pad_profiles,
+    search_profiles,
+)
+
+BUDGET = 100_000  # candidates per world and count
+CHUNK = 200  # worlds between two reports of progress
+LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is in no row
+CONSTANTS = 29  # even grid of constant commands from which every search also starts
+
+Progress = Callable[[int, int], None]  # worlds done, of how many
+
+
+def best_harm(
+    scenario: Scenario,
+    worlds: Worlds,
+    *,
+    counts: Sequence[HarmCount] = COUNTS,
+    vehicles: Sequence[int] | None = None,
+    budget: int = BUDGET,
+    seed: int = 0,
+    threads: int | None = None,
+    known: BestHarmTable | None = None,
+) -> BestHarmTable:
+    """Search every world (at t = 0) for the profiles of least harm, once per count.
+
+    ``vehicles`` are the controlled ones (default: the scenario's learners); all others follow their scripts. With both
+    counts, each may take the other's result. The result is never worse than the best constant deceleration of a
+    controlled vehicle (other controlled ones braking fully), than the same search with one of them alone, or than what
+    is ``known`` (a table with these vehicles), from which the search then starts. It does not depend on ``threads``
+    (default: every core) or on the batch. Raises ``InvalidInput`` for no vehicle, a script whose command is not fixed
+    at the alert, no count, or a budget below 1.
+    """
+    if not counts or not set(counts) <= set(COUNTS) or len(set(counts)) != len(counts):
+        raise InvalidInput(f"counts {tuple(counts)}: must be first, total, or both")
+    chosen = scenario.learners if vehicles is None else tuple(vehicles)
+    workers = _cores() if threads is None else threads
+    search = _Search(scenario, worlds, scripted_commands(scenario, worlds, chosen), budget, seed, workers)
+    found: list[Found] = []
+    identity = search.problem(chosen).identity
+    if known is not None:
+        known.check_fits(search.problem(chosen))
+    for count in counts:
+        given = [earlier.profiles for earlier in found]
+        if known is not None:
+            given.append(_startable(known.profiles(identity, count, search.problem(chosen).last_step)[0]))
+        found.append(search.best(chosen, count, given))
+    rows = np.arange(worlds.n)
+    best: dict[HarmCount, Best] = {}
+    for count in counts:
+        harms = np.stack([result.harm(count) for result in found])
+        pick = np.argmin(harms, axis=0)
+        ends = np.stack([result.profiles.ends for result in found])[pick, rows]
+        commands = np.stack([result.profiles.commands_mps2 for result in found])[pick, rows]
+        best[count] = Best(harms[pick, rows], Profiles(ends, commands))
+    names = [scenario.vehicle_names[i] for i in chosen]
+    header = {"scenario": scenario.name, "vehicles": names, "budget": budget, "search_seed": seed}
+    table = BestHarmTable(identity, best, header)
+    return table if known is None else _merged(table, known)
+
+
+def _merged(table: BestHarmTable, known: BestHarmTable) -> BestHarmTable:
+    """The table, with what is ``known`` to do less harm; its header says what came before."""
+    for count in [count for count in table.best if count in known.best]:
+        nowhere = np.zeros(len(table.identity), np.int64)
+        kept, has_profile = known.profiles(table.identity, count, nowhere + 1)
+        kept.ends[~has_profile] = 0
+        table, _ = table.improved(table.identity, count, known.harm(table.identity, count), kept)
+    return replace(table, header={**table.header, "after": dict(known.header)})
+
+
+def search_list(
+    scenario: Scenario,
+    sample: Sample,
+    *,
+    counts: Sequence[HarmCount] = COUNTS,
+    vehicles: Sequence[int] | None = None,
+    budget: int = BUDGET,
+    seed: int = 0,
+    threads: int | None = None,
+    known: BestHarmTable | None = None,
+    chunks: Path | None = None,
+    on_progress: Progress | None = None,
+) -> BestHarmTable:
+    """``best_harm`` of a long list, ``CHUNK`` worlds at a time, resumable.
+
+    With ``chunks``, a folder, each finished chunk is kept there as a file, and a later call with the same question
+    takes it from there. A file that answers another question is computed anew and replaced. A world that cannot be
+    advanced (a defect of the physics) is left out: no table holds it, and the header names it under ``LEFT_OUT``.
+    Raises ``InvalidInput``, as ``best_harm`` does, and if ``known`` holds no world of the list; ``PhysicsError`` if no
+    world is left.
+    """
+    parts: list[BestHarmTable] = []
+    left_out: dict[int, str] = {}
+    n = sample.worlds.n
+    if known is not None:
+        every, _, _ = leaving_out_failed(
+            lambda at: world_identity(scenario, sample.worlds.take(at), vehicles), np.arange(n)
+        )
+        if every is not None:
+            known.check_holds_any(every)
+    options = {"counts": counts, "budget": budget, "seed": seed, "threads": threads, "known": known}
+    for first in range(0, n, CHUNK):
+        rows = np.arange(first, min(first + CHUNK, n))
+        file = None if chunks is None else chunk_file(chunks, first)
+        work = partial(_kept_or_searched, scenario, sample.worlds, file, vehicles, options)
+        part, _, failed = leaving_out_failed(work, rows)
+        parts += [] if part is None else [part]
+        left_out |= {int(sample.index[row]): reason for row, reason in failed.items()}
+        if on_progress is not None:
+            on_progress(int(rows[-1]) + 1, n)
+    if not parts:
+        raise PhysicsError(left_out)
+    table = join_tables(parts)
+    named = {LEFT_OUT: {str(world): reason for world, reason in left_out.items()}} if left_out else {}
+    return replace(table, header={**table.header, **named})
+
+
+def _kept_or_searched(
+    scenario: Scenario, every: Worlds, file: Path | None, vehicles: Sequence[int] | None, options: dict[str, Any],
+    rows: Ints,
+) -> BestHarmTable:  # fmt: skip
+    """A chunk of a list, its ``rows``: from its file where that answers the same question, else searched, and kept."""
+    worlds = every.take(rows)
+    known = options["known"]
+    question = {"counts": list(options["counts"]), "budget": options["budget"], "search_seed": options["seed"]}
+    question |= {} if known is None else {"after": dict(known.header)}
+    if file is not None:
+        with suppress(CorruptBundle):
+            part = kept_chunk(file, world_identity(scenario, worlds, vehicles), question)
+            if part is not None:
+                return part
+    part = best_harm(scenario, worlds, vehicles=vehicles, **options)
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        save_table(file, part)
+    return part
+
+
+def chunk_file(chunks: Path, first: int) -> Path:
+    """Where the chunk that begins with world ``first`` is kept."""
+    return chunks / f"{first:07d}.npz"
+
+
+def kept_chunk(file: Path, identity: Words, question: Mapping[str, object]) -> BestHarmTable | None:
+    """A kept chunk, if it is there and answers this very question; raises ``CorruptBundle`` for a damaged one."""
+    if not file.is_file():
+        return None
+    table = load_table(file)
+    asked = {"counts": list(table.best), **{key: table.header[key] for key in question if key in table.header}}
+    return table if asked == question and np.array_equal(table.identity, identity) else None
+
+
+def world_identity(scenario: Scenario, worlds: Worlds, vehicles: Sequence[int] | None = None) -> Words:
+    """What tells the problem in one world (at t = 0) from that in any other, [n]: ``search.profiles.identities``."""
+    chosen = scenario.learners if vehicles is None else tuple(vehicles)
+    return _Search(scenario, worlds, scripted_commands(scenario, worlds, chosen), 1, 0, 1).problem(chosen).identity
+
+
+def realised_harm(scenario: Scenario, worlds: Worlds, best: Best, vehicles: Sequence[int]) -> tuple[Floats, Floats]:
+    """First-impact and total harm [n] of the stored profiles, driven again in these worlds."""
+    others = scripted_commands(scenario, worlds, vehicles)
+    return follow_profiles(_Search(scenario, worlds, others, 1, 0, 1).problem(vehicles), best.profiles)
+
+
+def scripted_commands(scenario: Scenario, worlds: Worlds, vehicles: Sequence[int]) -> Floats:
+    """The commands [n, N] of all vehicles but ``vehicles``; full braking in the columns of these.
+
+    Raises ``InvalidInput`` for a script whose command is not fixed at the alert.
+    """
+    others = {i: script for i, script in scripted(scenario).items() if i not in vehicles}
+    return fixed_commands(others, worlds, f"scenario {scenario.name!r}, search for the best profiles")
+
+
+def _cores() -> int:
+    return os.cpu_count() or 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """Searches in given worlds."""
+
+    scenario: Scenario
+    worlds: Worlds
+    others: Floats  # [n, N]
+    budget: int
+    seed: int
+    threads: int
+
+    def problem(
+        self, vehicles: Sequence[int], count: HarmCount = "first", deciders: Sequence[int] | None = None
+    ) -> ProfileProblem:
+        return profile_problem(
+            self.worlds,
+            vehicles,
+            count=count,
+            horizon_s=self.scenario.horizon_s,
+            time_step_s=self.scenario.time_step_s,
+            others_mps2=self.others,
+            deciders=deciders,
+        )
+
+    def best(
+        self,
+        vehicles: Sequence[int],
+        count: HarmCount,
+        given: Sequence[Profiles] = (),
+        deciders: Sequence[int] | None = None,
+    ) -> Found:
+        """The best profiles that start from constants, from ``given``, and from each vehicle's own best profile."""
+        problem = self.problem(vehicles, count, deciders)
+        starts = [constant_profiles(problem, even_grid(problem, CONSTANTS)), *given]
+        if len(vehicles) == 1:
+            coupled = optimise_coupled(
+                self.worlds, vehicles[0], count=count, horizon_s=self.scenario.horizon_s, others_mps2=self.others
+            )
+            starts.insert(0, constant_profiles(problem, -coupled.deceleration_mps2[:, np.newaxis, np.newaxis]))
+        else:
+            for c, vehicle in enumerate(vehicles):
+                alone = self.best([vehicle], count, (), vehicles if deciders is None else deciders).profiles
+                least = problem.bounds[:, np.newaxis, :, 0]
+                commands = np.broadcast_to(least, (*alone.ends.shape, len(vehicles))).copy()
+                commands[..., c] = alone.commands_mps2[..., 0]
+                starts.append(Profiles(alone.ends, commands))
+        return search_profiles(
+            problem, _joined(starts, problem.n), budget=self.budget, seed=self.seed, threads=self.threads
+        )
+
+
+def _startable(profiles: Profiles) -> Profiles:
+    """Those with as few phases as a search can start from; the others hold their first command."""
+    ends, commands = pad_profiles([profiles], MOST_PHASES)[0]
+    last = ends[:, -1:]
+    short = ends[:, MOST_PHASES - 1 : MOST_PHASES] == last
+    return Profiles(
+        np.where(short, ends[:, :MOST_PHASES], last),
+        np.where(short[..., np.newaxis], commands[:, :MOST_PHASES], commands[:, :1]),
+    )
+
+
+def _joined(parts: list[Profiles], n: int) -> Profiles:
+    """Several given profiles of each world, [n * Q_j] each, as one list [n * Q] world by world."""
+    parts = pad_profiles(parts, MOST_PHASES)
+    ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in parts], axis=1)
+    shape = (n, -1, MOST_PHASES, parts[0].commands_mps2.shape[2])
+    commands = np.concatenate([part.commands_mps2.reshape(shape) for part in parts], axis=1)
+    return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, *shape[2:]))

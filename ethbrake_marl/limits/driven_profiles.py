@@ -1,0 +1,119 @@
+"""Episodes that agents drive, as profiles: what one does better than the best known becomes the best known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Agent, LookingAhead
+from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.engine.stream import Script
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.limits.best_harm import scripted_commands, world_identity
+from ethbrake_marl.limits.best_harm_table import BestHarmTable
+from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.search.problem import profile_problem
+from ethbrake_marl.search.profiles import Profiles, follow_profiles
+
+LOWERED = "lowered_by"  # key of a table's header: agent -> count -> in how many worlds it did less harm
+
+
+def fold_agent(
+    table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
+) -> BestHarmTable:
+    """The table with the episodes of ``agents`` in it where they do less harm; its header says in how many worlds.
+
+    ``agents``: for each count, ``name`` made to minimise it. Each drives the scenario's learner through ``worlds`` (at
+    t = 0; those that are known to end without harm are left out), and either count takes from either episode. Harms are
+    those of the profiles, driven again. Where an agent cannot drive a world to its end, the table stays as it is.
+    Raises ``InvalidInput`` if the scenario has not exactly one learner.
+    """
+    if len(scenario.learners) != 1:
+        raise InvalidInput(f"scenario {scenario.name!r}: agents drive one learner, and it has {len(scenario.learners)}")
+    (vehicle,) = scenario.learners
+    identity = world_identity(scenario, worlds)
+    known = np.max([table.harm(identity, count) for count in table.best], axis=0)
+    hard = np.flatnonzero(known > 0.0)
+    lowered = dict.fromkeys(table.best, 0)
+    if hard.size:
+        worlds, identity = worlds.take(hard), identity[hard]
+        problem = profile_problem(
+            worlds,
+            [vehicle],
+            horizon_s=scenario.horizon_s,
+            time_step_s=scenario.time_step_s,
+            others_mps2=scripted_commands(scenario, worlds, scenario.learners),
+        )
+        for agent in agents.values():
+            work = partial(_driven_in, agent, scenario, worlds, vehicle, problem.last_step)
+            profiles, rows, _ = leaving_out_failed(work, np.arange(worlds.n))
+            if profiles is None:
+                continue
+            first, total = follow_profiles(problem.take(rows), profiles)
+            for count in table.best:
+                table, better = table.improved(identity[rows], count, first if count == "first" else total, profiles)
+                lowered[count] += int(better.sum())
+    before = table.header.get(LOWERED, {})
+    return replace(table, header={**table.header, LOWERED: {**before, name: lowered}})
+
+
+def _driven_in(agent: Agent, scenario: Scenario, every: Worlds, vehicle: int, last_step: Ints, rows: Ints) -> Profiles:
+    return driven_profiles(agent, scenario, every.take(rows), vehicle, last_step[rows])
+
+
+def driven_profiles(agent: Agent, scenario: Scenario, worlds: Worlds, vehicle: int, last_step: Ints) -> Profiles:
+    """What ``agent`` commands ``vehicle`` in every step of its episodes, as profiles; equal neighbours are joined."""
+    recorder = _Recorder(agent, int(last_step.max()), scenario.time_step_s)
+    drive(worlds, recorder, scenario, vehicle)
+    return _joined(recorder.commands_mps2, last_step)
+
+
+class _Recorder:
+    """An agent that drives as another one does and keeps every command."""
+
+    def __init__(self, agent: Agent, steps: int, time_step_s: float) -> None:
+        self.agent = agent
+        self.name = agent.name
+        self.commands_mps2: Floats = np.empty((0, steps))  # [n, steps], NaN after an episode's end
+        self._time_step_s = time_step_s
+        self._start_s: Floats = np.empty(0)
+
+    @property
+    def others(self) -> Mapping[int, Script]:
+        """The scripts of the other vehicles, for an agent that looks ahead."""
+        return self.agent.others if isinstance(self.agent, LookingAhead) else {}
+
+    @others.setter
+    def others(self, scripts: Mapping[int, Script]) -> None:
+        if isinstance(self.agent, LookingAhead):
+            self.agent.others = scripts
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """All episodes begin at once here."""
+        self._start_s = np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
+        self.commands_mps2 = np.full((worlds.n, self.commands_mps2.shape[1]), np.nan)
+        self.agent.begin(worlds, vehicle, rows)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        command = self.agent.act(worlds, vehicle)
+        step = np.floor((worlds.time_s - self._start_s) / self._time_step_s + 1e-6).astype(np.int64)
+        deciding = np.flatnonzero((step >= 0) & (step < self.commands_mps2.shape[1]))
+        self.commands_mps2[deciding, step[deciding]] = command[deciding]
+        return command
+
+
+def _joined(commands_mps2: Floats, last_step: Ints) -> Profiles:
+    """Step by step commands [n, steps] as profiles with one phase per change; after NaN the last command goes on."""
+    steps = commands_mps2.shape[1]
+    latest = np.maximum.accumulate(np.where(np.isnan(commands_mps2), 0, np.arange(steps)), axis=1)
+    filled = np.take_along_axis(commands_mps2, latest, axis=1)
+    ends = [np.append(np.flatnonzero(row[1:] != row[:-1]) + 1, steps) for row in filled]
+    width = max(len(each) for each in ends)
+    padded = np.array([np.append(each, np.full(width - len(each), steps)) for each in ends])
+    chosen = np.take_along_axis(filled, padded - 1, axis=1)
+    return Profiles(np.minimum(padded, last_step[:, np.newaxis]), chosen[:, :, np.newaxis])

@@ -1,0 +1,152 @@
+"""A proven lower bound on the harm of every world, whatever the controlled vehicle does.
+
+Three bounds, each proven in docs/avoidability.md, under both counting rules and with velocity exchange, bounces and
+pushing as the physics has them:
+
+* front pair alone: the closing speed of full braking, since a push from behind only makes it worse;
+* rear pair alone: the closing speed of full drive;
+* both together, where contact is unavoidable: whichever neighbour is met first and however softly, what follows at the
+  other one is bounded by momentum and energy.
+
+To these comes what has happened, for certain, before the vehicle may act.
+
+The proofs are about exact arithmetic; the bound and the harm that it is compared with are made of doubles. So every
+part is rounded outward: lowered by ``rounding``, more than both can be off together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import HarmCount, check_count, empty_ledger
+from ethbrake_marl.limits.avoidability import avoidability
+from ethbrake_marl.limits.lower_bound_kernel import BOUNDS, COMBINED_BOUND, FRONT_BOUND, REAR_BOUND, bound_worlds
+from ethbrake_marl.limits.meetings import (
+    A_F,
+    A_L,
+    A_R,
+    FRONT_SHARE,
+    GAP_L,
+    GAP_R,
+    LIMIT_F,
+    ONSET_R,
+    REAR_SHARE,
+    RESTITUTION,
+    U_F,
+    V_F,
+    V_L,
+    V_R,
+    WIDTH,
+)
+from ethbrake_marl.physics import Bools, Floats, Worlds, advance
+from tests.reference.tolerances import BOUND_EPS, EPS
+
+
+@dataclass(frozen=True, slots=True)
+class LowerBound:
+    """What is proven about each world [n], in m2/s2."""
+
+    harm: Floats  # no profile does less harm than this
+    early: Floats  # done before the controlled vehicle may act
+    front_pair: Floats  # of the front pair alone, from then on
+    rear_pair: Floats  # of the rear pair alone
+    combined: Floats  # of both together; 0 where nothing is proven
+
+    @property
+    def impact_proven(self) -> Bools:
+        """Whether every profile has an impact, [n]; elsewhere none is proven, which need not mean that one can."""
+        yes: Bools = self.harm > 0.0
+        return yes
+
+
+def lower_bound(
+    worlds: Worlds,
+    vehicle: int = 1,
+    *,
+    count: HarmCount = "first",
+    horizon_s: float = 8.0,
+    scripts: Mapping[int, str] | None = None,
+) -> LowerBound:
+    """Proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicle``.
+
+    ``harm = early + max(front_pair + rear_pair, combined)``, each part rounded outward (``rounding``). The combined
+    bound is proven for a controlled vehicle that brakes at least as hard as both neighbours; elsewhere it is 0. What
+    may come only after the horizon counts as 0, and so does the next impact of a pair that was hit before where
+    ``count`` is "first".
+
+    Covers the same lines as ``avoidability``, without an obstacle ahead, and raises ``InvalidInput`` for others, for an
+    unknown ``count``, and for a horizon that is not finite or lies before the vehicle may act.
+    """
+    check_count(count)
+    if np.isfinite(worlds.hazard_gap_m).any():
+        raise InvalidInput("lower_bound: worlds with an obstacle ahead (hazard_gap_m); the proofs know none")
+    verdict = avoidability(worlds, vehicle, scripts=scripts)
+    start = np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
+    if not (np.all(start <= horizon_s) and horizon_s < np.inf):
+        raise InvalidInput(f"lower_bound: horizon_s {horizon_s!r}: must be finite and at least {start.max():g} s")
+    at_onset, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=start)
+    early = empty_ledger(worlds).add(impacts).world_harm(count)
+    counts = ~at_onset.pair_hit if count == "first" else np.ones_like(at_onset.pair_hit)
+    forward = at_onset.speeds_mps >= 0.0
+    open_pair = counts & forward[:, 1:] & forward[:, :-1]
+    none = np.zeros(worlds.n, dtype=np.bool_)
+    has_front = open_pair[:, vehicle - 1] if vehicle > 0 else none
+    has_rear = open_pair[:, vehicle] if vehicle < worlds.N - 1 else none
+    unavoidable = has_front & has_rear & (verdict.reason >= 2)
+    out = np.empty((worlds.n, BOUNDS))
+    bound_worlds(_states(at_onset, vehicle), horizon_s - start, has_front, has_rear, unavoidable, out)
+    parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
+    early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
+    return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined)
+
+
+def rounding(worlds: Worlds, vehicle: int) -> Floats:
+    """How far arithmetic can move a bound and a realised harm apart, at most; [n] m2/s2.
+
+    A squared closing speed is ``D = w^2 + 2 b g``. With ``V`` the largest speed in the line, ``G`` its gaps, ``A`` the
+    largest closing acceleration and ``a`` the weakest brakes, every ``w^2`` is at most ``V^2`` and no gap grows beyond
+    ``G + V^2 / 2a``, so all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``. A segment of motion rounds each
+    speed twice and each gap five times, a round of impacts each speed by ``CLUSTER_EPS``: either moves D by at most
+    8 eps S. These add up and are not multiplied, for the proofs compare a run with itself, not with another one.
+    ``BOUND_EPS`` grants 500 of them; the steps of an episode of 8 s are 80, and the bound's own arithmetic, a few
+    hundred roundings, is among them too.
+    """
+    v = worlds.vehicles
+    drives = v.driving_capacity_mps2[:, vehicle] > 0.0
+    fastest = np.maximum(worlds.speeds_mps.max(axis=1), np.where(drives, v.speed_limit_mps[:, vehicle], 0.0))
+    closing = v.braking_capacity_mps2.max(axis=1) + v.driving_capacity_mps2[:, vehicle]
+    weakest = v.braking_capacity_mps2.min(axis=1)
+    scale = fastest * fastest * (1.0 + closing / weakest) + 2.0 * closing * worlds.gaps_m.sum(axis=1)
+    outward: Floats = BOUND_EPS * EPS * scale
+    return outward
+
+
+def _states(worlds: Worlds, i: int) -> Floats:
+    """The rows of the compiled bounds [n, WIDTH]; columns of a neighbour that is not there stay 0."""
+    v = worlds.vehicles
+    at = np.zeros((worlds.n, WIDTH))
+    columns = {
+        V_F: worlds.speeds_mps[:, i],
+        A_F: v.braking_capacity_mps2[:, i],
+        U_F: v.driving_capacity_mps2[:, i],
+        LIMIT_F: v.speed_limit_mps[:, i],
+        RESTITUTION: v.restitution,
+    }
+    if i > 0:
+        columns[GAP_L] = worlds.gaps_m[:, i - 1]
+        columns[V_L] = worlds.speeds_mps[:, i - 1]
+        columns[A_L] = v.braking_capacity_mps2[:, i - 1]
+        columns[FRONT_SHARE] = v.mass_t[:, i - 1] / (v.mass_t[:, i - 1] + v.mass_t[:, i])
+    if i < worlds.N - 1:
+        columns[GAP_R] = worlds.gaps_m[:, i]
+        columns[V_R] = worlds.speeds_mps[:, i + 1]
+        columns[A_R] = v.braking_capacity_mps2[:, i + 1]
+        columns[ONSET_R] = np.maximum(v.latency_s[:, i + 1] - worlds.time_s, 0.0)
+        columns[REAR_SHARE] = v.mass_t[:, i + 1] / (v.mass_t[:, i + 1] + v.mass_t[:, i])
+    for column, values in columns.items():
+        at[:, column] = values
+    return at

@@ -1,0 +1,1 @@
+"""Policies as plain files: read, checked and run without torch."""

@@ -1,0 +1,180 @@
+"""Which versions made a run or a policy."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+
+from ethbrake_marl.observations import ObservationSpec
+
+_PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "stable-baselines3", "torch")
+
+
+def installed_versions() -> dict[str, str]:
+    """Name -> version of this package, Python and every package that a training's numbers depend on."""
+    return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
+
+
+Activation = Literal["relu", "tanh"]
+Output = Literal["clip", "tanh"]
+Width = Annotated[int, Field(ge=1, le=4096)]
+Hidden = Annotated[tuple[Width, ...], Field(min_length=1, max_length=8)]
+PerhapsHidden = Annotated[tuple[Width, ...], Field(max_length=8)]
+
+
+class NetworkSpec(BaseModel):
+    """An actor, and perhaps a critic, both multilayer perceptrons on the same observation.
+
+    The action is ``output(actor(observation))`` in [-1, 1]: ``clip`` cuts the actor's mean at the bounds (PPO's
+    Gaussian, whose noise is one number per action), ``tanh`` squashes it (SAC's Gaussian, whose noise is a second
+    head of the actor). Without ``value_hidden`` there is no critic: a policy needs none to act.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    observation_size: Annotated[int, Field(ge=1, le=4096)]
+    action_size: Annotated[int, Field(ge=1, le=64)]
+    policy_hidden: Hidden
+    value_hidden: PerhapsHidden
+    activation: Activation
+    output: Output
+
+
+@dataclass(frozen=True, slots=True)
+class TensorRow:
+    """One tensor: its name in a bundle, its shape, and its name in Stable-Baselines3's policy (PPO's or SAC's)."""
+
+    name: str
+    shape: tuple[int, ...]
+    sb3_name: str
+
+
+def tensor_table(spec: NetworkSpec) -> tuple[TensorRow, ...]:
+    """List every tensor of ``spec``, all float32; weights are [outputs, inputs] as in ``y = W x + b``."""
+    last = spec.policy_hidden[-1]
+    if spec.output == "clip":
+        rows = [
+            *_layers("policy", "mlp_extractor.policy_net", spec.observation_size, spec.policy_hidden),
+            *_layer("policy.output", "action_net", last, spec.action_size),
+            TensorRow("policy.log_std", (spec.action_size,), "log_std"),
+        ]
+    else:
+        rows = [
+            *_layers("policy", "actor.latent_pi", spec.observation_size, spec.policy_hidden),
+            *_layer("policy.output", "actor.mu", last, spec.action_size),
+            *_layer("policy.log_std", "actor.log_std", last, spec.action_size),
+        ]
+    if spec.value_hidden:
+        rows += _layers("value", "mlp_extractor.value_net", spec.observation_size, spec.value_hidden)
+        rows += _layer("value.output", "value_net", spec.value_hidden[-1], 1)
+    return tuple(rows)
+
+
+def _layers(name: str, sb3_name: str, inputs: int, hidden: tuple[int, ...]) -> list[TensorRow]:
+    """Hidden layers; the training library counts activations too, so its index is twice ours."""
+    rows: list[TensorRow] = []
+    for k, width in enumerate(hidden):
+        rows += _layer(f"{name}.{k}", f"{sb3_name}.{2 * k}", inputs, width)
+        inputs = width
+    return rows
+
+
+def _layer(name: str, sb3_name: str, inputs: int, outputs: int) -> list[TensorRow]:
+    return [
+        TensorRow(f"{name}.weight", (outputs, inputs), f"{sb3_name}.weight"),
+        TensorRow(f"{name}.bias", (outputs,), f"{sb3_name}.bias"),
+    ]
+
+
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Neighbours = Annotated[int, Field(ge=0, le=64)]
+
+_VEHICLE = re.compile(r"vehicle_[1-9][0-9]?")
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class ObservationSchema(_Strict):
+    """What the policy sees: neighbours on each side, feature names in order, and a hash of how each is scaled."""
+
+    front: Neighbours
+    rear: Neighbours
+    features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]
+    scaling_sha256: Sha256
+
+    @property
+    def spec(self) -> ObservationSpec:
+        """The observation as the environment builds it; what follows the neighbours is told by the features' names."""
+        groups = {name.partition(".")[0] for name in self.features}
+        return ObservationSpec(front=self.front, rear=self.rear, role="role" in groups, hazard="hazard" in groups)
+
+
+class Manifest(_Strict):
+    """Everything about a policy but its tensors; ``action`` is a fraction of the own capacity, -1 = full braking."""
+
+    format: Literal["ethbrake-policy"] = "ethbrake-policy"
+    format_version: Literal[2] = 2
+    algorithm: Literal["ppo", "sac"]
+    network: NetworkSpec
+    observation: ObservationSchema
+    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"
+    learners: Annotated[tuple[str, ...], Field(min_length=1)]
+    scenario: dict[str, JsonValue]
+    reward: dict[str, JsonValue]
+    seeds: dict[str, int]
+    steps: Annotated[int, Field(ge=0)]
+    versions: dict[str, str]
+    weights_sha256: Sha256
+    manifest_sha256: Sha256  # of everything above, see ``content_sha256``
+
+    @model_validator(mode="after")
+    def _one_input_per_feature(self) -> Manifest:
+        features, inputs = len(self.observation.features), self.network.observation_size
+        if features != inputs:
+            raise ValueError(f"{features} observation features for a network that takes {inputs}")
+        return self
+
+    @model_validator(mode="after")
+    def _learners_of_the_scenario(self) -> Manifest:
+        for name in self.learners:
+            if _VEHICLE.fullmatch(name) is None:
+                raise ValueError(f"learners: {name!r} is no vehicle; vehicles are vehicle_1, vehicle_2, ...")
+        if len(set(self.learners)) < len(self.learners):
+            raise ValueError(f"learners: {', '.join(self.learners)}: each vehicle learns once")
+        vehicles, roles = self.scenario.get("vehicles"), self.scenario.get("roles")
+        for name in self.learners:
+            if isinstance(vehicles, int) and int(name.removeprefix("vehicle_")) > vehicles:
+                raise ValueError(f"learners: {name}: the scenario has {vehicles} vehicles")
+            if isinstance(roles, dict) and roles.get(name) != "learner":
+                raise ValueError(f"learners: {name}: does not learn in the scenario's roles")
+        return self
+
+
+def content_sha256(content: Mapping[str, Any]) -> str:
+    """SHA-256 of a manifest's plain content without its own hash: sorted keys, no blanks, ASCII.
+
+    It binds names, architecture and weights together, against accidents and edits; it is no signature.
+    """
+    hashed = {key: value for key, value in content.items() if key != "manifest_sha256"}
+    return hashlib.sha256(json.dumps(hashed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def observation_schema(spec: ObservationSpec) -> ObservationSchema:
+    """Describe ``spec`` so that a later change of a name, unit, scale or bound is noticed."""
+    rows = [[f.name, f.unit, f.scale, f.low, f.high] for f in spec.features]
+    return ObservationSchema(
+        front=spec.front,
+        rear=spec.rear,
+        features=tuple(f.name for f in spec.features),
+        scaling_sha256=hashlib.sha256(json.dumps(rows).encode()).hexdigest(),
+    )

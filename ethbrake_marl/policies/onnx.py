@@ -1,0 +1,98 @@
+"""A policy as an ONNX model: observation in, acceleration out. Needs the extra ``export``."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.policies.policy import Policy
+
+OPSET = 17
+IR_VERSION = 8  # old enough for every runtime since 2022
+
+_CAPACITIES = ("own.braking_capacity", "own.driving_capacity")
+
+
+def onnx_model(policy: Policy) -> bytes:
+    """The serialised model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
+
+    The acceleration is the action times the own braking (below 0) or driving capacity (above 0), which the observation
+    holds. Products are summed in another order than in our forward pass: results agree within rounding, not to the
+    bit. Raises ``InvalidInput`` when the package onnx is not installed.
+    """
+    try:
+        import onnx  # only here: an extra
+    except ImportError:
+        raise InvalidInput(f"ONNX export needs the package onnx: {sys.executable} -m pip install onnx") from None
+    writer = _Writer(onnx)
+    action = writer.actor(policy)
+    features = {f.name: (k, f.scale) for k, f in enumerate(policy.observation.features)}
+    braking, driving = (writer.feature(name, *features[name]) for name in _CAPACITIES)
+    zero = writer.constant("zero", np.zeros(1, np.float32))
+    below = writer.node("Mul", [writer.node("Min", [action, zero]), braking])
+    above = writer.node("Mul", [writer.node("Max", [action, zero]), driving])
+    writer.node("Add", [below, above], output="acceleration_mps2")
+    return writer.model(policy)
+
+
+class _Writer:
+    """Collects the nodes and constants of one graph."""
+
+    def __init__(self, onnx: Any) -> None:
+        self._onnx = onnx
+        self._nodes: list[Any] = []
+        self._constants: list[Any] = []
+
+    def constant(self, name: str, array: NDArray[Any]) -> str:
+        self._constants.append(self._onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+        return name
+
+    def node(self, operator: str, inputs: list[str], *, output: str = "", **attributes: Any) -> str:
+        name = output or f"{operator.lower()}_{len(self._nodes)}"
+        self._nodes.append(self._onnx.helper.make_node(operator, inputs, [name], **attributes))
+        return name
+
+    def actor(self, policy: Policy) -> str:
+        """The layers, and the output function that gives ``action``."""
+        network, tensors = policy.manifest.network, policy.tensors
+        names = [f"policy.{k}" for k in range(len(network.policy_hidden))] + ["policy.output"]
+        x = "observation"
+        for name in names:
+            weight, bias = (self.constant(f"{name}.{part}", tensors[f"{name}.{part}"]) for part in ("weight", "bias"))
+            x = self.node("Gemm", [x, weight, bias], transB=1)
+            if name != "policy.output":
+                x = self.node("Relu" if network.activation == "relu" else "Tanh", [x])
+        if network.output == "tanh":
+            return self.node("Tanh", [x], output="action")
+        low = self.constant("lowest", np.array(-1.0, np.float32))
+        high = self.constant("highest", np.array(1.0, np.float32))
+        return self.node("Clip", [x, low, high], output="action")
+
+    def feature(self, name: str, column: int, scale: float) -> str:
+        """One feature in its unit, [n, 1]."""
+        index = self.constant(f"{name}.column", np.array([column], np.int64))
+        unit = self.constant(f"{name}.scale", np.array([scale], np.float32))
+        return self.node("Mul", [self.node("Gather", ["observation", index], axis=1), unit])
+
+    def model(self, policy: Policy) -> bytes:
+        """The whole graph, checked, with what the bundle's manifest says about it."""
+        onnx, manifest = self._onnx, policy.manifest
+        helper, float32 = onnx.helper, onnx.TensorProto.FLOAT
+        inputs = [helper.make_tensor_value_info("observation", float32, ["n", manifest.network.observation_size])]
+        outputs = [helper.make_tensor_value_info(name, float32, ["n", 1]) for name in ("action", "acceleration_mps2")]
+        graph = helper.make_graph(self._nodes, "policy", inputs, outputs, self._constants)
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="ethbrake-marl")
+        model.ir_version = IR_VERSION
+        told = {
+            "algorithm": manifest.algorithm,
+            "manifest_sha256": manifest.manifest_sha256,
+            "features": ",".join(manifest.observation.features),
+        }
+        helper.set_model_props(model, told)
+        onnx.checker.check_model(model)
+        data: bytes = model.SerializeToString()
+        return data

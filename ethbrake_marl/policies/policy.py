@@ -1,0 +1,191 @@
+"""A policy as a folder of two plain files: ``manifest.json`` (what it is) and ``weights.safetensors`` (numbers).
+
+Reading one runs no code from it: no pickle, no names to import, no torch. Everything is checked against our own
+table of tensors before any of it is used, and what is damaged or unknown is refused by name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+from pydantic import ValidationError
+from safetensors import SafetensorError
+
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
+from ethbrake_marl.files.durable import new_folder, write_file
+from ethbrake_marl.files.json import parse_strict_json
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.observations import ObservationSpec
+from ethbrake_marl.policies.actor import Actor, Float32s
+from ethbrake_marl.policies.manifest import Manifest, content_sha256, observation_schema, tensor_table
+
+MANIFEST = "manifest.json"
+WEIGHTS = "weights.safetensors"
+MANIFEST_LIMIT_BYTES = 1 << 20
+WEIGHTS_LIMIT_BYTES = 256 << 20
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy in memory: its manifest, its tensors, and ``policy(observation)`` for the deterministic action."""
+
+    manifest: Manifest
+    tensors: Mapping[str, Float32s] = field(repr=False)
+    _actor: Actor = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Build the forward pass."""
+        object.__setattr__(self, "_actor", Actor(self.manifest.network, self.tensors))
+
+    def __call__(self, observation: Float32s) -> Float32s:
+        """Map observation [n, F] float32 to action [n, A] float32 in [-1, 1]; row k depends on row k alone."""
+        return self._actor(observation)
+
+    @property
+    def observation(self) -> ObservationSpec:
+        """What to observe for this policy."""
+        return self.manifest.observation.spec
+
+
+def make_policy(tensors: Mapping[str, Float32s], **manifest: Any) -> Policy:
+    """Build a policy from ``tensors`` and the fields of ``Manifest`` (all but the hashes, which are computed).
+
+    Raises ``InvalidInput`` naming the tensor or field that does not fit.
+    """
+    data = _serialise(tensors)
+    try:
+        draft = Manifest(**manifest, weights_sha256=hashlib.sha256(data).hexdigest(), manifest_sha256="0" * 64)
+        own = content_sha256(draft.model_dump(mode="json"))
+        checked = draft.model_copy(update={"manifest_sha256": own})
+        return Policy(checked, _tensors(data, checked))
+    except ValidationError as error:
+        raise InvalidInput(f"policy: {first_line(error)}") from None
+    except ValueError as error:
+        raise InvalidInput(f"policy: {error}") from None
+
+
+def actor_only(policy: Policy) -> Policy:
+    """The same policy without its critic, which it does not need to act: the same actions from half the bytes."""
+    network = policy.manifest.network.model_copy(update={"value_hidden": ()})
+    names = {row.name for row in tensor_table(network)}
+    fields = {name: getattr(policy.manifest, name) for name in Manifest.model_fields}
+    del fields["weights_sha256"], fields["manifest_sha256"]
+    tensors = {name: tensor for name, tensor in policy.tensors.items() if name in names}
+    return make_policy(tensors, **{**fields, "network": network})
+
+
+def save_policy(policy: Policy, folder: Path, *, replace: bool = False) -> None:
+    """Write ``policy`` as the new folder ``folder``, completely or not at all; raises ``AlreadyExists``.
+
+    With ``replace`` a folder that is there goes once the new one is written.
+    """
+    with new_folder(folder, replace=replace) as partial:
+        write_file(partial / WEIGHTS, _serialise(policy.tensors))
+        write_file(partial / MANIFEST, policy.manifest.model_dump_json(indent=2).encode() + b"\n")
+
+
+def load_policy(path: str | os.PathLike[str]) -> Policy:
+    """Read the bundle at ``path``: a bundle's own folder, or a run's folder (then its ``policy/``).
+
+    Raises ``InvalidInput`` when there is none, ``CorruptBundle`` (file, what is wrong) when it cannot be trusted.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise InvalidInput(f"policy {path!r:.60}: must be the path of a run or of a policy bundle")
+    folder = _bundle_folder(Path(path))
+    _check_files(folder)
+    manifest = _manifest(folder / MANIFEST)
+    data = _read(folder / WEIGHTS, WEIGHTS_LIMIT_BYTES)
+    found = hashlib.sha256(data).hexdigest()
+    if found != manifest.weights_sha256:
+        raise CorruptBundle(f"{folder / WEIGHTS}: SHA-256 is {found}, the manifest says {manifest.weights_sha256}")
+    try:
+        return Policy(manifest, _tensors(data, manifest))
+    except ValueError as error:
+        raise CorruptBundle(f"{folder / WEIGHTS}: {error}") from None
+
+
+def _bundle_folder(path: Path) -> Path:
+    for folder in (path, path / "policy"):
+        try:
+            found = (folder / MANIFEST).exists() or (folder / WEIGHTS).exists()
+        except OSError as error:
+            raise InvalidInput(f"{str(path)!r:.120}: cannot be read ({error.strerror})") from None
+        if found:
+            if folder.is_symlink():
+                raise CorruptBundle(f"{folder}: is a symbolic link; give the folder it points to")
+            return folder
+    members = sorted((path / "policy").glob("vehicle_*"))
+    if members:
+        raise InvalidInput(f"{path}: each of its learners has a policy of its own; name one, for instance {members[0]}")
+    reason = "holds no policy" if path.is_dir() else "is not a folder"
+    raise InvalidInput(f"{path}: {reason}; give a policy bundle ({MANIFEST}, {WEIGHTS}) or a run that finished")
+
+
+def _check_files(folder: Path) -> None:
+    found = {entry.name for entry in os.scandir(folder)}
+    for name in sorted({MANIFEST, WEIGHTS} - found):
+        raise CorruptBundle(f"{folder / name}: is missing")
+    for name in sorted(found - {MANIFEST, WEIGHTS}):
+        raise CorruptBundle(f"{folder / name}: does not belong into a bundle, which is {MANIFEST} and {WEIGHTS} only")
+
+
+def _read(path: Path, limit: int) -> bytes:
+    return read_plain(path, limit, refusal=CorruptBundle, follow_links=False)
+
+
+def _manifest(path: Path) -> Manifest:
+    data = _read(path, MANIFEST_LIMIT_BYTES)
+    try:
+        content = parse_strict_json(data)
+        manifest = Manifest.model_validate_json(data)
+    except ValidationError as error:
+        raise CorruptBundle(f"{path}: {first_line(error)}") from None
+    except ValueError as error:
+        raise CorruptBundle(f"{path}: {error}") from None
+    found = content_sha256(content)
+    if found != manifest.manifest_sha256:
+        raise CorruptBundle(
+            f"{path}: its content has SHA-256 {found}, but it says {manifest.manifest_sha256}; it was changed after it"
+            " was saved"
+        )
+    if manifest.observation != observation_schema(manifest.observation.spec):
+        raise CorruptBundle(
+            f"{path}: observation: features or their scaling are not those of this version of the package;"
+            f" use the one it was made with ({manifest.versions.get('ethbrake-marl', 'unknown')}), or train again"
+        )
+    return manifest
+
+
+def first_line(error: ValidationError) -> str:
+    """Where the first mistake is, and what: pydantic's own message has several lines."""
+    first = error.errors(include_url=False)[0]
+    where = ".".join(str(part) for part in first["loc"])
+    reason = first["msg"].removeprefix("Value error, ")
+    return f"{where}: {reason}" if where else reason
+
+
+def _serialise(tensors: Mapping[str, Float32s]) -> bytes:
+    return safetensors.numpy.save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+
+
+def _tensors(data: bytes, manifest: Manifest) -> dict[str, Float32s]:
+    """Check ``data`` against the tensor table, then read it; raises ``ValueError`` naming the tensor."""
+    rows = [ArrayRow(row.name, "F32", row.shape) for row in tensor_table(manifest.network)]
+    check_arrays(safetensors_headers(data), rows, "tensor")
+    try:
+        tensors = safetensors.numpy.load(data)
+    except SafetensorError as error:
+        raise ValueError(f"not a safetensors file ({error})") from None
+    for name, tensor in tensors.items():
+        if not np.isfinite(tensor).all():
+            raise ValueError(f"tensor {name!r} holds a number that is not finite")
+        tensor.setflags(write=False)
+    return tensors

@@ -1,0 +1,201 @@
+"""Checks of a scenario that concern a whole field or several fields at once.
+
+Each raises pydantic's error for the first defect, with the path inside the field or file and the value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+from pydantic import BaseModel
+from pydantic_core import PydanticCustomError
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.yaml import YamlPath, flow_text
+from ethbrake_marl.objectives import Declared, objectives_of
+from ethbrake_marl.scenario.distributions import support
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, OPTIONAL, QUANTITIES, QuantityRule
+from ethbrake_marl.scenario.roles import (
+    LEARNER,
+    STATE_FREE,
+    constant_deceleration,
+    is_state_free,
+    parse_agent_spec,
+)
+from ethbrake_marl.scenario.sampling import farthest_hazard_m
+
+if TYPE_CHECKING:
+    from ethbrake_marl.scenario.schema import Scenario
+
+
+def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
+    """Raise the error for ``value`` at ``at`` (inside the field being checked): ``right`` says what would do."""
+    plain = value.model_dump(exclude_none=True) if isinstance(value, BaseModel) else value
+    raise PydanticCustomError("scenario", "{right}", {"right": right, "value": flow_text(plain, 60), "at": at})
+
+
+def check_entries(rule: QuantityRule, value: Any, vehicles: int | None) -> None:
+    """Every entry of a quantity is in range over its whole support, and a list has the right length."""
+    listed = isinstance(value, tuple)
+    if listed and vehicles is not None and len(value) != rule.count(vehicles):
+        per = "one per pair" if rule.per == "pair" else "one per vehicle"
+        right = f"has {len(value)} entries; {vehicles} vehicles need {rule.count(vehicles)} ({per}), or one for all"
+        raise PydanticCustomError("scenario", "{right}", {"right": right, "value": "", "at": ()})
+    for index, entry in enumerate(value if listed else (value,)):
+        low, high = support(entry)
+        if not rule.allows(low, high):
+            overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
+            refuse((index,) if listed else (), entry, f"must be {rule.interval}{overlap}")
+
+
+class Roles(dict[str, str]):
+    """Vehicle -> ``learner`` or a script; like the rest of a scenario it cannot be changed."""
+
+    def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
+        raise InvalidInput("roles of a scenario are frozen; use scenario.replace(roles=...) or scenario.with_learners")
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    update = setdefault = pop = popitem = clear = _refuse
+
+    def __reduce__(self) -> tuple[type[Roles], tuple[dict[str, str]]]:
+        """Copy and pickle through the constructor."""
+        return Roles, (dict(self),)
+
+
+def complete_roles(given: Mapping[str, str] | None, vehicles: int) -> Roles:
+    """A role for every vehicle in order: full braking where none is given; by default vehicle_2 learns."""
+    roles = {"vehicle_2": LEARNER} if given is None else given
+    names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+    return Roles({name: roles.get(name, "full_brake") for name in names})
+
+
+def check_roles(roles: Mapping[str, str], vehicles: int) -> None:
+    """Every key is a vehicle of this scenario and every value is ``learner`` or the syntax of a script."""
+    names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+    for name, role in roles.items():
+        if name not in names:
+            close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
+            refuse((name,), role, f"unknown vehicle; {hint}")
+        try:
+            is_state_free(role)
+        except InvalidInput as error:
+            refuse((name,), role, str(error))
+        if role.startswith(f"{LEARNER}:"):
+            refuse((name,), role, f"{LEARNER} takes no argument")
+
+
+def check_objective(declared: Declared, vehicles: int) -> None:
+    """The objective is a known one, and there is one for all vehicles or one for each."""
+    try:
+        objectives_of(declared, vehicles)
+    except InvalidInput as error:
+        refuse((), declared, str(error).removeprefix("objective: "))
+
+
+def check_alternatives(scenario: Scenario) -> None:
+    """Gaps and speeds are declared in one of two ways, an obstacle in one at most; deviations need a line speed."""
+    if "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None:
+        right = "needs line_speed_mps, the speed that it is added to"
+        refuse(("speed_deviations_mps",), _plain(scenario.speed_deviations_mps), right)
+    for usual, other in ALTERNATIVES.items():
+        given = [key for key in (usual, other) if getattr(scenario, key) is not None]
+        if not given and usual not in OPTIONAL:
+            raise PydanticCustomError("missing", "missing", {"at": (usual,)})
+        if len(given) == 2:
+            refuse((other,), _plain(getattr(scenario, other)), f"give either {usual} or {other}, not both")
+
+
+def check_whole(scenario: Scenario) -> None:
+    """Fields that limit each other: time step, horizon, latency, speeds, gaps, constant scripts, rejection."""
+    if not scenario.time_step_s <= scenario.horizon_s:
+        refuse(("time_step_s",), scenario.time_step_s, f"must not be above horizon_s ({scenario.horizon_s:g} s)")
+    for i, latency in enumerate(scenario.quantities("latency_s")):
+        if not support(latency)[1] < scenario.horizon_s:
+            right = f"must be below horizon_s ({scenario.horizon_s:g} s), or the vehicle can never act"
+            refuse(_path(scenario, "latency_s", i), latency, right)
+    _check_reactions(scenario)
+    _check_speeds(scenario)
+    if scenario.time_gaps_s is not None:
+        _check_time_gaps(scenario)
+    if scenario.hazard_margin_m is not None:
+        _check_hazard_margin(scenario)
+    _check_constant_scripts(scenario)
+    if 0 in scenario.learners and not scenario.has_obstacle:
+        right = "has nothing to lose without an obstacle ahead; give hazard_gap_m too, for instance hazard_gap_m: 42"
+        refuse(("roles", "vehicle_1"), LEARNER, right)
+    if scenario.early_impacts == "reject" and scenario.learners:
+        _check_rejection(scenario)
+
+
+def _check_reactions(scenario: Scenario) -> None:
+    """However late the news is, every vehicle may act before the horizon."""
+    own = np.array([support(latency)[1] for latency in scenario.quantities("latency_s")])
+    latest = scenario.v2x.latest_reaction_s(own)
+    if not (latest < scenario.horizon_s).all():
+        i = int(np.argmin(latest < scenario.horizon_s))
+        right = (
+            f"vehicle_{i + 1} may have no news until {latest[i]:g} s; it must be below horizon_s"
+            f" ({scenario.horizon_s:g} s), which may be raised"
+        )
+        refuse(("v2x",), scenario.v2x, right)
+
+
+def _check_speeds(scenario: Scenario) -> None:
+    limits = scenario.quantities("speed_limit_mps")
+    for i, (low, high) in enumerate(scenario.bounds("speeds_mps")):
+        if low >= 0.0 and high <= support(limits[i])[0]:
+            continue
+        limit = f"speed_limit_mps of vehicle_{i + 1}, {flow_text(_plain(limits[i]))} m/s"
+        if scenario.line_speed_mps is None:
+            speed = scenario.quantities("speeds_mps")[i]
+            refuse(_path(scenario, "speeds_mps", i), speed, f"must not be above {limit}")
+        right = f"with speed_deviations_mps vehicle_{i + 1} drives {low:g} to {high:g} m/s; must be 0 to {limit}"
+        refuse(("line_speed_mps",), scenario.line_speed_mps, right)
+
+
+def _check_time_gaps(scenario: Scenario) -> None:
+    largest = QUANTITIES["gaps_m"].high
+    for pair, (_, high) in enumerate(scenario.bounds("gaps_m")):
+        if not high <= largest:
+            right = f"is up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"
+            refuse(_path(scenario, "time_gaps_s", pair), scenario.quantities("time_gaps_s")[pair], right)
+
+
+def _check_hazard_margin(scenario: Scenario) -> None:
+    farthest = farthest_hazard_m(scenario)
+    if not farthest <= OPTIONAL["hazard_gap_m"].high:
+        right = (
+            f"puts the obstacle up to {farthest:g} m ahead of vehicle_1; that distance must not be above"
+            f" {OPTIONAL['hazard_gap_m'].high:g} m"
+        )
+        refuse(("hazard_margin_m",), scenario.hazard_margin_m, right)
+
+
+def _check_constant_scripts(scenario: Scenario) -> None:
+    for i, script in scenario.scripts.items():
+        deceleration = constant_deceleration(script) or 0.0
+        field = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
+        capacity = support(scenario.quantities(field)[i])[0]
+        if not abs(deceleration) <= capacity:
+            refuse(("roles", f"vehicle_{i + 1}"), script, f"is above this vehicle's {field}, {capacity:g} m/s2")
+
+
+def _check_rejection(scenario: Scenario) -> None:
+    for i, script in scenario.scripts.items():
+        if not is_state_free(script):
+            close = get_close_matches(parse_agent_spec(script)[0], STATE_FREE, n=1)
+            hint = f"; did you mean {close[0]}?" if close else ""
+            right = f"with early_impacts: reject a script must be full_brake, coast or constant:a{hint}"
+            refuse(("roles", f"vehicle_{i + 1}"), script, right)
+
+
+def _path(scenario: Scenario, field: str, index: int) -> YamlPath:
+    return (field, index) if isinstance(getattr(scenario, field), tuple) else (field,)
+
+
+def _plain(quantity: Any) -> Any:
+    return quantity.model_dump(exclude_none=True) if isinstance(quantity, BaseModel) else quantity

@@ -1,0 +1,52 @@
+"""What messages about a scenario file know of its keys: which may stand where, what each means, whose value it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from ethbrake_marl.files.yaml import YamlPath
+from ethbrake_marl.scenario.distributions import DISTRIBUTIONS, Choice, NormalShape
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
+from ethbrake_marl.scenario.v2x import V2X
+
+_INSIDE = {
+    "uniform": ("uniform",),
+    "loguniform": ("loguniform",),
+    "normal": tuple(NormalShape.model_fields),
+    "choice": tuple(Choice.model_fields),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ScenarioWording:
+    """The ``Wording`` of a scenario; ``keys`` are its top-level keys."""
+
+    keys: Iterable[str]
+
+    def known(self, path: YamlPath) -> list[str]:
+        """The keys that may stand where ``path`` ends: at the top, in a distribution, in its parameters, in v2x."""
+        if len(path) == 1:
+            return list(self.keys)
+        outer = str(path[-2])
+        if outer == "v2x":
+            return list(V2X.model_fields)
+        return list(_INSIDE[outer]) if outer == "normal" else sorted({*DISTRIBUTIONS, "weights"})
+
+    def needed(self, path: YamlPath) -> str:
+        """What is needed at ``path``, with an example."""
+        key = path[-1]
+        if isinstance(key, int):
+            return "two numbers [low, high] are needed"
+        rule = DECLARED.get(key)
+        if rule is None and len(path) > 1:
+            return "a number is needed, as in {normal: {mean: 20, sd: 1, low: 18, high: 22}}"
+        if rule is None:
+            return f"it is needed, for instance {key}: my-scenario"
+        other = f", or {ALTERNATIVES[key]}: {DECLARED[ALTERNATIVES[key]].example}" if key in ALTERNATIVES else ""
+        return f"the {rule.meaning} is needed, for instance {key}: {rule.example}{other}"
+
+    def owner(self, path: YamlPath) -> str:
+        """Whose value stands at ``path``: a vehicle or a pair; empty for anything else."""
+        rule = DECLARED.get(str(path[0])) if len(path) > 1 else None
+        return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""

@@ -1,0 +1,1 @@
+"""Whole command profiles: play them, and search for the one of least harm."""

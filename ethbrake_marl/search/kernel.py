@@ -1,0 +1,252 @@
+"""The search for the profile of least harm in one world, compiled: one call per world, no Python inside.
+
+Method: given profiles (constants among them) and random ones are tried; the best of them, all different, are improved
+by random changes of any size, each success being repeated twice as large; after each round the better half goes on.
+The last one is divided into more phases and improved further, at the end decision by decision, as the engine runs.
+Letters as in ``profile_motion``; Q given profiles, M of them and of the random ones improved.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
+from ethbrake_marl.search.motion import LAST_STEP, STEPWISE, Setting, follow, follow_whole
+from ethbrake_marl.search.moves import (
+    AMOUNT,
+    CHANGE_WIDTH,
+    KIND,
+    SET_COMMAND,
+    apply_change,
+    compact,
+    draw_change,
+    draw_profile,
+    split_phases,
+)
+
+MOST_PHASES = 12
+DRAWN_PHASES = 6  # of a random profile
+DRAWN_SHARE = 0.35  # of the budget, for given and random profiles
+ROUNDS_SHARE = 0.50  # for the rounds of improvement that each halve the field
+STEPWISE_SHARE = 0.02  # for the last improvement; its candidates cost several times more
+PER_PROFILE = 400  # candidates of the budget for each profile of the first round, and at most
+SMALLEST_FIELD, LARGEST_FIELD = 4, 128  # profiles there
+SAME = 1e-6  # values (m2/s2) closer than this belong to the same profile
+ATTENTION_STEPS = 30  # phases are divided within these first steps
+
+
+class Field(NamedTuple):
+    """Profiles that are improved together."""
+
+    ends: Ints  # [M, K]
+    commands: Floats  # [M, K, C]
+    phases: Ints  # [M] how many of the K are used; 0 for an empty place
+    values: Floats  # [M] what is minimised
+
+
+@compiled
+def search_world(
+    world: Setting, start: Floats, seed_ends: Ints, seed_commands: Floats, budget: int, ends: Ints, commands: Floats
+) -> int:
+    """Fill ``ends`` [K] and ``commands`` [K, C] with the best profile found; its number of phases.
+
+    ``start`` [S] is the state at the first decision; ``seed_ends`` [Q, K] and ``seed_commands`` [Q, K, C] are given
+    profiles, and the result is never worse than any of them. 0 if the kernel failed on every profile.
+    """
+    K, C = commands.shape
+    states = np.zeros((K + 1, start.shape[0]))
+    copy_rows(start.reshape(1, -1), states, 1)
+    M, rounds = SMALLEST_FIELD, 3
+    while budget >= 2 * M * PER_PROFILE and M < LARGEST_FIELD:
+        M *= 2
+        rounds += 1
+    field = Field(np.zeros((M, K), np.int64), np.zeros((M, K, C)), np.zeros(M, np.int64), np.full(M, math.inf))
+    drawn = max(int(DRAWN_SHARE * budget) - seed_ends.shape[0], 0)
+    in_rounds, stepwise = int(ROUNDS_SHARE * budget), int(STEPWISE_SHARE * budget)
+    gather(world, seed_ends, seed_commands, states, drawn, field)
+    for stage in range(rounds + 2):
+        left = max(M >> stage, 1)
+        each = in_rounds // (rounds * left)
+        if stage == rounds:
+            divide(world, field)
+            each = budget - drawn - in_rounds - stepwise
+        elif stage == rounds + 1:
+            select_stepwise(world, seed_ends, seed_commands, states, field)
+            each = stepwise
+        for m in range(left):
+            used = field.phases[m]
+            if used > 0 and field.values[0] > 0.0:
+                field.values[m] = improve(world, field.ends[m, :used], field.commands[m, :used], states, each)
+        sort(field, left)
+    used = field.phases[0]
+    if used == 0:
+        return 0
+    copy_profile(field.ends[0], field.commands[0], ends, commands)
+    used = compact(ends[:used], commands[:used], used)
+    for k in range(used, K):
+        ends[k] = int(world.clock[LAST_STEP])
+        for c in range(C):
+            commands[k, c] = commands[used - 1, c]
+    return used
+
+
+@compiled
+def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Floats) -> None:
+    """Copy the phases of one profile over the first ones of another."""
+    for k in range(ends.shape[0]):
+        to_ends[k] = ends[k]
+    copy_rows(commands, to_commands, commands.shape[0])
+
+
+@compiled
+def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
+    """Copy the first ``n`` rows. (An assignment of slices compiles ten times longer, for its message of an error.)"""
+    for k in range(n):
+        for c in range(rows.shape[1]):
+            to_rows[k, c] = rows[k, c]
+
+
+@compiled_apart
+def improve(world: Setting, ends: Ints, commands: Floats, states: Floats, budget: int) -> float:
+    """Better and better neighbours of a profile, in place, until ``budget`` candidates have run; its value."""
+    new_ends, new_commands, new_states = ends.copy(), commands.copy(), states.copy()
+    change = np.zeros(CHANGE_WIDTH)
+    value, active, spent, phase, again = math.inf, 0, -1, 0, False  # the first candidate is the profile itself
+    for _ in range(4 * budget + 1):  # a change that changes nothing costs no candidate
+        if spent >= budget or value <= 0.0:
+            break
+        if spent >= 0:
+            if not again:
+                phase = draw_change(world.random, world.bounds, active, change)
+            copy_profile(ends, commands, new_ends, new_commands)
+            again = False
+            if not apply_change(change, world.bounds, new_ends, new_commands):
+                continue
+            copy_rows(states[phase:], new_states[phase:], 1)
+        spent += 1
+        new_value, reached = follow(world, new_ends, new_commands, new_states, phase, value)
+        if reached < 0 or not new_value < value:
+            if active == 0:
+                return math.inf
+            continue
+        value, active = new_value, reached
+        copy_profile(new_ends, new_commands, ends, commands)
+        copy_rows(new_states[phase + 1 :], states[phase + 1 :], reached - phase)
+        change[AMOUNT] *= 2.0
+        again = spent > 0 and change[KIND] != SET_COMMAND
+    for k in range(active - 1, ends.shape[0]):
+        ends[k] = int(world.clock[LAST_STEP])  # the episode is over by then
+    return value
+
+
+@compiled_apart
+def gather(world: Setting, seed_ends: Ints, seed_commands: Floats, states: Floats, drawn: int, field: Field) -> None:
+    """Fill the field with the best of the given profiles and of ``drawn`` random ones, all of different value."""
+    Q, K = seed_ends.shape
+    last = int(world.clock[LAST_STEP])
+    ends, commands = np.zeros(K, np.int64), np.zeros(field.commands.shape[1:])
+    worst = 0
+    for s in range(Q + drawn):
+        used = DRAWN_PHASES
+        if s < Q:
+            copy_profile(seed_ends[s], seed_commands[s], ends, commands)
+            used = 1
+            while used < K and ends[used - 1] != last:
+                used += 1
+        else:
+            draw_profile(world.random, world.bounds, ends[:used], commands[:used], last)
+        value, reached = follow_whole(world, ends[:used], commands[:used], states, field.values[worst])
+        if reached < 0 or not value < field.values[worst] or is_among(value, field.values):
+            continue
+        copy_profile(ends, commands, field.ends[worst], field.commands[worst])
+        field.phases[worst] = used
+        field.values[worst] = value
+        if value <= 0.0:
+            break
+        worst = largest(field.values)
+    sort(field, field.values.shape[0])
+
+
+@compiled_apart
+def sort(field: Field, left: int) -> None:
+    """Put the first ``left`` places of the field in order of value."""
+    for here in range(1, left):
+        m = here
+        while m > 0 and field.values[m] < field.values[m - 1]:
+            swap(field, m)
+            m -= 1
+
+
+@compiled
+def swap(field: Field, m: int) -> None:
+    """Exchange place m of the field with the one before it."""
+    field.values[m], field.values[m - 1] = field.values[m - 1], field.values[m]
+    field.phases[m], field.phases[m - 1] = field.phases[m - 1], field.phases[m]
+    for k in range(field.ends.shape[1]):
+        field.ends[m, k], field.ends[m - 1, k] = field.ends[m - 1, k], field.ends[m, k]
+        for c in range(field.commands.shape[2]):
+            before = field.commands[m - 1, k, c]
+            field.commands[m - 1, k, c] = field.commands[m, k, c]
+            field.commands[m, k, c] = before
+
+
+@compiled
+def is_among(value: float, values: Floats) -> bool:
+    """Whether one of ``values`` belongs to the same profile as this one."""
+    for other in values:  # noqa: SIM110  # any() is not compiled
+        if abs(other - value) < SAME:
+            return True
+    return False
+
+
+@compiled
+def largest(values: Floats) -> int:
+    """Place of the first largest value."""
+    place = 0
+    for k in range(values.shape[0]):
+        if values[k] > values[place]:
+            place = k
+    return place
+
+
+@compiled_apart
+def divide(world: Setting, field: Field) -> None:
+    """Give the best of the field as many phases as there may be."""
+    used = field.phases[0]
+    if used > 0 and field.values[0] > 0.0:
+        K = field.ends.shape[1]
+        used = compact(field.ends[0, :used], field.commands[0, :used], used)
+        split_phases(field.ends[0], field.commands[0], used, K, min(ATTENTION_STEPS, int(world.clock[LAST_STEP])))
+        field.phases[0] = K
+
+
+@compiled_apart
+def select_stepwise(world: Setting, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Field) -> None:
+    """From now on advance decision by decision; put the best of the field and the given profiles in the first place.
+
+    Rounding may decide on which side of a jump a profile lands.
+    """
+    world.clock[STEPWISE] = 1.0
+    Q, K = seed_ends.shape
+    best_ends, best_commands = np.zeros(K, np.int64), np.zeros(field.commands.shape[1:])
+    least, size = math.inf, 0
+    for s in range(SMALLEST_FIELD + Q):
+        given = s >= SMALLEST_FIELD
+        n = K if given else field.phases[s]
+        if n == 0:
+            continue
+        ends = seed_ends[s - SMALLEST_FIELD] if given else field.ends[s, :n]
+        commands = seed_commands[s - SMALLEST_FIELD] if given else field.commands[s, :n]
+        value, reached = follow_whole(world, ends, commands, states, least)
+        if reached > 0 and value < least:
+            least, size = value, n
+            copy_profile(ends, commands, best_ends, best_commands)
+            if value <= 0.0:
+                break
+    copy_profile(best_ends, best_commands, field.ends[0], field.commands[0])
+    field.phases[0] = size
+    field.values[0] = least

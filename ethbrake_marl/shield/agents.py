@@ -1,0 +1,277 @@
+"""The paper's hybrid (Algorithm 1): at the alert, choose between policy and baseline for the whole episode.
+
+The policy is rolled out in the engine from the alert on; its harm (each impact summed once) is compared with the
+baseline's ``H*`` and the lower one drives the episode. With ``H*`` coupled (realised in the same engine) the hybrid
+is never worse than the baseline, in any world. With the paper's pairwise ``H*``, which treats the two pairs as
+independent, that does not hold: the pairwise figure is about half of what the same deceleration realises.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.actions import action_to_command
+from ethbrake_marl.agents.e_v2x_bm.agent import EV2XBM
+from ethbrake_marl.agents.knowledge import Knowledge, Source, combined
+from ethbrake_marl.agents.protocol import Agent, check_agent, place, recall
+from ethbrake_marl.agents.refined import Rehearsed
+from ethbrake_marl.agents.rollout import drive, introduce, scripted
+from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.rows import TIME, Packed
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.search.problem import state_columns
+from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
+from ethbrake_marl.shield.rollouts import Proposer, proposed_action
+from ethbrake_marl.shield.settings import check_scenario
+from ethbrake_marl.shield.step_shield import Certified, StepShield
+from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
+
+Bound = Literal["coupled", "pairwise"]
+
+
+class HybridAgent:
+    """Drives by ``policy`` in the worlds where its rolled-out harm is at most ``H*``, else by E-V2X-BM.
+
+    ``bound`` says which ``H*`` and ``a*``; ``count`` which harm counts. After ``begin``, ``chosen_policy`` [n] says
+    who drives; ``policy_harm`` [n] and ``bound_harm`` [n] were compared and ``predicted_harm`` [n] is the lower one.
+    Raises ``InvalidInput`` for an unknown ``bound`` or ``count``, and for what is not an agent.
+    """
+
+    def __init__(
+        self, policy: Agent, scenario: Scenario, *, bound: Bound = "coupled", count: HarmCount = "first"
+    ) -> None:
+        check_agent(policy, "hybrid")
+        check_scenario(scenario, "hybrid")
+        self.policy = policy
+        self.backup = EV2XBM(bound, count=count, horizon_s=scenario.horizon_s)
+        self.scenario = scenario
+        self.bound: Bound = bound
+        self.count: HarmCount = count
+        self.name = f"hybrid({policy.name})" if bound == "coupled" else f"hybrid:pairwise({policy.name})"
+        self.policy_harm: Floats = np.zeros(0)
+        self.bound_harm: Floats = np.zeros(0)
+        self._rehearsal = copy.deepcopy(policy)  # predicting must not disturb the policy's memory of running episodes
+
+    @property
+    def knows(self) -> Knowledge:
+        """What the policy knows, and the model in which both are compared."""
+        return combined(self.policy, also=Source.MODEL)
+
+    @property
+    def chosen_policy(self) -> Bools:
+        """Where the policy drives, [n]."""
+        chosen: Bools = self.policy_harm <= self.bound_harm
+        return chosen
+
+    @property
+    def predicted_harm(self) -> Floats:
+        """Harm expected at the alert, [n] m2/s2."""
+        return np.minimum(self.policy_harm, self.bound_harm)
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Choose for these rows; ``worlds`` holds those rows only, at the alert."""
+        scripts = scripted(self.scenario, but=vehicle)
+        for agent in (self.policy, self.backup):
+            introduce(agent, vehicle, scripts)
+            agent.begin(worlds, vehicle, rows)
+        if isinstance(self.policy, Rehearsed):  # was rolled out just now
+            policy_harm = self.policy.predicted_harm[rows]
+        else:
+            policy_harm = self._harm(worlds, self._rehearsal, vehicle)
+        bound = self.backup.predicted_harm[rows]
+        if self.bound == "coupled":
+            bound = self._harm(worlds, FixedCommand(-self.backup.deceleration_mps2[rows]), vehicle)
+        self.bound_harm = place(self.bound_harm, rows, bound)
+        self.policy_harm = place(self.policy_harm, rows, policy_harm)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Wanted signed acceleration of the chosen strategy, [n] m/s2."""
+        self.policy_harm = recall(self.policy_harm, worlds.n, self.name)  # of this batch; an earlier one may be larger
+        self.bound_harm = recall(self.bound_harm, worlds.n, self.name)
+        return np.where(self.chosen_policy, self.policy.act(worlds, vehicle), self.backup.act(worlds, vehicle))
+
+    def _harm(self, worlds: Worlds, agent: Agent, vehicle: int) -> Floats:
+        return drive(worlds, agent, self.scenario, vehicle).ledger.world_harm(self.count)
+
+
+class FixedCommand:
+    """One given command per world, for all of its episode."""
+
+    name = "fixed"
+
+    def __init__(self, command_mps2: Floats) -> None:
+        self.command_mps2 = command_mps2
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Nothing to prepare."""
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The command of each world, [n] m/s2."""
+        return self.command_mps2
+
+
+def first_decision_s(worlds: Worlds, vehicle: int) -> Floats:
+    """Time of a vehicle's first decision in worlds at the alert, [n] s."""
+    return np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
+
+
+class _Asked(NamedTuple):
+    """What was decided when the agent was asked last, and is not known to be carried out."""
+
+    time_s: Floats  # [n] of the worlds then
+    certified: Certified
+    wanted: Floats  # [n] m/s2
+
+
+class StepShieldAgent:
+    """Drives by ``policy`` as far as ``StepShield`` certifies it.
+
+    At the alert the policy is rolled out once: where it harms no more than the coupled optimum, it drives unhindered,
+    and its harm is the bound. Elsewhere each of its actions must be certified: by the rest of the plan, by a constant,
+    or (``later_rollouts``) by the policy itself, rolled out from the state after the action. After ``begin``,
+    ``predicted_harm`` [n] is the bound: realised harm (``count``) is at most that. ``chosen_policy`` [n]: no
+    intervention so far; ``shield`` holds the rest. Raises ``InvalidInput`` for what is not an agent, and what
+    ``StepShield`` raises.
+
+    With an ``uncertainty`` this is robust mode: what is certified must hold in every member. ``believed`` (row k for
+    row k of the batch) is what the shield takes for the worlds at the alert; the policy sees the worlds themselves.
+    """
+
+    def __init__(
+        self,
+        policy: Agent,
+        scenario: Scenario,
+        *,
+        count: HarmCount = "first",
+        allowance: float = 0.0,
+        logging: bool = False,
+        later_rollouts: bool = True,
+        uncertainty: Uncertainty | str | None = None,
+        believed: Worlds | None = None,
+    ) -> None:
+        check_agent(policy, "step")
+        if not (believed is None or isinstance(believed, Worlds)):
+            raise InvalidInput(f"step: believed = {believed!r}: must be worlds at the alert, or None")
+        uncertainty = checked_uncertainty(uncertainty)
+        self.name = f"{'step' if uncertainty is None else 'robust'}({policy.name})"
+        self.policy = policy
+        self.scenario = scenario
+        self.shield: StepShield | None = None
+        self.predicted_harm: Floats = np.zeros(0)
+        self._believed = believed
+        self._settings = {"count": count, "allowance": allowance, "logging": logging, "uncertainty": uncertainty}
+        self._later_rollouts = later_rollouts
+        self._wanted: Floats = np.zeros(0)
+        self._first_s: Floats = np.zeros(0)  # [n] time of the first decision
+        self._asked: _Asked | None = None
+        self._make(0)  # refuses bad settings at once
+
+    @property
+    def knows(self) -> Knowledge:
+        """What the policy knows, and the model in which its actions are certified."""
+        return combined(self.policy, also=Source.MODEL)
+
+    @property
+    def chosen_policy(self) -> Bools:
+        """Where everything proposed was applied so far, [n]."""
+        assert self.shield is not None
+        untouched: Bools = self.shield.interventions == 0
+        return untouched
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Find the bound of these rows; ``worlds`` holds those rows only, at the alert."""
+        if self._believed is not None and not (rows < self._believed.n).all():
+            raise InvalidInput(f"step: believed holds {self._believed.n} worlds, but row {rows.max()} begins")
+        if self.shield is None or self.shield.vehicle != vehicle:
+            self.shield, self._asked = self._make(vehicle), None
+        if self._asked is not None and len(rows) < len(self._wanted):
+            self._commit(self._asked)  # some episodes of a batch are renewed: that step was made
+        introduce(self.policy, vehicle, scripted(self.scenario, but=vehicle))
+        self.policy.begin(worlds, vehicle, rows)
+        self.shield.begin(worlds if self._believed is None else self._believed.take(rows), rows, self.policy)
+        bound = self.shield.first_bound[rows] + self.shield.allowance
+        self.predicted_harm = place(self.predicted_harm, rows, bound)
+        self._wanted = place(self._wanted, rows, np.zeros(worlds.n))
+        self._first_s = place(self._first_s, rows, first_decision_s(worlds, vehicle))
+        self._asked = None
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The certified command, [n] m/s2. Asked again at the same moment, it says the same.
+
+        Raises ``UncertifiedStep`` where a decision was left out.
+        """
+        shield = self.shield
+        if shield is None or shield.running is None or len(self._wanted) < worlds.n:
+            raise InvalidInput(f"agent {self.name!r}: act on {worlds.n} worlds, but begin was not called for each")
+        if len(self._wanted) > worlds.n:  # a smaller batch has begun
+            shield.keep(worlds.n)
+            self.predicted_harm, self._wanted, self._first_s = (
+                values[: worlds.n] for values in (self.predicted_harm, self._wanted, self._first_s)
+            )
+        self._follow(worlds.time_s)
+        if self._asked is None:
+            due = self._due(worlds)
+            proposed = proposed_action(self.policy, worlds, vehicle)
+            proposer = Proposer(self.policy, worlds) if self._later_rollouts else None
+            certified = shield.propose(proposed, seen=state_columns(worlds), only=due, proposer=proposer)
+            command = action_to_command(certified.decision.applied, worlds.vehicles, vehicle)
+            self._asked = _Asked(worlds.time_s, certified, np.where(due, command, self._wanted))
+        return self._asked.wanted.copy()
+
+    def after_step(self, packed: Packed) -> None:
+        """Follow the engine over a step, the last one included, and compare what came of it with what was certified.
+
+        Where nothing else was ``believed`` than what was told, a difference raises ``UncertifiedStep``: another command
+        was applied. Else the world is distrusted.
+        """
+        asked, shield, time_s = self._asked, self.shield, packed.state[:, TIME]
+        self._follow(time_s)
+        if asked is None or shield is None or self._asked is asked:
+            return
+        assert shield.running is not None
+        seen = seen_columns(packed)
+        compared = asked.certified.asked & (time_s > asked.time_s) & ~shield.distrusted
+        wrong = compared & ~as_predicted(shield.running, seen)
+        if self._believed is None and wrong.any():
+            k = int(np.argmax(wrong))
+            told = difference(shield.running.nominal().states[k], seen[k])
+            raise UncertifiedStep(
+                f"agent {self.name!r}: after this step {told} (world {k}); what drives by this agent must pass its"
+                " commands on unchanged, and ask it at every decision"
+            )
+        shield.distrusted = shield.distrusted | wrong
+
+    def _due(self, worlds: Worlds) -> Bools:
+        """Where a decision is due now, [n]. Raises ``UncertifiedStep`` where one was due, and nobody asked."""
+        assert self.shield is not None and self.shield.running is not None
+        running, step_s = self.shield.running, self.scenario.time_step_s
+        due_s = self._first_s + running.steps * step_s
+        late = ~running.finished & (worlds.time_s > due_s + step_s / 2)
+        if late.any():
+            k = int(np.argmax(late))
+            raise UncertifiedStep(
+                f"agent {self.name!r}: asked at {worlds.time_s[k]:g} s in world {k}, but a decision was due at"
+                f" {due_s[k]:g} s; what drives by this agent must ask it at every decision, and once"
+            )
+        due: Bools = worlds.time_s == due_s
+        return due
+
+    def _follow(self, time_s: Floats) -> None:
+        """Commit what was decided if the worlds have moved since: that step was made. Else it stays to be made."""
+        asked = self._asked
+        if asked is not None and (time_s > asked.time_s).any():
+            self._commit(asked)
+
+    def _commit(self, asked: _Asked) -> None:
+        assert self.shield is not None
+        if asked.certified.before is self.shield.running:  # else an interrupt came between the next two lines
+            self.shield.commit(asked.certified)
+        self.__dict__.update(_wanted=asked.wanted, _asked=None)
+
+    def _make(self, vehicle: int) -> StepShield:
+        return StepShield(self.scenario, vehicle, **self._settings)  # type: ignore[arg-type]

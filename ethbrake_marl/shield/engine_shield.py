@@ -1,0 +1,275 @@
+"""Shields attached to a running engine: what every wrapped face shares.
+
+There is one way from a proposal to a step, whatever the face and whatever stands between it and the engine:
+
+1. *Certify.* The face asks what may be applied. That changes nothing.
+2. *Step.* The engine makes the step on a copy of its worlds and shows it to the shield. What is not the certified step,
+   in its command, its place in the episode, or the state and harm that it leads to, is refused: ``UncertifiedStep``.
+3. *Commit.* The engine puts the new worlds and the shield's new memory in place together (``engine.Watcher``).
+
+So the shield is where the engine is, always: a refused call, an exception, or an interrupt at any line leaves both as
+they were, or moves both.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.actions import command_to_action, commands_of
+from ethbrake_marl.agents.learned import LearnedPolicy
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.rows import params_at
+from ethbrake_marl.shield.agents import Bound, HybridAgent
+from ethbrake_marl.shield.certify import REASONS, Decision
+from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
+from ethbrake_marl.shield.rollouts import Proposer, proposed_action
+from ethbrake_marl.shield.settings import only_shielded, proposing_agent
+from ethbrake_marl.shield.step_shield import Certified, StepShield
+from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
+
+ADVICE = (
+    "what stands between the shield and the environment must pass each action on unchanged, exactly once; put wrappers"
+    " that skip frames, change actions or step by themselves around the shield, not inside it"
+)
+
+
+class MovingAtHorizon(UserWarning):
+    """A shield's bound ends at the horizon, and something may still be moving then."""
+
+
+class Sent(NamedTuple):
+    """What was certified and handed to the environment, and is not carried out yet."""
+
+    memory: object  # of the watcher, when it was certified
+    steps_made: int  # by the engine until then
+    applied: Floats  # [n] actions
+    asked: Bools  # [n] worlds whose episode runs
+    certified: Certified | None  # None: episode mode
+
+
+class Attached(ABC):
+    """A shield that follows an engine, and lets it do nothing but what was certified.
+
+    ``where`` is who builds it, for messages. Raises ``InvalidInput`` for another number of learners than one.
+    """
+
+    def __init__(self, engine: Engine, where: str, memory: object) -> None:
+        self.engine = engine
+        self.vehicle = only_shielded(engine, where)
+        self.sent: Sent | None = None
+        self._left = memory
+        engine.watch(self, memory)
+
+    @property
+    def memory(self) -> Any:
+        """What this shield knows now; once detached, what it knew last."""
+        return self.engine.memory(self) if self in self.engine.watchers else self._left
+
+    def confirm(self) -> None:
+        """Raise ``UncertifiedStep`` unless the engine made the step that was handed to the environment last."""
+        assert self.sent is not None
+        if self.engine.steps_made != self.sent.steps_made + 1:
+            raise UncertifiedStep(
+                f"shield: the environment returned from step, but its engine made"
+                f" {self.engine.steps_made - self.sent.steps_made} steps instead of 1; {ADVICE}"
+            )
+
+    def detach(self) -> None:
+        """Let go of the engine: this shield no longer follows it."""
+        self._left = self.memory
+        self.engine.unwatch(self)
+
+    def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
+        """The memory once the engine made the certified step. Raises ``UncertifiedStep`` for any other one."""
+        sent = self.sent
+        if sent is None or sent.memory is not memory:
+            raise UncertifiedStep(
+                f"shield: the engine was to make a step that nothing was certified for (a second one in one call, or"
+                f" one past the shield); step through the shield, or close() it first; {ADVICE}"
+            )
+        wanted = after.wanted_mps2[:, self.vehicle]
+        certified = self._commands(sent.applied)
+        wrong = np.flatnonzero(sent.asked & ~(wanted == certified))
+        if wrong.size:
+            k = int(wrong[0])
+            raise UncertifiedStep(
+                f"shield: in world {k} the applied command, {wanted[k]:g} m/s2, is not the certified one,"
+                f" {certified[k]:g} m/s2; {ADVICE}"
+            )
+        return self._carried_out(memory, sent, after)
+
+    def _commands(self, actions: Floats) -> Floats:
+        """Wanted signed accelerations of the shielded vehicle for its actions, to the bits of the engine, [n] m/s2."""
+        params, vehicles = self.engine.packed.params, self.engine.scenario.vehicles
+        braking, driving = (params[:, params_at(group, vehicles) + self.vehicle] for group in range(2))
+        return commands_of(actions, braking, driving)
+
+    @abstractmethod
+    def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
+        """The memory once episodes start in these rows."""
+
+    @abstractmethod
+    def _carried_out(self, memory: Any, sent: Sent, after: Engine) -> Any:
+        """The memory after the certified command was applied."""
+
+
+class AttachedShield(Attached):
+    """A ``StepShield`` that begins with the engine's episodes and sees the engine's worlds.
+
+    ``policy`` (an agent, a loaded policy, or None) is rolled out at each alert, and proposes where nobody else does.
+    Warns with ``MovingAtHorizon``, once, where the plan held at an alert leaves something moving at the horizon.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        policy: Agent | LearnedPolicy | None,
+        *,
+        count: HarmCount = "first",
+        allowance: float = 0.0,
+        uncertainty: Uncertainty | str | None = None,
+        logging: bool = False,
+        where: str = "shield",
+    ) -> None:
+        vehicle = only_shielded(engine, where)
+        self.policy = None if policy is None else proposing_agent(policy, where)
+        shield = StepShield(
+            engine.scenario, vehicle, count=count, allowance=allowance, others=engine.scripts,
+            uncertainty=checked_uncertainty(uncertainty), logging=logging,
+        )  # fmt: skip
+        self._warned = False
+        super().__init__(engine, where, shield)
+
+    @property
+    def shield(self) -> StepShield:
+        """The shield as it is now: to be read; the next step puts another one in its place."""
+        shield: StepShield = self.memory
+        return shield
+
+    @property
+    def decision(self) -> Decision | None:
+        """What was decided last."""
+        return None if self.sent is None or self.sent.certified is None else self.sent.certified.decision
+
+    def proposal(self) -> Floats:
+        """What the policy itself would do now, as actions [n]."""
+        if self.policy is None:
+            raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
+        return proposed_action(self.policy, self.engine.worlds, self.vehicle)
+
+    def decide(self, proposed: Floats) -> Floats:
+        """The actions [n] to apply instead of those proposed. Nothing changes until the engine applies them."""
+        engine, shield = self.engine, self.shield
+        proposer = None if self.policy is None else Proposer(self.policy, engine.worlds)
+        certified = shield.propose(proposed, seen=seen_columns(engine.packed), only=~engine.ended, proposer=proposer)
+        applied = certified.decision.applied
+        self.sent = Sent(shield, engine.steps_made, applied, certified.asked, certified)
+        return applied
+
+    def info(self, k: int, proposed: float) -> dict[str, Any]:
+        """What the shield decided in world ``k``, for ``infos[agent]["shield"]``."""
+        assert self.sent is not None and self.sent.certified is not None
+        decision, after = self.sent.certified.decision, self.sent.certified.after
+        return {
+            "mode": "step" if after.uncertainty is None else "robust",
+            "proposed_action": proposed,
+            "applied_action": float(decision.applied[k]),
+            "intervened": bool(decision.intervened[k]),
+            "reason": REASONS[decision.reason[k]],
+            "bound_harm": float(decision.bound[k]),
+            "margin": float(decision.margin[k]),
+            "trusted": not after.distrusted[k],
+            "settles": bool(after.settles[k]),
+            **({} if after.uncertainty is None else {"members": decision.after.members}),
+        }
+
+    def infos(self, proposed: Floats) -> dict[str, NDArray[Any]]:
+        """The same of every world, one array per key."""
+        rows = [self.info(k, float(proposed[k])) for k in range(len(proposed))]
+        return {key: np.array([row[key] for row in rows]) for key in rows[0]}
+
+    def begun(self, memory: StepShield, alert: Worlds, rows: Ints) -> StepShield:
+        """The shield once episodes start in these rows."""
+        if self.policy is not None:
+            self.policy.begin(alert, self.vehicle, rows)
+        shield = copy.copy(memory)
+        shield.begin(alert, rows, self.policy)
+        moving = int((~shield.settles[rows]).sum())
+        if moving and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"shield: in {moving} of {len(rows)} worlds something still moves at the horizon,"
+                f" {shield.scenario.horizon_s:g} s, under the plan that gives the bound; the bound says nothing of what"
+                " comes after; a longer horizon_s lets them come to rest",
+                MovingAtHorizon,
+                stacklevel=2,
+            )
+        return shield
+
+    def _carried_out(self, memory: StepShield, sent: Sent, after: Engine) -> StepShield:
+        assert sent.certified is not None
+        shield = sent.certified.after
+        running, wanted = shield.running, sent.asked & ~shield.distrusted
+        assert running is not None
+        if (wrong := np.flatnonzero(wanted & (after.steps != running.steps))).size:
+            k = int(wrong[0])
+            raise UncertifiedStep(
+                f"shield: world {k} is at step {after.steps[k]} of its episode, certified was step"
+                f" {running.steps[k]}; {ADVICE}"
+            )
+        seen = seen_columns(after.packed)
+        if (wrong := np.flatnonzero(wanted & ~as_predicted(running, seen))).size:
+            k = int(wrong[0])
+            told = difference(running.nominal().states[k], seen[k])
+            raise UncertifiedStep(f"shield: after this step {told} (world {k}); {ADVICE}")
+        return sent.certified.carried_out()
+
+
+class EpisodeChoice(NamedTuple):
+    """What episode mode remembers: who drives, and that nothing was asked of it yet at this decision."""
+
+    hybrid: HybridAgent
+
+
+class AttachedHybrid(Attached):
+    """Episode mode on a running engine: ``HybridAgent`` chooses at each alert, and its action alone may be applied."""
+
+    def __init__(
+        self, engine: Engine, policy: Agent | LearnedPolicy | None, *, bound: Bound, count: HarmCount, where: str
+    ) -> None:
+        hybrid = HybridAgent(proposing_agent(policy, where), engine.scenario, bound=bound, count=count)
+        super().__init__(engine, where, EpisodeChoice(hybrid))
+
+    @property
+    def hybrid(self) -> HybridAgent:
+        """The agent that drives, as it is now."""
+        choice: EpisodeChoice = self.memory
+        return choice.hybrid
+
+    def decide(self) -> Floats:
+        """The actions [n] to apply. Asked again before they were applied, the agent is not asked again."""
+        memory, engine = self.memory, self.engine
+        if self.sent is None or self.sent.memory is not memory:
+            worlds = engine.worlds
+            applied = command_to_action(memory.hybrid.act(worlds, self.vehicle), worlds.vehicles, self.vehicle)
+            self.sent = Sent(memory, engine.steps_made, applied, ~engine.ended, None)
+        return self.sent.applied
+
+    def begun(self, memory: EpisodeChoice, alert: Worlds, rows: Ints) -> EpisodeChoice:
+        """Who drives the episodes that start in these rows."""
+        hybrid = copy.copy(memory.hybrid)
+        hybrid.begin(alert, self.vehicle, rows)
+        return EpisodeChoice(hybrid)
+
+    def _carried_out(self, memory: EpisodeChoice, sent: Sent, after: Engine) -> EpisodeChoice:
+        return EpisodeChoice(memory.hybrid)  # another one: the next decision is another one, too

@@ -1,0 +1,293 @@
+"""Step mode for a batch of running episodes: what ``certify`` decides, kept from step to step, watched and logged."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.protocol import Agent, fixed_commands
+from ethbrake_marl.agents.rollout import scripted
+from ethbrake_marl.engine.stream import Script
+from ethbrake_marl.errors import InvalidInput, renumbered
+from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.search.problem import PER_WORLD as OF_PROBLEM
+from ethbrake_marl.search.problem import profile_problem
+from ethbrake_marl.shield.certify import (
+    Backup,
+    Decision,
+    Running,
+    begin_running,
+    bettered_plan,
+    certify,
+    from_now,
+    plan_harm,
+)
+from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE
+from ethbrake_marl.shield.comparison import as_predicted
+from ethbrake_marl.shield.interventions import Intervention, interventions, write_down
+from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, merged, put, rolled_out
+from ethbrake_marl.shield.settings import check_amount, check_scenario
+from ethbrake_marl.shield.settling import plan_rests
+from ethbrake_marl.shield.uncertainty import Uncertainty
+
+BROKEN = ENDED + 1  # a reason that the kernel does not know
+PER_WORLD = ("first_bound", "alone_harm", "settles", "interventions", "distrusted", "episode")  # a shield's arrays [n]
+LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions, for the bound at the alert where there are several members
+
+
+class Certified(NamedTuple):
+    """A decision that was made, and is not carried out yet."""
+
+    decision: Decision
+    asked: Bools  # [n] worlds that it is about; the others stay as they are
+    before: Running  # what it was made from
+    after: StepShield  # the shield as it will be once the decision was carried out
+
+    def carried_out(self) -> StepShield:
+        """The shield now that the decision was carried out."""
+        after = self.after
+        if after.log is not None:
+            write_down(after.log, after.found, self.before, after.episode)
+        return after
+
+
+class StepShield:
+    """Guarantees the harm of a batch: ``begin`` when episodes start, ``propose`` and ``commit`` in every step.
+
+    What ``propose`` certifies changes nothing yet: ``commit`` it when the engine has made that step, and not otherwise.
+    Whatever fails before (or interrupts) leaves bound, plan and trust as they were.
+
+    The bound starts as the harm of the coupled optimum, realised decision by decision, or as that of a ``policy``
+    rolled out from the alert where that is lower, and only ever falls; ``allowance`` (m2/s2) is what the budget grants
+    above it (0: none), and the bound is then that budget until the episode ends. It bounds the harm up to the
+    scenario's horizon and says nothing of what still moves then, or of what happens afterwards (``settles`` [n]: where
+    the plan held at the alert leaves nothing moving). The other vehicles follow ``others``
+    (default: the scenario's scripts), whose commands must be fixed at the alert. What happens is compared with what was
+    predicted, bit by bit: where it differs (a vehicle that brakes beyond its capacity, a number that is none, a message
+    that never came) ``distrusted`` [n] is set, nothing is guaranteed any more, and for the rest of the episode the
+    fallback ``best constant`` drives: the better one of the plan's rest and the constants, chosen again after every
+    surprise. With an ``uncertainty`` (robust mode) all of this holds for the worst member of each world, and what is
+    seen must lie within the range of their predictions. Raises ``InvalidInput`` for an unknown count or vehicle, a
+    negative allowance, or others whose commands are not fixed.
+    """
+
+    fallback = "best constant"
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        vehicle: int,
+        *,
+        count: HarmCount = "first",
+        allowance: float = 0.0,
+        others: Mapping[int, Script] | None = None,
+        uncertainty: Uncertainty | None = None,
+        logging: bool = False,
+    ) -> None:
+        check_count(count)
+        check_scenario(scenario, "shield")
+        check_amount("allowance", allowance, "shield", " m2/s2")
+        if vehicle not in range(scenario.vehicles):
+            raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
+        self.scenario, self.vehicle, self.count, self.allowance = scenario, vehicle, count, allowance
+        self.uncertainty = uncertainty
+        self.log: list[Intervention] | None = [] if logging else None
+        self.found: list[Intervention] = []  # in the last decision
+        self.running: Running | None = None
+        self.backup = Backup(np.zeros((0, 0)), np.zeros(0))
+        self.first_bound: Floats = np.zeros(0)  # [n] harm of the backup at the first decision
+        self.alone_harm: Floats = np.zeros(0)  # [n] of the policy rolled out; infinity without one
+        self.settles: Bools = np.zeros(0, np.bool_)  # [n] under the plan of the first decision all rest at the horizon
+        self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
+        self.episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode
+        self.distrusted: Bools = np.zeros(0, np.bool_)
+        self._others = scripted(scenario, but=vehicle) if others is None else others
+        self._width = int(np.ceil(scenario.horizon_s / scenario.time_step_s)) + 1
+
+    @property
+    def bound(self) -> Floats:
+        """Harm of each running episode is at most this, [n] m2/s2: what certificates may reach."""
+        if self.running is None or self.allowance == 0.0:
+            return self.backup.harm
+        granted = np.where(self.running.finished, 0.0, self.first_bound + self.allowance)
+        return np.maximum(self.backup.harm, granted)
+
+    def begin(self, worlds: Worlds, rows: Ints, policy: Agent | None = None) -> None:
+        """New episodes start in these rows; ``worlds`` holds those rows only, at the alert, as they are believed.
+
+        Rows 0 to k - 1 together may also begin a larger batch. Raises ``InvalidInput`` for rows that are not there.
+        """
+        scenario, vehicle, running_rows = self.scenario, self.vehicle, len(self.first_bound)
+        if not (rows < running_rows).all() and sorted(rows.tolist()) != list(range(len(rows))):
+            raise InvalidInput(
+                f"shield: begin in row {rows.max()} of a batch of {running_rows}: a larger batch begins with all of its"
+                " rows at once"
+            )
+        possible = worlds if self.uncertainty is None else self.uncertainty.members(worlds)
+        members = possible.n // worlds.n
+        latest = possible.vehicles.latency_s[:, vehicle].max()
+        if members > 1 and not latest < scenario.horizon_s:
+            raise InvalidInput(
+                f"uncertainty: {self.uncertainty}: vehicle_{vehicle + 1} may decide first at {latest:g} s; must be"
+                f" before the horizon, {scenario.horizon_s:g} s"
+            )
+        others = fixed_commands(self._others, possible, "shield", vehicle=vehicle)
+        best = optimise_coupled(
+            worlds, vehicle, count=self.count, horizon_s=scenario.horizon_s, others_mps2=others[::members]
+        ).deceleration_mps2
+        with renumbered(np.repeat(np.arange(worlds.n), members)):
+            problem = profile_problem(
+                possible, [vehicle], count=self.count, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s,
+                others_mps2=others,
+            )  # fmt: skip
+        running = begin_running(problem, members)
+        plan = np.repeat(command_to_action(-best, worlds.vehicles, vehicle)[:, np.newaxis], self._width, axis=1)
+        if members > 1:
+            plan = bettered_plan(running, plan, LOOKED_AT)[0]
+        harm, alone = plan_harm(running, plan), np.full(worlds.n, np.inf)
+        if policy is not None:
+            actions = rolled_out(worlds, policy, scenario, vehicle, running.nominal().problem, self._width)
+            alone = plan_harm(running, actions)
+            plan[alone <= harm] = actions[alone <= harm]
+            harm = np.minimum(alone, harm)
+        new = copy.copy(self)
+        new._place(rows, running, Backup(plan, harm), alone, plan_rests(running, plan))
+        self.__dict__.update(new.__dict__)
+
+    def propose(
+        self,
+        proposed: Floats,
+        *,
+        seen: Floats | None = None,
+        only: Bools | None = None,
+        proposer: Proposer | None = None,
+    ) -> Certified:
+        """Decide in every running episode, or ``only`` in some; the others stay as they are. Changes nothing.
+
+        ``seen`` [n, columns]: the worlds as they are now, in the first columns of ``Running.states``. Where nothing
+        else certifies a proposal, the ``proposer`` (if given) is rolled out from the state after it.
+        """
+        if self.running is None:
+            raise InvalidInput("shield: decide, but no episode has begun; call begin first")
+        if np.shape(proposed) != self.distrusted.shape:
+            raise InvalidInput(f"shield: proposed {np.shape(proposed)}; {self.distrusted.shape} is needed")
+        asked = ~self.running.finished if only is None else only
+        after = copy.copy(self)
+        decision = after._decided(proposed, seen, asked, proposer)
+        return Certified(decision, asked & ~self.running.finished, self.running, after)
+
+    def commit(self, certified: Certified) -> None:
+        """The decision was carried out. Raises ``InvalidInput`` for one that was not made from here."""
+        if certified.before is not self.running:
+            raise InvalidInput("shield: commit of a decision that was made from another state; propose again")
+        self.__dict__.update(certified.carried_out().__dict__)  # in one piece: not even an interrupt comes between
+
+    def decide(
+        self,
+        proposed: Floats,
+        *,
+        seen: Floats | None = None,
+        only: Bools | None = None,
+        proposer: Proposer | None = None,
+    ) -> Decision:
+        """``propose`` and ``commit`` at once: where nothing can fail before the decision is carried out."""
+        certified = self.propose(proposed, seen=seen, only=only, proposer=proposer)
+        self.commit(certified)
+        return certified.decision
+
+    def _decided(self, proposed: Floats, seen: Floats | None, asked: Bools, proposer: Proposer | None) -> Decision:
+        """Decide, and become the shield as it will be once that was carried out."""
+        assert self.running is not None
+        if seen is not None:
+            self._compare(seen, asked)
+        before = self.running
+        asked = asked & ~before.finished
+        each = np.repeat(asked, before.members)
+        now = before._replace(ended=before.ended | ~each)
+        given = np.where(self.distrusted, np.nan, np.asarray(proposed, np.float64))
+        held, budget = self.backup, self.bound
+        decision = certify(now, given, held, budget)
+        if proposer is not None and (rows := np.flatnonzero(decision.reason == NO_CERTIFICATE)).size:
+            decision = merged(decision, rows, certify_rollouts(now, given, rows, budget, held.plan, proposer))
+        decision.reason[asked & self.distrusted] = BROKEN
+        self.interventions = self.interventions + (decision.intervened & asked)
+        self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
+        self.backup = decision.backup
+        decision = decision._replace(bound=self.bound)
+        if self.log is not None:
+            self.found = interventions(now, self.episode, proposed, decision, held)
+        return decision
+
+    def keep(self, n: int) -> None:
+        """Keep the first ``n`` rows only: a smaller batch has begun."""
+        assert self.running is not None
+        backup = self.backup._replace(plan=self.backup.plan[:n], harm=self.backup.harm[:n])
+        rows = {name: getattr(self, name)[:n] for name in PER_WORLD}
+        self.__dict__.update(rows | {"running": self.running.take(np.arange(n)), "backup": backup})
+
+    def _compare(self, seen: Floats, asked: Bools) -> None:
+        """Find the worlds that did not do what was predicted, and choose anew there from what is seen."""
+        assert self.running is not None
+        running, columns = self.running, seen.shape[1]
+        surprising = asked & ~as_predicted(running, seen)
+        if not surprising.any():
+            return
+        self.distrusted = self.distrusted | surprising
+        rows = np.flatnonzero(surprising & np.isfinite(seen).all(axis=1))  # others: what was predicted goes on
+        states, ended, at = running.states.copy(), running.ended.copy(), running.rows_of(rows)
+        states[at, :columns] = np.repeat(seen[rows], running.members, axis=0)
+        ended[at] = np.repeat(running.steps[rows], running.members) >= running.problem.last_step[at]
+        self.running = running._replace(states=states, ended=ended)
+        plan, harm = self.backup.plan.copy(), self.backup.harm.copy()
+        harm[rows] = np.inf
+        held = self.backup.plan
+        for constant in (None, *self.backup.constants):
+            trial = held if constant is None else from_now(held, constant, running.steps)
+            found = _harm_of(self.running, trial, rows)
+            better = rows[found < harm[rows]]
+            harm[rows] = np.minimum(found, harm[rows])
+            plan[better] = trial[better]
+        self.backup = self.backup._replace(plan=plan, harm=harm)
+
+    def _place(self, rows: Ints, running: Running, backup: Backup, alone: Floats, settles: Bools) -> None:
+        """Keep new episodes in these rows."""
+        count, old = len(rows), self.running
+        new: dict[str, NDArray[Any]] = {
+            "first_bound": backup.harm, "alone_harm": alone, "settles": settles,
+            "interventions": np.zeros(count, np.int64), "distrusted": np.zeros(count, np.bool_),
+        }  # fmt: skip
+        if old is None or count >= old.n:
+            order = np.argsort(rows)
+            self.running, self.backup = running.take(order), Backup(backup.plan[order], backup.harm[order])
+            self.episode = np.full(count, self.episode.max(initial=-1) + 1)
+            for name, values in new.items():
+                setattr(self, name, values[order])
+            return
+        at = old.rows_of(rows)
+        arrays: dict[str, Any] = {
+            name: put(getattr(old.problem, name), at, getattr(running.problem, name)) for name in OF_PROBLEM
+        }
+        self.running = Running(
+            replace(old.problem, **arrays),
+            put(old.states, at, running.states),
+            put(old.steps, rows, running.steps),
+            put(old.ended, at, running.ended),
+        )
+        self.backup = Backup(put(self.backup.plan, rows, backup.plan), put(self.backup.harm, rows, backup.harm))
+        for name, values in {**new, "episode": self.episode[rows] + 1}.items():
+            setattr(self, name, put(getattr(self, name), rows, values))
+
+
+def _harm_of(running: Running, plan: Floats, rows: Ints) -> Floats:
+    """Harm of the plans in some of the worlds."""
+    with renumbered(rows):
+        return plan_harm(running.take(rows), plan[rows])

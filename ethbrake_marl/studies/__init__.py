@@ -1,0 +1,1 @@
+"""Studies: what is trained, measured and shown by one command each."""

@@ -1,0 +1,124 @@
+"""What an ablation says: harm per level, what each step is worth, who pays, how near the joint optimum it comes.
+
+Intervals hold for other training seeds and other worlds: both are drawn anew (``evaluation.seed_statistics``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.evaluation.seed_statistics import (
+    interquartile_mean,
+    mean_over_seeds,
+    paired_over_seeds,
+    share_over_seeds,
+)
+from ethbrake_marl.evaluation.statistics import Estimate
+from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.physics import Bools, Floats
+from ethbrake_marl.studies.ablation.run import Harms, Measured
+
+TOLERANCE = 1e-6  # m2/s2; a vehicle whose harm rose by more is worse off
+
+Json = dict[str, Any]
+
+
+def compare(measured: Sequence[Measured], searched: int) -> Json:
+    """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels`` (lost messages); see docs/cli.md.
+
+    The joint optimum is known in the first ``searched`` worlds; what stands beside it is of these worlds too. Each
+    algorithm has a ladder of its own; levels in which nobody learns are in all of them.
+    """
+    algorithms = [m.algorithm for m in measured if m.algorithm is not None]
+    steps, channels = [], []
+    for algorithm in dict.fromkeys(algorithms):
+        own = [m for m in measured if m.algorithm in (None, algorithm)]
+        ladder = [m for m in own if m.level.clear is None]
+        steps += [_change(before, after, algorithm) for before, after in pairwise(ladder)]
+        by_name = {m.level.name: m for m in own}
+        channels += [_change(by_name[m.level.clear], m, algorithm) for m in own if m.level.clear is not None]
+    return {"levels": [_level(one, searched) for one in measured], "steps": steps, "channels": channels}
+
+
+def _level(one: Measured, searched: int) -> Json:
+    """What one level reached under one algorithm."""
+    scenario = one.level.scenario
+    return {
+        "level": one.level.name,
+        "title": scenario.title,
+        "algorithm": one.algorithm,
+        "clear": one.level.clear,
+        "learners": [scenario.vehicle_names[i] for i in scenario.learners],
+        "seeds": len(one.reached.collided),
+        "worlds": one.reached.collided.shape[1],
+        "collision_rate": _plain(mean_over_seeds(one.reached.collided.astype(np.float64))),
+        **{count: _under_count(one, count, searched) for count in COUNTS},
+    }
+
+
+def _under_count(one: Measured, count: HarmCount, searched: int) -> Json:
+    """Harm (m2/s2) under one count and what it is if all brake fully, in all worlds and in the ``searched`` ones.
+
+    There also the joint optimum, and the share of its reduction that is realised.
+    """
+    reached, braking = one.reached.world[count], one.full_brake.world[count]
+    each = reached.mean(axis=1)
+    return {
+        "full_brake": _plain(mean_over_seeds(braking)),
+        "harm": _plain(mean_over_seeds(reached)),
+        "each_seed": each.tolist(),
+        "interquartile_mean": _plain(interquartile_mean([each], resamples=2000)),
+        "vehicles": [_plain(mean_over_seeds(column)) for column in _columns(one.reached, count)],
+        "searched": _searched(
+            reached[:, :searched], braking[:, :searched], None if one.best is None else one.best[count]
+        ),
+    }
+
+
+def _searched(reached: Floats, braking: Floats, best: Floats | None) -> Json:
+    """Everything in the worlds in which the joint optimum was searched."""
+    return {
+        "worlds": reached.shape[1],
+        "full_brake": _plain(mean_over_seeds(braking)),
+        "harm": _plain(mean_over_seeds(reached)),
+        "each_seed": reached.mean(axis=1).tolist(),
+        "best_known": None if best is None else _plain(mean_over_seeds(best)),
+        "realised_share": None if best is None else _plain(share_over_seeds(reached, braking, best)),
+    }
+
+
+def _change(before: Measured, after: Measured, algorithm: str) -> Json:
+    """From one level to another on the same worlds: positive is more harm."""
+    found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
+    for count in COUNTS:
+        pairs = zip(_columns(after.reached, count), _columns(before.reached, count), strict=True)
+        worse = _worse_off(before.reached, after.reached, count)
+        found[count] = {
+            "difference": _plain(paired_over_seeds(after.reached.world[count], before.reached.world[count])),
+            "vehicles": [_plain(paired_over_seeds(new, old)) for new, old in pairs],
+            "worse_off": _plain(mean_over_seeds(worse.any(axis=2).astype(np.float64))),
+            "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
+        }
+    return found
+
+
+def _worse_off(before: Harms, after: Harms, count: HarmCount) -> Bools:
+    """Which vehicles bear more than before, [seeds, worlds, N]: seed k against seed k, or against the only one."""
+    old, new = before.vehicle[count], after.vehicle[count]
+    worse: Bools = new > old + TOLERANCE
+    return worse
+
+
+def _columns(harms: Harms, count: HarmCount) -> list[Floats]:
+    """[seeds, worlds] of each vehicle."""
+    return [harms.vehicle[count][:, :, i] for i in range(harms.vehicle[count].shape[2])]
+
+
+def _plain(estimate: Estimate | None) -> Json | None:
+    if estimate is None:
+        return None
+    return {"value": estimate.value, "interval": None if estimate.interval is None else list(estimate.interval)}

@@ -1,0 +1,222 @@
+"""The figures of an ablation as text: Markdown tables, and one CSV row per level, algorithm and seed."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.evaluation.statistics import Estimate
+from ethbrake_marl.figures.ablation import change_figure, harm_curve, who_pays
+from ethbrake_marl.figures.style import png_bytes
+from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.studies.ablation.comparison import compare
+from ethbrake_marl.studies.ablation.longer_lines import LineResult, Question
+from ethbrake_marl.studies.ablation.plan import Plan
+from ethbrake_marl.studies.ablation.run import Measured
+
+NONE = "–"
+_ALGORITHM = "Algorithm"
+_SUMS = ("", "full_brake_", "searched_", "searched_full_brake_", "searched_best_known_")  # columns of each count
+_HARM = {"first": "first-impact harm", "total": "total harm"}
+
+Json = dict[str, Any]
+
+
+def markdown(found: Json, conditions: str) -> str:
+    """All tables, with their conditions below."""
+    blocks = ["## Levels", *[_levels(found["levels"], count) for count in COUNTS]]
+    worlds = found["levels"][0]["first"]["searched"]["worlds"]
+    blocks += [f"## How near the joint optimum, in the first {worlds:,} worlds"]
+    blocks += [_optima(found["levels"], count) for count in COUNTS]
+    for title, key in (("What each step is worth", "steps"), ("Price of lost messages", "channels")):
+        if found[key]:
+            blocks += [f"## {title}", _changes(found[key])]
+    if found["steps"] or found["channels"]:
+        blocks += ["## Who pays", *[_who_pays(found["steps"] + found["channels"], count) for count in COUNTS]]
+    return "\n\n".join([*blocks, conditions]) + "\n"
+
+
+def levels_csv(measured: Sequence[Measured], searched: int) -> str:
+    """One row per level, algorithm and seed: means over the worlds (m2/s2).
+
+    ``searched``: over the worlds in which the joint optimum was searched.
+    """
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    vehicles = measured[0].reached.vehicle["first"].shape[2]
+    harms = [f"{_column(count)}_{i + 1}" for count in COUNTS for i in range(vehicles)]
+    sums = [f"{name}{_column(count)}" for count in COUNTS for name in _SUMS]
+    writer.writerow(["level", "algorithm", "seed", "worlds", "collision_rate", *sums, *harms])
+    for one in measured:
+        for seed in range(len(one.reached.collided)):
+            row: list[object] = [one.level.name, one.algorithm or "", seed if one.algorithm else ""]
+            row += [one.reached.collided.shape[1], float(one.reached.collided[seed].mean())]
+            for count in COUNTS:
+                best = "" if one.best is None else float(one.best[count].mean())
+                reached, braking = one.reached.world[count][seed], one.full_brake.world[count]
+                row += [float(reached.mean()), float(braking.mean())]
+                row += [float(reached[:searched].mean()), float(braking[:, :searched].mean()), best]
+            for count in COUNTS:
+                row += [float(harm) for harm in one.reached.vehicle[count][seed].mean(axis=0)]
+            writer.writerow(row)
+    return text.getvalue()
+
+
+def interval_words(seeds: int) -> str:
+    """What the intervals of figures over so many seeds hold for."""
+    if seeds == 1:
+        return "95 % intervals for other worlds only: one seed says nothing about others"
+    rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""
+    return f"95 % intervals for other seeds and other worlds{rough}"
+
+
+def lines_markdown(found: Sequence[LineResult], question: Question, runs: int) -> str:
+    """One row per length of the line."""
+    head = ["Vehicles", "All brake fully", "Reached", "Decrease", "Somebody worse off"]
+    head += ["Best known", "Share of the joint optimum"] if question.search_episodes else []
+    rows = []
+    for one in found:
+        row = [str(one.vehicles), _of(one.full_brake), _of(one.reached), _of(one.decrease, 100.0, 1, " %")]
+        row.append(_of(one.worse_off, 100.0, 1, " %"))
+        rows.append(row + ([_of(one.best_known), _of(one.share, 100.0, 1, " %")] if question.search_episodes else []))
+    name = question.scenario.name
+    conditions = (
+        f"{_HARM[question.count].capitalize()} (m²/s², means per world) of the line of {name} made longer:"
+        f" {runs} {'policies' if runs > 1 else 'policy'}, {question.episodes:,} worlds of seed {question.list_seed} for"
+        f" each length; {interval_words(runs)}."
+    )
+    if question.search_episodes:
+        conditions += (
+            f" Best known and share: the first {question.search_episodes} worlds, {question.budget:,} candidates each."
+        )
+    return f"{_table(head, rows, left=1)}\n\n{conditions}\n"
+
+
+def _of(estimate: Estimate | None, scale: float = 1.0, digits: int = 2, unit: str = "") -> str:
+    plain = None if estimate is None else {"value": estimate.value, "interval": estimate.interval}
+    return _cell(plain, scale, digits, unit)
+
+
+def _levels(levels: Sequence[Json], count: HarmCount) -> str:
+    head = ["Level", _ALGORITHM, "Collisions", "All brake fully", f"Reached, {_HARM[count]}"]
+    rows = []
+    for level in levels:
+        own = level[count]
+        row = [f"`{level['level']}`", level["algorithm"] or NONE, _cell(level["collision_rate"], 100.0, 1, " %")]
+        rows.append([*row, _value(own["full_brake"]), _cell(own["harm"])])
+    return _table(head, rows, left=2)
+
+
+def _optima(levels: Sequence[Json], count: HarmCount) -> str:
+    head = ["Level", _ALGORITHM, "All brake fully", f"Reached, {_HARM[count]}"]
+    head += ["Joint optimum", "Share of its reduction"]
+    rows = []
+    for level in levels:
+        own = level[count]["searched"]
+        if own["best_known"] is not None:
+            row = [f"`{level['level']}`", level["algorithm"], _value(own["full_brake"]), _cell(own["harm"])]
+            rows.append([*row, _value(own["best_known"]), _cell(own["realised_share"], 100.0, 1, " %")])
+    return _table(head, rows, left=2)
+
+
+def _changes(changes: Sequence[Json]) -> str:
+    head = ["From", "To", _ALGORITHM]
+    for count in COUNTS:
+        head += [f"Change of {_HARM[count]}", f"Somebody worse off, {_HARM[count]}"]
+    rows = []
+    for change in changes:
+        row = [f"`{change['from']}`", f"`{change['to']}`", change["algorithm"]]
+        for count in COUNTS:
+            row += [_cell(change[count]["difference"], sign=True), _cell(change[count]["worse_off"], 100.0, 1, " %")]
+        rows.append(row)
+    return _table(head, rows, left=3)
+
+
+def _who_pays(changes: Sequence[Json], count: HarmCount) -> str:
+    vehicles = len(changes[0][count]["vehicles"])
+    head = [f"Change of {_HARM[count]}", _ALGORITHM, *(f"Vehicle {i + 1}" for i in range(vehicles))]
+    head += [f"Vehicle {i + 1} worse off" for i in range(vehicles)]
+    rows = []
+    for change in changes:
+        own = change[count]
+        row = [f"`{change['from']}` to `{change['to']}`", change["algorithm"]]
+        row += [_cell(estimate, sign=True) for estimate in own["vehicles"]]
+        rows.append(row + [f"{100.0 * share:.1f} %" for share in own["worse_off_vehicles"]])
+    return _table(head, rows, left=2)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
+    """A table whose first ``left`` columns are texts; without the algorithm's where there is only one."""
+    if _ALGORITHM in head:
+        column = head.index(_ALGORITHM)
+        if len({row[column] for row in rows} - {NONE}) == 1:
+            head, *rows = ([*row[:column], *row[column + 1 :]] for row in (head, *rows))
+            left -= 1
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * left + " ---: |" * (len(head) - left)]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def _cell(estimate: Json | None, scale: float = 1.0, digits: int = 2, unit: str = "", *, sign: bool = False) -> str:
+    """``12.34 [12.00, 12.70]``."""
+    if estimate is None:
+        return NONE
+    plus = "+" if sign else ""
+    value = f"{scale * estimate['value']:{plus}.{digits}f}{unit}"
+    if estimate["interval"] is None:
+        return value
+    low, high = (f"{scale * end:{plus}.{digits}f}" for end in estimate["interval"])
+    return f"{value} [{low}, {high}]"
+
+
+def _value(estimate: Json | None) -> str:
+    return NONE if estimate is None else f"{estimate['value']:.2f}"
+
+
+def _column(count: HarmCount) -> str:
+    return "first_impact_harm" if count == "first" else "total_harm"
+
+
+SUMMARY, TABLE, PAGE = "ablation.json", "ablation.csv", "ablation.md"
+FIGURES = {"ablation.png": harm_curve, "ablation-changes.png": change_figure, "ablation-who-pays.png": who_pays}
+
+
+def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> dict[str, Any]:
+    """Write all files, replacing earlier ones, and give what ``ablation.json`` holds."""
+    found = {"settings": _settings(plan, machine), **compare(measured, plan.search_episodes)}
+    conditions = _conditions(plan, machine)
+    write_output(plan.folder / SUMMARY, (json.dumps(found, indent=2, allow_nan=False) + "\n").encode(), force=True)
+    write_output(plan.folder / TABLE, levels_csv(measured, plan.search_episodes).encode(), force=True)
+    write_output(plan.folder / PAGE, markdown(found, conditions).encode(), force=True)
+    for name, draw in FIGURES.items():
+        if found["steps"] or found["channels"]:
+            write_output(plan.folder / name, png_bytes(draw(found, conditions)), force=True)
+    return found
+
+
+def _settings(plan: Plan, machine: str) -> dict[str, Any]:
+    return {
+        **plan.settings(),
+        "levels": [level.name for level in plan.levels],
+        "recipes": {name: r.model_dump(mode="json") for name, r in zip(plan.algorithms, plan.recipes, strict=True)},
+        "machine": machine,
+        "date": datetime.now(UTC).date().isoformat(),
+    }
+
+
+def _conditions(plan: Plan, machine: str) -> str:
+    recipes = ", ".join(
+        f"{name} (rewarded for {'first-impact' if recipe.reward.harm_count == 'first' else 'total'} harm)"
+        for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
+    )
+    return (
+        f"{recipes}; {plan.seeds} {'seeds' if plan.seeds > 1 else 'seed'}, {plan.steps_per_learner:,} decisions of each"
+        f" learner. Harms are means per world in m²/s² on the same {plan.episodes:,} worlds of seed {plan.list_seed} at"
+        f" every level; {interval_words(plan.seeds)}. Joint optimum: the least harm known that the level's learners can"
+        f" do, and everything beside it, in the first {plan.search_episodes:,} of these worlds, {plan.budget:,}"
+        f" candidates per world and count. {machine}."
+    )

@@ -1,0 +1,177 @@
+"""Training everything that an ablation needs: finished trainings are kept, begun ones go on, several at once."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import active_children, get_context, parent_process
+from multiprocessing.process import BaseProcess
+
+import numpy as np
+
+from ethbrake_marl.agents.team import Team
+from ethbrake_marl.evaluation.rollout import Outcome, evaluate
+from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.learning.loop import Progress
+from ethbrake_marl.learning.run_folder import RunDirectory
+from ethbrake_marl.learning.teams import load_team, resume_team, train_team
+from ethbrake_marl.lineup import PROGRESS_EVERY
+from ethbrake_marl.physics import Bools, Floats
+from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.studies.ablation.joint_optimum import Answer, best_known, search_all
+from ethbrake_marl.studies.ablation.plan import Level, Plan, Training, common_worlds
+
+TellTraining = Callable[[str, int, int], None]  # what, how far, of how much
+
+
+def train_all(trainings: Sequence[Training], jobs: int, tell: TellTraining | None = None) -> bool:
+    """Bring every training to its end, ``jobs`` at a time; False when Ctrl-C stopped it.
+
+    The policies do not depend on ``jobs`` or on interruptions. Raises what ``Training.steps_left`` and ``train_team``
+    raise.
+    """
+    left = [training for training in trainings if training.steps_left()]
+    say = tell or (lambda name, done, total: None)
+    if jobs == 1 or len(left) < 2:
+        return all(_train(training, partial(_told, say, training.folder.name)) for training in left)
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin_worker) as pool:
+        futures = [pool.submit(_train, training) for training in left]
+        say("trainings", 0, len(left))
+        try:
+            for done, future in enumerate(as_completed(futures)):
+                if not future.result():
+                    raise KeyboardInterrupt
+                say("trainings", done + 1, len(left))
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for worker in active_children():
+                worker.terminate()  # a training ends after its update, with a checkpoint
+            return False
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return True
+
+
+def check_finished(trainings: Iterable[Training]) -> None:
+    """Raise what ``load_team`` raises for a finished training that cannot drive, before anything long is begun."""
+    for training in trainings:
+        if not training.steps_left():
+            load_team(training.folder, training.level.scenario)
+
+
+def _begin_worker() -> None:
+    """Leave Ctrl-C to the parent, which passes it on once, and end with the parent however that ends."""
+    os.setpgrp()
+    parent = parent_process()
+    assert parent is not None
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(1)
+
+
+def _train(training: Training, tell: Callable[[Progress], None] | None = None) -> bool:
+    """Whether it is finished now."""
+    if RunDirectory(training.folder).status.is_file():
+        return resume_team(training.folder, on_progress=tell).status == "finished"
+    training.folder.parent.mkdir(parents=True, exist_ok=True)
+    result = train_team(training.recipe, training.level.scenario, training.folder, on_progress=tell)
+    return result.status == "finished"
+
+
+def _told(tell: TellTraining, name: str, progress: Progress) -> None:
+    tell(name, progress.steps, progress.total_steps)
+
+
+Tell = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Harms:
+    """What several trainings (or one script) did, on the same worlds."""
+
+    world: dict[HarmCount, Floats]  # [seeds, worlds] harm of all vehicles (m2/s2)
+    vehicle: dict[HarmCount, Floats]  # [seeds, worlds, N] harm of each
+    collided: Bools  # [seeds, worlds]
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """One level under one algorithm."""
+
+    level: Level
+    algorithm: str | None  # None: nobody learns
+    reached: Harms
+    full_brake: Harms  # of all vehicles, whatever their roles
+    best: dict[HarmCount, Floats] | None  # [1, search_episodes] joint optimum, best known; None: nobody to control
+
+
+def load_teams(plan: Plan) -> dict[tuple[str, str], list[Team]]:
+    """What was trained, by level and algorithm, seed by seed; raises what ``load_team`` raises."""
+    teams: dict[tuple[str, str], list[Team]] = {}
+    for training in plan.trainings():
+        team = load_team(training.folder, training.level.scenario, training.folder.name)
+        teams.setdefault((training.level.name, training.algorithm), []).append(team)
+    return teams
+
+
+def measure(plan: Plan, jobs: int = 1, tell: Tell | None = None) -> list[Measured]:
+    """Let everything that was trained drive the common worlds, and search the joint optima (parts found are kept).
+
+    Level by level in the plan's order, algorithm by algorithm. What some policy does better than the search becomes
+    the best known of that world. Raises what loading teams and ``common_worlds`` raise, before any long work.
+    """
+    say = tell or (lambda name, done, total: None)
+    teams = load_teams(plan)
+    samples = common_worlds(plan.levels, plan.episodes, plan.list_seed)
+    tables = search_all(plan, samples, jobs, say)
+    answers = {}
+    for level, sample in zip(plan.levels, samples, strict=True):
+        if level.trained:
+            own = [team for algorithm in plan.algorithms for team in teams[level.name, algorithm]]
+            part = sample.worlds.take(np.arange(plan.search_episodes))
+            answers[level.name] = Answer(level, part, tables[level.name], tuple(own))
+    found: list[Measured] = []
+    for level, sample in zip(plan.levels, samples, strict=True):
+        braking = _driven(_all_brake(level.scenario), sample, [Team({}, f"full braking in {level.name}")], say)
+        if not level.trained:
+            scripts = _driven(level.scenario, sample, [Team({}, f"scripts of {level.name}")], say)
+            found.append(Measured(level, None, scripts, braking, None))
+            continue
+        known = best_known(answers[level.name], list(answers.values()))
+        best = {count: harm[np.newaxis] for count, harm in known.items()}
+        for algorithm in plan.algorithms:
+            reached = _driven(level.scenario, sample, teams[level.name, algorithm], say)
+            found.append(Measured(level, algorithm, reached, braking, best))
+    return found
+
+
+def _all_brake(scenario: Scenario) -> Scenario:
+    """The scenario with every vehicle braking fully."""
+    return scenario.replace(roles=dict.fromkeys(scenario.vehicle_names, "full_brake"))
+
+
+def _driven(scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: Tell) -> Harms:
+    """Harms of several teams of one level."""
+    outcomes = []
+    for team in teams:
+        result = evaluate(sample, {team.name: team}, scenario=scenario, chunk=PROGRESS_EVERY).complete()
+        outcomes.append(result.outcome(team.name))
+        tell(f"driving {team.name}", sample.worlds.n, sample.worlds.n)
+    return harms_of(outcomes)
+
+
+def harms_of(outcomes: Sequence[Outcome]) -> Harms:
+    """The outcomes of several seeds on the same worlds, stacked."""
+    return Harms(
+        {count: np.stack([o.ledger.world_harm(count) for o in outcomes]) for count in COUNTS},
+        {count: np.stack([o.ledger.vehicle_harm(count) for o in outcomes]) for count in COUNTS},
+        np.stack([o.collided for o in outcomes]),
+    )

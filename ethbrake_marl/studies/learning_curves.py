@@ -1,0 +1,158 @@
+"""Learning curves: several seeds of several recipes on one scenario, in one folder, with one figure."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
+from ethbrake_marl.figures.learning_curves import SeedCurve, at_common_steps, seed_curves
+from ethbrake_marl.figures.style import png_bytes
+from ethbrake_marl.learning.kept_training import check_same
+from ethbrake_marl.learning.loop import Progress
+from ethbrake_marl.learning.progress import HARM_METRIC
+from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.learning.run_folder import RunDirectory, read_object
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.studies.experiment import resume_measured, train_measured
+
+FIGURE, TABLE, SUMMARY = "learning_curves.png", "learning_curves.csv", "learning_curves.json"
+
+_RETURN = "rollout/ep_rew_mean"  # mean over the last episodes, exploration included
+_LABELS = {
+    "first_impact_harm": "First-impact harm on the fixed list (m²/s²)",
+    "total_harm": "Total harm on the fixed list (m²/s²)",
+    "return": "Mean return of training episodes",
+}
+
+Tell = Callable[[str, Progress], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Trainings:
+    """The seeds 0 to ``seeds - 1`` of one recipe."""
+
+    recipe: TrainingRecipe
+    seeds: int
+
+
+def parse_trainings(text: str) -> list[Trainings]:
+    """Read ``ppo:5,sac:3``: recipes (names, or paths) with their numbers of seeds; raises ``InvalidInput``."""
+    found = []
+    for part in text.split(","):
+        match = re.fullmatch(r"(.+):([1-9][0-9]{0,3})", part)
+        if match is None:
+            raise InvalidInput(f"recipes {text!r}: {part!r} must be RECIPE:SEEDS, for instance ppo:5,sac:3")
+        found.append(Trainings(load_recipe(match[1]), int(match[2])))
+    names = [trainings.recipe.name for trainings in found]
+    if len(set(names)) < len(names):
+        raise InvalidInput(f"recipes {text!r}: two recipes have the same name")
+    return found
+
+
+def train_all(
+    scenario: Scenario, plan: Sequence[Trainings], folder: Path, *, steps: int | None = None, tell: Tell | None = None
+) -> bool:
+    """Train every seed of every recipe into ``folder/RECIPE-seedK``: finished ones are kept, begun ones go on.
+
+    Gives False when Ctrl-C stopped it. Raises ``InvalidInput`` for a folder that holds another training than this one
+    would be (``learning.kept_training``), before any is begun, besides what ``train`` raises.
+    """
+    wanted = {
+        folder / f"{trainings.recipe.name}-seed{seed}": trainings.recipe.replace(
+            seed=seed, total_steps=trainings.recipe.total_steps if steps is None else steps
+        )
+        for trainings in plan
+        for seed in range(trainings.seeds)
+    }
+    for path, recipe in wanted.items():
+        if RunDirectory(path).status.is_file():
+            check_same(path, recipe, scenario)
+    return all(
+        _train_one(scenario, recipe, path, None if tell is None else partial(tell, path.name))
+        for path, recipe in wanted.items()
+    )
+
+
+def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) -> dict[str, Any]:
+    """Draw the finished trainings of ``folder``, write figure, table and summary, and give the summary.
+
+    For each recipe: interquartile mean over seeds, with its stratified bootstrap interval, of the harm of the policy
+    that each training kept, and of the last one. Raises ``InvalidInput`` when they have no evaluation in common.
+    """
+    counts = {trainings.recipe.reward.harm_count for trainings in plan}
+    metrics = [HARM_METRIC[count] for count in ("first", "total") if count in counts]
+    curves: dict[str, dict[str, SeedCurve]] = {metric: {} for metric in (*metrics, "return")}
+    summary: dict[str, Any] = {"scenario": scenario.name, "recipes": {}}
+    for trainings in plan:
+        name = trainings.recipe.name
+        tables = [_table(folder / f"{name}-seed{seed}") for seed in range(trainings.seeds)]
+        for metric in curves:
+            values = [_column(table, _RETURN if metric == "return" else f"eval/{metric}") for table in tables]
+            if metric != "return" or all(values):  # no episode may have ended in a very short training
+                curves[metric][name] = at_common_steps(values)
+        own = curves.get(HARM_METRIC[trainings.recipe.reward.harm_count])
+        assert own is not None
+        kept, last = own[name].values.min(axis=1), own[name].values[:, -1]
+        summary["recipes"][name] = {"seeds": trainings.seeds, "kept": _estimate(kept), "last": _estimate(last)}
+    curves = {metric: lines for metric, lines in curves.items() if lines}
+    caption = f"{scenario.name}: mean over seeds, bands: one standard deviation. {_conditions(plan)}"
+    panels = {_LABELS[metric]: lines for metric, lines in curves.items()}
+    figure = seed_curves(panels, logarithmic=[_LABELS[metric] for metric in metrics], caption=caption)
+    write_output(folder / FIGURE, png_bytes(figure), force=True)
+    write_output(folder / TABLE, _csv(curves).encode(), force=True)
+    write_output(folder / SUMMARY, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode(), force=True)
+    return summary
+
+
+def _train_one(scenario: Scenario, recipe: TrainingRecipe, path: Path, tell: Callable[[Progress], None] | None) -> bool:
+    """Whether it is finished now."""
+    run = RunDirectory(path)
+    if not run.status.is_file():
+        return train_measured(scenario, path, recipe=recipe, on_progress=tell).status == "finished"
+    if read_object(run.status).get("status") == "finished":
+        return True
+    return resume_measured(path, on_progress=tell).status == "finished"
+
+
+def _table(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(RunDirectory(path).progress.read_text("utf-8").splitlines()))
+
+
+def _column(table: Sequence[Mapping[str, str]], name: str) -> dict[int, float]:
+    """Step -> value, where there is one."""
+    return {int(row["steps"]): float(row[name]) for row in table if row.get(name)}
+
+
+def _estimate(harms: Any) -> dict[str, Any]:
+    found = interquartile_mean([harms])
+    return {"interquartile_mean": found.value, "interval": found.interval, "each": [float(harm) for harm in harms]}
+
+
+def _conditions(plan: Sequence[Trainings]) -> str:
+    """The fixed list of each recipe, in words."""
+    lists = sorted({(t.recipe.evaluation.worlds, t.recipe.evaluation.seed) for t in plan})
+    return "Fixed list: " + "; ".join(f"{worlds:,} worlds of seed {seed}" for worlds, seed in lists) + "."
+
+
+def _csv(curves: Mapping[str, Mapping[str, SeedCurve]]) -> str:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["figure", "recipe", "seed", "steps", "value"])
+    for metric, lines in curves.items():
+        for recipe, curve in lines.items():
+            for seed, values in enumerate(curve.values):
+                writer.writerows(
+                    [metric, recipe, seed, int(step), float(value)]
+                    for step, value in zip(curve.steps, values, strict=True)
+                )
+    return text.getvalue()

@@ -1,0 +1,281 @@
+"""What this machine does per second of processor time: the figures of ``ethbrake bench``.
+
+Every rate is the median over repetitions of work done per second of this process's own processor time, on one core and
+after a first round that does not count (it compiles and fills caches). Programs that run beside it therefore weigh
+little, though not nothing: caches and memory are shared. ``relative`` sets a rate of world-steps against the
+calibration, a loop so simple that hardly anything but the machine can make it slower, measured in the same run.
+"""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.setup import make_engine
+from ethbrake_marl.harm import empty_ledger
+from ethbrake_marl.physics import Floats, Worlds, advance, forecast
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.scenario import load_scenario
+
+SCENARIO = "paper-random"
+SEED = 7
+_VEHICLES = 3
+STEP_S = 0.1
+SHARE = 0.75  # of its braking capacity, with which a learner brakes
+WORLD_STEPS = "world-steps/s"
+MOST_STEPS = 1000  # by then every world is at rest, or none will be
+
+Work = Callable[[], int]  # does some work and says how much it was
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How long to look: repetitions of each measurement, and processor seconds of each at least."""
+
+    repetitions: int
+    seconds: float
+
+
+QUICK = Effort(3, 0.1)
+FULL = Effort(7, 0.4)
+
+
+@dataclass(frozen=True, slots=True)
+class Speed:
+    """One measured figure."""
+
+    name: str
+    workload: str
+    worlds: int  # at once
+    vehicles: int  # in each world
+    unit: str
+    value: float  # median over repetitions
+    lowest: float
+    highest: float
+    floor: float | None = None  # what the project aims at: at least this (for seconds: at most)
+    relative: float | None = None  # rate of world-steps over that of the calibration
+
+
+def rates(work: Work, effort: Effort) -> Floats:
+    """Units of work per second of processor time, one for each repetition, ascending."""
+    work()
+    found = []
+    for _ in range(effort.repetitions):
+        done, spent, begin = 0, 0.0, time.process_time()
+        while spent < effort.seconds:
+            done += work()
+            spent = time.process_time() - begin
+        found.append(done / spent)
+    return np.sort(found)
+
+
+@dataclass(frozen=True, slots=True)
+class Benchmark:
+    """A figure before it is measured."""
+
+    name: str
+    workload: str
+    unit: str
+    worlds: int
+    floor: float | None
+    look: Callable[[Effort], Floats]  # one value for each repetition, ascending
+
+    def measure(self, effort: Effort) -> Speed:
+        """Measure it now."""
+        found = self.look(effort)
+        low, middle, high = float(found[0]), float(np.median(found)), float(found[-1])
+        return Speed(self.name, self.workload, self.worlds, _VEHICLES, self.unit, middle, low, high, self.floor)
+
+
+def measure(effort: Effort) -> Iterator[Speed]:
+    """Every figure of ``BENCHMARKS``, one after the other."""
+    calibration = None
+    for benchmark in BENCHMARKS:
+        speed = benchmark.measure(effort)
+        calibration = speed.value if calibration is None else calibration
+        yield replace(speed, relative=speed.value / calibration) if speed.unit == WORLD_STEPS else speed
+
+
+def first_decisions(n: int) -> Worlds:
+    """Worlds of the scenario's training stream at their first decision."""
+    return make_engine(SCENARIO, n, seed=SEED).worlds
+
+
+def braking(n: int, share: float) -> Work:
+    """Worlds from their first decision until all are at rest; Vehicle 2 brakes with a share of its capacity."""
+    worlds = first_decisions(n)
+    command = -worlds.vehicles.braking_capacity_mps2
+    command[:, 1] *= share
+    return until_rest(worlds, command)
+
+
+def until_rest(worlds: Worlds, command_mps2: Floats) -> Work:
+    """``advance`` and the ledger, step by step under constant commands, until all worlds are at rest."""
+    after, steps = worlds, 0
+    while after.speeds_mps.any() and steps < MOST_STEPS:
+        after, steps = advance(after, command_mps2, STEP_S)[0], steps + 1
+
+    def work() -> int:
+        now, ledger = worlds, empty_ledger(worlds)
+        for _ in range(steps):
+            now, impacts = advance(now, command_mps2, STEP_S)
+            ledger = ledger.add(impacts)
+        return steps * worlds.n
+
+    return work
+
+
+def stepping(n: int, steps: int = 100) -> Work:
+    """The engine: dynamics, ledger, rewards, ends of episodes, the learner's observation, and new episodes."""
+    engine = make_engine(SCENARIO, n, seed=SEED)
+    learners = np.array(engine.learners)
+    actions = np.full((n, len(learners)), -SHARE)
+
+    def work() -> int:
+        for _ in range(steps):
+            ended = engine.step(actions).ended
+            engine.renew(np.flatnonzero(ended))
+            engine.observe_all(learners)
+        return steps * n
+
+    return work
+
+
+def vec_env(n: int, steps: int = 100) -> Work:
+    """The Stable-Baselines3 ``VecEnv``: the engine's step, infos, and new episodes as old ones end."""
+    environment = eb.make_sb3_vec_env(SCENARIO, n, seed=SEED)  # imports torch, hence only now
+    environment.reset()
+    actions = np.full((n, 1), -SHARE, np.float32)
+
+    def work() -> int:
+        for _ in range(steps):
+            environment.step(actions)
+        return steps * n
+
+    return work
+
+
+def parallel(n: int, episodes: int = 20) -> Work:
+    """Whole episodes of one world (``n`` is 1) through PettingZoo's parallel API, resets included."""
+    environment = parallel_env(SCENARIO)
+    actions = {f"vehicle_{i + 1}": np.array([-SHARE], np.float32) for i in environment.engine.learners}
+    environment.reset(seed=SEED)
+
+    def work() -> int:
+        steps = 0
+        for _ in range(episodes):
+            environment.reset()
+            while environment.agents:
+                environment.step(actions)
+                steps += 1
+        return steps * n
+
+    return work
+
+
+def _sampling(n: int) -> Work:
+    scenario = load_scenario(SCENARIO)
+    return lambda: scenario.sample(n, SEED).worlds.n
+
+
+def _pairwise(n: int) -> Work:
+    worlds = load_scenario(SCENARIO).sample(n, SEED).worlds
+    return lambda: len(optimise_pairwise(worlds, 1).harm)
+
+
+def _coupled(n: int) -> Work:
+    worlds = load_scenario(SCENARIO).sample(n, SEED).worlds
+    return lambda: len(optimise_coupled(worlds, 1).harm)
+
+
+def _forecast(n: int, candidates: int = 16) -> Work:
+    scenario = load_scenario(SCENARIO)
+    worlds = scenario.sample(n, SEED).worlds
+    command = -worlds.vehicles.braking_capacity_mps2
+    tried = command[:, [1]] * np.linspace(0.0, 1.0, candidates)
+    return lambda: forecast(worlds, command, 1, tried, scenario.horizon_s)[0].size
+
+
+def _calibration(n: int) -> Work:
+    speeds, ways = np.full((n, 3), 20.0), np.zeros((n, 3))
+    return lambda: int(brake_apart(speeds, ways, 1000))
+
+
+@compiled
+def brake_apart(speeds: Floats, ways: Floats, steps: int) -> int:
+    """The calibration: vehicles that brake without seeing each other, and start again when at rest."""
+    for _ in range(steps):
+        for k in range(speeds.shape[0]):
+            for i in range(speeds.shape[1]):
+                after = max(speeds[k, i] - 0.5, 0.0)
+                ways[k, i] += 0.05 * (speeds[k, i] + after)
+                speeds[k, i] = after if after > 0.0 else 20.0
+    return steps * len(speeds)
+
+
+_START = """
+import ethbrake_marl
+environment = ethbrake_marl.parallel_env()
+environment.reset(seed=7)
+environment.step({"vehicle_2": [-1.0]})
+"""
+
+
+def _start_seconds(effort: Effort) -> Floats:
+    """Seconds of a fresh interpreter that makes one world and steps it once; the kernels' cache is warm."""
+    _child_seconds()
+    return np.sort([_child_seconds() for _ in range(effort.repetitions)])
+
+
+def _child_seconds() -> float:
+    """Processor seconds of that interpreter, from its start to its end."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, "-c", _START], check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+_BRAKING = "first decision to rest in steps of 0.1 s; Vehicle 2 brakes with {:.0%} of its capacity, all others fully"
+_DRIVING = "Vehicle 2 brakes with 75% of its capacity; new episodes as old ones end"
+_FRESH = "a fresh interpreter: import, parallel_env, reset, step; kernels compiled before"
+
+
+def _rate_of(
+    name: str, workload: str, make: Callable[[int], Work], n: int, floor: float | None = None, unit: str = WORLD_STEPS
+) -> Benchmark:
+    return Benchmark(name, workload, unit, n, floor, lambda effort: rates(make(n), effort))
+
+
+def _advance_of(n: int, share: float) -> Benchmark:
+    name = f"advance and ledger, {share:.0%}"
+    return _rate_of(name, _BRAKING.format(share), partial(braking, share=share), n, 15e6)
+
+
+# The calibration comes first: the others are set against it.
+BENCHMARKS: tuple[Benchmark, ...] = (
+    _rate_of("calibration", "constant deceleration, no event", _calibration, 1024),
+    _advance_of(1024, SHARE),
+    _advance_of(1024, 1.0),
+    _advance_of(4096, SHARE),
+    _advance_of(4096, 1.0),
+    _rate_of("engine step", _DRIVING, stepping, 1024, 8e6),
+    _rate_of("engine step", _DRIVING, stepping, 4096, 8e6),
+    _rate_of("Stable-Baselines3 VecEnv", _DRIVING, vec_env, 512, 4e6),
+    _rate_of("PettingZoo parallel", "whole episodes, resets included", parallel, 1, 80e3),
+    Benchmark("import and first step", _FRESH, "s", 1, 2.0, _start_seconds),
+    _rate_of("sampling", "a list of worlds, refused draws included", _sampling, 10_000, unit="worlds/s"),
+    _rate_of("E-V2X-BM pairwise", "one optimum per world", _pairwise, 10_000, unit="worlds/s"),
+    _rate_of("E-V2X-BM coupled", "one optimum per world", _coupled, 1000, unit="worlds/s"),
+    _rate_of("forecast", "16 constant commands per world, to the horizon", _forecast, 1000, unit="runs/s"),
+)

@@ -1,0 +1,435 @@
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
+from ethbrake_marl.policies import policy as bundle
+from ethbrake_marl.policies.manifest import content_sha256
+from ethbrake_marl.policies.policy import Policy, actor_only, load_policy, make_policy, save_policy
+
+Spoil = Callable[[Path], None]
+
+
+class _Payload:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (exec, ("raise RuntimeError('code of the bundle was run')",))
+
+
+def _edit(*, rehash: bool = True, **changes: Any) -> Spoil:
+    """Change manifest fields, a dotted key ``a__b`` one level down; its hash agrees, unless not ``rehash``."""
+
+    def spoil(folder: Path) -> None:
+        manifest = json.loads((folder / "manifest.json").read_bytes())
+        for key, value in changes.items():
+            *outer, last = key.split("__")
+            target = manifest
+            for name in outer:
+                target = target[name]
+            target[last] = value
+        if rehash:
+            manifest["manifest_sha256"] = content_sha256(manifest)
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+
+    return spoil
+
+
+def _manifest(change: Callable[[bytes], bytes]) -> Spoil:
+    return lambda folder: _replace(folder / "manifest.json", change)
+
+
+def _weights(change: Callable[[bytes], bytes]) -> Spoil:
+    """Change the weights file and make the manifest's hash agree, as an attacker would."""
+
+    def spoil(folder: Path) -> None:
+        _replace(folder / "weights.safetensors", change)
+        digest = hashlib.sha256((folder / "weights.safetensors").read_bytes()).hexdigest()
+        _edit(weights_sha256=digest)(folder)
+
+    return spoil
+
+
+def _tensors(change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> Spoil:
+    return _weights(
+        lambda data: safetensors.numpy.save(change({k: np.array(v) for k, v in safetensors.numpy.load(data).items()}))
+    )
+
+
+def _replace(path: Path, change: Callable[[bytes], bytes]) -> None:
+    path.write_bytes(change(path.read_bytes()))
+
+
+def _header(change: Callable[[dict[str, Any]], None]) -> Spoil:
+    def rewrite(data: bytes) -> bytes:
+        length = int.from_bytes(data[:8], "little")
+        header = json.loads(data[8 : 8 + length])
+        change(header)
+        text = json.dumps(header).encode()
+        return len(text).to_bytes(8, "little") + text + data[8 + length :]
+
+    return _weights(rewrite)
+
+
+def _link(name: str) -> Spoil:
+    def spoil(folder: Path) -> None:
+        (folder / name).rename(folder.parent / f"moved-{folder.name}-{name}")
+        (folder / name).symlink_to(folder.parent / f"moved-{folder.name}-{name}")
+
+    return spoil
+
+
+def _pipe(folder: Path) -> None:
+    (folder / "manifest.json").unlink()
+    os.mkfifo(folder / "manifest.json")
+
+
+def _folder_instead(folder: Path) -> None:
+    (folder / "weights.safetensors").unlink()
+    (folder / "weights.safetensors").mkdir()
+
+
+def _socket(folder: Path) -> None:
+    (folder / "weights.safetensors").unlink()
+    here = os.getcwd()
+    os.chdir(folder)  # the name of a socket has a short longest length
+    try:
+        with socket.socket(socket.AF_UNIX) as listening:
+            listening.bind("weights.safetensors")
+    finally:
+        os.chdir(here)
+
+
+def _endless_device(folder: Path) -> None:
+    """A file that never ends: a device where that may be made, else a huge file without blocks."""
+    path = folder / "weights.safetensors"
+    path.unlink()
+    try:
+        os.mknod(path, 0o600 | stat.S_IFCHR, os.makedev(1, 5))
+    except PermissionError:
+        path.touch()
+        os.truncate(path, 1 << 40)
+
+
+def _sparse_giant(folder: Path) -> None:
+    os.truncate(folder / "weights.safetensors", 1 << 40)
+
+
+def _first_tensor(**changes: Any) -> Spoil:
+    return _header(lambda h: h["policy.0.bias"].update(changes))
+
+
+def _renamed(name: str) -> Spoil:
+    return _header(lambda h: h.update({name: h.pop("policy.0.bias")}))
+
+
+def _raw_header(text: bytes) -> Spoil:
+    return _weights(lambda data: len(text).to_bytes(8, "little") + text + data[-400:])
+
+
+def _with(tensors: dict[str, np.ndarray], name: str, value: np.ndarray) -> dict[str, np.ndarray]:
+    return {**tensors, name: value}
+
+
+def _not_finite(tensors: dict[str, np.ndarray], number: float) -> dict[str, np.ndarray]:
+    tensors["value.0.bias"][2] = number
+    return tensors
+
+
+SPOILED: dict[str, tuple[Spoil, str]] = {
+    "no_manifest": (lambda f: (f / "manifest.json").unlink(), r"manifest.json: is missing"),
+    "no_weights": (lambda f: (f / "weights.safetensors").unlink(), r"weights.safetensors: is missing"),
+    "extra_file": (lambda f: (f / "policy.pkl").write_bytes(pickle.dumps(_Payload())), r"policy.pkl: does not belong"),
+    "manifest_link": (_link("manifest.json"), r"manifest.json: is a symbolic link"),
+    "weights_link": (_link("weights.safetensors"), r"weights.safetensors: is a symbolic link"),
+    "pipe": (_pipe, r"manifest.json: is not a plain file"),
+    "folder_for_file": (_folder_instead, r"weights.safetensors: (is not a plain file|cannot be read)"),
+    "empty_manifest": (_manifest(lambda _: b""), r"manifest.json: "),
+    "not_utf8": (_manifest(lambda data: data.replace(b"ppo", b"\xff\xfe")), r"manifest.json: 'utf-8' codec"),
+    "list_manifest": (_manifest(lambda _: b"[]"), r"manifest.json: Input should be an object"),
+    "key_twice": (
+        _manifest(lambda data: data.replace(b"{", b'{"algorithm": "ppo",', 1)),
+        r"manifest.json: key 'algorithm' stands twice",
+    ),
+    "nan": (_manifest(lambda data: data.replace(b"1024", b"NaN")), r"manifest.json: NaN is not a JSON number"),
+    "huge_number": (_manifest(lambda data: data.replace(b"1024", b"1e999")), r"manifest.json: 1e999 is too large"),
+    "huge_integer": (_manifest(lambda data: data.replace(b"1024", b"9" * 5000)), r"manifest.json: "),
+    "deep": (_manifest(lambda _: b"[" * 200_000), r"manifest.json: nested too deeply"),
+    "two_values": (_manifest(lambda data: data + data), r"manifest.json: Extra data"),
+    "large": (_manifest(lambda data: data + b" " * (1 << 20)), r"manifest.json: larger than 1 MiB"),
+    "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: Extra inputs"),
+    "dotted_algorithm": (
+        _edit(algorithm="subprocess.Popen"),
+        r"manifest.json: algorithm: Input should be 'ppo' or 'sac'",
+    ),
+    "dotted_activation": (_edit(network__activation="torch.nn.ReLU"), r"manifest.json: network.activation"),
+    "future_version": (_edit(format_version=3), r"manifest.json: format_version: Input should be 2"),
+    "wrong_type": (_edit(steps="many"), r"manifest.json: steps: Input should be a valid integer"),
+    "giant_layer": (_edit(network__policy_hidden=[10**9]), r"manifest.json: network.policy_hidden.0"),
+    "many_layers": (_edit(network__value_hidden=[1] * 9), r"manifest.json: network.value_hidden"),
+    "fewer_inputs": (
+        _edit(network__observation_size=4),
+        r"manifest.json: 27 observation features for a network that takes 4",
+    ),
+    "other_features": (_edit(observation__features=[f"own.{k}" for k in range(27)]), r"manifest.json: observation: "),
+    "other_scaling": (_edit(observation__scaling_sha256="0" * 64), r"manifest.json: observation: features or their"),
+    "older_version": (_edit(format_version=1), r"manifest.json: format_version: Input should be 2"),
+    "other_activation": (_edit(rehash=False, network__activation="tanh"), r"manifest.json: its content has SHA-256"),
+    "other_output": (_edit(rehash=False, network__output="tanh"), r"manifest.json: its content has SHA-256"),
+    "other_steps": (_edit(rehash=False, steps=999_999_999), r"manifest.json: its content has SHA-256"),
+    "other_reward": (_edit(rehash=False, reward={"jerk": 1.0}), r"manifest.json: its content has SHA-256"),
+    "no_vehicle": (_edit(learners=["car_2"]), r"manifest.json: learners: 'car_2' is no vehicle"),
+    "learner_twice": (_edit(learners=["vehicle_2"] * 2), r"manifest.json: learners: .*each vehicle learns once"),
+    "learner_beyond_the_line": (
+        _edit(learners=["vehicle_9"], scenario={"name": "x", "vehicles": 3}),
+        r"manifest.json: learners: vehicle_9: the scenario has 3 vehicles",
+    ),
+    "learner_with_a_script": (
+        _edit(scenario={"name": "x", "roles": {"vehicle_2": "coast"}}),
+        r"manifest.json: learners: vehicle_2: does not learn",
+    ),
+    "hash_not_hex": (_edit(weights_sha256="x" * 64), r"manifest.json: weights_sha256"),
+    "bit_flip": (
+        lambda f: _replace(f / "weights.safetensors", lambda d: d[:-3] + bytes([d[-3] ^ 1]) + d[-2:]),
+        r"weights.safetensors: SHA-256 is [0-9a-f]{64}, the manifest says",
+    ),
+    "socket": (_socket, r"weights.safetensors: (is not a plain file|cannot be read)"),
+    "endless_device": (_endless_device, r"weights.safetensors: (is not a plain file|larger than)"),
+    "sparse_giant": (_sparse_giant, r"weights.safetensors: larger than"),
+    "other_case": (lambda f: (f / "manifest.json").rename(f / "Manifest.json"), r"manifest.json: is missing"),
+    "hidden_file": (lambda f: (f / ".weights.py").write_text("raise SystemExit"), r".weights.py: does not belong"),
+    "extra_folder": (lambda f: (f / "__pycache__").mkdir(), r"__pycache__: does not belong"),
+    "byte_order_mark": (_manifest(lambda data: b"\xef\xbb\xbf" + data), r"manifest.json: "),
+    "utf16": (_manifest(lambda data: data.decode().encode("utf-16")), r"manifest.json: "),
+    "null_byte": (_manifest(lambda data: data + b"\0"), r"manifest.json: Extra data"),
+    "path_to_weights": (_edit(weights="../../other/weights.safetensors"), r"manifest.json: weights: Extra inputs"),
+    "path_as_learner": (_edit(learners=["../../vehicle_2"]), r"manifest.json: learners: '../../vehicle_2' is no"),
+    "unknown_activation": (_edit(network__activation="gelu"), r"manifest.json: network.activation: Input should be"),
+    "unknown_output": (_edit(network__output="eval"), r"manifest.json: network.output: Input should be"),
+    "negative_layer": (_edit(network__policy_hidden=[-13, 9]), r"manifest.json: network.policy_hidden.0"),
+    "layer_not_whole": (_edit(network__policy_hidden=[13.5, 9]), r"manifest.json: network.policy_hidden.0"),
+    "true_for_a_number": (_edit(network__action_size=True), r"manifest.json: network.action_size"),
+    "deep_scenario": (
+        _manifest(lambda data: data.replace(b'"paper-random"', b"[" * 100_000 + b"]" * 100_000)),
+        r"manifest.json: (nested too deeply|.*recursion)",
+    ),
+    "tensor_path": (_renamed("../../policy.0.bias"), r"tensor 'policy.0.bias' is missing"),
+    "tensor_dunder": (_renamed("__class__.__init__"), r"tensor 'policy.0.bias' is missing"),
+    "unknown_dtype": (_first_tensor(dtype="F99"), r"tensor 'policy.0.bias' is F99"),
+    "object_dtype": (_first_tensor(dtype="O"), r"tensor 'policy.0.bias' is O"),
+    "negative_shape": (_first_tensor(shape=[-13]), r"tensor 'policy.0.bias' is F32 \[-13\]"),
+    "overflowing_shape": (_first_tensor(shape=[2**63, 2]), r"tensor 'policy.0.bias' is F32 \[9223372036854775808, 2\]"),
+    "offsets_beyond": (_first_tensor(data_offsets=[0, 2**40]), r"weights.safetensors: not a safetensors file"),
+    "offsets_backwards": (_first_tensor(data_offsets=[52, 0]), r"weights.safetensors: not a safetensors file"),
+    "offsets_negative": (_first_tensor(data_offsets=[-52, 0]), r"weights.safetensors: not a safetensors file"),
+    "deep_header": (_raw_header(b"[" * 200_000), r"weights.safetensors: nested too deeply"),
+    "key_twice_in_header": (_raw_header(b'{"a": {}, "a": {}}'), r"weights.safetensors: key 'a' stands twice"),
+    "empty_header": (_raw_header(b"{}"), r"tensor 'policy.0.bias' is missing"),
+    "minus_infinite_weight": (_tensors(lambda t: _not_finite(t, -np.inf)), r"tensor 'value.0.bias' holds a number"),
+    "empty_weights": (_weights(lambda _: b""), r"weights.safetensors: not a safetensors file"),
+    "pickle": (_weights(lambda _: pickle.dumps(_Payload())), r"weights.safetensors: not a safetensors file"),
+    "zip": (_weights(lambda _: b"PK\x03\x04" + b"\0" * 4000), r"weights.safetensors: not a safetensors file"),
+    "cut_short": (_weights(lambda data: data[:-5]), r"weights.safetensors: not a safetensors file"),
+    "trailing_bytes": (_weights(lambda data: data + b"more"), r"weights.safetensors: not a safetensors file"),
+    "long_header": (_weights(lambda data: b"\xff" * 8 + data[8:]), r"weights.safetensors: not a safetensors file"),
+    "list_header": (_weights(lambda _: b"\2\0\0\0\0\0\0\0[]"), r"weights.safetensors: not a safetensors file"),
+    "metadata": (_header(lambda h: h.update(__metadata__={"a": "b"})), r"tensor '__metadata__' does not belong"),
+    "overlap": (
+        _header(lambda h: h["policy.0.bias"].update(data_offsets=h["policy.0.weight"]["data_offsets"])),
+        r"weights.safetensors: not a safetensors file",
+    ),
+    "missing_tensor": (
+        _tensors(lambda t: {name: t[name] for name in t if name != "policy.1.bias"}),
+        r"tensor 'policy.1.bias' is missing",
+    ),
+    "extra_tensor": (
+        _tensors(lambda t: _with(t, "policy.9.bias", np.zeros(3, "f4"))),
+        r"tensor 'policy.9.bias' does not belong here",
+    ),
+    "wrong_shape": (
+        _tensors(lambda t: _with(t, "policy.0.bias", np.zeros(14, "f4"))),
+        r"tensor 'policy.0.bias' is F32 \[14\], should be F32 \[13\]",
+    ),
+    "transposed": (
+        _tensors(lambda t: _with(t, "policy.1.weight", np.ascontiguousarray(t["policy.1.weight"].T))),
+        r"tensor 'policy.1.weight' is F32 \[13, 9\], should be F32 \[9, 13\]",
+    ),
+    "wrong_dtype": (
+        _tensors(lambda t: _with(t, "policy.0.bias", np.zeros(13, "f8"))),
+        r"tensor 'policy.0.bias' is F64 \[13\], should be F32 \[13\]",
+    ),
+    "nan_weight": (_tensors(lambda t: _not_finite(t, np.nan)), r"tensor 'value.0.bias' holds a number that is not"),
+    "infinite_weight": (_tensors(lambda t: _not_finite(t, np.inf)), r"tensor 'value.0.bias' holds a number that is"),
+}
+
+
+def test_bundle__round_trip_is_exact(policy: Policy, tmp_path: Path) -> None:
+    save_policy(policy, tmp_path / "policy")
+    loaded = load_policy(tmp_path / "policy")
+    assert loaded.manifest == policy.manifest
+    assert loaded.tensors.keys() == policy.tensors.keys()
+    assert all(np.array_equal(loaded.tensors[name], policy.tensors[name]) for name in policy.tensors)
+    seen = np.random.default_rng(0).normal(size=(50, policy.observation.size)).astype(np.float32)
+    assert np.array_equal(loaded(seen), policy(seen))
+    assert np.unique(loaded(seen)).size > 10
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["manifest.json", "policy", "weights.safetensors"]
+
+
+def test_bundle__the_same_policy_gives_the_same_bytes(policy: Policy, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        save_policy(policy, tmp_path / name)
+    for file in ("manifest.json", "weights.safetensors"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_load_policy__finds_the_policy_of_a_run(policy: Policy, tmp_path: Path) -> None:
+    save_policy(policy, tmp_path / "my-run" / "policy")
+    assert load_policy(str(tmp_path / "my-run")).manifest == policy.manifest
+
+
+@pytest.mark.parametrize(("name", "message"), [("nothing", "is not a folder"), ("empty", "holds no policy")])
+def test_load_policy__where_there_is_none(name: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InvalidInput, match=f"{name}: {message}"):
+        load_policy(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_load_policy__refuses_a_damaged_bundle(name: str, policy: Policy, tmp_path: Path) -> None:
+    spoil, message = SPOILED[name]
+    save_policy(policy, tmp_path / "policy")
+    spoil(tmp_path / "policy")
+    with pytest.raises(CorruptBundle, match=message) as caught:
+        load_policy(tmp_path / "policy")
+    assert str(caught.value).startswith(str(tmp_path / "policy"))
+    assert "\n" not in str(caught.value)
+
+
+def test_load_policy__refuses_a_linked_folder(policy: Policy, tmp_path: Path) -> None:
+    save_policy(policy, tmp_path / "elsewhere")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "policy").symlink_to(tmp_path / "elsewhere")
+    for path in (tmp_path / "run", tmp_path / "run" / "policy"):
+        with pytest.raises(CorruptBundle, match="policy: is a symbolic link"):
+            load_policy(path)
+
+
+_WATCHED_LOADS = """
+import json, sys
+from ethbrake_marl.errors import CorruptBundle
+from ethbrake_marl.policies.policy import load_policy
+
+root, names = sys.argv[1], json.loads(sys.argv[2])
+load_policy(f"{root}/good")
+events, refused, watching = [], [], True
+
+def watch(event, args):
+    if not watching:
+        return
+    inside = event == "open" and (isinstance(args[0], int) or str(args[0]).startswith(root)) and not args[2] & 3
+    if not inside and event not in ("os.scandir", "object.__getattr__", "sys._getframe"):
+        events.append(f"{event} {args!r:.200}")
+
+sys.addaudithook(watch)
+for name in names:
+    try:
+        load_policy(f"{root}/{name}")
+    except CorruptBundle:
+        refused.append(name)
+watching = False
+print(json.dumps({"events": events, "refused": refused, "torch": "torch" in sys.modules}))
+"""
+
+
+def test_load_policy__runs_nothing_and_opens_nothing_else(policy: Policy, tmp_path: Path) -> None:
+    save_policy(policy, tmp_path / "good")
+    for name, (spoil, _) in SPOILED.items():
+        save_policy(policy, tmp_path / name)
+        spoil(tmp_path / name)
+    done = subprocess.run(
+        [sys.executable, "-c", _WATCHED_LOADS, str(tmp_path), json.dumps(list(SPOILED))],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    seen = json.loads(done.stdout)
+    assert seen["refused"] == list(SPOILED)
+    assert seen["events"] == []
+    assert seen["torch"] is False
+
+
+def test_actor_only__acts_the_same_without_the_critic(policy: Policy, tmp_path: Path) -> None:
+    save_policy(actor_only(policy), tmp_path / "policy")
+    loaded = load_policy(tmp_path / "policy")
+    assert not any(name.startswith("value") for name in loaded.tensors)
+    assert loaded.manifest.scenario == policy.manifest.scenario
+    seen = np.random.default_rng(0).normal(size=(50, policy.observation.size)).astype(np.float32)
+    assert np.array_equal(loaded(seen), policy(seen))
+
+
+def test_load_policy__a_hard_link_is_the_file_itself(policy: Policy, tmp_path: Path) -> None:
+    """Installers link packages hard, so this is no sign of anything; what is in the file is checked all the same."""
+    save_policy(policy, tmp_path / "policy")
+    os.link(tmp_path / "policy" / "weights.safetensors", tmp_path / "elsewhere")
+    assert load_policy(tmp_path / "policy").manifest == policy.manifest
+
+
+@pytest.mark.parametrize("path", [None, 3, b"policy"])
+def test_load_policy__refuses_what_is_no_path(path: object) -> None:
+    with pytest.raises(InvalidInput, match=r"^policy .*: must be the path of a run or of a policy bundle"):
+        load_policy(path)
+
+
+def test_damaged_bundles__are_as_many_as_the_page_says() -> None:
+    page = Path(__file__).resolve().parents[2] / "docs" / "learning.md"
+    assert f"{len(SPOILED)} damaged and malicious\nbundles" in page.read_text("utf-8")
+
+
+def test_save_policy__does_not_replace(policy: Policy, tmp_path: Path) -> None:
+    save_policy(policy, tmp_path / "policy")
+    before = (tmp_path / "policy" / "manifest.json").stat().st_mtime_ns
+    with pytest.raises(AlreadyExists, match="policy: is there already"):
+        save_policy(policy, tmp_path / "policy")
+    assert (tmp_path / "policy" / "manifest.json").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("failing_call", [1, 2])
+def test_save_policy__leaves_nothing_when_it_fails(
+    failing_call: int, policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[Path] = []
+    write = bundle.write_file
+
+    def full_disk(path: Path, data: bytes) -> None:
+        calls.append(path)
+        if len(calls) == failing_call:
+            raise OSError(28, "No space left on device")
+        write(path, data)
+
+    monkeypatch.setattr(bundle, "write_file", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        save_policy(policy, tmp_path / "policy")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_make_policy__refuses_what_it_could_not_load(policy: Policy) -> None:
+    fields = {name: getattr(policy.manifest, name) for name in type(policy.manifest).model_fields}
+    del fields["weights_sha256"], fields["manifest_sha256"]
+    with pytest.raises(InvalidInput, match=r"policy: steps: Input should be greater"):
+        make_policy(policy.tensors, **{**fields, "steps": -1})
+    with pytest.raises(InvalidInput, match=r"policy: tensor 'policy.0.bias' holds a number that is not finite"):
+        make_policy({**policy.tensors, "policy.0.bias": np.full(13, np.nan, np.float32)}, **fields)

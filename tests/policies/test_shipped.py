@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.evaluation.paper import TESTS
+from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.lineup import make_lineup
+from ethbrake_marl.policies import shipped
+from ethbrake_marl.policies.policy import Policy, save_policy
+from ethbrake_marl.policies.shipped import card, load_named_policy, shipped_name, shipped_policies
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield import HybridAgent
+
+SCENARIO = load_scenario("paper-random")
+
+
+@pytest.fixture
+def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package in which four policies ship; they were trained on paper-random."""
+    for name in ("ppo", "ppo-total", "ppo-paper-distance", "universal"):
+        save_policy(policy, tmp_path / name / "policy")
+        (tmp_path / name / "card.md").write_text(f"# {name}\n")
+    monkeypatch.setattr(shipped, "_FOLDER", tmp_path)
+    return tmp_path
+
+
+def test_shipped_name__is_by_kind_scenario_and_count(folder: Path) -> None:
+    assert shipped_name("ppo", "paper-random", "first") == "ppo"
+    assert shipped_name("ppo", "paper-random", "total") == "ppo-total"
+    assert shipped_name("ppo", "paper-distance", "total") == "ppo-paper-distance"  # better than none
+    assert shipped_name("universal", "paper-delay-low", "first") == "universal"
+    assert shipped_name("ppo", None, "total") == "ppo-total"
+    assert card("universal") == "# universal\n"
+
+
+@pytest.mark.parametrize(("kind", "scenario"), [("sac", "paper-random"), ("ppo", "paper-delay-low"), ("sac", None)])
+def test_shipped_name__lists_what_ships_when_there_is_none(kind: str, scenario: str | None, folder: Path) -> None:
+    listed = "ppo, ppo-paper-distance, ppo-total, universal"
+    with pytest.raises(InvalidInput, match=f"shipped policy {kind}.*: there is none; shipped are: {listed}"):
+        shipped_name(kind, scenario, "first")
+
+
+def test_load_named_policy__by_its_own_name(folder: Path) -> None:
+    assert load_named_policy("shipped/universal").manifest.steps == 1024
+    with pytest.raises(UnknownName, match="unknown shipped policy 'universel'; did you mean 'universal'"):
+        load_named_policy("shipped/universel")
+
+
+def test_lineup__takes_what_ships(folder: Path, policy: Policy) -> None:
+    worlds = SCENARIO.sample(5, 1).worlds
+    specs = ["ppo@shipped", "universal@shipped", "hybrid@shipped", "ppo@shipped/ppo-paper-distance"]
+    lineup = make_lineup(specs, SCENARIO)
+    assert list(lineup) == specs
+    assert isinstance(lineup["hybrid@shipped"], HybridAgent)
+    assert lineup["universal@shipped"].name == "universal@shipped"
+    alone = lineup["ppo@shipped"].act(worlds, 1)
+    assert np.array_equal(alone, eb.make_agent("universal@shipped").act(worlds, 1))
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("universal@runs/x", "must be universal@shipped"),
+        ("sac@shipped/universal", "that policy was trained by PPO: ppo@shipped/universal"),
+        ("ppo@", "a path is needed|must be universal@shipped or one of ppo@PATH"),
+        ("sac", "must be universal@shipped or one of ppo@PATH, sac@PATH"),
+    ],
+)
+def test_lineup__says_what_a_policy_is_called(spec: str, message: str, folder: Path) -> None:
+    with pytest.raises(InvalidInput, match=message):
+        make_lineup([spec], SCENARIO)
+
+
+def test_shipped_policies__each_that_ships_is_small_and_has_a_card() -> None:
+    for name, path in shipped_policies().items():
+        assert load_named_policy(f"shipped/{name}").manifest.steps > 0
+        assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 1_000_000
+        assert card(name).startswith("# ")
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("test", list(TESTS))
+def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_shield(
+    test: str, count: HarmCount
+) -> None:
+    scenario = load_scenario(test)
+    name = shipped_name("ppo", test, count)
+    assert load_named_policy(f"shipped/{name}").manifest.scenario["name"] == test
+    lineup = make_lineup(["ppo@shipped", "hybrid@shipped"], scenario, count=count)
+    result = evaluate(scenario.sample(20, 7), lineup, scenario=scenario, seed=7)
+    alone, shielded = (result.outcome(spec).ledger.world_harm(count) for spec in lineup)
+    assert shielded.mean() <= alone.mean()
+    assert (shielded <= result.outcome("hybrid@shipped").predicted_harm + 1e-9).all()

@@ -1,0 +1,157 @@
+"""The episode shield: never worse than its baseline, in any world, and as predicted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pettingzoo.test import parallel_api_test
+
+from ethbrake_marl.agents.refined import Rehearsed
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield import HybridAgent, HybridShield
+
+SCENARIO = load_scenario("paper-random")
+WORLDS = SCENARIO.sample(300, 3).worlds
+
+
+def harm(agent, count="first"):
+    return drive(WORLDS, agent, SCENARIO, 1).ledger.world_harm(count)
+
+
+class LateBrake:
+    """Coasts until 0.9 s, then brakes fully: no constant deceleration, so sometimes better than any."""
+
+    name = "late_brake"
+
+    def begin(self, worlds, vehicle, rows):
+        pass
+
+    def act(self, worlds, vehicle):
+        return np.where(worlds.time_s < 0.9, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+
+@pytest.mark.parametrize("count", ["first", "total"])
+def test_coupled__is_never_worse_than_either_part(count):
+    hybrid = HybridAgent(LateBrake(), SCENARIO, count=count)
+    realised = harm(hybrid, count)
+    alone, baseline = harm(LateBrake(), count), harm(make_agent("e_v2x_bm", count=count), count)
+    assert (realised <= baseline).all() and (realised <= alone).all()
+    assert realised.tolist() == hybrid.predicted_harm.tolist()
+    assert hybrid.chosen_policy.tolist() == (alone <= baseline).tolist()
+    assert 0 < hybrid.chosen_policy.sum() < WORLDS.n
+
+
+def test_rehearsed__policy_is_taken_at_its_word():
+    hybrid = HybridAgent(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=6), SCENARIO)
+    realised = harm(hybrid)
+    plain = harm(HybridAgent(make_agent("constant:5"), SCENARIO))
+    assert realised.tolist() == hybrid.predicted_harm.tolist()
+    assert (realised <= plain).all() and (realised < plain).any()
+
+
+def test_pairwise__bound_is_exceeded_in_the_same_physics():
+    hybrid = HybridAgent(make_agent("constant:0.5"), SCENARIO, bound="pairwise")
+    realised = harm(hybrid)
+    assert (realised > hybrid.bound_harm + 1.0).mean() > 0.3
+
+
+def test_begin__of_some_rows_leaves_the_others_alone():
+    hybrid = HybridAgent(make_agent("full_brake"), SCENARIO)
+    hybrid.begin(WORLDS, 1, np.arange(WORLDS.n))
+    before = hybrid.bound_harm.copy()
+    hybrid.begin(WORLDS.take([7]), 1, np.array([2]))
+    assert hybrid.bound_harm[2] == before[7]
+    assert np.delete(hybrid.bound_harm, 2).tolist() == np.delete(before, 2).tolist()
+
+
+def test_wrapper__applies_the_certified_strategy_whatever_is_proposed():
+    for seed in range(6):
+        shielded = HybridShield(parallel_env(), make_agent("full_brake"))
+        _, _ = shielded.reset(seed=seed)
+        while shielded.agents:
+            _, _, _, _, infos = shielded.step({"vehicle_2": np.array([1.0])})
+            shield = infos["vehicle_2"]["shield"]
+            assert shield["proposed_action"] == 1.0 and shield["applied_action"] <= 0.0
+            assert infos["vehicle_2"]["applied_action"] == pytest.approx(shield["applied_action"], abs=1e-12)
+        realised = shielded.unwrapped.engine.ledger.world_harm("first")[0]
+        assert realised == pytest.approx(min(shield["policy_harm"], shield["bound_harm"]), abs=1e-9)
+
+
+def test_wrapper__passes_the_api_test():
+    with pytest.warns(UserWarning, match="option"):
+        parallel_api_test(HybridShield(parallel_env(), make_agent("constant:3")), num_cycles=100)
+
+
+def test_bad_input__is_refused():
+    with pytest.raises(UnknownName, match="did you mean 'episode'"):
+        HybridShield(parallel_env(), make_agent("full_brake"), mode="episod")
+    with pytest.raises(InvalidInput, match="exactly one learner"):
+        HybridShield(parallel_env(), make_agent("full_brake"), agents=["vehicle_1"])
+    shielded = HybridShield(parallel_env(), make_agent("full_brake"))
+    shielded.reset(seed=0)
+    with pytest.raises(InvalidInput, match="vehicle_2"):
+        shielded.step({"vehicle_2": np.array([1.5])})
+
+
+class Counting:
+    """Full braking that counts the episodes it began."""
+
+    name = "counting"
+
+    def __init__(self):
+        self.begun = 0
+
+    def begin(self, worlds, vehicle, rows):
+        self.begun += len(rows)
+
+    def act(self, worlds, vehicle):
+        return -worlds.vehicles.braking_capacity_mps2[:, vehicle]
+
+
+def test_begin__the_prediction_does_not_disturb_the_policy():
+    policy = Counting()
+    HybridAgent(policy, SCENARIO).begin(WORLDS, 1, np.arange(WORLDS.n))
+    assert policy.begun == WORLDS.n
+
+
+@pytest.mark.parametrize(("bound", "count"), [("pairwise", "frist"), ("coupled", "both"), ("couple", "first")])
+def test_hybrid__refuses_an_unknown_bound_or_count(bound, count):
+    with pytest.raises(InvalidInput, match="must be"):
+        HybridAgent(make_agent("full_brake"), SCENARIO, bound=bound, count=count)
+
+
+def test_wrapper__refuses_two_learners_and_leaves_the_environment_usable():
+    env = parallel_env(learners=["vehicle_2", "vehicle_3"])
+    with pytest.raises(InvalidInput, match=r"2 learners \(vehicle_2, vehicle_3\).*exactly one learner"):
+        HybridShield(env, make_agent("full_brake"), agents=["vehicle_2"])
+    env.reset(seed=0)
+
+
+def test_wrapper__closed_lets_go_of_the_environment():
+    env, policy = parallel_env(), Counting()
+    shielded = HybridShield(env, policy)
+    shielded.reset(seed=0)
+    begun = shielded.hybrid.policy.begun
+    shielded.close()
+    env.reset(seed=1)
+    assert begun == 1 and shielded.hybrid.policy.begun == 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"env": None}, "None is not one of this package's environments"),
+        ({"policy": None}, "policy = None: must be an agent or a policy"),
+        ({"agents": 5}, "agents = 5: must be a list of names"),
+        ({"agents": "vehicle_2"}, "agents = 'vehicle_2': must be a list of names"),
+        ({"mode": 5}, "unknown shield mode 5"),
+    ],
+)
+def test_wrapper__says_what_is_not_what_it_must_be(wrong, message):
+    given = {"env": parallel_env(), "policy": make_agent("full_brake")}
+    with pytest.raises(InvalidInput, match=message):
+        HybridShield(**{**given, **wrong})
