@@ -34,8 +34,8 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("evaluation",),
     ("learning", "figures"),
     ("lineup",),
-    ("studies",),
     ("__init__",),
+    ("studies",),
     ("cli", "__main__"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, parse_numeral
-from ethbrake_marl.scenario.distributions import DISTRIBUTIONS
-from ethbrake_marl.scenario.quantities import suggestion
 
-_QUANTITY = (
-    "must be a number, {uniform: [low, high]}, {loguniform: [low, high]}, {normal: {mean, sd, low, high}}"
-    " or {choice: [a, b, ...]}"
-)
+# Ending of a key -> the unit in words.
+UNITS = {
+    "s": "seconds",
+    "m": "metres",
+    "mps": "metres per second",
+    "mps2": "metres per second squared",
+    "t": "tonnes",
+}
 _RIGHT = {
     "finite_number": "must be a finite number",
     "int_type": "must be a whole number, written without a decimal point",
@@ -25,24 +28,27 @@ _RIGHT = {
     "model_attributes_type": "must be a mapping",
     "tuple_type": "must be a list",
     "string_pattern_mismatch": "must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or digit",
-    "quantity": _QUANTITY,
 }
 
 
-class Wording(Protocol):
+class Wording:
     """What messages know of the keys of one kind of file."""
 
     def known(self, path: YamlPath) -> list[str]:
         """The keys that may stand where ``path`` ends."""
-        ...
+        raise TypeError(f"{type(self).__name__} does not say which keys its files have")
 
     def needed(self, path: YamlPath) -> str:
         """What is needed at ``path``, where it is missing."""
-        ...
+        raise TypeError(f"{type(self).__name__} does not say what its files need")
 
     def owner(self, path: YamlPath) -> str:
         """Whose value stands at ``path``, in words; empty where that needs no saying."""
-        ...
+        return ""
+
+    def right(self, detail: ErrorDetails) -> str:
+        """What would be right, where only this kind of file knows; empty where the error says it itself."""
+        return ""
 
 
 def explain(error: ValidationError, document: Document, wording: Wording) -> InvalidInput:
@@ -83,7 +89,8 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
         return f"{place}: missing; {wording.needed(path)}"
     ctx = detail.get("ctx", {})
     value = ctx["value"] if "value" in ctx else _shown(detail)
-    return f"{place}{f' = {value}' if value else ''}: {_right(detail)}".removeprefix(": ")
+    right = _unquoted(detail) or wording.right(detail) or _right(detail)
+    return f"{place}{f' = {value}' if value else ''}: {right}".removeprefix(": ")
 
 
 def _shown(detail: ErrorDetails) -> str:
@@ -100,29 +107,37 @@ def _place(path: YamlPath, wording: Wording) -> str:
     return f"{text} ({owner})" if owner else text
 
 
+def _unquoted(detail: ErrorDetails) -> str:
+    """What would be right for a number in quotes; empty for anything else."""
+    given = detail["input"]
+    quoted = detail["type"] == "float_type" and isinstance(given, str) and parse_numeral(given) is not None
+    return "must be a number, not text; write it without quotes" if quoted else ""
+
+
 def _right(detail: ErrorDetails) -> str:
-    kind, given = detail["type"], detail["input"]
+    kind = detail["type"]
     if kind == "float_type":
-        quoted = isinstance(given, str) and parse_numeral(given) is not None
-        return (
-            "must be a number, not text; write it without quotes" if quoted else f"must be a number{_or_more(detail)}"
-        )
+        return "must be a number"
     if kind == "too_long":
         return f"must have {detail['ctx']['max_length']} entries"
     if kind == "too_short":
         return "must not be empty"
     if kind == "literal_error":
         return f"must be {detail['ctx']['expected'].replace(chr(39), '')}"
-    if kind == "quantity":
-        return f"{_QUANTITY}{_misspelt(given)}"
     text = str(detail["msg"]).removeprefix("Value error, ")
     return _RIGHT.get(kind, text.replace("Input should", "must").replace("must be a valid", "must be a"))
 
 
-def _or_more(detail: ErrorDetails) -> str:
-    return " or a distribution, " + _QUANTITY.split(", ", 1)[1] if detail["loc"][-1] == "#number" else ""
+def suggestion(key: str, known: Iterable[str]) -> str:
+    """What an unknown ``key`` was probably meant to be; empty when nothing is close.
 
-
-def _misspelt(given: Any) -> str:
-    hints = [suggestion(key, DISTRIBUTIONS) for key in given if isinstance(key, str)] if isinstance(given, dict) else []
-    return "".join(f"; {hint}" for hint in hints if hint)
+    A key that differs from a known one only in its unit is recognised as such: ``gaps_km``, ``mass``.
+    """
+    names = sorted(known)
+    stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}
+    same = stems.get(key.rsplit("_", 1)[0]) or stems.get(key)
+    close = [same] if same else get_close_matches(key, names, n=1)
+    if not close:
+        return ""
+    unit = UNITS.get(close[0].rsplit("_", 1)[-1], "")
+    return f"did you mean {close[0]}{f' ({unit})' if unit else ''}?"

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.files.messages import explain
+from ethbrake_marl.files.messages import Wording, explain
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.policies.manifest import Activation, NetworkSpec, Width
 from ethbrake_marl.rewards import RewardParams
@@ -281,7 +281,7 @@ def _checked(document: Document) -> TrainingRecipe:
         raise explain(error, document, RecipeWording(model)) from None
 
 
-class RecipeWording:
+class RecipeWording(Wording):
     """The ``Wording`` of messages about a recipe of one algorithm."""
 
     def __init__(self, model: type[TrainingRecipe] = PpoRecipe) -> None:
@@ -300,7 +300,3 @@ class RecipeWording:
         """Where an example stands."""
         name = next(name for name, model in RECIPES.items() if model is self._model)
         return f"it is needed; every key is in the shipped recipe {name}"
-
-    def owner(self, path: YamlPath) -> str:
-        """Nobody's: a recipe knows no vehicles."""
-        return ""

@@ -13,7 +13,7 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.json import parse_strict_json
-from ethbrake_marl.files.messages import explain
+from ethbrake_marl.files.messages import Wording, explain
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import Document, YamlPath
 from ethbrake_marl.learning.recipe import Scheme
@@ -54,7 +54,7 @@ class _TeamFile(BaseModel):
         return self
 
 
-class _TeamWording:
+class _TeamWording(Wording):
     """The ``Wording`` of messages about ``team.json``."""
 
     def known(self, path: YamlPath) -> list[str]:
@@ -64,10 +64,6 @@ class _TeamWording:
     def needed(self, path: YamlPath) -> str:
         """A whole file."""
         return _RIGHT
-
-    def owner(self, path: YamlPath) -> str:
-        """Nobody's."""
-        return ""
 
 
 def team_content(scheme: Scheme, scenario: Scenario) -> dict[str, Any]:

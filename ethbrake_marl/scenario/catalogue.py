@@ -10,8 +10,9 @@ from pathlib import Path
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import flow_text, read_yaml
+from ethbrake_marl.scenario.fields import NAME_PATTERN
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
-from ethbrake_marl.scenario.schema import NAME_PATTERN, Scenario
+from ethbrake_marl.scenario.schema import Scenario
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from pydantic import BaseModel
@@ -17,6 +17,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import YamlPath, flow_text
 from ethbrake_marl.objectives import Declared, objectives_of
 from ethbrake_marl.scenario.distributions import support
+from ethbrake_marl.scenario.fields import ScenarioFields
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, OPTIONAL, QUANTITIES, QuantityRule
 from ethbrake_marl.scenario.roles import (
     LEARNER,
@@ -25,10 +26,7 @@ from ethbrake_marl.scenario.roles import (
     is_state_free,
     parse_agent_spec,
 )
-from ethbrake_marl.scenario.sampling import farthest_hazard_m
-
-if TYPE_CHECKING:
-    from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.sampling import farthest_hazard_m, quantity_bounds
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
@@ -49,27 +47,6 @@ def check_entries(rule: QuantityRule, value: Any, vehicles: int | None) -> None:
         if not rule.allows(low, high):
             overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
             refuse((index,) if listed else (), entry, f"must be {rule.interval}{overlap}")
-
-
-class Roles(dict[str, str]):
-    """Vehicle -> ``learner`` or a script; like the rest of a scenario it cannot be changed."""
-
-    def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
-        raise InvalidInput("roles of a scenario are frozen; use scenario.replace(roles=...) or scenario.with_learners")
-
-    __setitem__ = __delitem__ = __ior__ = _refuse
-    update = setdefault = pop = popitem = clear = _refuse
-
-    def __reduce__(self) -> tuple[type[Roles], tuple[dict[str, str]]]:
-        """Copy and pickle through the constructor."""
-        return Roles, (dict(self),)
-
-
-def complete_roles(given: Mapping[str, str] | None, vehicles: int) -> Roles:
-    """A role for every vehicle in order: full braking where none is given; by default vehicle_2 learns."""
-    roles = {"vehicle_2": LEARNER} if given is None else given
-    names = [f"vehicle_{i + 1}" for i in range(vehicles)]
-    return Roles({name: roles.get(name, "full_brake") for name in names})
 
 
 def check_roles(roles: Mapping[str, str], vehicles: int) -> None:
@@ -96,7 +73,7 @@ def check_objective(declared: Declared, vehicles: int) -> None:
         refuse((), declared, str(error).removeprefix("objective: "))
 
 
-def check_alternatives(scenario: Scenario) -> None:
+def check_alternatives(scenario: ScenarioFields) -> None:
     """Gaps and speeds are declared in one of two ways, an obstacle in one at most; deviations need a line speed."""
     if "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None:
         right = "needs line_speed_mps, the speed that it is added to"
@@ -109,7 +86,7 @@ def check_alternatives(scenario: Scenario) -> None:
             refuse((other,), _plain(getattr(scenario, other)), f"give either {usual} or {other}, not both")
 
 
-def check_whole(scenario: Scenario) -> None:
+def check_whole(scenario: ScenarioFields) -> None:
     """Fields that limit each other: time step, horizon, latency, speeds, gaps, constant scripts, rejection."""
     if not scenario.time_step_s <= scenario.horizon_s:
         refuse(("time_step_s",), scenario.time_step_s, f"must not be above horizon_s ({scenario.horizon_s:g} s)")
@@ -131,7 +108,7 @@ def check_whole(scenario: Scenario) -> None:
         _check_rejection(scenario)
 
 
-def _check_reactions(scenario: Scenario) -> None:
+def _check_reactions(scenario: ScenarioFields) -> None:
     """However late the news is, every vehicle may act before the horizon."""
     own = np.array([support(latency)[1] for latency in scenario.quantities("latency_s")])
     latest = scenario.v2x.latest_reaction_s(own)
@@ -144,9 +121,9 @@ def _check_reactions(scenario: Scenario) -> None:
         refuse(("v2x",), scenario.v2x, right)
 
 
-def _check_speeds(scenario: Scenario) -> None:
+def _check_speeds(scenario: ScenarioFields) -> None:
     limits = scenario.quantities("speed_limit_mps")
-    for i, (low, high) in enumerate(scenario.bounds("speeds_mps")):
+    for i, (low, high) in enumerate(quantity_bounds(scenario, "speeds_mps")):
         if low >= 0.0 and high <= support(limits[i])[0]:
             continue
         limit = f"speed_limit_mps of vehicle_{i + 1}, {flow_text(_plain(limits[i]))} m/s"
@@ -157,15 +134,15 @@ def _check_speeds(scenario: Scenario) -> None:
         refuse(("line_speed_mps",), scenario.line_speed_mps, right)
 
 
-def _check_time_gaps(scenario: Scenario) -> None:
+def _check_time_gaps(scenario: ScenarioFields) -> None:
     largest = QUANTITIES["gaps_m"].high
-    for pair, (_, high) in enumerate(scenario.bounds("gaps_m")):
+    for pair, (_, high) in enumerate(quantity_bounds(scenario, "gaps_m")):
         if not high <= largest:
             right = f"is up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"
             refuse(_path(scenario, "time_gaps_s", pair), scenario.quantities("time_gaps_s")[pair], right)
 
 
-def _check_hazard_margin(scenario: Scenario) -> None:
+def _check_hazard_margin(scenario: ScenarioFields) -> None:
     farthest = farthest_hazard_m(scenario)
     if not farthest <= OPTIONAL["hazard_gap_m"].high:
         right = (
@@ -175,7 +152,7 @@ def _check_hazard_margin(scenario: Scenario) -> None:
         refuse(("hazard_margin_m",), scenario.hazard_margin_m, right)
 
 
-def _check_constant_scripts(scenario: Scenario) -> None:
+def _check_constant_scripts(scenario: ScenarioFields) -> None:
     for i, script in scenario.scripts.items():
         deceleration = constant_deceleration(script) or 0.0
         field = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
@@ -184,7 +161,7 @@ def _check_constant_scripts(scenario: Scenario) -> None:
             refuse(("roles", f"vehicle_{i + 1}"), script, f"is above this vehicle's {field}, {capacity:g} m/s2")
 
 
-def _check_rejection(scenario: Scenario) -> None:
+def _check_rejection(scenario: ScenarioFields) -> None:
     for i, script in scenario.scripts.items():
         if not is_state_free(script):
             close = get_close_matches(parse_agent_spec(script)[0], STATE_FREE, n=1)
@@ -193,7 +170,7 @@ def _check_rejection(scenario: Scenario) -> None:
             refuse(("roles", f"vehicle_{i + 1}"), script, right)
 
 
-def _path(scenario: Scenario, field: str, index: int) -> YamlPath:
+def _path(scenario: ScenarioFields, field: str, index: int) -> YamlPath:
     return (field, index) if isinstance(getattr(scenario, field), tuple) else (field,)
 
 

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.messages import suggestion
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds, make_worlds
 from ethbrake_marl.scenario.distributions import support
-from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OPTIONAL, QUANTITIES, QuantityRule, suggestion
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OPTIONAL, QUANTITIES, QuantityRule
 from ethbrake_marl.scenario.sampling import hazard_gap
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.v2x import fixed_news

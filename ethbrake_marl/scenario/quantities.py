@@ -6,21 +6,13 @@ the tables of initial states and the sampling.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Literal
+
+from ethbrake_marl.files.messages import UNITS
 
 BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the numbers of one Philox counter
 
-# Ending of a key -> the unit in words.
-UNITS = {
-    "s": "seconds",
-    "m": "metres",
-    "mps": "metres per second",
-    "mps2": "metres per second squared",
-    "t": "tonnes",
-}
 SYMBOLS = {"mps": "m/s", "mps2": "m/s2"}  # of the endings that are not their own symbol
 
 
@@ -144,18 +136,3 @@ OPTIONAL = {
 DECLARED = {**QUANTITIES, **OTHERWISE, **OPTIONAL}  # every key that declares a quantity
 # A scenario has exactly one of each two, or at most one where what they declare is optional.
 ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "hazard_gap_m": "hazard_margin_m"}
-
-
-def suggestion(key: str, known: Iterable[str]) -> str:
-    """What an unknown ``key`` was probably meant to be; empty when nothing is close.
-
-    A key that differs from a known one only in its unit is recognised as such: ``gaps_km``, ``mass``.
-    """
-    names = sorted(known)
-    stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}
-    same = stems.get(key.rsplit("_", 1)[0]) or stems.get(key)
-    close = [same] if same else get_close_matches(key, names, n=1)
-    if not close:
-        return ""
-    unit = UNITS.get(close[0].rsplit("_", 1)[-1], "")
-    return f"did you mean {close[0]}{f' ({unit})' if unit else ''}?"

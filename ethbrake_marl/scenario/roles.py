@@ -1,10 +1,12 @@
-"""Names of scripts, ``name[:argument]``, and the commands of the scripts that need no state."""
+"""Roles: who learns, names of scripts (``name[:argument]``), and the commands of the scripts that need no state."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from functools import lru_cache
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -84,3 +86,24 @@ def constant_command(
     if driving_capacity_mps2 is not None and not np.all(-deceleration <= np.asarray(driving_capacity_mps2)):
         raise InvalidInput(f"agent {spec!r}: above the driving capacity {np.min(driving_capacity_mps2):g} m/s2")
     return np.full(capacity.shape, 0.0 - deceleration)
+
+
+class Roles(dict[str, str]):
+    """Vehicle -> ``learner`` or a script; like the rest of a scenario it cannot be changed."""
+
+    def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
+        raise InvalidInput("roles of a scenario are frozen; use scenario.replace(roles=...) or scenario.with_learners")
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    update = setdefault = pop = popitem = clear = _refuse
+
+    def __reduce__(self) -> tuple[type[Roles], tuple[dict[str, str]]]:
+        """Copy and pickle through the constructor."""
+        return Roles, (dict(self),)
+
+
+def complete_roles(given: Mapping[str, str] | None, vehicles: int) -> Roles:
+    """A role for every vehicle in order: full braking where none is given; by default vehicle_2 learns."""
+    roles = {"vehicle_2": LEARNER} if given is None else given
+    names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+    return Roles({name: roles.get(name, "full_brake") for name in names})

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -16,18 +16,13 @@ from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.events import stopping_distances
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, concatenate, make_worlds
 from ethbrake_marl.scenario.distributions import support, values
+from ethbrake_marl.scenario.fields import ScenarioFields
 from ethbrake_marl.scenario.quantities import BLOCK, DECLARED, QUANTITIES
 from ethbrake_marl.scenario.roles import constant_command
 from ethbrake_marl.scenario.v2x import PER_LINK, with_news
 
-if TYPE_CHECKING:
-    from ethbrake_marl.scenario.schema import Scenario
 
-if TYPE_CHECKING:
-    from ethbrake_marl.scenario.schema import Scenario
-
-
-def world_quantities(scenario: Scenario, declared: Callable[[str], Floats]) -> dict[str, Floats]:
+def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]) -> dict[str, Floats]:
     """Every quantity of k worlds, each [k, entries], from what ``declared(key)`` gives for the keys in use.
 
     ``speed = line speed + own deviation`` and ``gap = time gap x speed of the rear vehicle of the pair``. Both only
@@ -41,7 +36,9 @@ def world_quantities(scenario: Scenario, declared: Callable[[str], Floats]) -> d
     return {key: found[key] for key in QUANTITIES}
 
 
-def hazard_gap(scenario: Scenario, found: Mapping[str, Floats], declared: Callable[[str], Floats]) -> Floats | None:
+def hazard_gap(
+    scenario: ScenarioFields, found: Mapping[str, Floats], declared: Callable[[str], Floats]
+) -> Floats | None:
     """Distance from Vehicle 1 to the obstacle ahead, [k], of worlds with the quantities ``found``; None without one.
 
     As declared, or ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: so far beyond where Vehicle 1 stops by itself.
@@ -54,16 +51,16 @@ def hazard_gap(scenario: Scenario, found: Mapping[str, Floats], declared: Callab
     return declared("hazard_margin_m") + stopping_distances(speed, latency, capacity)
 
 
-def farthest_hazard_m(scenario: Scenario) -> float:
+def farthest_hazard_m(scenario: ScenarioFields) -> float:
     """Upper bound of the distance to an obstacle that is declared by its margin."""
-    low, high = ({key: bounds[[row]] for key, bounds in quantity_bounds(scenario).items()} for row in (0, 1))
+    low, high = ({key: bounds[[row]] for key, bounds in _all_bounds(scenario).items()} for row in (0, 1))
     slowest = high | {"braking_capacity_mps2": low["braking_capacity_mps2"]}
     farthest = hazard_gap(scenario, slowest, lambda key: np.array([support(scenario.quantities(key)[0])[1]]))
     assert farthest is not None
     return float(farthest[0])
 
 
-def drawn_quantities(scenario: Scenario, u: Floats) -> dict[str, Floats]:
+def drawn_quantities(scenario: ScenarioFields, u: Floats) -> dict[str, Floats]:
     """Every quantity of n worlds, each [n, entries], from their uniform numbers ``u`` [n, width]."""
 
     def drawn(key: str) -> Floats:
@@ -76,8 +73,13 @@ def drawn_quantities(scenario: Scenario, u: Floats) -> dict[str, Floats]:
     return world_quantities(scenario, drawn)
 
 
-def quantity_bounds(scenario: Scenario) -> dict[str, Floats]:
-    """Smallest and largest value of every entry of every quantity of a world: each [2, entries]."""
+def quantity_bounds(scenario: ScenarioFields, key: str) -> tuple[tuple[float, float], ...]:
+    """Smallest and largest value of every entry of one quantity of a world, however it is declared."""
+    return tuple((float(low), float(high)) for low, high in _all_bounds(scenario)[key].T)
+
+
+def _all_bounds(scenario: ScenarioFields) -> dict[str, Floats]:
+    """The same of every quantity: each [2, entries]."""
     return world_quantities(scenario, lambda key: np.array([support(q) for q in scenario.quantities(key)]).T)
 
 
@@ -121,7 +123,7 @@ def uniform_numbers(
     return upper * 2.0**-53
 
 
-def draw_list(scenario: Scenario, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
+def draw_list(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
     """Worlds ``first`` to ``first + n - 1`` of the scenario's list; see ``Scenario.sample``."""
     _check_request(n, seed, first, channel)
     seed = int(seed)
@@ -135,7 +137,7 @@ def draw_list(scenario: Scenario, n: int, seed: int, *, first: int = 0, channel:
     return _redraw(scenario, seed, channel, index, worlds, early)
 
 
-def early_impact(scenario: Scenario, worlds: Worlds) -> Bools:
+def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
     """Which worlds have an impact before (or just when) the first learner may act: [n].
 
     Vehicles follow their state-free scripts and learners coast, which nobody can change before that moment. Needs a
@@ -153,7 +155,7 @@ def early_impact(scenario: Scenario, worlds: Worlds) -> Bools:
     return np.asarray(impacts.count.sum(axis=1) + impacts.hazard_count > 0)
 
 
-def _redraw(scenario: Scenario, seed: int, channel: Channel, index: Ints, worlds: Worlds, early: Bools) -> Sample:
+def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints, worlds: Worlds, early: Bools) -> Sample:
     """Draw refused worlds again, attempt by attempt, until every one is accepted."""
     accepted = np.flatnonzero(~early)
     pending = np.flatnonzero(early)
@@ -174,7 +176,7 @@ def _redraw(scenario: Scenario, seed: int, channel: Channel, index: Ints, worlds
     raise _unusable(scenario, int(index[pending[0]]))
 
 
-def _redraw_one(scenario: Scenario, seed: int, channel: Channel, index: Ints) -> None:
+def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
     """Follow one world to its end; if it fails the whole list fails, and this way soon."""
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
         if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index))[0]:
@@ -182,7 +184,7 @@ def _redraw_one(scenario: Scenario, seed: int, channel: Channel, index: Ints) ->
     raise _unusable(scenario, int(index[0]))
 
 
-def _unusable(scenario: Scenario, world: int) -> InvalidInput:
+def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners)
     gaps = "time_gaps_s" if scenario.gaps_m is None else "gaps_m"
     return InvalidInput(
@@ -191,7 +193,7 @@ def _unusable(scenario: Scenario, world: int) -> InvalidInput:
     )
 
 
-def _draw(scenario: Scenario, seed: int, channel: Channel, attempt: int, index: Ints) -> Worlds:
+def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Worlds:
     """The worlds with these numbers (ascending), as drawn in this attempt."""
     first, last = int(index[0]), int(index[-1])
     u = uniform_numbers(seed, channel, attempt, first, last - first + 1, BLOCK * scenario.vehicles)

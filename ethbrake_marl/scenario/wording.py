@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
+from pydantic_core import ErrorDetails
+
+from ethbrake_marl.files.messages import Wording, suggestion
 from ethbrake_marl.files.yaml import YamlPath
 from ethbrake_marl.scenario.distributions import DISTRIBUTIONS, Choice, NormalShape
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
 from ethbrake_marl.scenario.v2x import V2X
 
+_DISTRIBUTION = (
+    "{uniform: [low, high]}, {loguniform: [low, high]}, {normal: {mean, sd, low, high}} or {choice: [a, b, ...]}"
+)
 _INSIDE = {
     "uniform": ("uniform",),
     "loguniform": ("loguniform",),
@@ -19,7 +26,7 @@ _INSIDE = {
 
 
 @dataclass(frozen=True, slots=True)
-class ScenarioWording:
+class ScenarioWording(Wording):
     """The ``Wording`` of a scenario; ``keys`` are its top-level keys."""
 
     keys: Iterable[str]
@@ -50,3 +57,16 @@ class ScenarioWording:
         """Whose value stands at ``path``: a vehicle or a pair; empty for anything else."""
         rule = DECLARED.get(str(path[0])) if len(path) > 1 else None
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
+
+    def right(self, detail: ErrorDetails) -> str:
+        """A number or a distribution, with what a misspelt one was meant to be; empty for what is no quantity."""
+        if detail["type"] == "quantity":
+            return f"must be a number, {_DISTRIBUTION}{_misspelt(detail['input'])}"
+        if detail["type"] == "float_type" and detail["loc"][-1] == "#number":
+            return f"must be a number or a distribution, {_DISTRIBUTION}"
+        return ""
+
+
+def _misspelt(given: Any) -> str:
+    hints = [suggestion(key, DISTRIBUTIONS) for key in given if isinstance(key, str)] if isinstance(given, dict) else []
+    return "".join(f"; {hint}" for hint in hints if hint)

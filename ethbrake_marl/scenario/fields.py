@@ -1,0 +1,103 @@
+"""The fields of a scenario: what a file may say, before anything is checked or drawn."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.scenario.distributions import Choice, LogUniform, Normal, Quantity, Uniform
+from ethbrake_marl.scenario.quantities import DECLARED
+from ethbrake_marl.scenario.roles import LEARNER, complete_roles
+from ethbrake_marl.scenario.v2x import V2X
+
+AnyQuantity = float | Uniform | LogUniform | Normal | Choice
+
+NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
+
+
+def _one_or_each(value: object) -> str:
+    return "#each" if isinstance(value, list | tuple) else "#one"
+
+
+PerVehicle = Annotated[
+    Annotated[Quantity, Tag("#one")] | Annotated[tuple[Quantity, ...], Field(strict=False, min_length=1), Tag("#each")],
+    Discriminator(_one_or_each),
+]
+
+
+class ScenarioFields(BaseModel):
+    """What is declared of a line of vehicles, and what follows from the declaration alone. See ``Scenario``."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+    name: str = Field(pattern=NAME_PATTERN, description="name; equal to the file's name without .yaml")
+    title: str = Field(default="", description="one line for lists and figures")
+    description: str = Field(default="", description="what the scenario is for")
+    source: str = Field(default="", description="where the values come from")
+    vehicles: int = Field(default=3, ge=2, le=64, description="number of vehicles N, vehicle_1 in front")
+    time_step_s: float = Field(default=0.1, ge=1e-4, allow_inf_nan=False, description="time between two decisions")
+    horizon_s: float = Field(
+        default=8.0, gt=0.0, le=3600.0, allow_inf_nan=False, description="time after which an episode is cut off"
+    )
+    gaps_m: PerVehicle | None = Field(default=None, description=DECLARED["gaps_m"].meaning)
+    time_gaps_s: PerVehicle | None = Field(default=None, description=DECLARED["time_gaps_s"].meaning)
+    speeds_mps: PerVehicle | None = Field(default=None, description=DECLARED["speeds_mps"].meaning)
+    line_speed_mps: Quantity | None = Field(default=None, description=DECLARED["line_speed_mps"].meaning)
+    speed_deviations_mps: PerVehicle = Field(default=0.0, description=DECLARED["speed_deviations_mps"].meaning)
+    braking_capacity_mps2: PerVehicle = Field(description=DECLARED["braking_capacity_mps2"].meaning)
+    driving_capacity_mps2: PerVehicle = Field(description=DECLARED["driving_capacity_mps2"].meaning)
+    mass_t: PerVehicle = Field(description=DECLARED["mass_t"].meaning)
+    latency_s: PerVehicle = Field(description=DECLARED["latency_s"].meaning)
+    speed_limit_mps: PerVehicle = Field(default=40.0, description=DECLARED["speed_limit_mps"].meaning)
+    restitution: Quantity = Field(default=0.1, description=DECLARED["restitution"].meaning)
+    roles: dict[str, str] = Field(
+        default_factory=lambda data: complete_roles(None, data.get("vehicles", 3)),
+        description="learner or a script for each vehicle; vehicles left out of a given mapping brake fully",
+    )
+    hazard_gap_m: Quantity | None = Field(default=None, description=DECLARED["hazard_gap_m"].meaning)
+    hazard_margin_m: Quantity | None = Field(default=None, description=DECLARED["hazard_margin_m"].meaning)
+    early_impacts: Literal["keep", "reject"] = Field(
+        default="keep", description="what happens to worlds with an impact before the first learner may act"
+    )
+
+    objective: str | Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
+    )
+    v2x: V2X = Field(
+        default_factory=V2X, description="what each vehicle knows when: a preset, and what differs from it"
+    )
+
+    @property
+    def vehicle_names(self) -> tuple[str, ...]:
+        """``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
+        return tuple(f"vehicle_{i + 1}" for i in range(self.vehicles))
+
+    @property
+    def learners(self) -> tuple[int, ...]:
+        """Indices (from 0) of the vehicles that learn."""
+        return tuple(i for i, name in enumerate(self.vehicle_names) if self.roles[name] == LEARNER)
+
+    @property
+    def scripts(self) -> dict[int, str]:
+        """Index (from 0) -> script of every vehicle that does not learn."""
+        roles = [self.roles[name] for name in self.vehicle_names]
+        return {i: role for i, role in enumerate(roles) if role != LEARNER}
+
+    @property
+    def has_obstacle(self) -> bool:
+        """Whether an obstacle stands ahead of Vehicle 1, however its distance is declared."""
+        return self.hazard_gap_m is not None or self.hazard_margin_m is not None
+
+    def quantities(self, field: str) -> tuple[AnyQuantity, ...]:
+        """What is declared under a key, one entry per vehicle (gaps: per pair; restitution, line speed: one).
+
+        Raises ``InvalidInput`` for a key that this scenario does not use, ``gaps_m`` beside ``time_gaps_s``.
+        """
+        declared: AnyQuantity | tuple[AnyQuantity, ...] | None = getattr(self, DECLARED[field].name)
+        if declared is None:
+            raise InvalidInput(f"scenario {self.name!r}: {field} is not given; it is derived, see Scenario.bounds")
+        if isinstance(declared, tuple):
+            return declared
+        return (declared,) * DECLARED[field].count(self.vehicles)
