@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.actions import checked_action
+from ethbrake_marl.actions import action_to_command, checked_action, command_to_action
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import make_worlds
 
 
 @pytest.mark.parametrize("value", [-1.0000001, 1.0000000000000002, 2.0, np.nan, np.inf])
@@ -16,3 +17,27 @@ def test_action__beyond_the_bounds_is_told_in_digits_that_show_it(value):
 
 def test_action__at_the_bounds_is_taken():
     assert checked_action([-1, 1], (2,), "vehicle_2").tolist() == [-1.0, 1.0]
+
+
+def test_action__is_linear_on_each_side_of_coasting_and_back():
+    given = {"latency_s": 0.0, "mass_t": 1.0, "restitution": 0.0}
+    worlds = make_worlds(
+        5.0, np.full((5, 2), 20.0), braking_capacity_mps2=[8.0, 6.0], driving_capacity_mps2=[2.0, 3.0], **given
+    )
+    vehicles, actions = worlds.vehicles, np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    for vehicle, commands in ((0, [-8.0, -4.0, 0.0, 1.0, 2.0]), (1, [-6.0, -3.0, 0.0, 1.5, 3.0])):
+        assert action_to_command(actions, vehicles, vehicle).tolist() == commands
+        assert command_to_action(np.array(commands), vehicles, vehicle).tolist() == actions.tolist()
+    assert command_to_action(np.array([-99.0, -8.5, 0.0, 2.5, 99.0]), vehicles, 0).tolist() == [
+        -1.0,
+        -1.0,
+        0.0,
+        1.0,
+        1.0,
+    ]
+
+
+def test_action__without_the_capacity_is_coasting():
+    worlds = make_worlds(5.0, np.full((2, 2), 20.0), braking_capacity_mps2=6.0, driving_capacity_mps2=0.0,
+                         latency_s=0.0, mass_t=1.0, restitution=0.0)  # fmt: skip
+    assert command_to_action(np.array([2.0, -3.0]), worlds.vehicles, 0).tolist() == [0.0, -0.5]

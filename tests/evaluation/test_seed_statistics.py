@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import seed_statistics
 from ethbrake_marl.evaluation.seed_statistics import (
     interquartile_mean,
     mean_over_seeds,
@@ -95,6 +96,24 @@ def test_share_over_seeds__by_hand_and_wider_with_fewer_seeds() -> None:
     assert share_over_seeds(seeds, worst, worst) is None
     with pytest.raises(InvalidInput, match="same worlds"):
         share_over_seeds(seeds, worst, best[:5])
+
+
+def test_intervals__two_worlds_have_one_and_a_single_world_has_none() -> None:
+    for interval in (
+        share_over_seeds([[4.0, 6.0]], [10.0, 10.0], [0.0, 0.0]),
+        paired_over_seeds([[4.0, 6.0]], [[0.0, 0.0]]),
+        mean_over_seeds([[4.0, 6.0]]),
+    ):
+        assert interval is not None and interval.interval is not None and interval.interval[0] < interval.interval[1]
+    alone = share_over_seeds([[4.0]], [10.0], [0.0])
+    assert alone is not None and (alone.value, alone.interval) == (0.6, None)
+
+
+@pytest.mark.parametrize("resamples", [1, 2, 3])
+def test_resamples__are_as_many_as_asked_for(resamples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(seed_statistics, "_AT_ONCE", 4)  # two at a time
+    sides = (np.arange(4.0).reshape(2, 2),)
+    assert seed_statistics._resampled_means(sides, resamples, 0).shape == (resamples, 1)
 
 
 def test_mean_over_seeds__is_the_mean_with_the_spread_between_seeds() -> None:

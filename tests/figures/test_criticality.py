@@ -71,6 +71,7 @@ def test_figure__draws_harm_and_boundary_and_names_both_sides() -> None:
     found = criticality_map(DISTANCE, FULL, cells=9)
     figure = criticality_figure(found)
     first, total = figure.axes[:2]
+    assert first.get_shared_x_axes().joined(first, total) and first.get_shared_y_axes().joined(first, total)
     for axes, count in ((first, "first"), (total, "total")):
         drawn = np.ma.filled(axes.collections[0].get_array(), 0.0).reshape(9, 9)
         np.testing.assert_array_equal(np.nan_to_num(drawn), found.harm(count))

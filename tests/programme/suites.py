@@ -144,7 +144,7 @@ EVALUATION = Suite(
         "evaluation/statistics.py": ("tests/evaluation/test_statistics.py",),
         "evaluation/seed_statistics.py": ("tests/evaluation/test_seed_statistics.py",),
         "figures/learning_curves.py": ("tests/figures/test_learning_curves.py",),
-        "evaluation/rollout.py": ("tests/evaluation/test_rollout.py",),
+        "evaluation/rollout.py": ("tests/evaluation/test_rollout.py", "tests/agents/test_team.py"),
         "evaluation/regret.py": ("tests/evaluation/test_regret.py",),
         "evaluation/record.py": ("tests/evaluation/test_record.py",),
         "evaluation/table.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
