@@ -155,6 +155,15 @@ def test_import_order__every_module_stands_in_a_known_room() -> None:
     assert rooms <= set(LEVEL), f"give these a level in LEVELS: {sorted(rooms - set(LEVEL))}"
 
 
+def test_readme__shows_the_levels_from_the_top_down() -> None:
+    text = (ROOT / "README.md").read_text("utf-8")
+    rows = text[text.index("| in `ethbrake_marl/` |") :].split("\n\n")[0].splitlines()[2:]
+    shown = [name.strip("`/").removesuffix(".py") for row in rows for name in row.split("|")[1].strip().split(", ")]
+    levels = [LEVEL[name] for name in shown]
+    assert levels == sorted(levels, reverse=True)
+    assert set(shown) == {room for room, _ in modules(ROOT / PACKAGE)} - {"__init__", "__main__"}
+
+
 def test_import_order__no_arrow_points_up() -> None:
     found = arrows(ROOT / PACKAGE)
     assert any(arrow.target_room == "physics" for arrow in found)
