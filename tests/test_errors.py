@@ -44,6 +44,7 @@ def test_terminal__every_way_to_it_is_clean(capsys: pytest.CaptureFixture[str]) 
     say("runs/\x1b[2J\nx")
     show("# \u202egnp\n")
     result_console().print("[/] ppo@\x1b[31m :smile:")
+    show("6\N{NO-BREAK SPACE}m/s²")
     captured = capsys.readouterr()
     assert captured.err == "runs/\\x1b[2J\\nx\n"
-    assert captured.out == "# \\u202egnp\n\n[/] ppo@\\x1b[31m :smile:\n"
+    assert captured.out == "# \\u202egnp\n\n[/] ppo@\\x1b[31m :smile:\n6\N{NO-BREAK SPACE}m/s²\n"

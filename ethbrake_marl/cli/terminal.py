@@ -17,6 +17,7 @@ from rich.segment import Segment
 
 from ethbrake_marl.errors import one_line, plain_text
 
+_KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
 INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
 
@@ -26,8 +27,8 @@ def say(text: str) -> None:
 
 
 def show(text: str, end: str = "\n") -> None:
-    """Lines of a result, on stdout; nothing in them but line ends and tabs commands the terminal."""
-    typer.echo(plain_text(text, keep="\n\t") + end, nl=False)
+    """Lines of a result, on stdout; nothing in them but line ends and tabs moves the cursor."""
+    typer.echo(plain_text(text, keep=_KEPT) + end, nl=False)
 
 
 def write_json(content: Any) -> None:
@@ -113,7 +114,7 @@ class _PlainConsole(Console):
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         """The pieces of a line or table; those that rich made to style and move keep what they hold."""
         for piece in super().render(renderable, options):
-            yield piece if piece.control else Segment(plain_text(piece.text, keep="\n\t"), piece.style)
+            yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)
 
 
 def result_console() -> Console:
