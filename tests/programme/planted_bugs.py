@@ -22,11 +22,14 @@ from tests.programme.suites import ROOT
 
 REWARDS, V2X, ENGINE, STEPPING, STARTS, OBJECTIVES, CURVES = (
     f"ethbrake_marl/{name}.py"
-    for name in ("rewards", "v2x", "engine", "stepping", "starts", "objectives", "learning_curves")
-)
+    for name in (
+        "rewards", "scenario/v2x", "engine/engine", "engine/step", "engine/stream", "objectives",
+        "studies/learning_curves",
+    )
+)  # fmt: skip
 SB3 = "ethbrake_marl/envs/sb3.py"
-COMPARISON, OPTIMUM, LEVELS, PLAN = (
-    f"ethbrake_marl/ablation/{name}.py" for name in ("comparison", "joint_optimum", "levels", "plan")
+COMPARISON, OPTIMUM, PLAN = (
+    f"ethbrake_marl/studies/ablation/{name}.py" for name in ("comparison", "joint_optimum", "plan")
 )
 STATISTICS, SEEDS, TABLE, REGRET, ROLLOUT = (
     f"ethbrake_marl/evaluation/{name}.py" for name in ("statistics", "seed_statistics", "table", "regret", "rollout")
@@ -34,7 +37,7 @@ STATISTICS, SEEDS, TABLE, REGRET, ROLLOUT = (
 COURSE, CALLBACK, CHECKPOINT, EVENTS, KEPT, INDEPENDENT, RECIPE, MODELS = (
     f"ethbrake_marl/learning/{name}.py"
     for name in (
-        "course", "callback", "checkpoint", "event_files", "kept_training", "independent", "recipe", "models",
+        "progress", "loop", "checkpoint", "run_folder", "kept_training", "independent", "recipe", "models",
     )
 )  # fmt: skip
 
@@ -170,7 +173,7 @@ BUGS: dict[str, Bug] = {
     "the joint optimum of other latencies counts": Bug(
         OPTIMUM, "np.asarray(same & on_grid &", "np.asarray(on_grid &", OF_OPTIMUM
     ),
-    "levels may differ in their lines": Bug(LEVELS, "(*_LINE, *_WORLD, *_VEHICLE)", "(*_LINE, *_VEHICLE)", OF_ABLATION),
+    "levels may differ in their lines": Bug(PLAN, "(*_LINE, *_WORLD, *_VEHICLE)", "(*_LINE, *_VEHICLE)", OF_ABLATION),
     # ------------------------------------------------------------ evaluation
     "standard deviation of a population": Bug(STATISTICS, "data.std(ddof=1)", "data.std(ddof=0)", OF_STATISTICS),
     "relative decrease as if nothing were paired": Bug(
@@ -193,8 +196,8 @@ BUGS: dict[str, Bug] = {
     ),
     "an agent's prediction of the first chunk told for all": Bug(
         ROLLOUT,
-        "np.concatenate(predicted) if predicted",
-        "np.resize(predicted[0], len(ledger.mass_t)) if predicted",
+        "else np.concatenate(found)",
+        "else np.resize(found[0], len(ledger.mass_t))",
         OF_TABLES,
     ),
     # ------------------------------------------------------------ learning

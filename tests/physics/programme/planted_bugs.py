@@ -46,7 +46,7 @@ EVENTS, IMPACT, SEGMENT, ADVANCE = (
     f"ethbrake_marl/physics/{name}.py" for name in ("events", "impact", "segment", "advance")
 )
 HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/obstacle.py"
-BOUNDS, LOWER_BOUND = (f"ethbrake_marl/analysis/{name}.py" for name in ("avoidability_bounds", "lower_bound"))
+BOUNDS, LOWER_BOUND = (f"ethbrake_marl/limits/{name}.py" for name in ("lower_bound_kernel", "lower_bound"))
 PROFILES = "ethbrake_marl/search/profiles.py"
 
 
