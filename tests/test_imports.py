@@ -129,6 +129,11 @@ def module_name(package: Path, path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+def misplaced_matplotlib(found: list[Arrow]) -> list[str]:
+    """The arrows to matplotlib from outside figures/."""
+    return [f"{a.where}: {a.target}" for a in found if a.target.split(".")[0] == "matplotlib" and a.room != "figures"]
+
+
 def misplaced_torch(found: list[Arrow]) -> list[str]:
     """The arrows to torch from outside learning/ and agents/learned.py."""
     return [
@@ -219,6 +224,16 @@ def test_import_order__accepts_what_points_down_or_stays_in_the_room(tmp_path: P
 def test_import_order__folders_of_one_level_do_not_import_each_other(tmp_path: Path) -> None:
     files = {"learning/ppo.py": "from ethbrake_marl.figures import style", "figures/style.py": ""}
     assert len(upward(planted(tmp_path, files))) == 1
+
+
+def test_package__imports_nothing_from_the_tests() -> None:
+    assert [arrow for arrow in arrows(ROOT / PACKAGE) if arrow.target.split(".")[0] == "tests"] == []
+
+
+def test_matplotlib__is_imported_only_in_figures(tmp_path: Path) -> None:
+    assert misplaced_matplotlib(arrows(ROOT / PACKAGE)) == []
+    files = {"studies/speed.py": "def draw():\n    from matplotlib.figure import Figure", "figures/style.py": ""}
+    assert len(misplaced_matplotlib(planted(tmp_path, files))) == 1
 
 
 @pytest.mark.parametrize(

@@ -21,10 +21,6 @@ SPLIT = 1e-12  # in a world with up to 30 impacts,
 SPLIT_CASCADE = 1e-10  # and beyond: each impact multiplies the rounding of the ones before.
 FEW_IMPACTS = 30
 
-# Proven lower bounds are lowered by so many eps of the squared speeds that a world can hold (analysis.lower_bound): a
-# segment or a round of impacts moves a squared closing speed by at most 8 eps of these, and an episode has up to 500
-BOUND_EPS = 2.0**12
-
 EXACT_RUN = 1e-9  # m, m/s, s: every impact and the end of a run of 6 s against rational arithmetic
 RESTING_MPS2 = 1e-9  # accelerations of touching vehicles against the exact law, measured over 1/64 s
 BOUNCE_SERIES_EPS = 1e4  # relative duration of a series of up to 506 bounces: 20 eps each
