@@ -14,12 +14,12 @@ from matplotlib.patheffects import Normal, Stroke
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import parameter_line, parameters
-from ethbrake_marl.evaluation.regret import limits_do_not_apply
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome, controlled_vehicle, evaluate
 from ethbrake_marl.figures.style import COLOURS, GREY, add_caption, new_figure
 from ethbrake_marl.limits.avoidability import avoidability
+from ethbrake_marl.limits.limits import Unproven, unproven_because
 from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.scenario import Scenario, worlds_from_table
+from ethbrake_marl.scenario import Scenario, Task, worlds_from_table
 from ethbrake_marl.scenario.quantities import QUANTITIES
 
 CELLS = 81  # along each gap
@@ -82,8 +82,8 @@ def criticality_map(
     evaluation = evaluate(
         worlds, agents, scenario=scenario, chunk=CHUNK, on_progress=lambda agent, done: tell(agent, done, worlds.n)
     ).complete()
-    proven = limits_do_not_apply(worlds, scenario, evaluation.vehicle) is None
-    avoidable = avoidability(worlds, evaluation.vehicle).avoidable.reshape(cells, cells) if proven else None
+    limits = evaluation.limits
+    avoidable = None if isinstance(limits, Unproven) else limits.proof.avoidable.reshape(cells, cells)
     boundary = avoidability_boundary(scenario, *ranges)
     return CriticalityMap(first, second, evaluation, avoidable, *(boundary or (None, None)))
 
@@ -92,10 +92,11 @@ def avoidability_boundary(scenario: Scenario, range_1_m: Range, range_2_m: Range
     """Smallest second gap at which worlds are avoidable, for first gaps over a range: (gap 1 [B], gap 2 [B]).
 
     A larger gap to Vehicle 3 never makes contact unavoidable, so the boundary is found by halving. NaN where it is
-    outside the range. None where ``limits_do_not_apply``.
+    outside the range. None where nothing is proven.
     """
     vehicle = controlled_vehicle(scenario, None)
-    if limits_do_not_apply(_worlds_at(scenario, *np.array([range_1_m, range_2_m])), scenario, vehicle) is not None:
+    corners = _worlds_at(scenario, *np.array([range_1_m, range_2_m]))
+    if unproven_because(corners, Task(scenario, (vehicle,))) is not None:
         return None
 
     def avoidable(gap_1_m: Floats, gap_2_m: Floats) -> Bools:

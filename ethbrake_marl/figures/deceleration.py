@@ -19,12 +19,12 @@ from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_breakpoints, pairwise_harm
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import quantities, quantity_line
-from ethbrake_marl.evaluation.regret import Limits, known_limits
 from ethbrake_marl.figures.style import COLOURS, GREY, add_caption, new_figure, style_axes
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.best_harm import scripted_commands
+from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
 from ethbrake_marl.physics import Floats, Worlds, advance, forecast, make_worlds
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, Task
 
 POINTS = 2001  # evenly spaced decelerations; the breakpoints of the closed form come on top
 NONE = "none"
@@ -115,7 +115,7 @@ def deceleration_figure(scenario: Scenario, world: Worlds, vehicle: int, *, titl
     style_axes(axes)
     _draw_curves(axes, curve)
     _mark_chosen(axes, curve, scenario, world, vehicle)
-    _mark_best_known(axes, known_limits(world, scenario, vehicle))
+    _mark_best_known(axes, known_limits(world, Task(scenario, (vehicle,))))
     axes.set_xlim(0.0, float(curve.deceleration_mps2[-1]))
     axes.set_ylabel("Harm (m²/s²)", fontsize=9)
     axes.set_title(title or f"{scenario.name}: one world", loc="left", fontsize=10)
@@ -176,17 +176,18 @@ def _mark_chosen(axes: Axes, curve: DecelerationCurve, scenario: Scenario, world
         )  # fmt: skip
 
 
-def _mark_best_known(axes: Axes, limits: Limits | None) -> None:
+def _mark_best_known(axes: Axes, limits: Limits | Unproven) -> None:
     """Level lines at the least harm known of any profile, over all time-varying commands."""
-    if limits is None or not limits.known[0]:
+    if isinstance(limits, Unproven) or not limits.known[0]:
         return
     first, total = float(limits.first_impact_harm[0]), float(limits.total_harm[0])
     for (_, _, colour, dashes), harm in zip(_COUNTS, (first, total), strict=True):
         axes.axhline(harm, color=colour, linewidth=0.9, linestyle=dashes, alpha=0.7)
-    least = "" if limits.proven_harm is None else f"; proven: no less than {limits.proven_harm[0]:.2f}"
-    proof = " (avoidable)" if limits.avoidable[0] else least
+    proof = limits.proof
+    least = "" if proof.harm is None else f"; proven: no less than {proof.harm[0]:.2f}"
+    told = " (avoidable)" if proof.avoidable[0] else least
     axes.annotate(
-        f"best known profile: {first:.2f} first-impact, {total:.2f} total{proof}", (0.0, max(first, total)),
+        f"best known profile: {first:.2f} first-impact, {total:.2f} total{told}", (0.0, max(first, total)),
         xytext=(6, 3), textcoords="offset points", fontsize=8.5, color=GREY,
     )  # fmt: skip
 

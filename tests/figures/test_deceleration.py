@@ -7,10 +7,10 @@ from matplotlib.figure import Figure
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.regret import Limits
 from ethbrake_marl.figures import deceleration as module
 from ethbrake_marl.figures.deceleration import deceleration_curve, deceleration_figure, regimes_of
 from ethbrake_marl.figures.style import png_bytes
+from ethbrake_marl.limits.limits import Limits, Proof
 from ethbrake_marl.physics import Worlds, make_worlds
 from ethbrake_marl.scenario import Scenario, load_scenario, worlds_from_table
 
@@ -100,8 +100,9 @@ def test_curve__needs_one_world_and_two_points(paper_random: Scenario) -> None:
 
 def test_figure__marks_what_e_v2x_bm_takes_and_the_best_known(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = load_scenario("paper-distance")
-    known = Limits(np.array([False]), np.array(["rear"]), np.array([1.25]), np.array([2.5]), np.array([0.5]))
-    monkeypatch.setattr(module, "known_limits", lambda worlds, scenario, vehicle: known)
+    proof = Proof(np.array([False]), np.array(["rear"]), np.array([0.5]))
+    known = Limits(proof, np.array([1.25]), np.array([2.5]))
+    monkeypatch.setattr(module, "known_limits", lambda worlds, task: known)
     figure = deceleration_figure(scenario, seven_seven(scenario), 1, title="a title")
     axes, strips = figure.axes
     assert "a* = 5.170 m/s², closed form: predicts 4.03" in texts(figure)
