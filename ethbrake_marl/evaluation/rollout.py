@@ -61,6 +61,10 @@ class Outcome:
         """Number of impacts of all pairs, and with an obstacle ahead, [n]."""
         return self.ledger.impacts
 
+    def world_harm(self, count: HarmCount) -> Floats:
+        """Harm of all vehicles under a counting rule, [n] m2/s2."""
+        return self.ledger.world_harm(count)
+
     @property
     def first_impact_harm(self) -> Floats:
         """Harm of all vehicles, each pair's first impact only, [n] m2/s2."""
