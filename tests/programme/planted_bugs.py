@@ -16,27 +16,26 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from typing import NamedTuple
 
-from tests.physics.programme.planted_bugs import Patch, first_red, misfits
 from tests.programme.copies import mutated, working_copy
+from tests.programme.planting import Patch, first_red, misfits
 from tests.programme.suites import ROOT
 
-REWARDS, V2X, ENGINE, STEPPING, STARTS, OBJECTIVES, CURVES = (
+REWARDS, V2X, ENGINE, STEPPING, STARTS, OBJECTIVES = (
     f"ethbrake_marl/{name}.py"
-    for name in ("rewards", "v2x", "engine", "stepping", "starts", "objectives", "learning_curves")
-)
+    for name in (
+        "rewards", "scenario/v2x", "engine/engine", "engine/step", "engine/stream", "objectives",
+    )
+)  # fmt: skip
 SB3 = "ethbrake_marl/envs/sb3.py"
-COMPARISON, OPTIMUM, LEVELS, PLAN = (
-    f"ethbrake_marl/ablation/{name}.py" for name in ("comparison", "joint_optimum", "levels", "plan")
+COMPARISON, OPTIMUM, PLAN = (
+    f"ethbrake_marl/studies/ablation/{name}.py" for name in ("comparison", "joint_optimum", "plan")
 )
 STATISTICS, SEEDS, TABLE, REGRET, ROLLOUT = (
     f"ethbrake_marl/evaluation/{name}.py" for name in ("statistics", "seed_statistics", "table", "regret", "rollout")
 )
-COURSE, CALLBACK, CHECKPOINT, EVENTS, KEPT, INDEPENDENT, RECIPE, MODELS = (
-    f"ethbrake_marl/learning/{name}.py"
-    for name in (
-        "course", "callback", "checkpoint", "event_files", "kept_training", "independent", "recipe", "models",
-    )
-)  # fmt: skip
+COURSE, EVENTS, KEPT, INDEPENDENT, RECIPE = (
+    f"ethbrake_marl/learning/{name}.py" for name in ("progress", "run_folder", "kept_training", "independent", "recipe")
+)
 
 
 class Bug(NamedTuple):
@@ -170,7 +169,7 @@ BUGS: dict[str, Bug] = {
     "the joint optimum of other latencies counts": Bug(
         OPTIMUM, "np.asarray(same & on_grid &", "np.asarray(on_grid &", OF_OPTIMUM
     ),
-    "levels may differ in their lines": Bug(LEVELS, "(*_LINE, *_WORLD, *_VEHICLE)", "(*_LINE, *_VEHICLE)", OF_ABLATION),
+    "levels may differ in their lines": Bug(PLAN, "(*_LINE, *_WORLD, *_VEHICLE)", "(*_LINE, *_VEHICLE)", OF_ABLATION),
     # ------------------------------------------------------------ evaluation
     "standard deviation of a population": Bug(STATISTICS, "data.std(ddof=1)", "data.std(ddof=0)", OF_STATISTICS),
     "relative decrease as if nothing were paired": Bug(
@@ -193,8 +192,8 @@ BUGS: dict[str, Bug] = {
     ),
     "an agent's prediction of the first chunk told for all": Bug(
         ROLLOUT,
-        "np.concatenate(predicted) if predicted",
-        "np.resize(predicted[0], len(ledger.mass_t)) if predicted",
+        "else np.concatenate(found)",
+        "else np.resize(found[0], len(ledger.mass_t))",
         OF_TABLES,
     ),
     # ------------------------------------------------------------ learning
@@ -250,7 +249,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", default="", help="only bugs whose name contains this")
     given = parser.parse_args()
-    for wrong in (unfit := misfits(ROOT, patches(BUGS))):
+    for wrong in (unfit := misfits(patches(BUGS))):
         print(f"ERROR  {wrong}")
     if unfit:
         return 1

@@ -1,8 +1,9 @@
 """Nineteen bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
-applied to a temporary copy. There ``test_certify``, ``test_guard`` and one test of ``test_robust`` run with compilation
-switched off, and where they stay green, the other tests of the shield, compiled. Those must be green without any bug.
+applied to a temporary copy. There ``test_certify``, ``test_step_shield`` and one test of ``test_robust`` run with
+compilation switched off, and where they stay green, the other tests of the shield, compiled. Those must be green
+without any bug.
 """
 
 from __future__ import annotations
@@ -10,15 +11,14 @@ from __future__ import annotations
 import argparse
 import sys
 
-from tests.physics.programme.mutation import ROOT
-from tests.physics.programme.planted_bugs import Patch, red_with
+from tests.programme.planting import Patch, misfits, red_with
 
 BY_HAND = "test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner"
 QUICK = ("tests/shield/test_certify.py", "tests/shield/test_step_shield.py", f"tests/shield/test_robust.py::{BY_HAND}")
-WHOLE = tuple(f"tests/shield/test_{name}.py" for name in ("attached", "step", "rollouts", "faces", "interference"))
+WHOLE = tuple(f"tests/shield/test_{name}.py" for name in ("engine_shield", "step", "rollouts", "faces", "interference"))
 KERNEL, CERTIFY, GUARD, ROLLOUTS, ATTACHED, COMPARISON = (
     f"ethbrake_marl/shield/{name}.py"
-    for name in ("certify_kernel", "certify", "guard", "rollouts", "attached", "comparison")
+    for name in ("certify_kernel", "certify", "step_shield", "rollouts", "engine_shield", "comparison")
 )
 
 BUGS: dict[str, tuple[Patch, ...]] = {
@@ -131,12 +131,10 @@ def main() -> int:
     parser.add_argument("--only", default="", help="only bugs whose name contains this")
     parser.add_argument("--quick", action="store_true", help="only the tests that need no compilation")
     given = parser.parse_args()
-    for name, patches in BUGS.items():
-        for patch in patches:
-            count = (ROOT / patch.file).read_text("utf-8").count(patch.old)
-            if count != 1:
-                print(f"ERROR  {name}: {patch.file} holds {patch.old!r} {count} times, not once")
-                return 1
+    for wrong in (unfit := misfits(BUGS)):
+        print(f"ERROR  {wrong}")
+    if unfit:
+        return 1
     if red := red_with((), QUICK, compiled=False):
         print(f"ERROR  red without any bug: {red}")
         return 1
