@@ -23,7 +23,7 @@ from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table, save
 from ethbrake_marl.limits.driven_profiles import fold_agent
 from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable, make_agents
 from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.scenario import Sample, Scenario, Task
 
 TABLE_ENDING = ".npz"
 
@@ -92,7 +92,7 @@ def best_harm_command(
         shutil.rmtree(parts)
         say(f"every world: {output}")
     _show(
-        {**best_harm_figures(table), **_proven(chosen, sample.worlds, table, controlled or chosen.learners)},
+        {**best_harm_figures(table), **_proven(sample.worlds, Task(chosen, controlled or chosen.learners), table)},
         as_json=as_json,
     )
 
@@ -169,9 +169,9 @@ def _command_text(
     return shlex.join([*words, "--output", "FILE.npz"])
 
 
-def _proven(scenario: Scenario, worlds: Worlds, table: BestHarmTable, vehicles: Sequence[int]) -> dict[str, object]:
+def _proven(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[str, object]:
     """What is proven beside what was found, where one of three vehicles is controlled; see ``evaluation.bounds``."""
-    found = proven_of_table(scenario, worlds, table, vehicles[0]) if len(vehicles) == 1 else None
+    found = proven_of_table(worlds, task, table)
     if found is None:
         return {}
     told = {"proven_harm": found.proven_harm, "contact_proven_rate": found.contact_proven_rate}

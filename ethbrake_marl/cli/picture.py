@@ -11,9 +11,12 @@ from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, V
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
+from ethbrake_marl.evaluation.criticality import CELLS, criticality_map
+from ethbrake_marl.evaluation.deceleration import deceleration_curve
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.lineup import LIST_SEED, load_driven, make_agents, make_proposers
+from ethbrake_marl.scenario import Task
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 PICTURE_ENDING = ".png"
@@ -49,7 +52,7 @@ def picture_criticality(
     """
     target = picture_target(output, force=force)
     # Here and below: matplotlib takes a second to load, and most commands draw nothing.
-    from ethbrake_marl.figures.criticality import CELLS, criticality_figure, criticality_map
+    from ethbrake_marl.figures.criticality import criticality_figure
     from ethbrake_marl.figures.style import png_bytes
 
     chosen = load_driven(scenario, None)
@@ -85,9 +88,8 @@ def picture_deceleration(
 
     chosen = load_driven(scenario, vehicle)
     sample = chosen.sample(1, seed, first=world)
-    figure = deceleration_figure(
-        chosen, sample.worlds, chosen.learners[0], title=f"{chosen.name}, world {world} of the list of seed {seed}"
-    )
+    curve = deceleration_curve(sample.worlds, Task(chosen, chosen.learners))
+    figure = deceleration_figure(curve, title=f"{chosen.name}, world {world} of the list of seed {seed}")
     write_output(target, png_bytes(figure), force=force)
     say(f"picture: {target}")
 

@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.evaluation.regret import Between, between, harm_is_bounded, limits_do_not_apply
+from ethbrake_marl.evaluation.regret import Between, between
 from ethbrake_marl.harm import COUNTS
-from ethbrake_marl.limits.avoidability import avoidability
 from ethbrake_marl.limits.best_harm import world_identity
 from ethbrake_marl.limits.best_harm_table import BestHarmTable
-from ethbrake_marl.limits.lower_bound import lower_bound
+from ethbrake_marl.limits.limits import Unproven, prove, unproven_because
 from ethbrake_marl.limits.shipped import shipped_tables
 from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.physics.obstacle import obstacle_ahead
+from ethbrake_marl.scenario import Task, load_scenario
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,24 +34,23 @@ class Proven:
     between: Between
 
 
-def proven_of(scenario: Scenario, worlds: Worlds, vehicle: int, first: Floats, total: Floats) -> Proven | None:
+def proven_of(worlds: Worlds, task: Task, first: Floats, total: Floats) -> Proven | None:
     """What is proven about worlds at the alert, ``first`` and ``total`` [n] being the least harms known; or None."""
-    if limits_do_not_apply(worlds, scenario, vehicle) is not None or not harm_is_bounded(worlds):
+    proof = prove(worlds, task)
+    if isinstance(proof, Unproven) or proof.harm is None:
         return None
-    bound = lower_bound(worlds, vehicle, horizon_s=scenario.horizon_s)
-    contact = ~avoidability(worlds, vehicle).avoidable
-    impact = bound.impact_proven
+    contact, impact = ~proof.avoidable, proof.harm > 0.0
     rates = float(contact.mean()), float(impact.mean())
-    return Proven(float(bound.harm.mean()), *rates, between(contact, impact, first, total))
+    return Proven(float(proof.harm.mean()), *rates, between(contact, impact, first, total))
 
 
-def proven_of_table(scenario: Scenario, worlds: Worlds, table: BestHarmTable, vehicle: int) -> Proven | None:
+def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> Proven | None:
     """``proven_of`` the worlds of a list with the least harms of a table, without those that cannot be advanced."""
 
     def of(rows: Ints) -> Proven | None:
         some = worlds.take(rows)
-        identity = world_identity(scenario, some, (vehicle,))
-        return proven_of(scenario, some, vehicle, table.harm(identity, "first"), table.harm(identity, "total"))
+        identity = world_identity(task.scenario, some, task.vehicles)
+        return proven_of(some, task, table.harm(identity, "first"), table.harm(identity, "total"))
 
     return leaving_out_failed(of, np.arange(worlds.n))[0]
 
@@ -95,14 +94,14 @@ def bounds_of(table: BestHarmTable) -> ShippedBounds:
     header = table.header
     scenario = load_scenario(header["scenario"])
     names, seed, episodes = tuple(header["vehicles"]), int(header["list_seed"]), int(header["episodes"])
-    vehicles = [scenario.vehicle_names.index(name) for name in names]
+    task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
     worlds = scenario.sample(episodes, seed).worlds
-    table.check_holds_any(world_identity(scenario, worlds, vehicles))
+    table.check_holds_any(world_identity(scenario, worlds, task.vehicles))
     first, total = (float(table.best[count].harm.mean()) if count in table.best else None for count in COUNTS)
-    why = f"{len(names)} vehicles are driven; it is proven for one" if len(vehicles) != 1 else None
-    why = why or limits_do_not_apply(worlds, scenario, vehicles[0])
-    why = why or (None if harm_is_bounded(worlds) else "an obstacle stands ahead; no least harm is proven")
-    proven = None if why is not None else proven_of_table(scenario, worlds, table, vehicles[0])
+    why = unproven_because(worlds, task)
+    if why is None and obstacle_ahead(worlds).any():
+        why = "an obstacle stands ahead; no least harm is proven"
+    proven = None if why is not None else proven_of_table(worlds, task, table)
     return ShippedBounds(scenario.name, names, seed, len(table.identity), first, total, proven, why)
 
 

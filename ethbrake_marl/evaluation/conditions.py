@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.evaluation.regret import no_limits_because
 from ethbrake_marl.evaluation.rollout import Evaluation
+from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.scenario.quantities import DECLARED, OPTIONAL, QUANTITIES, QuantityRule
 
@@ -63,7 +63,7 @@ def parameters(evaluation: Evaluation) -> dict[str, Any]:
         "scripts": scripts,
         "time_step_s": scenario.time_step_s,
         "horizon_s": scenario.horizon_s,
-        "no_limits_because": no_limits_because(evaluation),
+        "no_limits_because": evaluation.limits.because if isinstance(evaluation.limits, Unproven) else None,
         **quantities(evaluation.worlds),
     }
 

@@ -118,15 +118,15 @@ def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
     """What was avoidable and the best known in each world; empty where nothing is proven."""
     if regrets is None:
         return {name: [""] * len(outcome.collided) for name in REGRET_COLUMNS}
-    n, certain, proven = len(outcome.collided), regrets.limits.impact_proven, regrets.limits.proven_harm
+    n, proof = len(outcome.collided), regrets.limits.proof
     columns = (
-        regrets.limits.avoidable.astype(int),
-        regrets.limits.reason,
+        proof.avoidable.astype(int),
+        proof.reason,
         regrets.first_impact_harm,
         regrets.total_harm,
         regrets.source,
-        np.full(n, "") if certain is None else certain.astype(int),
-        np.full(n, "") if proven is None else proven,
+        np.full(n, "") if proof.impact is None else proof.impact.astype(int),
+        np.full(n, "") if proof.harm is None else proof.harm,
         regrets.regret(outcome, "first"),
         regrets.regret(outcome, "total"),
     )

@@ -1,10 +1,7 @@
 """How far each agent stays from the best that is known: which collisions nobody avoids, and regret world by world.
 
-Three vehicles, Vehicle 2 driven, the others braking fully: for these it is proven world by world whether some command
-avoids all contact (``limits.avoidability``) and which harm no command undercuts (``limits.lower_bound``). The least
-harm known is the first proof's witness (harm 0), or the result of a search (``limits.best_harm``), or what an agent
-of the same evaluation achieved, whichever is least. An obstacle that Vehicle 1 does not reach by itself leaves the
-first proof as it is (only a push brings it there); the second knows none.
+The least harm known is that of the limits (``limits.limits``), or what an agent of the same evaluation achieved,
+whichever is less.
 """
 
 from __future__ import annotations
@@ -17,41 +14,13 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate, relative_decrease
-from ethbrake_marl.harm import COUNTS, HarmCount
-from ethbrake_marl.limits.avoidability import avoidability
-from ethbrake_marl.limits.lower_bound import lower_bound
-from ethbrake_marl.limits.shipped import best_known
-from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.physics.events import stopping_distances
-from ethbrake_marl.physics.obstacle import obstacle_ahead
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.limits.limits import Limits, Unproven
+from ethbrake_marl.physics import Bools, Floats
 
 NO_HARM = 1e-3  # m2/s2: nobody is hurt by 0.03 m/s
 TOLERANCE = 1e-6  # m2/s2; less than this below the best known harm is rounding
 Source = Literal["witness", "table", "agents", "below_table"]
-
-_VEHICLES, _DRIVEN = 3, 1
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What is known of each world before anybody drives: [n] each."""
-
-    avoidable: Bools  # some admissible command of Vehicle 2 avoids all contact
-    reason: NDArray[np.str_]  # why not: "early", "front" or "rear"; "" where avoidable
-    first_impact_harm: Floats  # least known (m2/s2): 0 where avoidable, else a table's; NaN in no table
-    total_harm: Floats
-    proven_harm: Floats | None  # no command does less (m2/s2), under either count; None with an obstacle ahead
-
-    @property
-    def impact_proven(self) -> Bools | None:
-        """Worlds in which every command leads to an impact, not only to contact; None with an obstacle ahead."""
-        return None if self.proven_harm is None else self.proven_harm > 0.0
-
-    @property
-    def known(self) -> Bools:
-        """Worlds whose best is known for both counts, without looking at any agent."""
-        return np.isfinite(self.first_impact_harm) & np.isfinite(self.total_harm)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,64 +106,17 @@ def between(contact: Bools, impact: Bools, first: Floats, total: Floats) -> Betw
     return Between(float(there.mean()), float(first[known].mean()), float(total[known].mean()), harmless)
 
 
-def limits_do_not_apply(worlds: Worlds, scenario: Scenario, vehicle: int) -> str | None:
-    """Why nothing is proven for this line-up, as a clause; None when it is."""
-    if scenario.vehicles != _VEHICLES:
-        return f"{scenario.vehicles} vehicles; avoidability is proven for {_VEHICLES}"
-    if vehicle != _DRIVEN:
-        return f"{scenario.vehicle_names[vehicle]} is driven; avoidability is proven for {scenario.vehicle_names[1]}"
-    for i in (0, 2):
-        script = scenario.scripts.get(i, "full_brake")
-        if script != "full_brake":
-            return f"{scenario.vehicle_names[i]} follows {script}; avoidability is proven where it follows full_brake"
-    speeds_mps, latency_s = worlds.speeds_mps, worlds.vehicles.latency_s
-    way_m = stopping_distances(speeds_mps[:, 0], latency_s[:, 0], worlds.vehicles.braking_capacity_mps2[:, 0])
-    if not (way_m < worlds.hazard_gap_m).all():
-        return "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"
-    if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():
-        front, driven = scenario.vehicle_names[: _DRIVEN + 1]
-        return f"{front} may brake later than {driven}; nothing is proven then"
-    return None
-
-
-def harm_is_bounded(worlds: Worlds) -> bool:
-    """Whether the proof of a least harm applies where avoidability does: it knows no obstacle."""
-    return not obstacle_ahead(worlds).any()
-
-
-def no_limits_because(evaluation: Evaluation) -> str | None:
-    """Why nothing is proven for what was evaluated, as a clause; None when it is."""
-    if len(evaluation.vehicles) != 1:
-        driven = ", ".join(evaluation.scenario.vehicle_names[i] for i in evaluation.vehicles)
-        return f"driven are: {driven or 'none'}; avoidability is proven for one vehicle"
-    return limits_do_not_apply(evaluation.worlds, evaluation.scenario, evaluation.vehicle)
-
-
-def known_limits(worlds: Worlds, scenario: Scenario, vehicle: int) -> Limits | None:
-    """The limits of worlds at the alert; None where ``limits_do_not_apply``."""
-    if limits_do_not_apply(worlds, scenario, vehicle) is not None:
-        return None
-    proof = avoidability(worlds, vehicle)
-    first, total = (best_known(worlds, scenario, count, vehicles=(vehicle,)) for count in COUNTS)
-    bounded = harm_is_bounded(worlds)
-    proven = lower_bound(worlds, vehicle, count="first", horizon_s=scenario.horizon_s).harm if bounded else None
-    free = proof.avoidable
-    return Limits(free, proof.reason_name, np.where(free, 0.0, first), np.where(free, 0.0, total), proven)
-
-
 def assess(evaluation: Evaluation) -> Regrets | None:
     """Best known harm of every world, the agents of this evaluation included; None where nothing is proven."""
-    if len(evaluation.vehicles) != 1:
-        return None
-    limits = known_limits(evaluation.worlds, evaluation.scenario, evaluation.vehicle)
-    if limits is None:
+    limits = evaluation.limits
+    if isinstance(limits, Unproven):
         return None
     outcomes = evaluation.outcomes.values()
     first = np.fmin.reduce([limits.first_impact_harm, *(outcome.first_impact_harm for outcome in outcomes)])
     total = np.fmin.reduce([limits.total_harm, *(outcome.total_harm for outcome in outcomes)])
     regrets = Regrets(limits, first, total, np.zeros(0, np.str_))
     below = np.logical_or.reduce([regrets.below(outcome) for outcome in outcomes])
-    source = np.select([limits.avoidable, ~limits.known, below], ["witness", "agents", "below_table"], "table")
+    source = np.select([limits.proof.avoidable, ~limits.known, below], ["witness", "agents", "below_table"], "table")
     return Regrets(limits, first, total, source)
 
 
@@ -207,7 +129,7 @@ def distance(regrets: Regrets | None, outcome: Outcome, full_brake: Outcome | No
     if regrets is None:
         return Distance()
     limits = regrets.limits
-    avoidable, known, proven, certain = limits.avoidable, limits.known, limits.proven_harm, limits.impact_proven
+    avoidable, known, proven, certain = limits.proof.avoidable, limits.known, limits.proof.harm, limits.proof.impact
     first, total = regrets.regret(outcome, "first"), regrets.regret(outcome, "total")
     reference = full_brake if bool(known.all()) else None
     return Distance(

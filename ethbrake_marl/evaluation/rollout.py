@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +21,9 @@ from ethbrake_marl.engine.stream import check_alert
 from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
 from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
 from ethbrake_marl.harm import HarmCount, Ledger
+from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate, leaving_out_failed
-from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.scenario.v2x import hidden_from
 
 CHUNK = 10_000  # worlds advanced together: bounds memory, changes no result
@@ -59,6 +61,10 @@ class Outcome:
         """Number of impacts of all pairs, and with an obstacle ahead, [n]."""
         return self.ledger.impacts
 
+    def world_harm(self, count: HarmCount) -> Floats:
+        """Harm of all vehicles under a counting rule, [n] m2/s2."""
+        return self.ledger.world_harm(count)
+
     @property
     def first_impact_harm(self) -> Floats:
         """Harm of all vehicles, each pair's first impact only, [n] m2/s2."""
@@ -92,7 +98,7 @@ class LeftOut(NamedTuple):
         return f"world {self.world}{of} ({self.agent}: {self.reason})"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Evaluation:
     """Outcomes of agents that drove the same vehicles in the same worlds, row k of every array being world k."""
 
@@ -107,10 +113,17 @@ class Evaluation:
     @property
     def vehicle(self) -> int:
         """The vehicle that was driven; raises ``InvalidInput`` if it is not exactly one."""
-        if len(self.vehicles) != 1:
-            driven = ", ".join(self.scenario.vehicle_names[i] for i in self.vehicles) or "none"
-            raise InvalidInput(f"scenario {self.scenario.name!r}: needs one driven vehicle; driven are: {driven}")
-        return self.vehicles[0]
+        return self.task.vehicle
+
+    @property
+    def task(self) -> Task:
+        """What was asked of the agents."""
+        return Task(self.scenario, self.vehicles)
+
+    @cached_property
+    def limits(self) -> Limits | Unproven:
+        """What is known of each world whoever drives: found once, for everything that tells of this evaluation."""
+        return known_limits(self.worlds, self.task)
 
     @property
     def hidden(self) -> Bools:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference
+from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.scenario import Scenario
@@ -41,15 +41,12 @@ class ModeRow:
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
-        against = self.against_episode
         told: dict[str, Any] = {
             "agent": self.agent,
             "mode": self.mode,
-            "harm": self.harm.value,
-            "harm_interval": _interval(self.harm),
+            **estimates_to_json({"harm": self.harm}),
             "horizon_ends": self.horizon_ends,
-            "against_episode": None if against is None else against.value,
-            "against_episode_interval": _interval(against),
+            **estimates_to_json({"against_episode": self.against_episode}),
             "decisions_replaced": self.replaced,
         }
         shares = (None,) * len(VERDICTS) if self.verdicts is None else self.verdicts
@@ -141,10 +138,6 @@ def _rows(name: str, parts: list[dict[str, Any]]) -> list[ModeRow]:
             ModeRow(name, mode, mean(harm[mode]), moving[mode], difference, replaced / decisions, shares, above)
         )
     return rows
-
-
-def _interval(estimate: Estimate | None) -> list[float] | None:
-    return None if estimate is None or estimate.interval is None else list(estimate.interval)
 
 
 def _shown(estimate: Estimate | None) -> str:

@@ -8,7 +8,9 @@ between easy and hard worlds cancels.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtri, stdtrit
@@ -25,6 +27,22 @@ class Estimate:
 
     value: float
     interval: tuple[float, float] | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for JSON: ``value``, and ``interval`` as ``[low, high]`` or null."""
+        return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
+
+
+def estimates_to_json(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
+    """Estimates by name as plain data, side by side: ``{name: value, name_interval: [low, high]}``.
+
+    What does not exist is null.
+    """
+    found: dict[str, Any] = {}
+    for name, estimate in estimates.items():
+        told = {"value": None, "interval": None} if estimate is None else estimate.to_json()
+        found |= {name: told["value"], f"{name}_interval": told["interval"]}
+    return found
 
 
 def rate(successes: int, count: int, *, confidence: float = CONFIDENCE) -> Estimate:

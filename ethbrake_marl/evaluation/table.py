@@ -16,7 +16,14 @@ from ethbrake_marl.evaluation.conditions import parameters
 from ethbrake_marl.evaluation.paper import is_papers_test
 from ethbrake_marl.evaluation.regret import Distance, assess, distance
 from ethbrake_marl.evaluation.rollout import Evaluation, LeftOut, Outcome
-from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, rate, relative_decrease
+from ethbrake_marl.evaluation.statistics import (
+    Estimate,
+    estimates_to_json,
+    mean,
+    paired_difference,
+    rate,
+    relative_decrease,
+)
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.objectives import STANDARD, Declared, objectives_of, scored
 
@@ -34,11 +41,8 @@ class Rescored:
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON: objective, count, and each vehicle's mean with its interval."""
-        found: dict[str, Any] = {"objective": self.objective, "count": self.count}
-        for i, estimate in enumerate(self.each):
-            interval = None if estimate.interval is None else list(estimate.interval)
-            found |= {f"vehicle_{i + 1}": estimate.value, f"vehicle_{i + 1}_interval": interval}
-        return found
+        each = estimates_to_json({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
+        return {"objective": self.objective, "count": self.count, **each}
 
 
 def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
@@ -127,29 +131,32 @@ class SummaryRow:
             "episodes": self.episodes,
             "collisions": self.collisions,
             "horizon_ends": self.horizon_ends,
-            **_named("collision_rate", self.collision_rate),
-            **_named("first_impact_harm", self.first_impact_harm),
-            **_named("total_harm", self.total_harm),
-            **_named("sampled_harm", self.sampled_harm),
-            **_named("vehicle_1_shoved_m", self.shoved_m),
-            **_named("vehicle_1_shoved_far_rate", self.shoved_far),
-            **_named("first_impact_harm_difference", self.first_difference),
-            **_named("total_harm_difference", self.total_difference),
-            **_named("harm_decrease_first", self.first_decrease),
-            **_named("harm_decrease_total", self.total_decrease),
-            **(_named("predicted_harm", self.predicted_harm) if self.predicted_harm else {}),
+            **estimates_to_json(self._estimates()),
             **({"policy_share": self.policy_share} if self.policy_share is not None else {}),
             **self._distance_to_json(),
             "left_out": [left._asdict() for left in self.left_out],
             "parameters": self.parameters,
         }
 
-    def _distance_to_json(self) -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for name, estimate in self.distance.estimates().items():
-            found |= _named(name, estimate)
+    def _estimates(self) -> dict[str, Estimate | None]:
+        """What was measured, by its names in JSON."""
         return {
-            **found,
+            "collision_rate": self.collision_rate,
+            "first_impact_harm": self.first_impact_harm,
+            "total_harm": self.total_harm,
+            "sampled_harm": self.sampled_harm,
+            "vehicle_1_shoved_m": self.shoved_m,
+            "vehicle_1_shoved_far_rate": self.shoved_far,
+            "first_impact_harm_difference": self.first_difference,
+            "total_harm_difference": self.total_difference,
+            "harm_decrease_first": self.first_decrease,
+            "harm_decrease_total": self.total_decrease,
+            **({"predicted_harm": self.predicted_harm} if self.predicted_harm else {}),
+        }
+
+    def _distance_to_json(self) -> dict[str, Any]:
+        return {
+            **estimates_to_json(self.distance.estimates()),
             "known_best_share": self.distance.known_best_share,
             "below_best_known": self.distance.below_best_known,
             "impact_unproven": None if self.distance.between is None else asdict(self.distance.between),
@@ -213,11 +220,3 @@ def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: di
         shoved_far=None if outcome.shoved_m is None else rate(int((outcome.shoved_m > FAR_M).sum()), episodes),
         sampled_harm=None if outcome.sampled_harm is None else mean(outcome.sampled_harm),
     )
-
-
-def _named(name: str, estimate: Estimate | None) -> dict[str, Any]:
-    """``{name: value, name_interval: [low, high]}``, with null for what does not exist."""
-    if estimate is None:
-        return {name: None, f"{name}_interval": None}
-    interval = estimate.interval
-    return {name: estimate.value, f"{name}_interval": None if interval is None else list(interval)}

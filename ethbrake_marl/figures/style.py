@@ -7,7 +7,7 @@ import textwrap
 
 import matplotlib
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Figure  # the type that every figure has, for modules outside this folder
 
 # Okabe and Ito's palette without its yellow (invisible on white); markers and dashes repeat the distinction.
 COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")

@@ -23,7 +23,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count, empty_ledger
-from ethbrake_marl.limits.avoidability import avoidability
+from ethbrake_marl.limits.avoidability import Avoidability, avoidability
 from ethbrake_marl.limits.lower_bound_kernel import BOUNDS, COMBINED_BOUND, FRONT_BOUND, REAR_BOUND, bound_worlds
 from ethbrake_marl.limits.meetings import (
     A_F,
@@ -59,6 +59,7 @@ class LowerBound:
     front_pair: Floats  # of the front pair alone, from then on
     rear_pair: Floats  # of the rear pair alone
     combined: Floats  # of both together; 0 where nothing is proven
+    contact: Avoidability  # the verdict on contact that the bound of both together rests on
 
     @property
     def impact_proven(self) -> Bools:
@@ -105,7 +106,7 @@ def lower_bound(
     bound_worlds(_states(at_onset, vehicle), horizon_s - start, has_front, has_rear, unavoidable, out)
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
     early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
-    return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined)
+    return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)
 
 
 def rounding(worlds: Worlds, vehicle: int) -> Floats:

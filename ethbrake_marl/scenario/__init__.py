@@ -19,6 +19,7 @@ from ethbrake_marl.scenario.initial_states import (
 from ethbrake_marl.scenario.roles import constant_command, is_state_free, parse_agent_spec
 from ethbrake_marl.scenario.sampling import Channel, Sample
 from ethbrake_marl.scenario.schema import Scenario, scenario_json_schema
+from ethbrake_marl.scenario.task import Task
 
 __all__ = [
     "CatalogueEntry",
@@ -29,6 +30,7 @@ __all__ = [
     "Normal",
     "Sample",
     "Scenario",
+    "Task",
     "Uniform",
     "constant_command",
     "initial_state_worlds",

@@ -20,7 +20,7 @@ from ethbrake_marl.agents.knowledge import Knowledge, knowledge_text
 from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.evaluation.rollout import Outcome, evaluate
-from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference
+from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.scenario import Sample, Scenario
 
@@ -47,11 +47,8 @@ class TimedRow:
         """Plain data for JSON; an interval is ``[low, high]`` or null."""
         found: dict[str, Any] = {"agent": self.agent, "knows": knowledge_text(self.knows)}
         found |= {"cpu_ms": self.median_ms, "cpu_ms_range": [self.lowest_ms, self.highest_ms]}
-        for name in ("first_impact_harm", "total_harm", "difference"):
-            estimate: Estimate = getattr(self, name)
-            interval = estimate.interval
-            found |= {name: estimate.value, f"{name}_interval": None if interval is None else list(interval)}
-        return found
+        harms = {"first_impact_harm": self.first_impact_harm, "total_harm": self.total_harm}
+        return found | estimates_to_json({**harms, "difference": self.difference})
 
 
 def equal_time(

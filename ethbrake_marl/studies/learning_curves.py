@@ -135,7 +135,8 @@ def _column(table: Sequence[Mapping[str, str]], name: str) -> dict[int, float]:
 
 def _estimate(harms: Any) -> dict[str, Any]:
     found = interquartile_mean([harms])
-    return {"interquartile_mean": found.value, "interval": found.interval, "each": [float(harm) for harm in harms]}
+    told = found.to_json()
+    return {"interquartile_mean": told["value"], "interval": told["interval"], "each": [float(harm) for harm in harms]}
 
 
 def _conditions(plan: Sequence[Trainings]) -> str:

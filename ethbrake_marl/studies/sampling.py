@@ -11,12 +11,11 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.figures.style import GREY, add_caption, new_figure, png_bytes, series_style, style_axes
+from ethbrake_marl.figures.sampling import draw_errors
+from ethbrake_marl.figures.style import Figure, png_bytes
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Impacts, Worlds, advance, advance_sampled
 from ethbrake_marl.scenario import load_scenario
@@ -147,29 +146,12 @@ _SERIES = (
 
 
 def convergence_figure(studies: Sequence[Convergence], caption: str) -> Figure:
-    """Absolute errors over the step, both on logarithmic axes, one panel per study, with a line of order 1."""
-    figure = new_figure(7.4, 3.9)
-    panels = figure.subplots(1, len(studies), sharey=True, squeeze=False)[0]
-    for axes, study in zip(panels, studies, strict=True):
-        _draw(axes, study)
-    panels[0].set_ylabel("Absolute error of harm (m²/s²)", fontsize=9)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=2, frameon=False, fontsize=9)
-    add_caption(figure, caption)
-    return figure
-
-
-def _draw(axes: Axes, study: Convergence) -> None:
-    style_axes(axes)
-    for number, (name, label) in enumerate(_SERIES):
-        axes.loglog(study.steps_s, np.abs(study.column(name)), label=label, **series_style(number))
-    ends = np.array([min(study.steps_s), max(study.steps_s)])
-    axes.loglog(ends, 10.0 * ends, color=GREY, linewidth=0.9, label="order 1")
-    axes.set_xticks(study.steps_s, [f"{step:g}" for step in study.steps_s])
-    axes.minorticks_off()
-    axes.tick_params(labelsize=8)
-    axes.set_title(f"Vehicle 2: {study.agent}", loc="left", fontsize=10)
-    axes.set_xlabel("Step (s)", fontsize=9)
+    """Absolute errors over the step, one panel per study."""
+    panels = {
+        f"Vehicle 2: {study.agent}": [(label, np.abs(study.column(name))) for name, label in _SERIES]
+        for study in studies
+    }
+    return draw_errors(panels, steps_s=studies[0].steps_s, caption=caption)
 
 
 def sampling_report(figure_path: str | Path, *, scenario: str = "paper-random", n: int = 2000, seed: int = 7) -> str:

@@ -6,10 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from ethbrake_marl.figures.style import GREY, add_caption, new_figure, series_style, style_axes
+from ethbrake_marl.figures.scaling import draw_costs
+from ethbrake_marl.figures.style import Figure
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.studies.speed import SEED, STEP_S, Effort, Work, braking, rates, stepping, until_rest
 
@@ -78,29 +77,7 @@ def _cost(what: str, n: int, vehicles: int, work: Work, effort: Effort) -> Cost:
 
 
 def scaling_figure(by_worlds: Sequence[Cost], by_vehicles: Sequence[Cost], caption: str) -> Figure:
-    """Cost of a step of the whole batch over n, and of one world over N; logarithmic axes, with lines of slope 1."""
-    figure = new_figure(7.4, 3.9)
-    left, right = figure.subplots(1, 2)
-    _draw(left, [(c.what, c.worlds, c.nanoseconds * c.worlds * 1e-3) for c in by_worlds])
-    left.set_xlabel("Worlds n, of three vehicles", fontsize=9)
-    left.set_ylabel("One step of all n worlds (µs)", fontsize=9)
-    _draw(right, [(c.what, c.vehicles, c.nanoseconds) for c in by_vehicles])
-    right.set_xlabel("Vehicles N in a world", fontsize=9)
-    right.set_ylabel("One step of one world (ns)", fontsize=9)
-    right.set_xticks(VEHICLES, [str(vehicles) for vehicles in VEHICLES])
-    right.minorticks_off()
-    add_caption(figure, caption)
-    return figure
-
-
-def _draw(axes: Axes, points: Sequence[tuple[str, int, float]]) -> None:
-    """A line for each series, and through the last point of each a line of slope 1."""
-    style_axes(axes)
-    series = dict.fromkeys(name for name, _, _ in points)
-    lines = {what: np.array([point[1:] for point in points if point[0] == what]).T for what in series}
-    for number, (what, (counts, costs)) in enumerate(lines.items()):
-        axes.loglog(counts, costs, label=what, **series_style(number))
-    for number, (counts, costs) in enumerate(lines.values()):
-        label = "proportional" if number == 0 else None
-        axes.loglog(counts, costs[-1] / counts[-1] * counts, color=GREY, linewidth=0.8, label=label, zorder=1)
-    axes.legend(frameon=False, fontsize=8, loc="upper left")
+    """Cost of a step of the whole batch over n, and of one world over N."""
+    batches = [(c.what, c.worlds, c.nanoseconds * c.worlds * 1e-3) for c in by_worlds]
+    single = [(c.what, c.vehicles, c.nanoseconds) for c in by_vehicles]
+    return draw_costs(batches, single, vehicles=VEHICLES, caption=caption)

@@ -13,7 +13,7 @@ from ethbrake_marl.evaluation.bounds import bounds_of, proven_of_table, shipped_
 from ethbrake_marl.evaluation.regret import between
 from ethbrake_marl.limits.best_harm_table import BestHarmTable
 from ethbrake_marl.limits.shipped import shipped_tables
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.scenario import Task, load_scenario
 
 
 def shipped(name: str) -> BestHarmTable:
@@ -68,7 +68,7 @@ def replace_header(table: BestHarmTable, **changes: object) -> BestHarmTable:
 
 def test_shipped__where_nothing_is_proven_the_reason_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
     table = replace_header(shipped("paper-delay-low"), episodes=5)
-    monkeypatch.setattr(bounds, "limits_do_not_apply", lambda *_: "an obstacle stands ahead of vehicle_1")
+    monkeypatch.setattr(bounds, "unproven_because", lambda *_: "an obstacle stands ahead of vehicle_1")
     found = bounds_of(table)
     assert found.proven is None and found.gap(found.best_known_first) is None
     assert "an obstacle stands ahead" in shipped_lines([found])[2]
@@ -77,7 +77,7 @@ def test_shipped__where_nothing_is_proven_the_reason_stands_there(monkeypatch: p
 
 def test_proven__of_a_table_leaves_out_what_cannot_be_advanced() -> None:
     scenario, table = load_scenario("paper-delay-low"), shipped("paper-delay-low")
-    worlds = scenario.sample(6, 7).worlds
-    whole = proven_of_table(scenario, worlds.take([0, 1, 3, 4, 5]), table, 1)
+    worlds, task = scenario.sample(6, 7).worlds, Task(scenario, (1,))
+    whole = proven_of_table(worlds.take([0, 1, 3, 4, 5]), task, table)
     worlds.gaps_m[2], worlds.speeds_mps[2] = [0.2, -1.0], [10.0, 20.0, 16.0]
-    assert whole is not None and proven_of_table(scenario, worlds, table, 1) == whole
+    assert whole is not None and proven_of_table(worlds, task, table) == whole

@@ -18,11 +18,12 @@ from ethbrake_marl.evaluation import (
     summarise,
     write_per_world_csv,
 )
-from ethbrake_marl.evaluation import regret as regret_module
-from ethbrake_marl.evaluation.regret import assess, distance, known_limits, limits_do_not_apply
+from ethbrake_marl.evaluation.regret import assess, distance
 from ethbrake_marl.harm import Ledger
+from ethbrake_marl.limits import limits as limits_module
+from ethbrake_marl.limits.limits import Unproven, known_limits, unproven_because
 from ethbrake_marl.physics.advance import no_hazard_harm
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
 
 # Four worlds by hand: the first is avoidable, the second is in the table, in the third the agent is below the table,
 # the fourth is in no table.
@@ -53,14 +54,14 @@ def outcome(evaluation: Evaluation, harms: tuple[list[float], list[float]]) -> O
 def four(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> Evaluation:
     """An evaluation of full_brake and another agent in the four worlds."""
     monkeypatch.setattr(
-        regret_module,
-        "avoidability",
-        lambda worlds, vehicle: SimpleNamespace(avoidable=AVOIDABLE[: worlds.n], reason_name=REASON[: worlds.n]),
+        limits_module,
+        "lower_bound",
+        lambda worlds, vehicle, **settings: SimpleNamespace(
+            harm=PROVEN[: worlds.n],
+            contact=SimpleNamespace(avoidable=AVOIDABLE[: worlds.n], reason_name=REASON[: worlds.n]),
+        ),
     )
-    monkeypatch.setattr(
-        regret_module, "lower_bound", lambda worlds, vehicle, **settings: SimpleNamespace(harm=PROVEN[: worlds.n])
-    )
-    monkeypatch.setattr(regret_module, "best_known", lambda worlds, scenario, count, vehicles: TABLE[count][: worlds.n])
+    monkeypatch.setattr(limits_module, "best_known", lambda worlds, scenario, count, vehicles: TABLE[count][: worlds.n])
     return first_worlds(evaluation, 4)
 
 
@@ -164,9 +165,10 @@ def test_limits__do_not_apply_to_other_scripts_and_vehicles(
 ) -> None:
     scenario = paper_random.replace(roles=dict(zip(paper_random.vehicle_names, roles, strict=True)))
     worlds = scenario.sample(2, 7).worlds
-    found = limits_do_not_apply(worlds, scenario, vehicle)
+    task = Task(scenario, (vehicle,))
+    found = unproven_because(worlds, task)
     assert found is None if reason is None else found is not None and found.startswith(reason)
-    assert (known_limits(worlds, scenario, vehicle) is None) == (reason is not None)
+    assert isinstance(known_limits(worlds, task), Unproven) == (reason is not None)
 
 
 def test_limits__an_obstacle_out_of_vehicle_1_s_own_reach_leaves_avoidability_and_no_least_harm(tmp_path: Path) -> None:
@@ -185,7 +187,7 @@ def test_limits__an_obstacle_out_of_vehicle_1_s_own_reach_leaves_avoidability_an
     assert {line["proven_harm"] + line["impact_proven"] for line in lines} == {""}
     assert {line["avoidable"] for line in lines} == {"0", "1"}
     near = scenario.replace(hazard_gap_m=30.0)
-    found = limits_do_not_apply(near.sample(50, 7).worlds, near, 1)
+    found = unproven_because(near.sample(50, 7).worlds, Task(near, (1,)))
     assert found == "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"
 
 
@@ -235,12 +237,12 @@ def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, un
     assert full["unavoidable_rate"] == best["unavoidable_rate"] == unavoidable / 500
     for spec in agents:
         driven = result.outcome(spec)
-        assert driven.collided[found.limits.impact_proven].all()  # nobody avoids what is proven
-        assert (driven.first_impact_harm >= found.limits.proven_harm - 1e-9).all()
+        assert driven.collided[found.limits.proof.impact].all()  # nobody avoids what is proven
+        assert (driven.first_impact_harm >= found.limits.proof.harm - 1e-9).all()
         assert (found.regret(driven, "first") >= 0.0).all()
         assert (found.regret(driven, "total") >= 0.0).all()
-    assert not (found.limits.avoidable & found.limits.impact_proven).any()
-    assert (found.first_impact_harm >= found.limits.proven_harm - 1e-9).all()
+    assert not (found.limits.proof.avoidable & found.limits.proof.impact).any()
+    assert (found.first_impact_harm >= found.limits.proof.harm - 1e-9).all()
     assert best["avoidable_collision_rate"] < 0.02 < full["avoidable_collision_rate"]
 
 

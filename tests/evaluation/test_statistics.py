@@ -5,7 +5,14 @@ import pytest
 from scipy.stats import bootstrap
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.statistics import mean, paired_difference, rate, relative_decrease
+from ethbrake_marl.evaluation.statistics import (
+    Estimate,
+    estimates_to_json,
+    mean,
+    paired_difference,
+    rate,
+    relative_decrease,
+)
 
 T_4, T_1 = 2.7764451, 12.7062047  # 97.5 % quantiles of Student's t with 4 and 1 degrees of freedom
 Z_SQUARED = 3.8414588  # of the normal quantile at 97.5 %
@@ -90,3 +97,13 @@ def test_statistics__refuse_what_is_not_a_column_of_numbers(values: np.ndarray) 
 def test_statistics__refuse_to_pair_lists_of_different_length() -> None:
     with pytest.raises(InvalidInput, match="3 values cannot be paired with 2"):
         paired_difference(np.zeros(3), np.zeros(2))
+
+
+def test_json__of_an_estimate_has_its_interval_as_a_list_and_null_for_what_does_not_exist() -> None:
+    assert Estimate(2.0, (1.0, 3.0)).to_json() == {"value": 2.0, "interval": [1.0, 3.0]}
+    assert Estimate(2.0, None).to_json() == {"value": 2.0, "interval": None}
+    told = estimates_to_json({"harm": Estimate(2.0, (1.0, 3.0)), "alone": Estimate(4.0, None), "absent": None})
+    assert list(told.items()) == [
+        ("harm", 2.0), ("harm_interval", [1.0, 3.0]), ("alone", 4.0), ("alone_interval", None),
+        ("absent", None), ("absent_interval", None),
+    ]  # fmt: skip

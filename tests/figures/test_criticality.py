@@ -5,16 +5,13 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import criticality as module
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.regret import known_limits
-from ethbrake_marl.figures import criticality as module
-from ethbrake_marl.figures.criticality import (
-    avoidability_boundary,
-    criticality_figure,
-    criticality_map,
-)
+from ethbrake_marl.evaluation.criticality import avoidability_boundary, criticality_map
+from ethbrake_marl.figures.criticality import criticality_figure
 from ethbrake_marl.figures.style import png_bytes
-from ethbrake_marl.scenario import Scenario, load_scenario, worlds_from_table
+from ethbrake_marl.limits.limits import Limits, known_limits
+from ethbrake_marl.scenario import Scenario, Task, load_scenario, worlds_from_table
 
 DISTANCE = load_scenario("paper-distance")
 FULL = {"full_brake": make_agent("full_brake")}
@@ -52,9 +49,10 @@ def test_boundary__lies_between_avoidable_and_unavoidable_worlds() -> None:
     inside = np.isfinite(found[1]) & (found[1] > 5.001) & (found[1] < 9.999)
     assert inside.sum() > 100
     for shift, expected in ((1e-6, True), (-1e-6, False)):
-        limits = known_limits(module._worlds_at(DISTANCE, found[0][inside], found[1][inside] + shift), DISTANCE, 1)
-        assert limits is not None
-        assert (limits.avoidable == expected).all()
+        worlds = module._worlds_at(DISTANCE, found[0][inside], found[1][inside] + shift)
+        limits = known_limits(worlds, Task(DISTANCE, (1,)))
+        assert isinstance(limits, Limits)
+        assert (limits.proof.avoidable == expected).all()
 
 
 def test_boundary__leaves_the_range_and_jumps_where_it_does() -> None:

@@ -6,13 +6,14 @@ from matplotlib.figure import Figure
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import deceleration as module
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.regret import Limits
-from ethbrake_marl.figures import deceleration as module
-from ethbrake_marl.figures.deceleration import deceleration_curve, deceleration_figure, regimes_of
+from ethbrake_marl.evaluation.deceleration import deceleration_curve, regimes_of
+from ethbrake_marl.figures.deceleration import deceleration_figure
 from ethbrake_marl.figures.style import png_bytes
+from ethbrake_marl.limits.limits import Limits, Proof
 from ethbrake_marl.physics import Worlds, make_worlds
-from ethbrake_marl.scenario import Scenario, load_scenario, worlds_from_table
+from ethbrake_marl.scenario import Scenario, Task, load_scenario, worlds_from_table
 
 
 def pair_world(gap_m: float, speeds_mps: tuple[float, float], latency_s: tuple[float, float]) -> Worlds:
@@ -55,7 +56,7 @@ def test_regimes__by_hand(
 
 def test_curve__of_scenario_1_changes_its_regimes_at_the_known_decelerations() -> None:
     scenario = load_scenario("paper-scenario-1")
-    curve = deceleration_curve(scenario, scenario.sample(1, 7).worlds, 1)
+    curve = deceleration_curve(scenario.sample(1, 7).worlds, Task(scenario, (1,)))
     at = curve.deceleration_mps2
     front, rear = curve.regimes["front pair"], curve.regimes["rear pair"]
     assert [str(name) for name in dict.fromkeys(front.tolist())] == ["B", "C", "none"]
@@ -69,7 +70,7 @@ def test_curve__of_scenario_1_changes_its_regimes_at_the_known_decelerations() -
 def test_curve__its_values_are_the_closed_form_and_the_simulation() -> None:
     scenario = load_scenario("paper-distance")
     world = seven_seven(scenario)
-    curve = deceleration_curve(scenario, world, 1, points=11)
+    curve = deceleration_curve(world, Task(scenario, (1,)), points=11)
     assert curve.predicted.min() == pytest.approx(4.03447, abs=1e-5)
     assert curve.deceleration_mps2[np.argmin(curve.predicted)] == pytest.approx(5.17021, abs=1e-5)
     for k in (3, 9):
@@ -84,25 +85,26 @@ def test_curve__its_values_are_the_closed_form_and_the_simulation() -> None:
 def test_curve__the_others_follow_their_scripts(paper_random: Scenario) -> None:
     coasting = paper_random.replace(roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "coast"})
     world = paper_random.sample(1, 7).worlds
-    curve = deceleration_curve(coasting, world, 1, points=5)
+    curve = deceleration_curve(world, Task(coasting, (1,)), points=5)
     driven = evaluate(world, {"x": make_agent("full_brake")}, scenario=coasting).outcome("x")
     assert curve.total_harm[-1] == pytest.approx(driven.total_harm[0], rel=1e-9)
     assert curve.total_harm[-1] > 100.0  # Vehicle 3 arrives at about 20 m/s
-    assert "Vehicle 1 full_brake, Vehicle 3 coast" in deceleration_figure(coasting, world, 1).get_supxlabel()
+    assert "Vehicle 1 full_brake, Vehicle 3 coast" in deceleration_figure(curve).get_supxlabel()
 
 
 def test_curve__needs_one_world_and_two_points(paper_random: Scenario) -> None:
     with pytest.raises(InvalidInput, match="exactly one"):
-        deceleration_curve(paper_random, paper_random.sample(2, 7).worlds, 1)
+        deceleration_curve(paper_random.sample(2, 7).worlds, Task(paper_random, (1,)))
     with pytest.raises(InvalidInput, match="points = 1"):
-        deceleration_curve(paper_random, paper_random.sample(1, 7).worlds, 1, points=1)
+        deceleration_curve(paper_random.sample(1, 7).worlds, Task(paper_random, (1,)), points=1)
 
 
 def test_figure__marks_what_e_v2x_bm_takes_and_the_best_known(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = load_scenario("paper-distance")
-    known = Limits(np.array([False]), np.array(["rear"]), np.array([1.25]), np.array([2.5]), np.array([0.5]))
-    monkeypatch.setattr(module, "known_limits", lambda worlds, scenario, vehicle: known)
-    figure = deceleration_figure(scenario, seven_seven(scenario), 1, title="a title")
+    proof = Proof(np.array([False]), np.array(["rear"]), np.array([0.5]))
+    known = Limits(proof, np.array([1.25]), np.array([2.5]))
+    monkeypatch.setattr(module, "known_limits", lambda worlds, task: known)
+    figure = deceleration_figure(deceleration_curve(seven_seven(scenario), Task(scenario, (1,))), title="a title")
     axes, strips = figure.axes
     assert "a* = 5.170 m/s², closed form: predicts 4.03" in texts(figure)
     assert "coupled, least first-impact harm: 10.55" in texts(figure)  # 10.546 in docs/cli.md
@@ -116,7 +118,7 @@ def test_figure__marks_what_e_v2x_bm_takes_and_the_best_known(monkeypatch: pytes
 
 
 def test_figure__of_a_vehicle_without_limits_has_no_level_line(pair: Scenario) -> None:
-    figure = deceleration_figure(pair, pair.sample(1, 0).worlds, 1)
+    figure = deceleration_figure(deceleration_curve(pair.sample(1, 0).worlds, Task(pair, (1,))))
     axes, strips = figure.axes
     assert not [text for text in axes.texts if "best known" in text.get_text()]
     assert [label.get_text() for label in strips.get_yticklabels()] == ["front pair"]

@@ -16,15 +16,14 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from typing import NamedTuple
 
-from tests.physics.programme.planted_bugs import Patch, first_red, misfits
 from tests.programme.copies import mutated, working_copy
+from tests.programme.planting import Patch, first_red, misfits
 from tests.programme.suites import ROOT
 
-REWARDS, V2X, ENGINE, STEPPING, STARTS, OBJECTIVES, CURVES = (
+REWARDS, V2X, ENGINE, STEPPING, STARTS, OBJECTIVES = (
     f"ethbrake_marl/{name}.py"
     for name in (
         "rewards", "scenario/v2x", "engine/engine", "engine/step", "engine/stream", "objectives",
-        "studies/learning_curves",
     )
 )  # fmt: skip
 SB3 = "ethbrake_marl/envs/sb3.py"
@@ -34,12 +33,9 @@ COMPARISON, OPTIMUM, PLAN = (
 STATISTICS, SEEDS, TABLE, REGRET, ROLLOUT = (
     f"ethbrake_marl/evaluation/{name}.py" for name in ("statistics", "seed_statistics", "table", "regret", "rollout")
 )
-COURSE, CALLBACK, CHECKPOINT, EVENTS, KEPT, INDEPENDENT, RECIPE, MODELS = (
-    f"ethbrake_marl/learning/{name}.py"
-    for name in (
-        "progress", "loop", "checkpoint", "run_folder", "kept_training", "independent", "recipe", "models",
-    )
-)  # fmt: skip
+COURSE, EVENTS, KEPT, INDEPENDENT, RECIPE = (
+    f"ethbrake_marl/learning/{name}.py" for name in ("progress", "run_folder", "kept_training", "independent", "recipe")
+)
 
 
 class Bug(NamedTuple):
@@ -253,7 +249,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", default="", help="only bugs whose name contains this")
     given = parser.parse_args()
-    for wrong in (unfit := misfits(ROOT, patches(BUGS))):
+    for wrong in (unfit := misfits(patches(BUGS))):
         print(f"ERROR  {wrong}")
     if unfit:
         return 1

@@ -138,7 +138,7 @@ TABLES = ("tests/evaluation/test_table.py", "tests/evaluation/test_rollout.py")
 EVALUATION = Suite(
     files=(
         "evaluation/*.py", "figures/learning_curves.py", "figures/criticality.py", "figures/deceleration.py",
-        "studies/sampling.py",
+        "figures/sampling.py", "studies/sampling.py",
     ),
     quick={
         "evaluation/statistics.py": ("tests/evaluation/test_statistics.py",),
@@ -148,8 +148,11 @@ EVALUATION = Suite(
         "evaluation/regret.py": ("tests/evaluation/test_regret.py",),
         "evaluation/record.py": ("tests/evaluation/test_record.py",),
         "evaluation/table.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
+        "evaluation/criticality.py": ("tests/figures/test_criticality.py",),
+        "evaluation/deceleration.py": ("tests/figures/test_deceleration.py",),
         "figures/criticality.py": ("tests/figures/test_criticality.py",),
         "figures/deceleration.py": ("tests/figures/test_deceleration.py",),
+        "figures/sampling.py": ("tests/studies/test_sampling.py",),
         "evaluation/shield_modes.py": ("tests/evaluation/test_shield_modes.py",),
         "studies/sampling.py": ("tests/studies/test_sampling.py",),
         "evaluation/per_world.py": ("tests/evaluation/test_report.py", "tests/evaluation/test_per_world.py"),

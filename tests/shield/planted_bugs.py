@@ -11,8 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from tests.physics.programme.mutation import ROOT
-from tests.physics.programme.planted_bugs import Patch, misfits, red_with
+from tests.programme.planting import Patch, misfits, red_with
 
 BY_HAND = "test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner"
 QUICK = ("tests/shield/test_certify.py", "tests/shield/test_step_shield.py", f"tests/shield/test_robust.py::{BY_HAND}")
@@ -132,8 +131,9 @@ def main() -> int:
     parser.add_argument("--only", default="", help="only bugs whose name contains this")
     parser.add_argument("--quick", action="store_true", help="only the tests that need no compilation")
     given = parser.parse_args()
-    if unfit := misfits(ROOT, BUGS):
-        print(f"ERROR  {unfit[0]}")
+    for wrong in (unfit := misfits(BUGS)):
+        print(f"ERROR  {wrong}")
+    if unfit:
         return 1
     if red := red_with((), QUICK, compiled=False):
         print(f"ERROR  red without any bug: {red}")

@@ -17,7 +17,6 @@ from ethbrake_marl.evaluation.seed_statistics import (
     paired_over_seeds,
     share_over_seeds,
 )
-from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.studies.ablation.run import Harms, Measured
@@ -55,7 +54,7 @@ def _level(one: Measured, searched: int) -> Json:
         "learners": [scenario.vehicle_names[i] for i in scenario.learners],
         "seeds": len(one.reached.collided),
         "worlds": one.reached.collided.shape[1],
-        "collision_rate": _plain(mean_over_seeds(one.reached.collided.astype(np.float64))),
+        "collision_rate": mean_over_seeds(one.reached.collided.astype(np.float64)).to_json(),
         **{count: _under_count(one, count, searched) for count in COUNTS},
     }
 
@@ -68,11 +67,11 @@ def _under_count(one: Measured, count: HarmCount, searched: int) -> Json:
     reached, braking = one.reached.world[count], one.full_brake.world[count]
     each = reached.mean(axis=1)
     return {
-        "full_brake": _plain(mean_over_seeds(braking)),
-        "harm": _plain(mean_over_seeds(reached)),
+        "full_brake": mean_over_seeds(braking).to_json(),
+        "harm": mean_over_seeds(reached).to_json(),
         "each_seed": each.tolist(),
-        "interquartile_mean": _plain(interquartile_mean([each], resamples=2000)),
-        "vehicles": [_plain(mean_over_seeds(column)) for column in _columns(one.reached, count)],
+        "interquartile_mean": interquartile_mean([each], resamples=2000).to_json(),
+        "vehicles": [mean_over_seeds(column).to_json() for column in _columns(one.reached, count)],
         "searched": _searched(
             reached[:, :searched], braking[:, :searched], None if one.best is None else one.best[count]
         ),
@@ -81,13 +80,14 @@ def _under_count(one: Measured, count: HarmCount, searched: int) -> Json:
 
 def _searched(reached: Floats, braking: Floats, best: Floats | None) -> Json:
     """Everything in the worlds in which the joint optimum was searched."""
+    share = None if best is None else share_over_seeds(reached, braking, best)
     return {
         "worlds": reached.shape[1],
-        "full_brake": _plain(mean_over_seeds(braking)),
-        "harm": _plain(mean_over_seeds(reached)),
+        "full_brake": mean_over_seeds(braking).to_json(),
+        "harm": mean_over_seeds(reached).to_json(),
         "each_seed": reached.mean(axis=1).tolist(),
-        "best_known": None if best is None else _plain(mean_over_seeds(best)),
-        "realised_share": None if best is None else _plain(share_over_seeds(reached, braking, best)),
+        "best_known": None if best is None else mean_over_seeds(best).to_json(),
+        "realised_share": None if share is None else share.to_json(),
     }
 
 
@@ -98,9 +98,9 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
         pairs = zip(_columns(after.reached, count), _columns(before.reached, count), strict=True)
         worse = _worse_off(before.reached, after.reached, count)
         found[count] = {
-            "difference": _plain(paired_over_seeds(after.reached.world[count], before.reached.world[count])),
-            "vehicles": [_plain(paired_over_seeds(new, old)) for new, old in pairs],
-            "worse_off": _plain(mean_over_seeds(worse.any(axis=2).astype(np.float64))),
+            "difference": paired_over_seeds(after.reached.world[count], before.reached.world[count]).to_json(),
+            "vehicles": [paired_over_seeds(new, old).to_json() for new, old in pairs],
+            "worse_off": mean_over_seeds(worse.any(axis=2).astype(np.float64)).to_json(),
             "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
         }
     return found
@@ -116,9 +116,3 @@ def _worse_off(before: Harms, after: Harms, count: HarmCount) -> Bools:
 def _columns(harms: Harms, count: HarmCount) -> list[Floats]:
     """[seeds, worlds] of each vehicle."""
     return [harms.vehicle[count][:, :, i] for i in range(harms.vehicle[count].shape[2])]
-
-
-def _plain(estimate: Estimate | None) -> Json | None:
-    if estimate is None:
-        return None
-    return {"value": estimate.value, "interval": None if estimate.interval is None else list(estimate.interval)}

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.seed_statistics import mean_over_seeds, share_over_seeds
-from ethbrake_marl.evaluation.statistics import Estimate
+from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.recipe import WORDS
 from ethbrake_marl.learning.run_folder import RunDirectory
@@ -61,12 +61,7 @@ class LineResult:
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON."""
         names = ("full_brake", "reached", "decrease", "best_known", "share", "worse_off")
-        found: dict[str, Any] = {"vehicles": self.vehicles}
-        for name in names:
-            estimate: Estimate | None = getattr(self, name)
-            interval = None if estimate is None or estimate.interval is None else list(estimate.interval)
-            found |= {name: None if estimate is None else estimate.value, f"{name}_interval": interval}
-        return found
+        return {"vehicles": self.vehicles, **estimates_to_json({name: getattr(self, name) for name in names})}
 
 
 def lengthened(scenario: Scenario, vehicles: int) -> Scenario:

@@ -98,8 +98,7 @@ def lines_markdown(found: Sequence[LineResult], question: Question, runs: int) -
 
 
 def _of(estimate: Estimate | None, scale: float = 1.0, digits: int = 2, unit: str = "") -> str:
-    plain = None if estimate is None else {"value": estimate.value, "interval": estimate.interval}
-    return _cell(plain, scale, digits, unit)
+    return _cell(None if estimate is None else estimate.to_json(), scale, digits, unit)
 
 
 def _levels(levels: Sequence[Json], count: HarmCount) -> str:

@@ -10,19 +10,10 @@ green. (The second one is what ``make test`` runs.) A patch that does not fit th
 from __future__ import annotations
 
 import argparse
-import os
-import re
-import shutil
-import subprocess
 import sys
-import tempfile
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import NamedTuple
 
-from tests.programme.copies import KERNELS, copy_repository
-from tests.programme.suites import ROOT
+from tests.programme.planting import Patch, misfits, red_with
 
 BY_HAND = (
     "tests/physics/test_instants.py::test_plastic_cluster__three_vehicles_do_not_hand_the_last_bit_to_and_fro",
@@ -39,8 +30,6 @@ QUICK = (
     *BY_HAND,
 )
 WHOLE = ("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py")
-LIMIT_S = 900.0
-QUIETLY = ("-p", "no:cacheprovider", "-p", "no:randomly")  # in a fixed order, leaving nothing behind
 
 EVENTS, IMPACT, SEGMENT, ADVANCE = (
     f"ethbrake_marl/physics/{name}.py" for name in ("events", "impact", "segment", "advance")
@@ -48,14 +37,6 @@ EVENTS, IMPACT, SEGMENT, ADVANCE = (
 HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/obstacle.py"
 BOUNDS, LOWER_BOUND = (f"ethbrake_marl/limits/{name}.py" for name in ("lower_bound_kernel", "lower_bound"))
 PROFILES = "ethbrake_marl/search/profiles.py"
-
-
-class Patch(NamedTuple):
-    """Replace ``old``, which must stand in the file exactly once, by ``new``."""
-
-    file: str
-    old: str
-    new: str
 
 
 BUGS: dict[str, tuple[Patch, ...]] = {
@@ -173,60 +154,9 @@ BUGS: dict[str, tuple[Patch, ...]] = {
 }
 
 
-def plant(folder: Path, patches: tuple[Patch, ...]) -> None:
-    """Apply the patches of one bug; raises ``ValueError`` when one does not fit."""
-    for patch in patches:
-        file = folder / patch.file
-        text = file.read_text("utf-8")
-        if text.count(patch.old) != 1:
-            raise ValueError(f"{patch.file}: {patch.old!r} stands there {text.count(patch.old)} times, not once")
-        file.write_text(text.replace(patch.old, patch.new), "utf-8")
-
-
-def first_red(folder: Path, suite: tuple[str, ...], *, compiled: bool) -> str:
-    """The first test of a suite that fails in ``folder``, or an empty string."""
-    switch = "0" if compiled else "1"
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / KERNELS), "NUMBA_DISABLE_JIT": switch}
-    command = [sys.executable, "-B", "-m", "pytest", "-x", "-q", *QUIETLY, "--rootdir=.", *suite]
-    try:
-        done = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=LIMIT_S, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return f"no end after {LIMIT_S:.0f} s"
-    if done.returncode == 0:
-        return ""
-    found = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-    if found is None:
-        raise RuntimeError(f"the suite could not run: {done.stdout[-500:]}{done.stderr[-500:]}")
-    return found.group(1)
-
-
 def try_bug(name: str) -> str:
     """The test that finds one planted bug, or an empty string."""
     return red_with(BUGS[name], QUICK, compiled=False) or red_with(BUGS[name], WHOLE, compiled=True)
-
-
-def red_with(patches: tuple[Patch, ...], suite: tuple[str, ...], *, compiled: bool) -> str:
-    """The first test of a suite that fails in a copy with these patches, or an empty string."""
-    folder = Path(tempfile.mkdtemp(prefix="planted-"))
-    try:
-        copy_repository(folder)
-        plant(folder, patches)
-        return first_red(folder, suite, compiled=compiled)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def misfits(root: Path, bugs: Mapping[str, tuple[Patch, ...]]) -> list[str]:
-    """What is wrong with a list of bugs itself, without running anything."""
-    wrong = []
-    for name, patches in bugs.items():
-        for patch in patches:
-            count = (root / patch.file).read_text("utf-8").count(patch.old)
-            if count != 1:
-                wrong.append(f"{name}: {patch.file} holds {patch.old!r} {count} times, not once")
-    return wrong
 
 
 def main() -> int:
@@ -235,7 +165,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", default="", help="only bugs whose name contains this")
     given = parser.parse_args()
-    for wrong in (unfit := misfits(ROOT, BUGS)):
+    for wrong in (unfit := misfits(BUGS)):
         print(f"ERROR  {wrong}")
     if unfit:
         return 1

@@ -1,0 +1,104 @@
+"""What is known of each world of a list before anybody drives: what is avoidable, proven, and the best known harm.
+
+Three vehicles, Vehicle 2 driven, the others braking fully: for these it is proven world by world whether some command
+avoids all contact (``limits.avoidability``) and which harm no command undercuts (``limits.lower_bound``). The least
+harm known is the first proof's witness (harm 0), or the result of a search (``limits.best_harm``). An obstacle that
+Vehicle 1 does not reach by itself leaves the first proof as it is (only a push brings it there); the second knows none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.harm import COUNTS
+from ethbrake_marl.limits.avoidability import avoidability
+from ethbrake_marl.limits.lower_bound import lower_bound
+from ethbrake_marl.limits.shipped import best_known
+from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.physics.events import stopping_distances
+from ethbrake_marl.physics.obstacle import obstacle_ahead
+from ethbrake_marl.scenario import Task
+
+_VEHICLES, _DRIVEN = 3, 1
+
+
+@dataclass(frozen=True, slots=True)
+class Unproven:
+    """Nothing is proven for a task in these worlds."""
+
+    because: str  # a clause
+
+
+@dataclass(frozen=True, slots=True)
+class Proof:
+    """What is proven about each world, [n] each."""
+
+    avoidable: Bools  # some admissible command of Vehicle 2 avoids all contact
+    reason: NDArray[np.str_]  # why not: "early", "front" or "rear"; "" where avoidable
+    harm: Floats | None  # no command does less (m2/s2), under either count; None with an obstacle ahead
+
+    @property
+    def impact(self) -> Bools | None:
+        """Worlds in which every command leads to an impact, not only to contact; None with an obstacle ahead."""
+        return None if self.harm is None else self.harm > 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What is known of each world before anybody drives: [n] each."""
+
+    proof: Proof
+    first_impact_harm: Floats  # least known (m2/s2): 0 where avoidable, else a table's; NaN in no table
+    total_harm: Floats
+
+    @property
+    def known(self) -> Bools:
+        """Worlds whose best is known for both counts, without looking at any agent."""
+        return np.isfinite(self.first_impact_harm) & np.isfinite(self.total_harm)
+
+
+def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
+    """The limits of worlds at the alert; ``Unproven`` where the proofs do not cover the task."""
+    proof = prove(worlds, task)
+    if isinstance(proof, Unproven):
+        return proof
+    first, total = (best_known(worlds, task.scenario, count, vehicles=task.vehicles) for count in COUNTS)
+    return Limits(proof, np.where(proof.avoidable, 0.0, first), np.where(proof.avoidable, 0.0, total))
+
+
+def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
+    """The proofs alone, for worlds at the alert; ``Unproven`` where they do not cover the task."""
+    because = unproven_because(worlds, task)
+    if because is not None:
+        return Unproven(because)
+    if obstacle_ahead(worlds).any():
+        contact, harm = avoidability(worlds, task.vehicle), None
+    else:
+        bound = lower_bound(worlds, task.vehicle, count="first", horizon_s=task.scenario.horizon_s)
+        contact, harm = bound.contact, bound.harm
+    return Proof(contact.avoidable, contact.reason_name, harm)
+
+
+def unproven_because(worlds: Worlds, task: Task) -> str | None:
+    """Why nothing is proven for the task in these worlds, as a clause; None when it is."""
+    scenario, names = task.scenario, task.scenario.vehicle_names
+    if len(task.vehicles) != 1:
+        return f"driven are: {task.names}; avoidability is proven for one vehicle"
+    if scenario.vehicles != _VEHICLES:
+        return f"{scenario.vehicles} vehicles; avoidability is proven for {_VEHICLES}"
+    if task.vehicle != _DRIVEN:
+        return f"{task.names} is driven; avoidability is proven for {names[_DRIVEN]}"
+    for i in (0, 2):
+        script = scenario.scripts.get(i, "full_brake")
+        if script != "full_brake":
+            return f"{names[i]} follows {script}; avoidability is proven where it follows full_brake"
+    latency_s = worlds.vehicles.latency_s
+    way_m = stopping_distances(worlds.speeds_mps[:, 0], latency_s[:, 0], worlds.vehicles.braking_capacity_mps2[:, 0])
+    if not (way_m < worlds.hazard_gap_m).all():
+        return "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"
+    if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():
+        return f"{names[0]} may brake later than {names[_DRIVEN]}; nothing is proven then"
+    return None

@@ -1,0 +1,114 @@
+"""The limits of a list: found once for everything that tells of an evaluation, and what a task may ask."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import yaml
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import evaluate, parameters, rollout, summarise, write_per_world_csv
+from ethbrake_marl.evaluation.regret import assess
+from ethbrake_marl.limits import limits, lower_bound
+from ethbrake_marl.limits.limits import Limits, Unproven, known_limits, prove
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
+from tests.cli.conftest import TINY_RECIPE
+from tests.fixtures.evaluation import PAIR
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How often each part of the limits was computed, and how many evaluations there were."""
+    found: Counter[str] = Counter()
+
+    def watch(place: object, name: str, told: str) -> None:
+        given = getattr(place, name)
+
+        def counted(*arguments: object, **options: object) -> object:
+            found[told] += 1
+            return given(*arguments, **options)
+
+        monkeypatch.setattr(place, name, counted)
+
+    watch(limits, "avoidability", "avoidability")
+    watch(lower_bound, "avoidability", "avoidability")
+    watch(limits, "lower_bound", "bound")
+    watch(limits, "best_known", "best known")
+    watch(rollout, "known_limits", "limits")
+    watch(rollout._Whole, "evaluation", "evaluation")
+    return found
+
+
+def test_evaluate__finds_the_limits_once_for_table_csv_and_json(calls: Counter[str], tmp_path: Path) -> None:
+    lines = ["--episodes", "20", "--per-world", str(tmp_path / "worlds.csv"), "--json"]
+    assert run_command(["evaluate", "--agents", "full_brake,coast", *lines]) == 0
+    assert calls == {"evaluation": 1, "limits": 1, "avoidability": 1, "bound": 1, "best known": 2}  # both counts
+
+
+def test_run__finds_the_limits_once_per_evaluation(calls: Counter[str], tmp_path: Path) -> None:
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(TINY_RECIPE))
+    lines = ["--episodes", "20", "--output", str(tmp_path / "run"), "--json"]
+    assert run_command(["run", "--recipe", str(tmp_path / "tiny.yaml"), *lines]) == 0
+    told = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert told[0]["unavoidable_rate"] is not None
+    assert calls["evaluation"] >= 4  # the three tests, and the policy while it learns
+    assert calls["limits"] == calls["avoidability"] == calls["evaluation"]
+    assert calls["best known"] == 2 * calls["evaluation"]
+
+
+def test_evaluation__whose_limits_nobody_asks_for_finds_none(
+    calls: Counter[str], pair: Scenario, tmp_path: Path
+) -> None:
+    found = evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair)
+    assert calls["limits"] == 0
+    write_per_world_csv(tmp_path / "out.csv", found)
+    assert (len(summarise(found)), assess(found)) == (1, None)
+    assert parameters(found)["no_limits_because"]
+    assert calls["limits"] == 1
+    assert found.limits is found.limits
+
+
+@pytest.fixture
+def worlds() -> Worlds:
+    return load_scenario("paper-random").sample(50, 7).worlds
+
+
+def test_known_limits__are_the_proof_and_the_best_known(worlds: Worlds) -> None:
+    task = Task(load_scenario("paper-random"), (1,))
+    found, proof = known_limits(worlds, task), prove(worlds, task)
+    assert isinstance(found, Limits) and not isinstance(proof, Unproven)
+    assert proof.harm is not None and proof.impact is not None
+    assert found.known.all()
+    assert (found.first_impact_harm[proof.avoidable] == 0.0).all()
+    assert (found.first_impact_harm >= proof.harm - 1e-9).all() and (found.total_harm >= proof.harm - 1e-9).all()
+    assert not (proof.impact & proof.avoidable).any()
+
+
+def test_known_limits__say_why_nothing_is_proven(worlds: Worlds) -> None:
+    scenario = load_scenario("paper-random")
+    assert known_limits(worlds, Task(scenario, (0, 1))) == Unproven(
+        "driven are: vehicle_1, vehicle_2; avoidability is proven for one vehicle"
+    )
+    assert known_limits(worlds, Task(scenario, ())) == Unproven(
+        "driven are: none; avoidability is proven for one vehicle"
+    )
+
+
+@pytest.mark.parametrize("vehicles", [(2,), (-1,), (0, 0)])
+def test_task__refuses_vehicles_that_are_not_there_or_twice(vehicles: tuple[int, ...]) -> None:
+    with pytest.raises(InvalidInput, match=r"task: vehicles .*different indices from 0 to 1"):
+        Task(PAIR, vehicles)
+
+
+def test_task__refuses_an_unknown_count_and_names_its_one_vehicle() -> None:
+    with pytest.raises(InvalidInput, match="count 'last'"):
+        Task(PAIR, (1,), "last")  # type: ignore[arg-type]
+    assert Task(PAIR, (1,)).vehicle == 1
+    with pytest.raises(InvalidInput, match="needs one driven vehicle; driven are: vehicle_1, vehicle_2"):
+        assert Task(PAIR, (0, 1)).vehicle
