@@ -33,7 +33,6 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("shield", "policies"),
     ("evaluation",),
     ("learning", "figures"),
-    ("lineup",),
     ("studies",),
     ("__init__",),
     ("cli", "__main__"),

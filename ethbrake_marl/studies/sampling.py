@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.registry import make_single_agent
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.figures.style import GREY, add_caption, new_figure, png_bytes, series_style, style_axes
 from ethbrake_marl.harm import empty_ledger
@@ -82,7 +82,7 @@ def chain_impacts(worlds: Worlds, rows: ImpactRows) -> Bools:
 def convergence(worlds: Worlds, agent: str, *, until_s: float = 8.0, steps_s: Sequence[float] = STEPS_S) -> Convergence:
     """Exact and sampled harm of ``worlds`` (at the alert) up to ``until_s``, for every step."""
     command = -worlds.vehicles.braking_capacity_mps2
-    driver = make_agent(agent)
+    driver = make_single_agent(agent)
     driver.begin(worlds, _VEHICLE, np.arange(worlds.n))
     command[:, _VEHICLE] = driver.act(worlds, _VEHICLE)
     _, exact = advance(worlds, command, until_s=until_s, record=True)
