@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from ethbrake_marl.envs.registration import register_environments
 
 if TYPE_CHECKING:
+    from ethbrake_marl.agents.registry import make_agent as make_agent
+    from ethbrake_marl.agents.registry import register_agent as register_agent
     from ethbrake_marl.engine.engine import Engine as Engine
     from ethbrake_marl.envs.parallel import EthBrakeParallelEnv as EthBrakeParallelEnv
     from ethbrake_marl.envs.parallel import env as env
@@ -23,7 +25,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.envs.vector import EthBrakeVectorEnv as EthBrakeVectorEnv
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError
     from ethbrake_marl.evaluation import evaluate as evaluate
-    from ethbrake_marl.lineup import make_agent as make_agent
     from ethbrake_marl.observations import ObservationSpec as ObservationSpec
     from ethbrake_marl.observations import observation_for as observation_for
     from ethbrake_marl.physics import Worlds as Worlds
@@ -56,12 +57,13 @@ _HOME = {
     "list_scenarios": "scenario",
     "load_policy": "policies.policy",
     "load_scenario": "scenario",
-    "make_agent": "lineup",  # above the registry: best_harm and trained policies are registered there
+    "make_agent": "agents.registry",
     "make_sb3_vec_env": "envs.sb3",
     "make_worlds": "physics",
     "observation_for": "observations",
     "parallel_env": "envs.parallel",
     "raw_env": "envs.parallel",
+    "register_agent": "agents.registry",
 }
 
 __all__ = ["__version__", *_HOME]

@@ -82,6 +82,10 @@ class PhysicsError(EthBrakeError, ArithmeticError):
         return PhysicsError({int(rows[row]): reason for row, reason in self.worlds.items()})
 
 
+class OldSpelling(FutureWarning):
+    """Something is written as it was before this version; the message holds the new spelling. The next refuses it."""
+
+
 class FailedWorld(UserWarning):
     """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
 

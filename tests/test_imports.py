@@ -33,7 +33,6 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("shield", "policies"),
     ("evaluation",),
     ("learning", "figures"),
-    ("lineup",),
     ("__init__",),
     ("studies",),
     ("cli", "__main__"),

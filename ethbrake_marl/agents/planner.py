@@ -10,7 +10,8 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.protocol import fixed_commands, place
+from ethbrake_marl.agents.protocol import Agent, fixed_commands, place
+from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
@@ -145,4 +146,11 @@ def _budget(argument: str | None) -> tuple[int, float]:
     raise InvalidInput(
         f"agent 'planner:{argument}': the argument must be a number of candidates per decision, for instance 256 (at"
         f" most {MOST_CANDIDATES:,}), or a time per decision, for instance 20ms (at most {MOST_MILLISECONDS:,.0f}ms)"
+    )
+
+
+def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
+    """``planner``, ``planner:CANDIDATES`` or ``planner:20ms``."""
+    return Planner(
+        argument, count=settings.harm_count, horizon_s=settings.horizon_s, most_candidates=settings.most_candidates
     )

@@ -8,6 +8,7 @@ import numpy as np
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source, combined
 from ethbrake_marl.agents.protocol import Agent, Divisible, check_agent, place, recall
+from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, introduce, scripted
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
@@ -49,7 +50,7 @@ class Rehearsed:
             if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= 10_000:
                 raise InvalidInput(f"rehearsed: {name} = {number!r}: must be a whole number in 1..10000")
         check_count(count)
-        self.name = f"rehearsed({policy.name})"
+        self.name = f"{policy.name}+refined"
         self.policy = policy
         self.scenario = scenario
         self.rehearsals = rehearsals
@@ -102,6 +103,11 @@ class Rehearsed:
     def _harm(self, worlds: Worlds, vehicle: int, deviation: Floats) -> Floats:
         """Harm under one deviation per world, [n]."""
         return drive(worlds, _Deviating(self._stage, deviation), self.scenario, vehicle).ledger.world_harm(self.count)
+
+
+def refine(policy: Agent, argument: None, settings: AgentSettings) -> Agent:
+    """``+refined`` around an agent."""
+    return Rehearsed(policy, settings.needed_scenario(), count=settings.harm_count)
 
 
 class _Deviating:

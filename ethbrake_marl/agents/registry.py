@@ -1,118 +1,265 @@
-"""Agents by name: ``name[:argument]``, for instance ``constant:3.5``, or ``name@path`` for a saved policy."""
+"""Agents by name: the one list of them, for command lines, scripts of scenarios and ``eb.make_agent`` alike.
+
+An entry names the function that makes the agent, and is loaded when it is first used: so policies, searches and
+shields, which stand above this folder, are in the same list without being imported here.
+"""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.e_v2x_bm.agent import EV2XBM
-from ethbrake_marl.agents.planner import Planner
+from ethbrake_marl.agents.knowledge import Knowledge, Source
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.scripts import CopyLeader, GentlestFront, StateFree
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
+from ethbrake_marl.agents.spelling import AROUND, OLD_NAMES, OLD_SPELLINGS, AgentSpec, parse_spec
+from ethbrake_marl.agents.team import Driver, Team
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, OldSpelling, unknown_name
 from ethbrake_marl.harm import HarmCount, check_count
-from ethbrake_marl.scenario.roles import parse_agent_spec
+from ethbrake_marl.scenario import Scenario
+
+HORIZON_S = 8.0  # until when an agent looks ahead that knows no scenario
 
 
 @dataclass(frozen=True, slots=True)
 class AgentSettings:
     """What an agent may need beyond its own argument."""
 
-    count: HarmCount = "first"  # which harm an optimising agent minimises
-    horizon_s: float = 8.0  # until when it looks ahead
+    spec: str  # as it is written, with what is around it so far
+    policy: str | None = None  # what stands after the @
+    scenario: Scenario | None = None
+    harm_count: HarmCount = "first"  # which harm an optimising agent minimises
+    horizon_s: float = HORIZON_S  # until when it looks ahead
     most_candidates: int | None = None  # of a search, whatever its argument says; None: what that says
+    uncertainty: object = None  # what a robust shield does not know, as ``shield.uncertainty`` reads it
+
+    def needed_scenario(self) -> Scenario:
+        """The scenario, for an agent that cannot do without. Raises ``InvalidInput`` if there is none."""
+        if self.scenario is None:
+            raise InvalidInput(
+                f"agent {self.spec!r}: needs a scenario: make_agent({self.spec!r},"
+                " scenario=eb.load_scenario('paper-random')); as a vehicle's script it cannot be used"
+            )
+        return self.scenario
 
 
-Factory = Callable[[str | None, AgentSettings], Agent]
+Factory = Callable[[str | None, AgentSettings], Driver]
+"""Makes the agent of an argument (what stands after the colon, or None)."""
+
+Wrapper = Callable[[Agent, str | None, AgentSettings], Agent]
+"""Makes the agent around an agent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One line of the registry."""
+
+    form: str  # how it is written; without ":" it takes no argument, without "@" no policy
+    about: str  # one line
+    knows: Knowledge  # of the line while it drives; of what goes around an agent: what is added
+    make: str | Factory | Wrapper  # "module:function" is loaded at first use
+
+    def load(self) -> Any:
+        """The function that makes it."""
+        if not isinstance(self.make, str):
+            return self.make
+        module, _, function = self.make.partition(":")
+        return getattr(import_module(f"ethbrake_marl.{module}"), function)
+
+
+_SCRIPTS, _POLICIES = "agents.scripts", "learning.driving:make_policy_agent"
+_ENTRIES: dict[str, Entry] = {
+    "coast": Entry("coast", "nothing at all", (Source.SENSORS,), f"{_SCRIPTS}:make_state_free"),
+    "full_brake": Entry(
+        "full_brake",
+        "full braking, the paper's non-ethical strategy",
+        (Source.SENSORS,),
+        f"{_SCRIPTS}:make_state_free",
+    ),
+    "constant": Entry(
+        "constant:A",
+        "this deceleration in m/s2; negative drives",
+        (Source.SENSORS,),
+        f"{_SCRIPTS}:make_state_free",
+    ),
+    "copy_leader": Entry(
+        "copy_leader",
+        "brakes as hard as the vehicle in front can",
+        (Source.STATE,),
+        f"{_SCRIPTS}:make_copy_leader",
+    ),
+    "gentlest_front": Entry(
+        "gentlest_front",
+        "the smallest constant deceleration that spares the vehicle in front",
+        (Source.STATE,),
+        f"{_SCRIPTS}:make_gentlest_front",
+    ),
+    "e_v2x_bm": Entry(
+        "e_v2x_bm[:pairwise]",
+        "the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state",
+        (Source.MODEL,),
+        "agents.e_v2x_bm.agent:make_e_v2x_bm",
+    ),
+    "planner": Entry(
+        "planner[:CANDIDATES|:20ms]",
+        "a search in the simulation at every decision, with this budget for each",
+        (Source.MODEL,),
+        "agents.planner:make_planner",
+    ),
+    "best_harm": Entry(
+        "best_harm[:CANDIDATES]",
+        "the best profile known; a search at the alert where none is known",
+        (Source.MODEL,),
+        "limits.shipped:make_best_harm",
+    ),
+    "ppo": Entry("ppo@PATH", "a policy trained by PPO: a run, a bundle, or shipped", (Source.MESSAGES,), _POLICIES),
+    "sac": Entry("sac@PATH", "a policy trained by SAC: a run, a bundle, or shipped", (Source.MESSAGES,), _POLICIES),
+    "universal": Entry("universal@shipped", "the shipped policy for all parameters", (Source.MESSAGES,), _POLICIES),
+    "team": Entry("team@RUN", "the learners of a run, each as it was trained", (Source.MESSAGES,), _POLICIES),
+}
+
+_WRAPPERS: dict[str, Entry] = {
+    "refined": Entry(
+        "+refined",
+        "plus the best deviation that a search at the alert finds",
+        (Source.MODEL,),
+        "agents.refined:refine",
+    ),
+    "episode": Entry(
+        "+episode[:pairwise]",
+        "behind Algorithm 1: it or E-V2X-BM drives the episode, whichever harms less",
+        (Source.MODEL,),
+        "shield.agents:shield_episodes",
+    ),
+    "step": Entry("+step", "every action certified, or replaced", (Source.MODEL,), "shield.agents:shield_steps"),
+    "robust": Entry(
+        "+robust",
+        "the same where not everything is known: against an uncertainty",
+        (Source.MODEL,),
+        "shield.agents:shield_steps_robustly",
+    ),
+}
 
 
 def make_agent(
-    spec: str, *, count: HarmCount = "first", horizon_s: float = 8.0, most_candidates: int | None = None
-) -> Agent:
-    """A fresh agent for one vehicle in one batch.
+    spec: str,
+    *,
+    scenario: Scenario | None = None,
+    harm_count: HarmCount = "first",
+    horizon_s: float | None = None,
+    most_candidates: int | None = None,
+    uncertainty: object = None,
+) -> Driver:
+    """A fresh agent for one vehicle in one batch, or the team of a run.
 
-    ``full_brake``, ``coast``, ``constant:a`` (deceleration in m/s2, negative = drive), ``copy_leader``,
-    ``gentlest_front``, ``e_v2x_bm`` (= ``e_v2x_bm:coupled``), ``e_v2x_bm:pairwise``, ``planner``,
-    ``planner:candidates``, ``planner:20ms`` (a time per decision), and what was registered. ``most_candidates`` is for
-    trying an agent out: no search of it takes more.
-    Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, count or horizon.
+    Args:
+        spec: ``name[:argument][@policy]`` and what is put around it, for instance ``constant:3.5``, ``planner:20ms``,
+            ``ppo@shipped+refined+step``; ``ethbrake agents`` lists all.
+        scenario: needed by teams, by what is put around an agent, and to find the shipped policy of this scenario.
+        harm_count: which harm an optimising agent minimises, ``first`` or ``total``.
+        horizon_s: until when it looks ahead; by default the scenario's horizon, or 8 s.
+        most_candidates: for trying an agent out: no search of it takes more.
+        uncertainty: what a robust shield does not know, such as ``"gaps_m=0.5"``.
+
+    Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, harm count or
+    horizon, and for a scenario that is missing.
+
     """
-    check_count(count)
+    check_count(harm_count)
+    if not (scenario is None or isinstance(scenario, Scenario)):
+        raise InvalidInput(f"scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")
+    if horizon_s is None:
+        horizon_s = HORIZON_S if scenario is None else scenario.horizon_s
     if not isinstance(horizon_s, int | float | np.number) or not 0.0 < horizon_s < float("inf"):
         raise InvalidInput(f"horizon_s {horizon_s!r}: must be a positive number of seconds")
-    name, argument = _split(spec)
-    if name not in _FACTORIES:
-        raise unknown_name("agent", name, _FACTORIES)
-    return _FACTORIES[name](argument, AgentSettings(count, horizon_s, most_candidates))
+    written = current_spelling(spec, scenario=scenario, harm_count=harm_count)
+    settings = AgentSettings(
+        written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty
+    )
+    driver: Driver = find_entry(written).load()(written.argument, settings)
+    for each in written.around:
+        settings = replace(settings, spec=f"{settings.spec}+{each}")
+        driver = _put_around(driver, each, settings)
+    return driver
+
+
+def make_single_agent(spec: str, **settings: Any) -> Agent:
+    """``make_agent`` for who drives one vehicle; raises ``InvalidInput`` for a team too."""
+    agent = make_agent(spec, **settings)
+    if isinstance(agent, Team):
+        raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
+    return agent
+
+
+def current_spelling(spec: str, *, scenario: Scenario | None = None, harm_count: HarmCount = "first") -> AgentSpec:
+    """The parts of a spec; one in the old spelling of a policy is written as it is now, with an ``OldSpelling``."""
+    written = parse_spec(spec)
+    if written.name not in OLD_NAMES:
+        return written
+    old = replace(written, policy=None, around=()).core
+    if written.policy is None or old not in OLD_SPELLINGS:
+        now = OLD_SPELLINGS.get(old, OLD_SPELLINGS[written.name])
+        raise InvalidInput(f"agent {spec!r}: is nobody; what goes around an agent is written behind it: ppo@PATH{now}")
+    algorithm_of = Entry("", "", (), "policies.shipped:algorithm_of").load()
+    around = "".join([OLD_SPELLINGS[old], *(f"+{each}" for each in written.around)])
+    new = f"{algorithm_of(written.policy, scenario, harm_count)}@{written.policy}{around}"
+    warnings.warn(OldSpelling(f"agent {spec!r}: is written {new!r} now"), stacklevel=2)
+    return parse_spec(new)
+
+
+def find_entry(written: AgentSpec) -> Entry:
+    """The registry's entry of an agent.
+
+    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for an argument or a policy that it does not take.
+    """
+    if written.name not in _ENTRIES:
+        raise unknown_name("agent", written.name, {*_ENTRIES, "ladder"})
+    entry = _ENTRIES[written.name]
+    if written.argument is not None and ":" not in entry.form:
+        raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
+    if written.policy is not None and "@" not in entry.form:
+        raise InvalidInput(f"agent {written.core!r}: {written.name} takes no policy")
+    return entry
 
 
 def agent_names() -> tuple[str, ...]:
     """Names that ``make_agent`` knows, in alphabetical order."""
-    return tuple(sorted(_FACTORIES))
+    return tuple(sorted(_ENTRIES))
 
 
-def register_agent(name: str, factory: Factory) -> None:
-    """Make ``name``, ``name:argument`` and ``name@argument`` known to ``make_agent``.
+def agent_entries() -> tuple[Entry, ...]:
+    """All agents, and then all that can be put around one, in the order in which they were registered."""
+    return (*_ENTRIES.values(), *_WRAPPERS.values())
 
-    This is how code above this room, yours included, adds agents without an import upward; the factory gets what
-    stands after the colon or the ``@``. Registering the same factory again changes nothing; another one under a taken
-    name raises ``AlreadyExists``, a name that is not plain ``InvalidInput``.
+
+def register_agent(
+    name: str, factory: Factory, *, about: str = "an agent of your own", knows: Knowledge = (Source.UNSTATED,)
+) -> None:
+    """Make ``name``, ``name:argument`` and ``name@policy`` known to ``make_agent``, and so to every command.
+
+    This is how code outside this folder, yours included, adds agents. ``factory`` gets what stands after the colon (or
+    None) and ``AgentSettings``, whose ``policy`` is what stands after the ``@``; ``about`` and ``knows`` are what
+    ``ethbrake agents`` shows. Registering the same factory again changes nothing; another one under a taken name raises
+    ``AlreadyExists``, a name that is not plain ``InvalidInput``.
     """
-    if _split(name) != (name, None):
+    if parse_spec(name) != AgentSpec(name, None, None, ()):
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
-    if _FACTORIES.setdefault(name, factory) is not factory:
+    entry = Entry(f"{name}[:ARGUMENT][@POLICY]", about, knows, factory)
+    if name in OLD_NAMES or _ENTRIES.setdefault(name, entry).make is not factory:
         raise AlreadyExists(f"agent {name!r} is registered already")
 
 
-def _split(spec: str) -> tuple[str, str | None]:
-    """Name and argument of ``name``, ``name:argument`` or ``name@argument``; a path may hold any character."""
-    head, at, path = spec.partition("@") if isinstance(spec, str) else ("", "", "")
-    if not at or ":" in head:
-        return parse_agent_spec(spec)
-    if not path:
-        raise InvalidInput(f"agent {spec!r}: a path is needed after '@'")
-    return parse_agent_spec(head)[0], path
-
-
-def _state_free(name: str) -> Factory:
-    def factory(argument: str | None, settings: AgentSettings) -> Agent:
-        return StateFree(name if argument is None else f"{name}:{argument}")
-
-    return factory
-
-
-def _without_argument(name: str, make: Callable[[], Agent]) -> Factory:
-    def factory(argument: str | None, settings: AgentSettings) -> Agent:
-        if argument is not None:
-            raise InvalidInput(f"agent '{name}:{argument}': {name} takes no argument")
-        return make()
-
-    return factory
-
-
-def _e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    match argument:
-        case None | "coupled":
-            return EV2XBM("coupled", count=settings.count, horizon_s=settings.horizon_s)
-        case "pairwise":
-            return EV2XBM("pairwise", count=settings.count, horizon_s=settings.horizon_s)
-    raise InvalidInput(f"agent 'e_v2x_bm:{argument}': the argument must be 'coupled' or 'pairwise'")
-
-
-def _planner(argument: str | None, settings: AgentSettings) -> Agent:
-    return Planner(
-        argument, count=settings.count, horizon_s=settings.horizon_s, most_candidates=settings.most_candidates
-    )
-
-
-_FACTORIES: dict[str, Factory] = {
-    "full_brake": _state_free("full_brake"),
-    "coast": _state_free("coast"),
-    "constant": _state_free("constant"),
-    "copy_leader": _without_argument("copy_leader", CopyLeader),
-    "gentlest_front": _without_argument("gentlest_front", GentlestFront),
-    "e_v2x_bm": _e_v2x_bm,
-    "planner": _planner,
-}
+def _put_around(driver: Driver, around: str, settings: AgentSettings) -> Agent:
+    assert around in AROUND
+    if isinstance(driver, Team):
+        raise InvalidInput(
+            f"agent {settings.spec!r}: is a team, and +{around} is for one driven vehicle, the others following"
+            " scripts; name that vehicle (--vehicle vehicle_2) and one policy of the team (ppo@RUN/policy/vehicle_2)"
+        )
+    name, _, argument = around.partition(":")
+    agent: Agent = _WRAPPERS[name].load()(driver, argument or None, settings)
+    return agent

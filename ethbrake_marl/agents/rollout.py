@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, LookingAhead
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.registry import make_single_agent
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.stream import Script
@@ -43,7 +43,7 @@ def scripted(scenario: Scenario, *, but: int | Collection[int] | None = None) ->
     """Fresh agents for the scenario's scripts, by vehicle, ``but`` some; those that look ahead know the others."""
     left_out = () if but is None else (but,) if isinstance(but, int) else but
     specs = {i: spec for i, spec in scenario.scripts.items() if i not in left_out}
-    scripts = {i: make_agent(spec, horizon_s=scenario.horizon_s) for i, spec in specs.items()}
+    scripts = {i: make_single_agent(spec, horizon_s=scenario.horizon_s) for i, spec in specs.items()}
     for vehicle, script in scripts.items():
         introduce(script, vehicle, scripts)
     return scripts

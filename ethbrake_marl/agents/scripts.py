@@ -6,7 +6,8 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.protocol import place, recall
+from ethbrake_marl.agents.protocol import Agent, place, recall
+from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario.roles import constant_command, is_state_free
@@ -86,6 +87,21 @@ class GentlestFront:
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """Minus that deceleration, [n] m/s2."""
         return -recall(self._deceleration_mps2, worlds.n, self.name)
+
+
+def make_state_free(argument: str | None, settings: AgentSettings) -> Agent:
+    """``full_brake``, ``coast`` or ``constant:A``, as it is written."""
+    return StateFree(settings.spec)
+
+
+def make_copy_leader(argument: None, settings: AgentSettings) -> Agent:
+    """``copy_leader``."""
+    return CopyLeader()
+
+
+def make_gentlest_front(argument: None, settings: AgentSettings) -> Agent:
+    """``gentlest_front``."""
+    return GentlestFront()
 
 
 def _check_has_front(name: str, vehicle: int) -> None:

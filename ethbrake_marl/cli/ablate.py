@@ -11,8 +11,8 @@ from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import JsonOption, ScenarioOption
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, show, write_json
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.inputs import LIST_SEED, load_runnable
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.lineup import LIST_SEED, load_runnable
 
 if TYPE_CHECKING:
     from ethbrake_marl.studies.ablation.plan import Plan

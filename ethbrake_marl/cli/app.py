@@ -12,6 +12,7 @@ import typer
 from typer.exceptions import TyperException
 
 from ethbrake_marl.cli.ablate import ablate_command, generalise_command
+from ethbrake_marl.cli.agents import agents_command
 from ethbrake_marl.cli.bench import bench_command
 from ethbrake_marl.cli.best_harm import best_harm_command
 from ethbrake_marl.cli.doctor import diagnose
@@ -35,6 +36,7 @@ from ethbrake_marl.cli.terminal import (
     progress_bars,
     say,
     show,
+    tell_old_spellings,
     tolerate_narrow_streams,
     write_json,
 )
@@ -48,16 +50,16 @@ from ethbrake_marl.cli.train import (
     train_command,
 )
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.files.plain import read_plain
-from ethbrake_marl.files.yaml import SIZE_LIMIT
-from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.lineup import (
+from ethbrake_marl.evaluation.inputs import (
     EPISODES,
     LIST_SEED,
     load_driven,
     load_runnable,
 )
+from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.yaml import SIZE_LIMIT
+from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.scenario import (
     list_scenarios,
     load_scenario,
@@ -98,6 +100,7 @@ app.command(
     "import-legacy", epilog="Example: ethbrake import-legacy old.zip --output old --algorithm sac --i-trust-this-file"
 )(import_legacy_command)
 app.command("best-harm", epilog="Example: ethbrake best-harm --episodes 200 --budget 20000 --json")(best_harm_command)
+app.command("agents", epilog="Example: ethbrake agents")(agents_command)
 app.command("shield", epilog="Example: ethbrake shield --agents ppo@shipped,full_brake --episodes 500")(shield_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
 app.command("equal-time", epilog="Example: ethbrake equal-time --episodes 200 --repeats 1")(equal_time_command)
@@ -106,6 +109,7 @@ app.command("equal-time", epilog="Example: ethbrake equal-time --episodes 200 --
 def main() -> None:
     """Entry point: run the command line and exit with its status."""
     tolerate_narrow_streams()
+    tell_old_spellings()
     sys.exit(run_command(sys.argv[1:]))
 
 

@@ -17,11 +17,11 @@ from ethbrake_marl.cli.terminal import interruptible, progress_bars, say, show, 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.bounds import proven_of_table, shipped_bounds, shipped_lines
+from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, load_runnable, make_agents
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm import BUDGET, search_list
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table, save_table
 from ethbrake_marl.limits.driven_profiles import fold_agent
-from ethbrake_marl.lineup import EPISODES, LIST_SEED, load_runnable, make_agents
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample, Scenario, Task
 
@@ -78,7 +78,7 @@ def best_harm_command(
     sample = chosen.sample(episodes, seed)
     counts: Sequence[HarmCount] = COUNTS if count is None else (count,)
     specs = _agent_specs(agents, chosen, controlled)
-    lineups = {each: make_agents(specs, chosen, count=each) for each in counts}
+    lineups = {each: make_agents(specs, chosen, harm_count=each) for each in counts}
     drivers = {name: {each: lineups[each][name] for each in counts} for name in lineups[counts[0]]}
     parts = None if output is None else output.with_name(f".{output.name}.parts")
     table = _search(

@@ -12,14 +12,14 @@ from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import JsonOption, ScenarioOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, write_json
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.inputs import check_agents, load_driven, make_lineup
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.shipped import best_known
-from ethbrake_marl.lineup import check_agents, load_driven, make_lineup
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies.equal_time import equal_time, timed_table
 
-REHEARSED = "hybrid:rehearsed@shipped"
+REFINED = "ppo@shipped+refined+episode"
 SEARCHES = (  # without a policy, from a millisecond per world to what rehearsing takes and more
     "best_harm:1000,best_harm:3000,best_harm:10000,best_harm:20000,best_harm:40000,"
     "planner:64,planner:256,planner:1024,planner:2048"
@@ -31,8 +31,8 @@ def equal_time_command(
     scenario: ScenarioOption = "paper-random",
     agents: Annotated[
         str, typer.Option(metavar="A,B,...", help="Who drives, with commas between them.")
-    ] = f"e_v2x_bm,ppo@shipped,{REHEARSED},{SEARCHES}",
-    against: Annotated[str, typer.Option(metavar="A", help="Whose harm the others' is compared with.")] = REHEARSED,
+    ] = f"e_v2x_bm,ppo@shipped,{REFINED},{SEARCHES}",
+    against: Annotated[str, typer.Option(metavar="A", help="Whose harm the others' is compared with.")] = REFINED,
     episodes: Annotated[int, typer.Option(help="Worlds of the list.")] = 1000,
     seed: Annotated[int, typer.Option(help="Seed of the list; not one of which a table ships.")] = LIST_SEED,
     count: Annotated[HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")] = "first",
@@ -46,7 +46,7 @@ def equal_time_command(
     """
     chosen = load_driven(scenario, None)
     worlds = chosen.sample(episodes, seed)
-    lineup = make_lineup(agents.split(","), chosen, count=count)
+    lineup = make_lineup(agents.split(","), chosen, harm_count=count)
     check_agents(lineup, worlds.worlds, chosen)
     if any(spec.startswith("best_harm") for spec in lineup):
         _check_unknown(worlds.worlds, chosen, count, seed)

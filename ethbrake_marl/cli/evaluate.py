@@ -24,15 +24,11 @@ from ethbrake_marl.evaluation import (
     summarise,
     write_per_world_csv,
 )
-from ethbrake_marl.evaluation.paper import TESTS
-from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.lineup import (
+from ethbrake_marl.evaluation.inputs import (
     EPISODES,
     LIST_SEED,
+    OLD_SHIELDS,
     PROGRESS_EVERY,
-    SHIELDS,
     check_agents,
     choose_worlds,
     load_driven,
@@ -40,6 +36,10 @@ from ethbrake_marl.lineup import (
     make_lineup,
     make_proposers,
 )
+from ethbrake_marl.evaluation.paper import TESTS
+from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty
 
@@ -53,7 +53,8 @@ def evaluate_command(
     seed: Annotated[int | None, typer.Option(help="Seed of the list.", show_default=str(LIST_SEED))] = None,
     count: Annotated[HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")] = "first",
     shield: Annotated[
-        str, typer.Option(metavar="|".join(SHIELDS), help="Put around every learned agent that has none.")
+        str,
+        typer.Option(metavar="|".join(OLD_SHIELDS), help="Old: now +SHIELD behind an agent, such as ppo@shipped+step."),
     ] = "none",
     uncertainty: Annotated[
         str | None,
@@ -78,10 +79,9 @@ def evaluate_command(
 ) -> None:
     """Compare agents on the same fixed list of worlds.
 
-    Agents: full_brake, coast, constant:A (deceleration in m/s2), copy_leader, gentlest_front, e_v2x_bm,
-    e_v2x_bm:pairwise, planner, best_harm; ladder: all of these but constant; of a run: team@PATH; and of a run or a
-    policy bundle: ppo@PATH, sac@PATH, rehearsed@PATH, hybrid@PATH, hybrid:pairwise@PATH, hybrid:rehearsed@PATH,
-    step@PATH, step:rehearsed@PATH, robust@PATH, robust:rehearsed@PATH. PATH may be shipped.
+    `ethbrake agents` lists who can drive; ladder stands for all of them from coast to best_harm. Behind any agent:
+    +refined, then one shield, +episode, +step or +robust; for instance full_brake+step or ppo@PATH+refined+episode.
+    PATH is a run or a policy bundle, or shipped.
     """
     if per_world is not None:
         check_target(per_world, force=force)
@@ -89,7 +89,7 @@ def evaluate_command(
     objectives = declared_objectives(objective or (), chosen.vehicles)
     sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
     intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
-    lineup = make_lineup(agents.split(","), chosen, count=count, shield=shield, uncertainty=intervals)
+    lineup = make_lineup(agents.split(","), chosen, harm_count=count, shield=shield, uncertainty=intervals)
     check_agents(lineup, sample.worlds, chosen)
     with interruptible("nothing was written"), progress_bars() as bars:
         evaluation = evaluate(
@@ -194,7 +194,7 @@ def picture_shield_modes(
 def measured_modes(agents: str, scenario: Scenario, episodes: int, count: HarmCount) -> list[ModeRow]:
     """The rows of these agents, with progress on stderr."""
     worlds = scenario.sample(episodes, LIST_SEED).worlds
-    lineup = make_proposers(agents.split(","), scenario, count=count)
+    lineup = make_proposers(agents.split(","), scenario, harm_count=count)
     with interruptible("nothing was written"), progress_bars() as bars:
         return compare_modes(
             lineup,

@@ -13,9 +13,9 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.criticality import CELLS, criticality_map
 from ethbrake_marl.evaluation.deceleration import deceleration_curve
+from ethbrake_marl.evaluation.inputs import LIST_SEED, load_driven, make_agents, make_proposers
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.lineup import LIST_SEED, load_driven, make_agents, make_proposers
 from ethbrake_marl.scenario import Task
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
@@ -56,7 +56,7 @@ def picture_criticality(
     from ethbrake_marl.figures.style import png_bytes
 
     chosen = load_driven(scenario, None)
-    lineup = make_agents([agent], chosen, count=count)
+    lineup = make_agents([agent], chosen, harm_count=count)
     with interruptible("nothing was written"), progress_bars() as bars:
         found = criticality_map(
             chosen,
@@ -116,7 +116,7 @@ def picture_shield(
     worlds = chosen.sample(episodes, LIST_SEED).worlds
     curves = []
     with interruptible("nothing was written"), progress_bars() as bars:
-        for name, agent in make_proposers(agents.split(","), chosen, count=count).items():
+        for name, agent in make_proposers(agents.split(","), chosen, harm_count=count).items():
             curves.append((name, operating_curve(worlds, agent, chosen, chosen.learners[0], ALLOWANCES, count=count)))
             bars.show(name, episodes, episodes)
     caption = (
@@ -156,7 +156,7 @@ def picture_robustness(
 
     chosen = load_driven(scenario, vehicle)
     worlds = chosen.sample(episodes, LIST_SEED).worlds
-    (policy,) = make_proposers([agent], chosen, count=count).values()
+    (policy,) = make_proposers([agent], chosen, harm_count=count).values()
     with interruptible("nothing was written"), progress_bars() as bars:
         points = robustness(
             worlds, policy, chosen, chosen.learners[0], intervals, count=count,

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -15,7 +16,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 
-from ethbrake_marl.errors import one_line, plain_text
+from ethbrake_marl.errors import OldSpelling, one_line, plain_text
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
 INTERRUPTED = 130  # 128 + SIGINT, as shells expect
@@ -40,6 +41,19 @@ def tolerate_narrow_streams() -> None:
     """Show ``?`` for what stdout's encoding does not have (m², box lines in Latin-1) instead of failing at the end."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
+
+
+def tell_old_spellings() -> None:
+    """Show what is written as before this version in one line, without the place in this package's code."""
+    shown = warnings.showwarning
+
+    def show_warning(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if issubclass(category, OldSpelling):
+            say(f"note: {message}")
+        else:
+            shown(message, category, *place, **more)
+
+    warnings.showwarning = show_warning
 
 
 def abandon_output() -> None:

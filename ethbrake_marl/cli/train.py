@@ -20,10 +20,10 @@ from ethbrake_marl.cli.options import (
 )
 from ethbrake_marl.cli.terminal import INTERRUPTED, Bars, interruptible, progress_bars, say, write_json
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.evaluation.per_world import check_target, write_output
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.schemes import check_scheme, drivers, scheme_of, who_drives_what
-from ethbrake_marl.lineup import load_runnable
 from ethbrake_marl.policies.onnx import onnx_model
 from ethbrake_marl.policies.policy import save_policy
 from ethbrake_marl.policies.shipped import load_named_policy
@@ -49,7 +49,7 @@ def train_command(
 ) -> None:
     """Train a policy, or the policies of several learners, into a run's folder.
 
-    Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,hybrid@FOLDER`; of several learners: `team@FOLDER`.
+    Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,ppo@FOLDER+episode`; of several: `team@FOLDER`.
     Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake resume FOLDER` goes on.
     """
     with interruptible(KEPT):

@@ -151,7 +151,8 @@ def _asked_for(directory: Path) -> tuple[RunDirectory, TrainingRecipe, Scenario]
     run, config = open_run(directory)
     recipe, scenario = asked_for(directory, config)
     if has_finished(run):
-        agents = f"{'team' if len(scenario.learners) > 1 else 'hybrid'}@{directory}"
+        alone = len(scenario.learners) == 1
+        agents = f"{recipe.algorithm}@{directory}+episode" if alone else f"team@{directory}"
         raise InvalidInput(
             f"{directory}: this training has finished; measure what it has learned with: ethbrake evaluate --scenario"
             f" {scenario.name} --agents {agents}"

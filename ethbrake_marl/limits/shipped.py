@@ -70,4 +70,4 @@ def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
             f" at most {MOST_CANDIDATES:,}"
         )
     budget = int(number) if settings.most_candidates is None else min(int(number), settings.most_candidates)
-    return BestHarm(shipped_profiles, count=settings.count, horizon_s=settings.horizon_s, budget=budget)
+    return BestHarm(shipped_profiles, count=settings.harm_count, horizon_s=settings.horizon_s, budget=budget)

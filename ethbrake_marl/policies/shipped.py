@@ -72,6 +72,11 @@ def load_named_policy(
     return load_shipped(shipped_name(kind, None if scenario is None else scenario.name, count))
 
 
+def algorithm_of(path: str, scenario: Scenario | None, harm_count: HarmCount) -> str:
+    """The algorithm that trained the policy at ``path``, with which its agent's name begins: ``ppo`` or ``sac``."""
+    return load_named_policy(path, "ppo", scenario, harm_count).manifest.algorithm
+
+
 def card(name: str) -> str:
     """The card of a shipped policy, in Markdown."""
     folders = shipped_policies()

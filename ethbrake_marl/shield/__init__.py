@@ -3,6 +3,7 @@
 from ethbrake_marl.shield.agents import HybridAgent, StepShieldAgent
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
 from ethbrake_marl.shield.engine_shield import MovingAtHorizon
+from ethbrake_marl.shield.options import ShieldOptions
 from ethbrake_marl.shield.parallel import HybridShield, shielded_aec
 from ethbrake_marl.shield.single import ShieldedEnv
 from ethbrake_marl.shield.step_shield import Certified, StepShield
@@ -18,6 +19,7 @@ __all__ = [
     "Interval",
     "MovingAtHorizon",
     "Running",
+    "ShieldOptions",
     "ShieldedEnv",
     "ShieldedVectorEnv",
     "StepShield",

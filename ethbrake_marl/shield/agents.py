@@ -18,6 +18,7 @@ from ethbrake_marl.agents.e_v2x_bm.agent import EV2XBM
 from ethbrake_marl.agents.knowledge import Knowledge, Source, combined
 from ethbrake_marl.agents.protocol import Agent, check_agent, place, recall
 from ethbrake_marl.agents.refined import Rehearsed
+from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, introduce, scripted
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.harm import HarmCount
@@ -29,7 +30,7 @@ from ethbrake_marl.shield.comparison import as_predicted, difference, seen_colum
 from ethbrake_marl.shield.rollouts import Proposer, proposed_action
 from ethbrake_marl.shield.settings import check_scenario
 from ethbrake_marl.shield.step_shield import Certified, StepShield
-from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
+from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty, mode_uncertainty
 
 Bound = Literal["coupled", "pairwise"]
 
@@ -52,7 +53,7 @@ class HybridAgent:
         self.scenario = scenario
         self.bound: Bound = bound
         self.count: HarmCount = count
-        self.name = f"hybrid({policy.name})" if bound == "coupled" else f"hybrid:pairwise({policy.name})"
+        self.name = f"{policy.name}+episode{'' if bound == 'coupled' else ':pairwise'}"
         self.policy_harm: Floats = np.zeros(0)
         self.bound_harm: Floats = np.zeros(0)
         self._rehearsal = copy.deepcopy(policy)  # predicting must not disturb the policy's memory of running episodes
@@ -158,7 +159,7 @@ class StepShieldAgent:
         if not (believed is None or isinstance(believed, Worlds)):
             raise InvalidInput(f"step: believed = {believed!r}: must be worlds at the alert, or None")
         uncertainty = checked_uncertainty(uncertainty)
-        self.name = f"{'step' if uncertainty is None else 'robust'}({policy.name})"
+        self.name = f"{policy.name}+{'step' if uncertainty is None else 'robust'}"
         self.policy = policy
         self.scenario = scenario
         self.shield: StepShield | None = None
@@ -275,3 +276,21 @@ class StepShieldAgent:
 
     def _make(self, vehicle: int) -> StepShield:
         return StepShield(self.scenario, vehicle, **self._settings)  # type: ignore[arg-type]
+
+
+def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
+    """``+episode`` or ``+episode:pairwise`` around an agent."""
+    bound: Bound = "coupled" if argument is None else "pairwise"
+    return HybridAgent(policy, settings.needed_scenario(), bound=bound, count=settings.harm_count)
+
+
+def shield_steps(policy: Agent, argument: None, settings: AgentSettings) -> Agent:
+    """``+step`` around an agent."""
+    return StepShieldAgent(policy, settings.needed_scenario(), count=settings.harm_count)
+
+
+def shield_steps_robustly(policy: Agent, argument: None, settings: AgentSettings) -> Agent:
+    """``+robust`` around an agent, against the uncertainty of the settings."""
+    scenario, where = settings.needed_scenario(), f"agent {settings.spec!r}"
+    uncertainty = mode_uncertainty("robust", settings.uncertainty, where)
+    return StepShieldAgent(policy, scenario, count=settings.harm_count, uncertainty=uncertainty)

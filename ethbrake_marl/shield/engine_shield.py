@@ -21,21 +21,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.actions import command_to_action, commands_of
+from ethbrake_marl.actions import commands_of
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.rows import params_at
-from ethbrake_marl.shield.agents import Bound, HybridAgent
 from ethbrake_marl.shield.certify import REASONS, Decision
 from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
+from ethbrake_marl.shield.options import ShieldOptions
 from ethbrake_marl.shield.rollouts import Proposer, proposed_action
 from ethbrake_marl.shield.settings import only_shielded, proposing_agent
 from ethbrake_marl.shield.step_shield import Certified, StepShield
-from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
+from ethbrake_marl.shield.uncertainty import checked_uncertainty
 
 ADVICE = (
     "what stands between the shield and the environment must pass each action on unchanged, exactly once; put wrappers"
@@ -60,12 +59,13 @@ class Sent(NamedTuple):
 class Attached(ABC):
     """A shield that follows an engine, and lets it do nothing but what was certified.
 
-    ``where`` is who builds it, for messages. Raises ``InvalidInput`` for another number of learners than one.
+    Raises ``InvalidInput`` for another number of learners than one.
     """
 
-    def __init__(self, engine: Engine, where: str, memory: object) -> None:
+    def __init__(self, engine: Engine, options: ShieldOptions, memory: object) -> None:
         self.engine = engine
-        self.vehicle = only_shielded(engine, where)
+        self.options = options
+        self.vehicle = only_shielded(engine, options.where)
         self.sent: Sent | None = None
         self._left = memory
         engine.watch(self, memory)
@@ -114,6 +114,28 @@ class Attached(ABC):
         braking, driving = (params[:, params_at(group, vehicles) + self.vehicle] for group in range(2))
         return commands_of(actions, braking, driving)
 
+    def infos(self, proposed: Floats) -> dict[str, NDArray[Any]]:
+        """``info`` of every world, one array per key."""
+        rows = [self.info(k, float(proposed[k])) for k in range(len(proposed))]
+        return {key: np.array([row[key] for row in rows]) for key in rows[0]}
+
+    @property
+    @abstractmethod
+    def running(self) -> bool:
+        """Whether any episode has begun."""
+
+    @abstractmethod
+    def proposal(self) -> Floats:
+        """What stands for a proposal where nobody makes one, as actions [n]; NaN where none is needed."""
+
+    @abstractmethod
+    def decide(self, proposed: Floats) -> Floats:
+        """The actions [n] to apply instead of those proposed. Nothing changes until the engine applies them."""
+
+    @abstractmethod
+    def info(self, k: int, proposed: float) -> dict[str, Any]:
+        """What the shield decided in world ``k``, for ``infos[agent]["shield"]``."""
+
     @abstractmethod
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
         """The memory once episodes start in these rows."""
@@ -134,27 +156,27 @@ class AttachedShield(Attached):
         self,
         engine: Engine,
         policy: Agent | LearnedPolicy | None,
-        *,
-        count: HarmCount = "first",
-        allowance: float = 0.0,
-        uncertainty: Uncertainty | str | None = None,
-        logging: bool = False,
-        where: str = "shield",
+        options: ShieldOptions,
     ) -> None:
-        vehicle = only_shielded(engine, where)
-        self.policy = None if policy is None else proposing_agent(policy, where)
+        vehicle = only_shielded(engine, options.where)
+        self.policy = None if policy is None else proposing_agent(policy, options.where)
         shield = StepShield(
-            engine.scenario, vehicle, count=count, allowance=allowance, others=engine.scripts,
-            uncertainty=checked_uncertainty(uncertainty), logging=logging,
+            engine.scenario, vehicle, count=options.count, allowance=options.allowance, others=engine.scripts,
+            uncertainty=checked_uncertainty(options.uncertainty), logging=options.logging,
         )  # fmt: skip
         self._warned = False
-        super().__init__(engine, where, shield)
+        super().__init__(engine, options, shield)
 
     @property
     def shield(self) -> StepShield:
         """The shield as it is now: to be read; the next step puts another one in its place."""
         shield: StepShield = self.memory
         return shield
+
+    @property
+    def running(self) -> bool:
+        """Whether any episode has begun."""
+        return self.shield.running is not None
 
     @property
     def decision(self) -> Decision | None:
@@ -193,11 +215,6 @@ class AttachedShield(Attached):
             **({} if after.uncertainty is None else {"members": decision.after.members}),
         }
 
-    def infos(self, proposed: Floats) -> dict[str, NDArray[Any]]:
-        """The same of every world, one array per key."""
-        rows = [self.info(k, float(proposed[k])) for k in range(len(proposed))]
-        return {key: np.array([row[key] for row in rows]) for key in rows[0]}
-
     def begun(self, memory: StepShield, alert: Worlds, rows: Ints) -> StepShield:
         """The shield once episodes start in these rows."""
         if self.policy is not None:
@@ -233,43 +250,3 @@ class AttachedShield(Attached):
             told = difference(running.nominal().states[k], seen[k])
             raise UncertifiedStep(f"shield: after this step {told} (world {k}); {ADVICE}")
         return sent.certified.carried_out()
-
-
-class EpisodeChoice(NamedTuple):
-    """What episode mode remembers: who drives, and that nothing was asked of it yet at this decision."""
-
-    hybrid: HybridAgent
-
-
-class AttachedHybrid(Attached):
-    """Episode mode on a running engine: ``HybridAgent`` chooses at each alert, and its action alone may be applied."""
-
-    def __init__(
-        self, engine: Engine, policy: Agent | LearnedPolicy | None, *, bound: Bound, count: HarmCount, where: str
-    ) -> None:
-        hybrid = HybridAgent(proposing_agent(policy, where), engine.scenario, bound=bound, count=count)
-        super().__init__(engine, where, EpisodeChoice(hybrid))
-
-    @property
-    def hybrid(self) -> HybridAgent:
-        """The agent that drives, as it is now."""
-        choice: EpisodeChoice = self.memory
-        return choice.hybrid
-
-    def decide(self) -> Floats:
-        """The actions [n] to apply. Asked again before they were applied, the agent is not asked again."""
-        memory, engine = self.memory, self.engine
-        if self.sent is None or self.sent.memory is not memory:
-            worlds = engine.worlds
-            applied = command_to_action(memory.hybrid.act(worlds, self.vehicle), worlds.vehicles, self.vehicle)
-            self.sent = Sent(memory, engine.steps_made, applied, ~engine.ended, None)
-        return self.sent.applied
-
-    def begun(self, memory: EpisodeChoice, alert: Worlds, rows: Ints) -> EpisodeChoice:
-        """Who drives the episodes that start in these rows."""
-        hybrid = copy.copy(memory.hybrid)
-        hybrid.begin(alert, self.vehicle, rows)
-        return EpisodeChoice(hybrid)
-
-    def _carried_out(self, memory: EpisodeChoice, sent: Sent, after: Engine) -> EpisodeChoice:
-        return EpisodeChoice(memory.hybrid)  # another one: the next decision is another one, too

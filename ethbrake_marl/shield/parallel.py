@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
@@ -14,15 +13,13 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
-from ethbrake_marl.shield.agents import Bound, HybridAgent
-from ethbrake_marl.shield.engine_shield import AttachedHybrid, AttachedShield
+from ethbrake_marl.shield.agents import HybridAgent
+from ethbrake_marl.shield.engine_episode import AttachedHybrid, attach
+from ethbrake_marl.shield.options import read_options
 from ethbrake_marl.shield.settings import engine_of, only_shielded
-from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
 
-MODES = ("episode", "step", "robust")
 Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
 
 
@@ -35,9 +32,9 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
     ``infos[agent]["shield"]`` holds proposed and applied action, who drives, and both harms. Mode ``step`` certifies
     every action that is proposed (by the caller, or by ``policy`` where none is passed), and replaces those that cannot
     keep the bound: see ``StepShield``; its infos say why. Mode ``robust`` is step mode with an ``uncertainty``
-    (``"latency_s=0.1"``): what is certified must hold in every member. ``bound`` is the episode mode's, ``allowance``
-    (m2/s2 above the bound) that of the others; where a mode has none, giving one is refused. The claim of a bound holds
-    for one shielded vehicle, the others following their scripts.
+    (``"latency_s=0.1"``): what is certified must hold in every member. The other ``options`` are those of
+    ``ShieldOptions``; where a mode has none, giving one is refused. The claim of a bound holds for one shielded
+    vehicle, the others following their scripts.
     """
 
     def __init__(
@@ -46,19 +43,10 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         policy: Agent | LearnedPolicy | None = None,
         *,
         mode: str = "episode",
-        bound: Bound = "coupled",
-        count: HarmCount = "first",
-        allowance: float = 0.0,
-        uncertainty: Uncertainty | str | None = None,
         agents: Sequence[str] | None = None,
+        **options: Any,
     ) -> None:
-        if mode not in MODES:
-            raise unknown_name("shield mode", mode, MODES)
-        intervals = mode_uncertainty(mode, uncertainty, "HybridShield")
-        if mode == "episode" and allowance != 0.0:
-            raise InvalidInput(f"HybridShield: allowance = {allowance!r}: mode episode takes none; step and robust do")
-        if mode != "episode" and bound != "coupled":
-            raise InvalidInput(f"HybridShield: bound = {bound!r}: mode {mode} takes none; episode does")
+        settings = read_options("HybridShield", {"mode": mode, **options})
         engine = engine_of(env, ParallelEnv, "HybridShield", "eb.parallel_env")
         super().__init__(env)
         self._engine = engine
@@ -69,21 +57,14 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
             raise InvalidInput(f"HybridShield: shields exactly one learner in mode {mode!r}; got {shielded}")
         self.mode = mode
         self.shielded = shielded[0]
-        self.attached: AttachedShield | None = None
-        self._chooser: AttachedHybrid | None = None
-        if mode == "episode":
-            self._chooser = AttachedHybrid(engine, policy, bound=bound, count=count, where="HybridShield")
-        else:
-            self.attached = AttachedShield(
-                engine, policy, count=count, allowance=allowance, uncertainty=intervals, where="HybridShield"
-            )
+        self.attached: Any = attach(engine, policy, settings)  # what it is depends on the mode
 
     @property
     def hybrid(self) -> HybridAgent:
         """Who drives the running episode, in mode ``episode``. Raises ``InvalidInput`` in another mode."""
-        if self._chooser is None:
+        if not isinstance(self.attached, AttachedHybrid):
             raise InvalidInput(f"HybridShield: hybrid: mode {self.mode} chooses nobody for a whole episode")
-        return self._chooser.hybrid
+        return self.attached.hybrid
 
     def step(self, actions: Mapping[str, Any]) -> Told:
         """Advance by one step with the shielded agent's action replaced; it may also be left out."""
@@ -97,38 +78,19 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
             checked_action(proposed, (1,), agent)
         if not self.env.agents:
             return self.env.step(actions)  # type: ignore[no-any-return]  # says that no episode is running
-        if self._chooser is not None:
-            applied = self._chooser.decide()
-            told: Told = super().step({**actions, agent: applied})
-            self._chooser.confirm()
-            told[4][agent]["shield"] = self._info(proposed, float(applied[0]))
-            return told
         attached = self.attached
-        assert attached is not None
         given = attached.proposal() if proposed is None else checked_action(proposed, (1,), agent)
-        told = super().step({**actions, agent: attached.decide(given)})
+        told: Told = super().step({**actions, agent: attached.decide(given)})
         attached.confirm()
-        told[4][agent]["shield"] = attached.info(0, float(given[0]))
+        shown = told[4][agent]["shield"] = attached.info(0, float(given[0]))
+        if shown["intervened"]:
+            told[1][agent] -= attached.options.intervention_penalty
         return told
 
     def close(self) -> None:
         """Let go of the environment: this shield no longer follows it."""
-        for attached in (self.attached, self._chooser):
-            if attached is not None:
-                attached.detach()
+        self.attached.detach()
         super().close()
-
-    def _info(self, proposed: Any, applied: float) -> dict[str, Any]:
-        """What the shield did, for ``infos``; ``proposed_action`` is NaN when nothing was proposed."""
-        value = float("nan") if proposed is None else float(np.asarray(proposed).item())
-        return {
-            "mode": self.mode,
-            "proposed_action": value,
-            "applied_action": applied,
-            "chosen_policy": bool(self.hybrid.chosen_policy[0]),
-            "policy_harm": float(self.hybrid.policy_harm[0]),
-            "bound_harm": float(self.hybrid.bound_harm[0]),
-        }
 
 
 def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, **settings: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Step mode as a Stable-Baselines3 ``VecEnvWrapper``: training under the shield. Importing this file imports torch."""
+"""The shield as a Stable-Baselines3 ``VecEnvWrapper``: training under the shield. Importing this file imports torch."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, Rewards
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
-from ethbrake_marl.shield.engine_shield import AttachedShield
-from ethbrake_marl.shield.settings import check_amount, engine_of
-from ethbrake_marl.shield.uncertainty import Uncertainty
+from ethbrake_marl.shield.engine_episode import attach
+from ethbrake_marl.shield.options import read_options
+from ethbrake_marl.shield.settings import engine_of
 
 
 class ShieldedVecEnv(VecEnvWrapper):
-    """``make_sb3_vec_env`` with one learner behind the step shield: each row's action is certified, or replaced.
+    """``make_sb3_vec_env`` with one learner behind a shield, by default in mode ``step``.
 
-    Without a ``policy`` the bound is the coupled optimum's harm. ``intervention_penalty`` is taken off a step's reward
-    (not off the return in ``infos[row]["episode"]``) where something else than the proposal was applied. Each row's
+    The ``options`` are those of ``ShieldOptions``; the penalty is not taken off the return in
+    ``infos[row]["episode"]``. Without a ``policy`` the bound is the coupled optimum's harm. Each row's
     infos hold ``shield`` in every step. Raises ``InvalidInput`` for another environment or number of learners.
     """
 
@@ -33,21 +32,12 @@ class ShieldedVecEnv(VecEnvWrapper):
         self,
         venv: EthBrakeVecEnv,
         policy: Agent | LearnedPolicy | None = None,
-        *,
-        count: HarmCount = "first",
-        allowance: float = 0.0,
-        uncertainty: Uncertainty | str | None = None,
-        intervention_penalty: float = 0.0,
-        logging: bool = False,
+        **options: Any,
     ) -> None:
-        check_amount("intervention_penalty", intervention_penalty, "ShieldedVecEnv")
+        settings = read_options("ShieldedVecEnv", options)
         engine = engine_of(venv, EthBrakeVecEnv, "ShieldedVecEnv", "make_sb3_vec_env")
-        self.attached = AttachedShield(
-            engine, policy, count=count, allowance=allowance, uncertainty=uncertainty, logging=logging,
-            where="ShieldedVecEnv",
-        )  # fmt: skip
+        self.attached = attach(engine, policy, settings)
         super().__init__(venv)
-        self.intervention_penalty = intervention_penalty
         self._proposed: NDArray[np.float64] = np.zeros(0)
 
     def reset(self) -> Observations:
@@ -57,7 +47,7 @@ class ShieldedVecEnv(VecEnvWrapper):
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Certify or replace the actions [rows, 1], and pass them on."""
-        if self.attached.shield.running is None:
+        if not self.attached.running:
             self.venv.step_async(actions)
             return
         self._proposed = checked_action(actions, (self.num_envs, 1), "the learners")[:, 0]
@@ -71,7 +61,7 @@ class ShieldedVecEnv(VecEnvWrapper):
         for k, info in enumerate(infos):
             info["shield"] = shield.info(k, float(self._proposed[k]))
         intervened = np.array([info["shield"]["intervened"] for info in infos], np.float32)
-        paid = reward - np.float32(self.intervention_penalty) * intervened
+        paid = reward - np.float32(shield.options.intervention_penalty) * intervened
         return observation, paid, done, infos  # type: ignore[return-value]
 
     def __getstate__(self) -> dict[str, Any]:

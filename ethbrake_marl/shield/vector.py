@@ -1,4 +1,4 @@
-"""Step mode as a Gymnasium vector wrapper."""
+"""The shield as a Gymnasium vector wrapper."""
 
 from __future__ import annotations
 
@@ -12,47 +12,38 @@ from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.envs.vector import EthBrakeVectorEnv
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
-from ethbrake_marl.shield.engine_shield import AttachedShield
-from ethbrake_marl.shield.settings import check_amount, engine_of
-from ethbrake_marl.shield.uncertainty import Uncertainty
+from ethbrake_marl.shield.engine_episode import attach
+from ethbrake_marl.shield.options import read_options
+from ethbrake_marl.shield.settings import engine_of
 
 
 class ShieldedVectorEnv(VectorWrapper):
-    """``EthBrakeVectorEnv`` behind the step shield: each row's action is certified, or replaced; see ``StepShield``.
+    """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``: each row's action is certified, or replaced.
+
+    The ``options`` are those of ``ShieldOptions``.
 
     ``infos["shield"]`` tells the step that was made, also of rows whose episode ended with it: one array per key,
-    marked by ``infos["_shield"]`` (rows that the autoreset mode spends on a reset are not). ``intervention_penalty`` is
-    taken off a step's reward where something else than the proposal was applied. Raises ``InvalidInput`` for another
-    environment.
+    marked by ``infos["_shield"]`` (rows that the autoreset mode spends on a reset are not). Raises ``InvalidInput`` for
+    another environment.
     """
 
     def __init__(
         self,
         env: EthBrakeVectorEnv,
         policy: Agent | LearnedPolicy | None = None,
-        *,
-        count: HarmCount = "first",
-        allowance: float = 0.0,
-        uncertainty: Uncertainty | str | None = None,
-        intervention_penalty: float = 0.0,
-        logging: bool = False,
+        **options: Any,
     ) -> None:
-        check_amount("intervention_penalty", intervention_penalty, "ShieldedVectorEnv")
+        settings = read_options("ShieldedVectorEnv", options)
         engine = engine_of(env, EthBrakeVectorEnv, "ShieldedVectorEnv", "gymnasium.make_vec('EthBrake-v0')")
-        self.attached = AttachedShield(
-            engine, policy, count=count, allowance=allowance, uncertainty=uncertainty, logging=logging,
-            where="ShieldedVectorEnv",
-        )  # fmt: skip
+        self.attached = attach(engine, policy, settings)
         super().__init__(env)
-        self.intervention_penalty = intervention_penalty
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with the actions [rows, 1] certified or replaced."""
         attached = self.attached
-        if attached.shield.running is None:
+        if not attached.running:
             return self.env.step(actions)  # says that no episode is running
         before = attached.engine.ended
         given = np.array(actions)
@@ -64,7 +55,7 @@ class ShieldedVectorEnv(VectorWrapper):
         attached.confirm()
         told = attached.infos(proposed)
         infos |= {"shield": told, "_shield": ~before}
-        paid = reward - self.intervention_penalty * (told["intervened"] & ~before)
+        paid = reward - attached.options.intervention_penalty * (told["intervened"] & ~before)
         return observation, paid, terminated, truncated, infos
 
     def close(self, **kwargs: Any) -> None:

@@ -15,6 +15,7 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, evaluate, parameter_line, summarise
+from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, PROGRESS_EVERY, make_agents
 from ethbrake_marl.evaluation.paper import TESTS, other_tests
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.learning.loop import Progress
@@ -22,7 +23,6 @@ from ethbrake_marl.learning.measure import measure_on_list
 from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.learning.run_folder import RunDirectory, RunStatus, read_object
 from ethbrake_marl.learning.train import TrainResult, resume, train
-from ethbrake_marl.lineup import EPISODES, LIST_SEED, PROGRESS_EVERY, make_agents
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.rewards import RewardParams

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.registry import make_single_agent
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.figures.sampling import draw_errors
 from ethbrake_marl.figures.style import Figure, png_bytes
@@ -81,7 +81,7 @@ def chain_impacts(worlds: Worlds, rows: ImpactRows) -> Bools:
 def convergence(worlds: Worlds, agent: str, *, until_s: float = 8.0, steps_s: Sequence[float] = STEPS_S) -> Convergence:
     """Exact and sampled harm of ``worlds`` (at the alert) up to ``until_s``, for every step."""
     command = -worlds.vehicles.braking_capacity_mps2
-    driver = make_agent(agent)
+    driver = make_single_agent(agent)
     driver.begin(worlds, _VEHICLE, np.arange(worlds.n))
     command[:, _VEHICLE] = driver.act(worlds, _VEHICLE)
     _, exact = advance(worlds, command, until_s=until_s, record=True)

@@ -10,6 +10,7 @@ import pytest
 
 from ethbrake_marl.agents import agent_names, make_agent, optimise_coupled, optimise_pairwise, register_agent, registry
 from ethbrake_marl.agents.protocol import PredictingAgent
+from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 
@@ -75,7 +76,7 @@ def test_gentlest_front__collides_in_the_worlds_of_e_v2x_bm():
 @pytest.mark.parametrize("count", ["first", "total"])
 def test_e_v2x_bm__predicts_what_it_realises(count):
     worlds = random_worlds(100)
-    agent = make_agent("e_v2x_bm", count=count)
+    agent = make_agent("e_v2x_bm", harm_count=count)
     agent.begin(worlds, 1, np.arange(100))
     assert isinstance(agent, PredictingAgent)
     command = -worlds.vehicles.braking_capacity_mps2
@@ -99,9 +100,10 @@ def test_e_v2x_bm__pairwise_predicts_the_closed_form():
 
 def test_e_v2x_bm__uses_the_count_and_the_horizon_it_was_given():
     worlds = random_worlds(40)
-    for settings in ({"count": "first"}, {"count": "total"}, {"horizon_s": 1.5}):
-        assert np.array_equal(asked("e_v2x_bm", worlds, **settings), -optimise_coupled(worlds, 1, **settings)[0])
-    assert not np.array_equal(asked("e_v2x_bm", worlds), asked("e_v2x_bm", worlds, count="total"))
+    for settings in ({"harm_count": "first"}, {"harm_count": "total"}, {"horizon_s": 1.5}):
+        given = {key.removeprefix("harm_"): value for key, value in settings.items()}
+        assert np.array_equal(asked("e_v2x_bm", worlds, **settings), -optimise_coupled(worlds, 1, **given)[0])
+    assert not np.array_equal(asked("e_v2x_bm", worlds), asked("e_v2x_bm", worlds, harm_count="total"))
     assert not np.array_equal(asked("e_v2x_bm", worlds), asked("e_v2x_bm", worlds, horizon_s=1.5))
 
 
@@ -175,27 +177,31 @@ def test_make_agent__suggests_the_name_that_was_meant():
 
 
 def test_agent_names__are_those_that_ship():
-    own = ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front", "planner")
-    # Rooms above register more, where another test of this process loaded them.
-    here = [name for name in agent_names() if registry._FACTORIES[name].__module__ == registry.__name__]
-    assert tuple(here) == own
+    scripts = ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front", "planner")
+    assert agent_names() == tuple(sorted((*scripts, "best_harm", "ppo", "sac", "universal", "team")))
+    for entry in agent_entries():
+        assert callable(entry.load()) and entry.about and entry.knows
 
 
-def test_register_agent__makes_names_and_paths_known(monkeypatch):
-    monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))
+def test_register_agent__makes_names_and_policies_known(monkeypatch):
+    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
     seen = []
 
     def factory(argument, settings):
-        seen.append((argument, settings.count))
+        seen.append((argument, settings.policy, settings.harm_count))
         return make_agent("coast")
 
     register_agent("mine", factory)
     register_agent("mine", factory)
-    for spec in ("mine", "mine:my-run", "mine@my-run", "mine@C:/runs/my run@2"):
-        make_agent(spec, count="total")
-    assert seen == [(None, "total"), ("my-run", "total"), ("my-run", "total"), ("C:/runs/my run@2", "total")]
-    assert "mine" in agent_names()
+    for spec in ("mine", "mine:x", "mine@my-run", "mine:x@C:/runs/my run@2"):
+        make_agent(spec, harm_count="total")
+    assert [each[:2] for each in seen] == [(None, None), ("x", None), (None, "my-run"), ("x", "C:/runs/my run@2")]
+    assert {each[2] for each in seen} == {"total"} and "mine" in agent_names()
     with pytest.raises(AlreadyExists):
         register_agent("mine", lambda argument, settings: make_agent("coast"))
-    with pytest.raises(InvalidInput):
-        register_agent("mine:x", factory)
+    for taken in ("step", "hybrid"):
+        with pytest.raises(AlreadyExists):
+            register_agent(taken, factory)
+    for name in ("mine:x", "mine@x", "mine+step"):
+        with pytest.raises(InvalidInput, match="must be a plain name"):
+            register_agent(name, factory)

@@ -26,7 +26,7 @@ def worlds(scenario: Scenario) -> Worlds:
 def test_planner__does_no_more_harm_than_its_first_plan_and_improves_on_constants(
     scenario: Scenario, worlds: Worlds, count: HarmCount
 ) -> None:
-    agent = make_agent("planner:150", count=count)
+    agent = make_agent("planner:150", harm_count=count)
     harm = drive(worlds, agent, scenario, 1).ledger.world_harm(count)
     assert isinstance(agent, Planner)
     assert (harm <= agent.predicted_harm + 1e-4).all()

@@ -9,7 +9,7 @@ from ethbrake_marl.agents import refined as rehearsed
 from ethbrake_marl.agents.refined import HOLDS, SIZES, Rehearsed, changes, deviated
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.lineup import make_agent, make_lineup
+from ethbrake_marl.evaluation.inputs import make_agent, make_lineup
 from ethbrake_marl.scenario import load_scenario
 
 SCENARIO = load_scenario("paper-random")

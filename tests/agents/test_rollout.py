@@ -92,7 +92,7 @@ def test_drive__a_scripted_vehicle_that_is_driven_follows_its_script_in_nobodys_
 def test_hybrid__its_parts_know_the_others_too():
     scenario = with_role("constant:3")
     worlds = scenario.sample(30, 7).worlds
-    hybrid = HybridAgent(make_agent("e_v2x_bm", count="total"), scenario)
+    hybrid = HybridAgent(make_agent("e_v2x_bm", harm_count="total"), scenario)
     realised = harm(hybrid, scenario, worlds)
     assert realised.tolist() == hybrid.predicted_harm.tolist()
     best = harm(make_agent("e_v2x_bm"), scenario, worlds)

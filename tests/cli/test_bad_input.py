@@ -118,7 +118,7 @@ def test_long_command__a_defect_of_the_scenario_is_found_before_any_work(ethbrak
         (["--agents", "coast,"], ["agent ''"]),
         (["--agents", "ppo"], ["'ppo'", "ppo@PATH"]),
         (["--agents", "ppo@runs/nothing-here"], ["runs/nothing-here"]),
-        (["--agents", "hybrid@runs/nothing-here"], ["runs/nothing-here"]),
+        (["--agents", "ppo@runs/nothing-here+episode"], ["runs/nothing-here"]),
         (["--episodes", "0"], ["0"]),
         (["--episodes", "100000000000000"], ["100000000000000", "at most 10,000,000"]),
         (["--episodes", "many"], ["--episodes"]),

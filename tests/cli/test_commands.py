@@ -189,5 +189,5 @@ def test_evaluate__several_learners_and_objectives(ethbrake, tmp_path):
 
 
 def test_evaluate__what_drives_one_vehicle_only_is_refused_for_several(ethbrake, finished_run):
-    answer = ethbrake("evaluate", "--scenario", "cooperation-3-pair", "--agents", f"hybrid@{finished_run}")
+    answer = ethbrake("evaluate", "--scenario", "cooperation-3-pair", "--agents", f"ppo@{finished_run}+episode")
     assert answer.status == 2 and "vehicle_3 of scenario 'cooperation-3-pair' must be driven too" in answer.err

@@ -28,7 +28,7 @@ def names(typer_app) -> set[str]:
 
 def test_cli_page__has_every_command_and_agent():
     training = {"run", "train", "resume", "learning-curves", "ablate", "generalise", "export", "import-legacy"}
-    assert names(app) == training | {"evaluate", "shield", "doctor", "bench", "best-harm", "equal-time"}
+    assert names(app) == training | {"evaluate", "agents", "shield", "doctor", "bench", "best-harm", "equal-time"}
     for command in names(app) | {"scenario"}:
         assert f"\n## {command}\n" in CLI and f"`{command}" in TABLE_OF_COMMANDS
     about_scenarios = CLI.partition("\n## scenario\n")[2].partition("\n## ")[0]

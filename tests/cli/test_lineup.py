@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import agent_names
-from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.errors import InvalidInput, OldSpelling, UnknownName
+from ethbrake_marl.evaluation.inputs import LADDER, check_agents, choose_worlds, make_lineup
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.lineup import LADDER, check_agents, choose_worlds, make_lineup
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
 from ethbrake_marl.studies.experiment import run_folder
@@ -40,21 +40,19 @@ def test_lineup__agents_of_a_run_and_of_its_bundle_are_the_same(finished_run):
     assert np.array_equal(run.act(worlds, 1), bundle.act(worlds, 1))
 
 
-@pytest.mark.parametrize(("spec", "bound"), [("hybrid", "coupled"), ("hybrid:pairwise", "pairwise")])
-def test_lineup__the_hybrids_bound_and_count_are_as_asked(finished_run, spec, bound):
-    (agent,) = make_lineup([f"{spec}@{finished_run}"], SCENARIO, count="total").values()
+@pytest.mark.parametrize(("shield", "bound"), [("episode", "coupled"), ("episode:pairwise", "pairwise")])
+def test_lineup__the_hybrids_bound_and_count_are_as_asked(finished_run, shield, bound):
+    (agent,) = make_lineup([f"ppo@{finished_run}+{shield}"], SCENARIO, harm_count="total").values()
     assert isinstance(agent, HybridAgent)
     assert (agent.bound, agent.count) == (bound, "total")
 
 
-def test_lineup__the_step_shield_by_its_spec_or_around_what_learned(finished_run):
+def test_lineup__shields_are_put_around_who_has_none_in_the_old_way(finished_run):
     spec = f"ppo@{finished_run}"
-    (step,) = make_lineup([f"step@{finished_run}"], SCENARIO, count="total").values()
-    lineup = make_lineup([spec, f"hybrid@{finished_run}", "coast"], SCENARIO, shield="step")
-    assert list(lineup) == [f"{spec}+step", f"hybrid@{finished_run}", "coast"]
-    assert [type(agent) for agent in (step, *lineup.values())][:3] == [StepShieldAgent, StepShieldAgent, HybridAgent]
-    (episode,) = make_lineup([spec], SCENARIO, shield="episode").values()
-    assert isinstance(episode, HybridAgent)
+    with pytest.warns(OldSpelling, match="shield step: is written behind each agent now"):
+        lineup = make_lineup([spec, f"{spec}+episode", "coast"], SCENARIO, shield="step")
+    assert list(lineup) == [f"{spec}+step", f"{spec}+episode", "coast"]
+    assert [type(agent) for agent in lineup.values()][:2] == [StepShieldAgent, HybridAgent]
     with pytest.raises(UnknownName, match="did you mean 'step'"):
         make_lineup([spec], SCENARIO, shield="stap")
 

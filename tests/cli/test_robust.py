@@ -6,39 +6,38 @@ import json
 
 import pytest
 
-from ethbrake_marl.lineup import make_lineup
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import StepShieldAgent, parse_uncertainty
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def test_evaluate__the_robust_shield_by_its_option_and_by_its_spec(ethbrake):
-    agents = "ppo@shipped,robust@shipped"
-    options = ("--agents", agents, "--shield", "robust", "--uncertainty", "gaps_m=0.5", "--episodes", "8", "--json")
+def test_evaluate__the_robust_shield_goes_around_any_agent(ethbrake):
+    agents = "ppo@shipped+robust,full_brake+robust"
+    options = ("--agents", agents, "--uncertainty", "gaps_m=0.5", "--episodes", "8", "--json")
     answer = ethbrake("evaluate", *options)
     assert answer.status == 0
     rows = json.loads(answer.out)
-    assert [row["agent"] for row in rows] == ["ppo@shipped+robust", "robust@shipped"]
+    assert [row["agent"] for row in rows] == ["ppo@shipped+robust", "full_brake+robust"]
 
 
 def test_lineup__robust_agents_certify_against_the_uncertainty():
     intervals = parse_uncertainty("gaps_m=0.5")
-    lineup = make_lineup(["robust@shipped"], load_scenario("paper-random"), uncertainty=intervals)
-    agent = lineup["robust@shipped"]
-    assert isinstance(agent, StepShieldAgent) and agent.name.startswith("robust(")
+    lineup = make_lineup(["ppo@shipped+robust"], load_scenario("paper-random"), uncertainty=intervals)
+    agent = lineup["ppo@shipped+robust"]
+    assert isinstance(agent, StepShieldAgent) and agent.name == "ppo@shipped+robust"
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--agents", "ppo@shipped", "--shield", "robust"), "shield: mode robust needs an uncertainty"),
-        (("--agents", "robust@shipped"), "robust@shipped: mode robust needs an uncertainty"),
+        (("--agents", "ppo@shipped+robust"), "agent 'ppo@shipped+robust': mode robust needs an uncertainty"),
         (("--agents", "coast", "--uncertainty", "gaps_m=1"), "nobody uses it"),
-        (("--agents", "ppo@shipped", "--shield", "robust", "--uncertainty", "gap=1"), "unknown uncertain quantity"),
-        (("--agents", "ppo@shipped", "--shield", "robust", "--uncertainty", "mass_t=9"), "it must stay above 0"),
+        (("--agents", "ppo@shipped+robust", "--uncertainty", "gap=1"), "unknown uncertain quantity"),
+        (("--agents", "ppo@shipped+robust", "--uncertainty", "mass_t=9"), "it must stay above 0"),
         (
-            ("--agents", "ppo@shipped", "--shield", "robust", "--uncertainty", "latency_s=1000"),
+            ("--agents", "ppo@shipped+robust", "--uncertainty", "latency_s=1000"),
             "uncertainty: latency_s=1000: vehicle_2 may decide first at 1000.5 s; must be before the horizon, 8 s",
         ),
         (("--agents", "full_brake", "--shield", "robust", "--uncertainty", "gaps_m=1"), "nobody of full_brake gets it"),

@@ -19,8 +19,8 @@ import pytest
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.cli.terminal import Bars
 from ethbrake_marl.evaluation import evaluate, summarise
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.figures.run import learning_curve
-from ethbrake_marl.lineup import make_lineup
 from ethbrake_marl.policies.policy import load_policy
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies import results as results_folder
@@ -104,7 +104,12 @@ def test_run__the_hybrid_is_in_no_world_worse_than_its_baseline(finished_run):
 
 def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake, finished_run):
     answer = ethbrake(
-        "evaluate", "--agents", f"full_brake,ppo@{finished_run},hybrid@{finished_run}", "--episodes", "60", "--json"
+        "evaluate",
+        "--agents",
+        f"full_brake,ppo@{finished_run},ppo@{finished_run}+episode",
+        "--episodes",
+        "60",
+        "--json",
     )
     now = json.loads(answer.out)
     then = {row["agent"]: row for row in json.loads((finished_run / "results.json").read_text())}

@@ -6,10 +6,11 @@ import json
 
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents import registry
+from ethbrake_marl.agents.registry import Entry, make_agent
 from ethbrake_marl.agents.team import Team
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.lineup import make_lineup
+from ethbrake_marl.errors import InvalidInput, OldSpelling
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.scenario.catalogue import shipped_folder
 
@@ -38,7 +39,7 @@ def test_picture__shows_the_modes(ethbrake, tmp_path):
     assert out.read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("spec", ["hybrid@shipped", "step@shipped", "step:rehearsed@shipped", "robust@shipped"])
+@pytest.mark.parametrize("spec", ["ppo@shipped+episode", "full_brake+step", "ppo@shipped+refined+step"])
 @pytest.mark.parametrize("command", ["shield", "picture shield", "picture robustness"])
 def test_shield__what_has_a_shield_already_is_refused(ethbrake, tmp_path, command, spec):
     option = "--agent" if command.endswith("robustness") else "--agents"
@@ -50,19 +51,20 @@ def test_shield__what_has_a_shield_already_is_refused(ethbrake, tmp_path, comman
 
 @pytest.mark.parametrize("shield", ["episode", "step"])
 def test_evaluate__a_shield_that_nobody_gets_is_refused(ethbrake, shield):
-    for agents in ("full_brake", "step@shipped", "full_brake,hybrid@shipped"):
+    for agents in ("full_brake", "full_brake+step", "full_brake,ppo@shipped+episode"):
         answer = ethbrake("evaluate", "--agents", agents, "--shield", shield, "--episodes", "3")
         assert answer.status == 2 and f"shield {shield}: nobody of " in answer.err
-    lineup = make_lineup(["full_brake", "ppo@shipped"], load_scenario("paper-random"), shield=shield)
+    with pytest.warns(OldSpelling, match=rf"is written behind each agent now: full_brake,ppo@shipped\+{shield}$"):
+        lineup = make_lineup(["full_brake", "ppo@shipped"], load_scenario("paper-random"), shield=shield)
     assert list(lineup) == ["full_brake", f"ppo@shipped+{shield}"]
 
 
 def test_evaluate__a_team_behind_a_shield_is_refused(monkeypatch):
-    scenario = load_scenario("cooperation-3-pair")
-    monkeypatch.setattr("ethbrake_marl.lineup._driver", lambda *given: Team.copies(make_agent("coast"), [1, 2]))
+    scenario, team = load_scenario("cooperation-3-pair"), Team.copies(make_agent("coast"), [1, 2])
+    monkeypatch.setitem(registry._ENTRIES, "team", Entry("team@RUN", "", (), lambda argument, settings: team))
     assert list(make_lineup(["team@run"], scenario)) == ["team@run"]
-    with pytest.raises(InvalidInput, match="agent 'team@run': is a team, and shield step is for one driven vehicle"):
-        make_lineup(["team@run"], scenario, shield="step")
+    with pytest.raises(InvalidInput, match=r"agent 'team@run\+step': is a team, and \+step is for one driven vehicle"):
+        make_lineup(["team@run+step"], scenario)
 
 
 def test_horizon__what_still_moves_then_is_told_by_both_commands(ethbrake, tmp_path):
@@ -72,7 +74,7 @@ def test_horizon__what_still_moves_then_is_told_by_both_commands(ethbrake, tmp_p
     note = "note: bounds of the shield end at the horizon (3 s) and say nothing of what comes after; worlds, of 20,"
     told = ethbrake("shield", "--agents", "full_brake", "--episodes", "20", "--scenario", str(short), "--json")
     assert note in told.err and all(row["horizon_ends"] > 10 for row in json.loads(told.out))
-    policy = "hybrid@ethbrake_marl/_policies/ppo"
+    policy = "ppo@ethbrake_marl/_policies/ppo+episode"
     evaluated = ethbrake("evaluate", "--agents", f"{policy},full_brake", "--episodes", "20", "--scenario", str(short))
     assert (
         note in evaluated.err and "rest then: full_brake" not in evaluated.err and ", full_brake" not in evaluated.err

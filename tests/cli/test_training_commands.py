@@ -58,7 +58,7 @@ def test_resume__goes_on_and_ends_as_if_nothing_had_happened(ethbrake, tiny_reci
     for name in ("policy", "policy-last"):
         expected = load_policy(whole / name).manifest.weights_sha256
         assert load_policy(stopped / name).manifest.weights_sha256 == expected
-    refused(ethbrake("resume", stopped), "has finished", "ethbrake evaluate --scenario paper-random --agents hybrid@")
+    refused(ethbrake("resume", stopped), "has finished", "ethbrake evaluate --scenario paper-random --agents ppo@")
     refused(ethbrake("resume", tmp_path), "holds no training")
 
 

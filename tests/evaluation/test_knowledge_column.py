@@ -12,12 +12,12 @@ from rich.console import Console
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, rich_table, summarise, write_per_world_csv
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.report import Report, render_report
-from ethbrake_marl.lineup import make_lineup
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.results import results_csv
 
-SPECS = ("full_brake", "ppo@shipped/ppo", "hybrid@shipped/ppo", "e_v2x_bm:pairwise")
+SPECS = ("full_brake", "ppo@shipped/ppo", "ppo@shipped/ppo+episode", "e_v2x_bm:pairwise")
 KNOWN = ("own sensors", "messages", "messages + true model", "true state")
 BLOCKED = load_scenario("cooperation-2-blocked")
 
@@ -67,7 +67,7 @@ def test_knowledge__is_a_column_of_every_table(clear: Evaluation) -> None:
             assert spec in text and known in text
     lines = markdown_table(rows).splitlines()
     assert lines[0].startswith("| Agent | Knows | ")
-    assert lines[4].startswith("| hybrid@shipped/ppo | messages + true model | ")
+    assert lines[4].startswith("| ppo@shipped/ppo+episode | messages + true model | ")
     assert {line.count("|") for line in lines[:7]} == {lines[0].count("|")}
     flat = list(csv.DictReader(io.StringIO(results_csv(rows))))
     assert [row["knows"] for row in flat] == [*KNOWN, "not stated"]
@@ -83,7 +83,7 @@ def test_knowledge__a_hiding_channel_marks_who_sees_through_it(hiding: Evaluatio
         assert "† messages + true model" in text and "† true state" in text
         assert "† messages |" not in text and "† own sensors" not in text
         assert f"In {100 * share:.1f} % of these worlds the channel hides something" in text
-        assert "† hybrid@shipped/ppo, e_v2x_bm:pairwise: drives by the line as it is" in text
+        assert "† ppo@shipped/ppo+episode, e_v2x_bm:pairwise: drives by the line as it is" in text
         assert "Not stated what it knows: mine." in text
 
 

@@ -279,8 +279,8 @@ def test_best_known__is_nan_where_no_table_holds_the_world(scenario: Scenario) -
     assert np.isnan(known).all()
 
 
-def test_make_agent__knows_best_harm_through_the_lineup(scenario: Scenario) -> None:
-    from ethbrake_marl.lineup import make_lineup
+def test_make_agent__knows_best_harm(scenario: Scenario) -> None:
+    from ethbrake_marl.evaluation.inputs import make_lineup
 
     (agent,) = make_lineup(["best_harm:50"], scenario).values()
     assert isinstance(agent, BestHarm)

@@ -8,9 +8,9 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.paper import TESTS
 from ethbrake_marl.harm import COUNTS, HarmCount
-from ethbrake_marl.lineup import make_lineup
 from ethbrake_marl.policies import shipped
 from ethbrake_marl.policies.policy import Policy, save_policy
 from ethbrake_marl.policies.shipped import card, load_named_policy, shipped_name, shipped_policies
@@ -54,10 +54,10 @@ def test_load_named_policy__by_its_own_name(folder: Path) -> None:
 
 def test_lineup__takes_what_ships(folder: Path, policy: Policy) -> None:
     worlds = SCENARIO.sample(5, 1).worlds
-    specs = ["ppo@shipped", "universal@shipped", "hybrid@shipped", "ppo@shipped/ppo-paper-distance"]
+    specs = ["ppo@shipped", "universal@shipped", "ppo@shipped+episode", "ppo@shipped/ppo-paper-distance"]
     lineup = make_lineup(specs, SCENARIO)
     assert list(lineup) == specs
-    assert isinstance(lineup["hybrid@shipped"], HybridAgent)
+    assert isinstance(lineup["ppo@shipped+episode"], HybridAgent)
     assert lineup["universal@shipped"].name == "universal@shipped"
     alone = lineup["ppo@shipped"].act(worlds, 1)
     assert np.array_equal(alone, eb.make_agent("universal@shipped").act(worlds, 1))
@@ -68,8 +68,8 @@ def test_lineup__takes_what_ships(folder: Path, policy: Policy) -> None:
     [
         ("universal@runs/x", "must be universal@shipped"),
         ("sac@shipped/universal", "that policy was trained by PPO: ppo@shipped/universal"),
-        ("ppo@", "a path is needed|must be universal@shipped or one of ppo@PATH"),
-        ("sac", "must be universal@shipped or one of ppo@PATH, sac@PATH"),
+        ("ppo@", "a path is needed after '@'"),
+        ("sac", "a policy is needed: sac@PATH, where PATH is a run or a policy bundle"),
     ],
 )
 def test_lineup__says_what_a_policy_is_called(spec: str, message: str, folder: Path) -> None:
@@ -92,8 +92,8 @@ def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_sh
     scenario = load_scenario(test)
     name = shipped_name("ppo", test, count)
     assert load_named_policy(f"shipped/{name}").manifest.scenario["name"] == test
-    lineup = make_lineup(["ppo@shipped", "hybrid@shipped"], scenario, count=count)
+    lineup = make_lineup(["ppo@shipped", "ppo@shipped+episode"], scenario, harm_count=count)
     result = evaluate(scenario.sample(20, 7), lineup, scenario=scenario, seed=7)
     alone, shielded = (result.outcome(spec).ledger.world_harm(count) for spec in lineup)
     assert shielded.mean() <= alone.mean()
-    assert (shielded <= result.outcome("hybrid@shipped").predicted_harm + 1e-9).all()
+    assert (shielded <= result.outcome("ppo@shipped+episode").predicted_harm + 1e-9).all()

@@ -11,6 +11,7 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.certify import certify
 from ethbrake_marl.shield.engine_shield import AttachedShield
+from ethbrake_marl.shield.options import ShieldOptions
 from tests.shield.trained import trained
 
 _ROLES = {
@@ -94,7 +95,7 @@ def attack(scenario: Scenario, worlds, adversary, *, count="first", allowance=0.
     learner = scenario.learners[0]
     scripts = {i: make_agent(spec) for i, spec in scenario.scripts.items()}
     engine = Engine(scenario, worlds.n, learners=(learner,), scripts=scripts, worlds=worlds)
-    attached = AttachedShield(engine, None, count=count, allowance=allowance)
+    attached = AttachedShield(engine, None, ShieldOptions(count=count, allowance=allowance))
     engine.reset(worlds=worlds)
     accepted, decisions, k = np.zeros(worlds.n, np.int64), 0, 0
     while not engine.ended.all():

@@ -38,7 +38,7 @@ class LateBrake:
 def test_coupled__is_never_worse_than_either_part(count):
     hybrid = HybridAgent(LateBrake(), SCENARIO, count=count)
     realised = harm(hybrid, count)
-    alone, baseline = harm(LateBrake(), count), harm(make_agent("e_v2x_bm", count=count), count)
+    alone, baseline = harm(LateBrake(), count), harm(make_agent("e_v2x_bm", harm_count=count), count)
     assert (realised <= baseline).all() and (realised <= alone).all()
     assert realised.tolist() == hybrid.predicted_harm.tolist()
     assert hybrid.chosen_policy.tolist() == (alone <= baseline).tolist()

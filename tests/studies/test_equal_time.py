@@ -9,7 +9,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.lineup import make_lineup
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.equal_time import equal_time
 

@@ -10,7 +10,8 @@ import numpy as np
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.protocol import fixed_commands, place, recall
+from ethbrake_marl.agents.protocol import Agent, fixed_commands, place, recall
+from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.engine.stream import Script, is_state_free
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_count
@@ -76,3 +77,13 @@ class EV2XBM:
         )
         who = f"agent {self.name!r}"
         return fixed_commands(self.others, worlds, who, vehicle=vehicle, is_fixed=is_fixed, advice=advice)
+
+
+def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
+    """``e_v2x_bm``, the same as ``e_v2x_bm:coupled``, or ``e_v2x_bm:pairwise``."""
+    match argument:
+        case None | "coupled":
+            return EV2XBM("coupled", count=settings.harm_count, horizon_s=settings.horizon_s)
+        case "pairwise":
+            return EV2XBM("pairwise", count=settings.harm_count, horizon_s=settings.horizon_s)
+    raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise'")

@@ -11,7 +11,9 @@ import numpy as np
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.registry import make_single_agent
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.seed_statistics import mean_over_seeds, share_over_seeds
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json
@@ -20,7 +22,6 @@ from ethbrake_marl.learning.recipe import WORDS
 from ethbrake_marl.learning.run_folder import RunDirectory
 from ethbrake_marl.learning.teams import is_team
 from ethbrake_marl.limits.best_harm import best_harm
-from ethbrake_marl.lineup import PROGRESS_EVERY, make_agent
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.policies.policy import Policy, load_policy
 from ethbrake_marl.scenario import Sample, Scenario
@@ -154,7 +155,7 @@ def _of_length(
     question: Question, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: Tell | None
 ) -> LineResult:
     count = question.count
-    braking = _driven([make_agent("full_brake")], scenario, sample, tell)
+    braking = _driven([make_single_agent("full_brake")], scenario, sample, tell)
     reached = _driven(agents, scenario, sample, tell)
     worst, own = braking.world[count], reached.world[count]
     none = np.zeros_like(worst)

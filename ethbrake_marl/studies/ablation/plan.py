@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.files.durable import check_writable, write_file
 from ethbrake_marl.learning.kept_training import check_same
 from ethbrake_marl.learning.recipe import WORDS, PpoRecipe, Scheme, TrainingRecipe
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
-from ethbrake_marl.lineup import load_runnable
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Sample, Scenario
 

@@ -14,12 +14,12 @@ from multiprocessing.process import BaseProcess
 import numpy as np
 
 from ethbrake_marl.agents.team import Team
+from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.rollout import Outcome, evaluate
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.learning.loop import Progress
 from ethbrake_marl.learning.run_folder import RunDirectory
 from ethbrake_marl.learning.teams import load_team, resume_team, train_team
-from ethbrake_marl.lineup import PROGRESS_EVERY
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.studies.ablation.joint_optimum import Answer, best_known, search_all

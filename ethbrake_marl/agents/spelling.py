@@ -1,0 +1,97 @@
+"""How an agent is written: ``name[:argument][@policy]``, and behind it what is put around that agent.
+
+``+refined`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.scenario.roles import parse_agent_spec
+
+REFINED = "refined"
+SHIELDS = ("episode", "episode:pairwise", "step", "robust")
+AROUND = (REFINED, *SHIELDS)  # in the order in which they are put around an agent
+
+OLD_SPELLINGS = {  # of a policy; ``hybrid@PATH`` is ``ppo@PATH+episode`` now
+    "rehearsed": "+refined",
+    "hybrid": "+episode",
+    "hybrid:pairwise": "+episode:pairwise",
+    "hybrid:rehearsed": "+refined+episode",
+    "step": "+step",
+    "step:rehearsed": "+refined+step",
+    "robust": "+robust",
+    "robust:rehearsed": "+refined+robust",
+}
+OLD_NAMES = frozenset(old.partition(":")[0] for old in OLD_SPELLINGS)
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSpec:
+    """An agent as it is written, in its parts."""
+
+    name: str
+    argument: str | None  # after the colon
+    policy: str | None  # after the @: a path, or "shipped"
+    around: tuple[str, ...]  # of AROUND, innermost first
+
+    @property
+    def core(self) -> str:
+        """The agent without what is around it."""
+        argument = "" if self.argument is None else f":{self.argument}"
+        return f"{self.name}{argument}" + ("" if self.policy is None else f"@{self.policy}")
+
+    @property
+    def shield(self) -> str | None:
+        """The shield around it, if there is one."""
+        return self.around[-1] if self.around and self.around[-1] in SHIELDS else None
+
+    def __str__(self) -> str:
+        return "".join([self.core, *(f"+{each}" for each in self.around)])
+
+
+def parse_spec(spec: str) -> AgentSpec:
+    """The parts of a spec. A path may hold any character; one that ends like ``+step`` is written with a ``/`` behind.
+
+    Raises ``InvalidInput`` for what is not written so, and for two shields or another order; ``UnknownName`` for
+    something else behind a ``+``.
+    """
+    core, around = _split_around(spec)
+    head, at, path = core.partition("@")
+    name, argument = parse_agent_spec(head if at else core)
+    if at and not path:
+        raise InvalidInput(f"agent {spec!r}: a path is needed after '@'")
+    return AgentSpec(name, argument, path if at else None, around)
+
+
+def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
+    core, around = spec if isinstance(spec, str) else "", list[str]()
+    if not core:
+        parse_agent_spec(spec)  # says what is right
+    while True:
+        before, plus, last = core.rpartition("+")
+        if not plus or last not in AROUND:
+            break
+        core, around = before, [last, *around]
+    if plus and _is_meant_around(before, core, last):
+        raise unknown_name("shield or refinement", last, AROUND)
+    shields = [each for each in around if each in SHIELDS]
+    if len(shields) > 1 or around.count(REFINED) > 1 or REFINED in around[1:]:
+        raise InvalidInput(
+            f"agent {spec!r}: +{REFINED} comes first and once, then one shield of +{', +'.join(SHIELDS)}; for instance"
+            " ppo@shipped+refined+step"
+        )
+    return core, tuple(around)
+
+
+def _is_meant_around(before: str, core: str, last: str) -> bool:
+    """Whether a word behind a ``+`` that is none of ``AROUND`` is no part of an argument or path either."""
+    if ":" not in before and "@" not in before:
+        return True
+    if "/" in last or "\\" in last:
+        return False  # the last part of a path
+    path = core.partition("@")[2]
+    return bool(get_close_matches(last, AROUND)) and not (path and os.path.lexists(path))

@@ -1,0 +1,211 @@
+"""What an evaluation is given: who drives (agents from their specs, trained policies among them), in which worlds."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.registry import current_spelling, make_agent, make_single_agent
+from ethbrake_marl.agents.rollout import introduce, scripted
+from ethbrake_marl.agents.spelling import AgentSpec, parse_spec
+from ethbrake_marl.agents.team import Driver, Team, team_of
+from ethbrake_marl.errors import InvalidInput, OldSpelling, unknown_name
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
+from ethbrake_marl.shield.uncertainty import Uncertainty
+
+EPISODES = 10_000
+PROGRESS_EVERY = 500  # worlds between two signs of life
+TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only checked
+LIST_SEED = 7  # of the worlds on which everything is measured; has nothing to do with the seed of a training
+
+LADDER = (  # from no decision at all up to the best that is known
+    "coast",
+    "copy_leader",
+    "full_brake",
+    "gentlest_front",
+    "e_v2x_bm:pairwise",
+    "e_v2x_bm",
+    "planner",
+    "best_harm",
+)
+_LADDER_SPEC = "ladder"
+_LEARNED = ("ppo", "sac", "universal", "team")  # around whom ``--shield`` puts a shield
+OLD_SHIELDS = ("none", "episode", "step", "robust")  # of ``--shield``, the old spelling of ``+episode`` and so on
+
+
+def load_runnable(name_or_path: str) -> Scenario:
+    """Load a scenario as ``load_scenario`` does, and try its scripts, which the file's own check cannot know.
+
+    Raises ``InvalidInput`` naming the file, line, role and script that no agent of that name and argument can play.
+    """
+    scenario = load_scenario(name_or_path)
+    worlds = scenario.replace(early_impacts="keep").sample(1, LIST_SEED).worlds
+    for vehicle, script in scenario.scripts.items():
+        try:
+            agent = make_single_agent(script, horizon_s=scenario.horizon_s, most_candidates=TRIED_CANDIDATES)
+            _try_out(agent, worlds, vehicle)
+        except InvalidInput as error:
+            role = scenario.vehicle_names[vehicle]
+            where = _place_of_role(name_or_path, role)
+            raise InvalidInput(f"{where}: roles.{role} = {script}: {error}") from None
+    return scenario
+
+
+def load_driven(name_or_path: str, vehicle: str | None) -> Scenario:
+    """A runnable scenario with one learner, the vehicle to drive: ``vehicle``, by default the only learner.
+
+    Raises ``InvalidInput`` when there is no such vehicle, or nothing says which one it is.
+    """
+    scenario = load_runnable(name_or_path)
+    if vehicle is not None:
+        return scenario.with_learners([vehicle])
+    if len(scenario.learners) != 1:
+        learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "none"
+        raise InvalidInput(
+            f"scenario {scenario.name!r} has {len(scenario.learners)} learners ({learners}); say which vehicle is"
+            " driven, for instance --vehicle vehicle_2"
+        )
+    return scenario
+
+
+def load_evaluated(name_or_path: str, vehicle: str | None) -> Scenario:
+    """A runnable scenario whose learners are to be driven: ``vehicle`` alone, by default all learners there are.
+
+    Raises ``InvalidInput`` when there is no such vehicle, or no learner.
+    """
+    scenario = load_runnable(name_or_path)
+    if vehicle is not None:
+        return scenario.with_learners([vehicle])
+    if not scenario.learners:
+        raise InvalidInput(
+            f"scenario {scenario.name!r} has no learner to drive; give the scenario that the agents were trained for"
+            " (--scenario), or say which vehicle is driven, for instance --vehicle vehicle_2"
+        )
+    return scenario
+
+
+def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario) -> None:
+    """Try every agent before the first of them starts a long evaluation; raises what it would raise then.
+
+    Scripts that need no state are tried on all worlds, which takes no time; all others on the first.
+    """
+    for agent in agents.values():
+        team = team_of(agent, scenario.learners)
+        scripts = scripted(scenario, but=team.drivers)
+        for vehicle, driver in team.drivers.items():
+            introduce(driver, vehicle, scripts)
+            _try_out(driver, worlds if getattr(driver, "state_free", False) else worlds.take([0]), vehicle)
+
+
+def make_lineup(
+    specs: Sequence[str],
+    scenario: Scenario,
+    *,
+    harm_count: HarmCount = "first",
+    shield: str = "none",
+    uncertainty: Uncertainty | None = None,
+) -> dict[str, Driver]:
+    """One fresh agent per spec of ``make_agent``, by its spec as it is written now, to drive the scenario's learners.
+
+    ``ladder`` stands for every agent of ``LADDER``. ``harm_count`` is the harm that optimising and choosing agents
+    minimise. ``shield`` (one of ``OLD_SHIELDS``) is the old way to put ``+SHIELD`` behind every learned agent that has
+    none. ``uncertainty`` is what agents with ``+robust`` certify against. Raises ``InvalidInput`` for a spec given
+    twice, a shield that nobody gets, an uncertainty that is missing or that nobody uses, and what ``make_agent``
+    raises.
+    """
+    specs = [each for spec in specs for each in (LADDER if spec == _LADDER_SPEC else [spec])]
+    written = [current_spelling(spec, scenario=scenario, harm_count=harm_count) for spec in specs]
+    written = _behind(shield, written)
+    for k, each in enumerate(written):
+        if each in written[:k]:
+            raise InvalidInput(f"agent {str(each)!r} is given twice; each agent drives every world once")
+    if uncertainty is not None and not any(each.shield == "robust" for each in written):
+        raise InvalidInput(f"uncertainty {uncertainty}: nobody uses it; an agent with +robust does: ppo@PATH+robust")
+    return {
+        str(each): make_agent(str(each), scenario=scenario, harm_count=harm_count, uncertainty=uncertainty)
+        for each in written
+    }
+
+
+def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
+    """``make_lineup`` where one vehicle is driven; raises ``InvalidInput`` for a team too."""
+    alone = {}
+    for spec, agent in make_lineup(specs, scenario, harm_count=harm_count).items():
+        if isinstance(agent, Team):
+            raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
+        alone[spec] = agent
+    return alone
+
+
+def make_proposers(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
+    """``make_agents`` for what goes behind a shield; raises ``InvalidInput`` for a spec that has one already."""
+    agents = make_agents(specs, scenario, harm_count=harm_count)
+    for spec in agents:
+        if parse_spec(spec).shield is not None:
+            raise InvalidInput(
+                f"agent {spec!r}: has a shield already; here the shields are put around what proposes: ppo@PATH"
+            )
+    return agents
+
+
+def choose_worlds(
+    scenario: Scenario, *, initial_states: Path | None = None, episodes: int | None = None, seed: int | None = None
+) -> tuple[Sample, int | None]:
+    """The user's own worlds, or the first ``episodes`` of the list of ``seed``; and that seed, None for own worlds.
+
+    Raises ``InvalidInput`` when worlds are given and drawn at once, and what reading or drawing them raises.
+    """
+    if initial_states is None:
+        list_seed = LIST_SEED if seed is None else seed
+        return scenario.sample(EPISODES if episodes is None else episodes, list_seed), list_seed
+    if episodes is not None or seed is not None:
+        raise InvalidInput(
+            f"{initial_states}: gives the worlds, and a number of episodes or a seed draws them; use one"
+        )
+    worlds = read_initial_states(initial_states, scenario)
+    return Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0), None
+
+
+def _try_out(agent: Agent, worlds: Worlds, vehicle: int) -> None:
+    """Let a copy of the agent begin and act once."""
+    driver = copy.deepcopy(agent)
+    driver.begin(worlds, vehicle, np.arange(worlds.n))
+    driver.act(worlds, vehicle)
+
+
+def _place_of_role(name_or_path: str, role: str) -> str:
+    """File and line of a role, or the name of a shipped scenario."""
+    if not Path(name_or_path).is_file():
+        return f"scenario {name_or_path!r}"
+    return f"{name_or_path}, line {read_yaml(name_or_path).line_of(('roles', role))}"
+
+
+def _behind(shield: str, written: Sequence[AgentSpec]) -> list[AgentSpec]:
+    """Each learned agent that has no shield with this one behind it, the others as they are; ``none`` changes nothing.
+
+    Raises ``UnknownName`` for another shield, ``InvalidInput`` if nobody gets it.
+    """
+    if shield == "none":
+        return list(written)
+    if shield not in OLD_SHIELDS:
+        raise unknown_name("shield", shield, OLD_SHIELDS)
+    shielded = [
+        replace(each, around=(*each.around, shield)) if each.name in _LEARNED and each.shield is None else each
+        for each in written
+    ]
+    if shielded == list(written):
+        raise InvalidInput(
+            f"shield {shield}: nobody of {', '.join(map(str, written))} gets it; it is put around what learned and has"
+            f" no shield yet; any agent gets it as full_brake+{shield}"
+        )
+    now = ",".join(map(str, shielded))
+    warnings.warn(OldSpelling(f"shield {shield}: is written behind each agent now: {now}"), stacklevel=3)
+    return shielded

@@ -1,0 +1,93 @@
+"""Episode mode on a running engine, and the shield of each mode."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.agents.learned import LearnedPolicy
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.shield.agents import HybridAgent
+from ethbrake_marl.shield.engine_shield import Attached, AttachedShield, Sent
+from ethbrake_marl.shield.options import ShieldOptions
+from ethbrake_marl.shield.settings import proposing_agent
+
+ROUNDING = 1e-6  # of an action in 32 bits
+
+
+class EpisodeChoice(NamedTuple):
+    """What episode mode remembers: who drives, and that nothing was asked of it yet at this decision."""
+
+    hybrid: HybridAgent
+
+
+class AttachedHybrid(Attached):
+    """Episode mode on a running engine: ``HybridAgent`` chooses at each alert, and its action alone may be applied."""
+
+    def __init__(self, engine: Engine, policy: Agent | LearnedPolicy | None, options: ShieldOptions) -> None:
+        agent = proposing_agent(policy, options.where)
+        hybrid = HybridAgent(agent, engine.scenario, bound=options.bound, count=options.count)
+        super().__init__(engine, options, EpisodeChoice(hybrid))
+
+    @property
+    def hybrid(self) -> HybridAgent:
+        """The agent that drives, as it is now."""
+        choice: EpisodeChoice = self.memory
+        return choice.hybrid
+
+    @property
+    def running(self) -> bool:
+        """Whether any episode has begun."""
+        return self.hybrid.policy_harm.size > 0
+
+    def proposal(self) -> Floats:
+        """NaN: the agent that was chosen drives, whatever is proposed."""
+        return np.full(self.engine.n, np.nan)
+
+    def decide(self, proposed: Floats) -> Floats:
+        """The actions [n] to apply. Asked again before they were applied, the agent is not asked again."""
+        memory, engine = self.memory, self.engine
+        if self.sent is None or self.sent.memory is not memory:
+            worlds = engine.worlds
+            applied = command_to_action(memory.hybrid.act(worlds, self.vehicle), worlds.vehicles, self.vehicle)
+            self.sent = Sent(memory, engine.steps_made, applied, ~engine.ended, None)
+        return self.sent.applied
+
+    def begun(self, memory: EpisodeChoice, alert: Worlds, rows: Ints) -> EpisodeChoice:
+        """Who drives the episodes that start in these rows."""
+        hybrid = copy.copy(memory.hybrid)
+        hybrid.backup = copy.copy(hybrid.backup)
+        hybrid.begin(alert, self.vehicle, rows)
+        return EpisodeChoice(hybrid)
+
+    def info(self, k: int, proposed: float) -> dict[str, Any]:
+        """Who drives the episode of world ``k``; ``proposed_action`` is NaN when nothing was proposed.
+
+        A proposal counts as replaced where it differs by more than the rounding of its 32 bits.
+        """
+        assert self.sent is not None
+        applied = float(self.sent.applied[k])
+        return {
+            "mode": "episode",
+            "proposed_action": proposed,
+            "applied_action": applied,
+            "intervened": abs(applied - proposed) > ROUNDING,
+            "chosen_policy": bool(self.hybrid.chosen_policy[k]),
+            "policy_harm": float(self.hybrid.policy_harm[k]),
+            "bound_harm": float(self.hybrid.bound_harm[k]),
+        }
+
+    def _carried_out(self, memory: EpisodeChoice, sent: Sent, after: Engine) -> EpisodeChoice:
+        return EpisodeChoice(memory.hybrid)  # another one: the next decision is another one, too
+
+
+def attach(engine: Engine, policy: Agent | LearnedPolicy | None, options: ShieldOptions) -> Attached:
+    """The shield of the options' mode on a running engine."""
+    if options.mode == "episode":
+        return AttachedHybrid(engine, policy, options)
+    return AttachedShield(engine, policy, options)

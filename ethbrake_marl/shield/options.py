@@ -1,0 +1,73 @@
+"""What a shield around an interface is set to: its settings and their checks, the same for every interface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.shield.agents import Bound
+from ethbrake_marl.shield.settings import check_amount
+from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
+
+MODES = ("episode", "step", "robust")
+
+
+@dataclass(frozen=True, slots=True)
+class ShieldOptions:
+    """The settings of ``HybridShield``, ``ShieldedEnv``, ``ShieldedVectorEnv`` and ``ShieldedVecEnv``: their keywords.
+
+    Args:
+        mode: ``episode`` (Algorithm 1: policy or E-V2X-BM for a whole episode), ``step`` (each action is certified or
+            replaced) or ``robust`` (``step`` against an uncertainty). None: ``robust`` with an uncertainty, else
+            ``step``.
+        bound: the ``H*`` of mode ``episode``, ``coupled`` or the paper's ``pairwise``.
+        count: the harm that is guaranteed, ``first`` or ``total``.
+        allowance: how far above the bound is allowed, m2/s2; not in mode ``episode``.
+        uncertainty: what mode ``robust`` does not know, such as ``"gaps_m=0.5"``.
+        intervention_penalty: taken off the reward of a step in which something else than the proposal was applied.
+        logging: keep every intervention in ``shield.log``; not in mode ``episode``.
+        where: who is given them, for messages.
+
+    Raises ``InvalidInput`` naming the setting that does not fit, ``UnknownName`` for a mode.
+
+    >>> ShieldOptions(uncertainty="gaps_m=0.5").mode
+    'robust'
+
+    """
+
+    mode: str | None = None
+    bound: Bound = "coupled"
+    count: HarmCount = "first"
+    allowance: float = 0.0
+    uncertainty: Uncertainty | str | None = None
+    intervention_penalty: float = 0.0
+    logging: bool = False
+    where: str = field(default="shield", compare=False)
+
+    def __post_init__(self) -> None:
+        mode = self.mode if self.mode is not None else "step" if self.uncertainty is None else "robust"
+        if mode not in MODES:
+            raise unknown_name("shield mode", mode, MODES)
+        uncertainty = mode_uncertainty(mode, self.uncertainty, self.where)
+        if mode == "episode" and (self.allowance != 0.0 or self.logging):
+            name = "allowance" if self.allowance != 0.0 else "logging"
+            raise InvalidInput(
+                f"{self.where}: {name} = {getattr(self, name)!r}: mode episode takes none; step and robust do"
+            )
+        if mode != "episode" and self.bound != "coupled":
+            raise InvalidInput(f"{self.where}: bound = {self.bound!r}: mode {mode} takes none; episode does")
+        check_amount("intervention_penalty", self.intervention_penalty, self.where)
+        object.__setattr__(self, "mode", mode)
+        object.__setattr__(self, "uncertainty", uncertainty)
+
+
+def read_options(where: str, given: Mapping[str, Any]) -> ShieldOptions:
+    """The options of an interface's keywords; raises ``UnknownName`` for one that is none."""
+    known = {each.name for each in fields(ShieldOptions)} - {"where"}
+    for name in given:
+        if name not in known:
+            raise unknown_name(f"{where} option", name, known)
+    return ShieldOptions(**given, where=where)
