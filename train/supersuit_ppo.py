@@ -23,9 +23,8 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.durable import new_folder
-from ethbrake_marl.learning.models import tensors_of
-from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.schemes import scheme_of
+from ethbrake_marl.learning.algorithms.networks import tensors_of
+from ethbrake_marl.learning.training import resolve
 from ethbrake_marl.policies.manifest import NetworkSpec, installed_versions, observation_schema
 from ethbrake_marl.policies.policy import Policy, make_policy, save_policy
 from ethbrake_marl.rewards import reward_params
@@ -131,7 +130,7 @@ def train(scenario: eb.Scenario, steps: int, seed: int, output: Path) -> None:
 
     Refuses at once what cannot be: steps, a seed, a scenario in which nobody learns, an `output` that is there.
     """
-    scheme_of(load_recipe("ppo").replace(total_steps=steps, seed=seed), scenario)
+    resolve("ppo", scenario, total_steps=steps, seed=seed)
     with new_folder(output) as folder:
         save_policy(learn(scenario, steps, seed), folder / "policy")
 

@@ -23,14 +23,14 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.evaluation.per_world import check_target, write_output
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.schemes import check_scheme, drivers, scheme_of, who_drives_what
+from ethbrake_marl.learning.schemes import check_scheme, who_drives_what
 from ethbrake_marl.policies.onnx import onnx_model
 from ethbrake_marl.policies.policy import save_policy
 from ethbrake_marl.policies.shipped import load_named_policy
 
 if TYPE_CHECKING:
     from ethbrake_marl.learning.loop import Progress
-    from ethbrake_marl.learning.teams import TeamResult
+    from ethbrake_marl.learning.train import TrainResult
 
 
 KEPT = "if the training had begun, the run's folder keeps the last good policy, and ethbrake resume FOLDER goes on"
@@ -54,15 +54,18 @@ def train_command(
     """
     with interruptible(KEPT):
         # Here and in other commands that learn: torch takes seconds to load, and no other command needs it.
-        from ethbrake_marl.learning.teams import train_team
+        from ethbrake_marl.learning.train import train
+        from ethbrake_marl.learning.training import resolve
         from ethbrake_marl.studies.experiment import run_folder
 
         chosen, plan = load_runnable(scenario), load_recipe(recipe)
         if scheme is not None:
             plan = plan.replace(scheme=check_scheme(scheme))
-        used = scheme_of(plan, chosen)
+        training = resolve(plan, chosen)
         folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
-        begun = [f"scheme {used}: {who_drives_what(drivers(used, chosen))}"]  # said once all input is known to be good
+        begun = [
+            f"scheme {training.scheme}: {who_drives_what(training.drivers)}"
+        ]  # said once all input is known to be good
         with progress_bars() as bars:
 
             def tell(progress: Progress) -> None:
@@ -70,7 +73,7 @@ def train_command(
                     bars.tell(begun.pop())
                 show_progress(bars, progress)
 
-            result = train_team(plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell)
+            result = train(plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell)
     _show_result(result, as_json)
 
 
@@ -86,10 +89,10 @@ def resume_command(
     The policy is the one that the training would have come to without the stop, bit for bit.
     """
     with interruptible(KEPT):
-        from ethbrake_marl.learning.teams import resume_team
+        from ethbrake_marl.learning.train import resume
 
         with progress_bars() as bars:
-            result = resume_team(folder, on_progress=lambda p: show_progress(bars, p), other_versions=other_versions)
+            result = resume(folder, on_progress=lambda p: show_progress(bars, p), other_versions=other_versions)
     _show_result(result, as_json)
 
 
@@ -146,12 +149,12 @@ def end_of_training(status: str, steps: int, folder: Path) -> None:
     say(f"{status} after {steps:,} training steps: {folder}")
 
 
-def _show_result(result: TeamResult, as_json: bool) -> None:
+def _show_result(result: TrainResult, as_json: bool) -> None:
     if as_json:
         last = result.evaluations[-1] if result.evaluations else None
         content = {"directory": str(result.directory), "status": result.status, "steps": result.steps}
         best = next(iter(result.policies.values())).manifest.steps
-        team = {"scheme": result.scheme, "drivers": dict(result.drivers)}
+        team = {"scheme": result.training.scheme, "drivers": dict(result.training.drivers)}
         write_json({**content, **team, "evaluation": last, "policy_steps": best, "alarms": list(result.alarms)})
     end_of_training(result.status, result.steps, result.directory)
 

@@ -24,11 +24,11 @@ from torchrl.modules import MultiAgentMLP
 
 from ethbrake_marl.envs.setup import feature_box, make_engine
 from ethbrake_marl.envs.state import full_state, state_features
+from ethbrake_marl.learning.algorithms.ppo import PpoRecipe
 from ethbrake_marl.learning.model_state import own_random_state
-from ethbrake_marl.learning.recipe import PpoRecipe
 from ethbrake_marl.learning.run_folder import create_run, write_status
-from ethbrake_marl.learning.schemes import scheme_of
 from ethbrake_marl.learning.team_file import team_content
+from ethbrake_marl.learning.training import resolve
 from ethbrake_marl.observations import observation_for
 from ethbrake_marl.policies.actor import Float32s
 from ethbrake_marl.policies.manifest import NetworkSpec, installed_versions, observation_schema
@@ -162,10 +162,10 @@ def train_mappo(recipe: PpoRecipe, scenario: Scenario, directory: str | Path, *,
     """Train BenchMARL's MAPPO with the numbers of ``recipe``, and leave the shared actor in the new ``directory``.
 
     ``load_team`` and ``ppo@DIRECTORY`` take it. The learning rate stays at its start, as BenchMARL has no schedule;
-    there are no checkpoints and nothing is measured on the way. Raises what ``train_team`` raises.
+    there are no checkpoints and nothing is measured on the way. Raises what ``learning.train.train`` raises.
     """
     recipe = recipe.replace(scheme="centralised")
-    team = team_content(scheme_of(recipe, scenario), scenario)
+    team = team_content(resolve(recipe, scenario).scheme, scenario)
     content = {"recipe": recipe.model_dump(mode="json"), "scenario": scenario.model_dump(mode="json")}
     run = create_run(Path(directory), {**content, "library": "benchmarl"}, team=team, force=force)
     with own_random_state(), tempfile.TemporaryDirectory() as scratch:

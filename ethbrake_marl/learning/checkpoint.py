@@ -25,7 +25,7 @@ from ethbrake_marl.files.arrays import map_npy, safetensors_headers
 from ethbrake_marl.files.durable import new_folder, remove_folder, write_file
 from ethbrake_marl.files.plain import open_plain, read_plain
 from ethbrake_marl.learning.checkpoint_schema import Listing, Numbers, checked_json
-from ethbrake_marl.learning.run_folder import parse_progress
+from ethbrake_marl.learning.run_log import parse_progress
 from ethbrake_marl.policies.team import Trained, read_trained, save_trained
 
 FORMAT_VERSION = 1

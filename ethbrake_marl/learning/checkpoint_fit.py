@@ -5,6 +5,7 @@ A listing whose hashes agree says that a checkpoint was not damaged, not that it
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stable_baselines3 import SAC
 
 from ethbrake_marl.engine.snapshot import Arrays
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.files.arrays import ArrayHeader, ArrayRow, check_arrays
+from ethbrake_marl.learning.algorithms.protocol import Algorithm
 from ethbrake_marl.learning.checkpoint import TrainingState
-from ethbrake_marl.learning.model_state import REPLAY, Model, optimizers_of
+from ethbrake_marl.learning.model_state import REPLAY, Model
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.team import Trained, drivers_of
 
@@ -28,7 +29,7 @@ _STREAM = "environment.engine.stream"
 _DRAWN_LIMIT = 1 << 53  # worlds
 
 
-def check_fits(folder: Path, state: TrainingState, model: Model, policy: Trained) -> None:
+def check_fits(folder: Path, state: TrainingState, model: Model, algorithm: Algorithm, policy: Trained) -> None:
     """Raise ``CorruptBundle`` unless ``state`` is one of this freshly built ``model``, whose policy is ``policy``.
 
     ``folder`` is where the checkpoints stand, for the message.
@@ -36,9 +37,9 @@ def check_fits(folder: Path, state: TrainingState, model: Model, policy: Trained
     Resets the model's environment, which the state is going to replace.
     """
     try:
-        _check_arrays(state.arrays, model)
+        _check_arrays(state.arrays, model, algorithm)
         _check_generators(state.arrays)
-        _check_numbers(state, model)
+        _check_numbers(state, tuple(algorithm.optimizers(model)))
         _check_replay(state, model)
         for name, trained in (("policy", state.policy), ("best", state.best)):
             if trained is not None:
@@ -50,13 +51,12 @@ def check_fits(folder: Path, state: TrainingState, model: Model, policy: Trained
         ) from None
 
 
-def _check_arrays(arrays: Arrays, model: Model) -> None:
+def _check_arrays(arrays: Arrays, model: Model, algorithm: Algorithm) -> None:
     environment: Any = model.env
     environment.reset()
     rows = [_row(f"policy.{name}", tensor.numpy()) for name, tensor in model.policy.state_dict().items()]
-    if isinstance(model, SAC) and model.log_ent_coef is not None:
-        rows.append(_row("log_ent_coef", model.log_ent_coef.detach().numpy()))
-    for name, optimizer in optimizers_of(model).items():
+    rows += [_row(name, tensor.numpy()) for name, tensor in algorithm.learned_beside(model).items()]
+    for name, optimizer in algorithm.optimizers(model).items():
         rows += _optimizer_rows(f"optimizer.{name}.", optimizer, arrays)
     fresh: Arrays = {f"environment.{name}": array for name, array in environment.snapshot().items()}
     rows += [_environment_row(name, array) for name, array in fresh.items()]
@@ -82,12 +82,15 @@ def _check_arrays(arrays: Arrays, model: Model) -> None:
 
 
 def _optimizer_rows(prefix: str, optimizer: torch.optim.Optimizer, arrays: Arrays) -> Iterator[ArrayRow]:
-    """Adam's three arrays of each parameter that has had a gradient."""
-    for index, parameter in enumerate(optimizer.param_groups[0]["params"]):
-        if f"{prefix}{index}.step" in arrays:
-            yield ArrayRow(f"{prefix}{index}.step", "<f4", ())
-            yield ArrayRow(f"{prefix}{index}.exp_avg", "<f4", tuple(parameter.shape))
-            yield ArrayRow(f"{prefix}{index}.exp_avg_sq", "<f4", tuple(parameter.shape))
+    """What this optimiser keeps of each parameter that has had a gradient, shown by one step of a copy of it."""
+    shown = copy.deepcopy(optimizer)  # its hooks are not copied
+    for parameter in shown.param_groups[0]["params"]:
+        parameter.grad = torch.zeros_like(parameter)
+    shown.step()
+    had = {name.removeprefix(prefix).partition(".")[0] for name in arrays if name.startswith(prefix)}
+    for index, kept in shown.state_dict()["state"].items():
+        if str(index) in had:
+            yield from (_row(f"{prefix}{index}.{key}", torch.as_tensor(value).numpy()) for key, value in kept.items())
 
 
 def _environment_row(name: str, array: NDArray[Any]) -> ArrayRow:
@@ -111,14 +114,14 @@ def _check_generators(arrays: Arrays) -> None:
         raise ValueError(f"array 'random.torch' is no state of torch's generator ({error})") from None
 
 
-def _check_numbers(state: TrainingState, model: Model) -> None:
+def _check_numbers(state: TrainingState, optimizers: tuple[str, ...]) -> None:
     """The counters agree with each other, and there is a learning rate for every optimiser."""
-    counters, optimizers = state.numbers["counters"], optimizers_of(model)
+    counters = state.numbers["counters"]
     if counters["num_timesteps"] != state.steps or state.numbers["between"]["updates"] != state.updates:
         raise ValueError("state.json: steps or updates are not those of the listing")
     if counters["_total_timesteps"] < counters["num_timesteps"]:
         raise ValueError("state.json: counters._total_timesteps is below the steps done")
-    if state.numbers["learning_rates"].keys() != optimizers.keys():
+    if state.numbers["learning_rates"].keys() != set(optimizers):
         raise ValueError(f"state.json: learning_rates must be of {', '.join(optimizers)}")
 
 

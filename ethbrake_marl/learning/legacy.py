@@ -5,19 +5,16 @@ from __future__ import annotations
 import hashlib
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC
-from torch import nn
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.models import tensors_of
-from ethbrake_marl.learning.recipe import Algorithm
+from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS, tensors_of
 from ethbrake_marl.observations import observation_for
 from ethbrake_marl.policies.manifest import (
-    Activation,
     NetworkSpec,
     installed_versions,
     observation_schema,
@@ -26,11 +23,12 @@ from ethbrake_marl.policies.manifest import (
 from ethbrake_marl.policies.policy import Policy, make_policy
 from ethbrake_marl.scenario import Scenario
 
-_CLASSES: dict[Algorithm, Any] = {"ppo": PPO, "sac": SAC}
-_ACTIVATIONS: dict[type[nn.Module], Activation] = {nn.ReLU: "relu", nn.Tanh: "tanh"}
+Saved = Literal["ppo", "sac"]
+
+_CLASSES: dict[Saved, Any] = {"ppo": PPO, "sac": SAC}
 
 
-def import_legacy(file: Path, scenario: Scenario, *, algorithm: Algorithm = "ppo", trusted: bool = False) -> Policy:
+def import_legacy(file: Path, scenario: Scenario, *, algorithm: Saved = "ppo", trusted: bool = False) -> Policy:
     """The policy in ``file``, which was trained by ``algorithm`` on ``scenario`` with this package's observations.
 
     ``trusted`` says that the file may run code: Stable-Baselines3 unpickles parts of it, and a pickle can do anything
@@ -73,13 +71,14 @@ def _check_spaces(file: Path, model: Any, size: int) -> None:
         raise InvalidInput(f"{file}: its actions are {acting}; ours are one number in [-1, 1]")
 
 
-def _network(file: Path, model: Any, algorithm: Algorithm, observation_size: int) -> NetworkSpec:
+def _network(file: Path, model: Any, algorithm: Saved, observation_size: int) -> NetworkSpec:
     """Our description of its network, read off its tensors."""
     state: dict[str, torch.Tensor] = model.policy.state_dict()
     actor = "mlp_extractor.policy_net" if algorithm == "ppo" else "actor.latent_pi"
-    activation = model.policy.activation_fn
-    if activation not in _ACTIVATIONS:
-        raise InvalidInput(f"{file}: activation {activation.__name__}; only ReLU and Tanh are known")
+    made = model.policy.activation_fn
+    activation = next((name for name, known in ACTIVATIONS.items() if known is made), None)
+    if activation is None:
+        raise InvalidInput(f"{file}: activation {made.__name__}; only ReLU and Tanh are known")
     hidden, value = _widths(state, actor), _widths(state, "mlp_extractor.value_net") if algorithm == "ppo" else ()
     if not hidden:
         raise InvalidInput(f"{file}: its policy has no hidden layers of its own ({actor}.*)")
@@ -88,7 +87,7 @@ def _network(file: Path, model: Any, algorithm: Algorithm, observation_size: int
         action_size=1,
         policy_hidden=hidden,
         value_hidden=value,
-        activation=_ACTIVATIONS[activation],
+        activation=activation,
         output="clip" if algorithm == "ppo" else "tanh",
     )
     for row in tensor_table(spec):

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from ethbrake_marl.learning.algorithms.protocol import Algorithm
 from ethbrake_marl.learning.model_state import Model
 from ethbrake_marl.learning.progress import RETURN, Course, check_losses, check_rollout, check_step, check_weights
 from ethbrake_marl.learning.recipe import TrainingRecipe
@@ -41,6 +43,9 @@ class Progress:
     note: str = ""  # to be told once
 
 
+OnProgress = Callable[[Progress], None]
+
+
 class Save(Protocol):
     """Writes a checkpoint of the training at rest."""
 
@@ -59,15 +64,16 @@ class BetweenUpdates(BaseCallback):
     def __init__(
         self,
         recipe: TrainingRecipe,
+        algorithm: Algorithm,
         policy_now: Callable[[Model], Trained],
         *,
         save: Save,
         stop: Callable[[], bool],
         evaluate: Evaluate | None,
-        on_progress: Callable[[Progress], None] | None,
+        on_progress: OnProgress | None,
     ) -> None:
         super().__init__()
-        self.recipe, self._policy_now, self._save = recipe, policy_now, save
+        self.recipe, self._algorithm, self._policy_now, self._save = recipe, algorithm, policy_now, save
         self._stop, self._evaluate, self._on_progress = stop, evaluate, on_progress
         self.updates = 0
         self.course = Course(recipe.reward.harm_count)
@@ -117,7 +123,7 @@ class BetweenUpdates(BaseCallback):
 
     def _on_step(self) -> bool:
         infos = self.locals["infos"]
-        if not isinstance(self.model, PPO):
+        if not isinstance(self.model, OnPolicyAlgorithm):
             check_step(self.model, self.locals["rewards"], self.locals["new_obs"])
         for row in np.flatnonzero(self.locals["dones"]):
             for column, name in EPISODE_COLUMNS.items():
@@ -125,7 +131,7 @@ class BetweenUpdates(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        if isinstance(self.model, PPO):
+        if isinstance(self.model, OnPolicyAlgorithm):
             check_rollout(self.model)
         self.updates += 1
 
@@ -150,7 +156,7 @@ class BetweenUpdates(BaseCallback):
         """Bring the course to this moment."""
         course = self.course
         if course.policy is None or (course.steps, course.updates) != (self.model.num_timesteps, self.updates):
-            check_weights(self.model)
+            check_weights(self.model, self._algorithm)
             course.policy = self._policy_now(self.model)
             course.steps, course.updates = self.model.num_timesteps, self.updates
 
@@ -173,10 +179,12 @@ class BetweenUpdates(BaseCallback):
             for column, values in self._ended.items():
                 self.logger.record(column, float(np.mean(values)))
         self._ended = {column: [] for column in EPISODE_COLUMNS}
-        if self.updates and isinstance(self.model, PPO):
+        if self.updates and isinstance(self.model, OnPolicyAlgorithm):
             self.model.dump_logs(self.updates)
-        elif self.updates:
+        elif self.updates and isinstance(self.model, OffPolicyAlgorithm):
             self.model.dump_logs()
+        elif self.updates:
+            self.logger.dump(step=self.model.num_timesteps)
         elif self.course.evaluations:
             self.logger.dump(step=0)
         self.tell()

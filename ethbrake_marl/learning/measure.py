@@ -6,7 +6,7 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.team import Driver, Team
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.learning.loop import Evaluate
-from ethbrake_marl.learning.recipe import TrainingRecipe
+from ethbrake_marl.learning.training import Training
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.team import Trained
 from ethbrake_marl.scenario import Scenario
@@ -14,8 +14,9 @@ from ethbrake_marl.scenario import Scenario
 METRICS = ("first_impact_harm", "total_harm", "collision_rate")
 
 
-def measure_on_list(recipe: TrainingRecipe, scenario: Scenario) -> Evaluate:
+def measure_on_list(training: Training) -> Evaluate:
     """What measures the learners' policies on the recipe's fixed list: the means that ``evaluate`` gives on it."""
+    recipe, scenario = training.recipe, training.scenario
     worlds = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
 
     def measure(trained: Trained) -> dict[str, float]:

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from gymnasium.spaces import Space
 from numpy.typing import NDArray
-from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from ethbrake_marl.engine.snapshot import Arrays
-from ethbrake_marl.learning.independent import IndependentPPO
+from ethbrake_marl.learning.algorithms.protocol import Algorithm
 
 
 @contextmanager
@@ -65,19 +65,18 @@ def restore_random(actions: Space[Any], arrays: Mapping[str, NDArray[Any]], plai
     actions.np_random.bit_generator.state = plain["actions"]
 
 
-Model = PPO | SAC
+Model = BaseAlgorithm  # of Stable-Baselines3
 
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "_total_timesteps")
 
 
-def capture_model(model: Model) -> tuple[Arrays, dict[str, Any]]:
+def capture_model(model: Model, algorithm: Algorithm) -> tuple[Arrays, dict[str, Any]]:
     """Weights, optimisers, environment, random generators and counters between two updates, replay memory aside."""
     arrays: Arrays = {f"policy.{name}": _copied(tensor) for name, tensor in model.policy.state_dict().items()}
-    if isinstance(model, SAC) and model.log_ent_coef is not None:
-        arrays["log_ent_coef"] = _copied(model.log_ent_coef.detach())
+    arrays |= {name: _copied(tensor) for name, tensor in algorithm.learned_beside(model).items()}
     rates: dict[str, float] = {}
-    for name, optimizer in optimizers_of(model).items():
+    for name, optimizer in algorithm.optimizers(model).items():
         content = optimizer.state_dict()
         rates[name] = float(content["param_groups"][0]["lr"])
         for index, entries in content["state"].items():
@@ -97,12 +96,14 @@ def capture_model(model: Model) -> tuple[Arrays, dict[str, Any]]:
     return arrays, {"counters": counters, "learning_rates": rates, "random": random_plain, "log": _pending_log(model)}
 
 
-def restore_model(model: Model, arrays: Mapping[str, NDArray[Any]], plain: Mapping[str, Any]) -> None:
+def restore_model(
+    model: Model, algorithm: Algorithm, arrays: Mapping[str, NDArray[Any]], plain: Mapping[str, Any]
+) -> None:
     """Bring a freshly built model of the same recipe to the state of ``capture_model``."""
     model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in _group(arrays, "policy.").items()})
-    if isinstance(model, SAC) and model.log_ent_coef is not None:
-        model.log_ent_coef.data.copy_(torch.from_numpy(arrays["log_ent_coef"]))
-    for name, optimizer in optimizers_of(model).items():
+    for name, tensor in algorithm.learned_beside(model).items():
+        tensor.data.copy_(torch.from_numpy(arrays[name]))
+    for name, optimizer in algorithm.optimizers(model).items():
         _restore_optimizer(optimizer, _group(arrays, f"optimizer.{name}."), plain["learning_rates"][name])
     environment: Any = model.env
     environment.restore(_group(arrays, "environment."))
@@ -140,18 +141,6 @@ def restore_replay(model: Model, arrays: Mapping[str, NDArray[Any]], plain: Mapp
     for name in REPLAY:
         getattr(memory, name)[: len(arrays[name])] = arrays[name]
     memory.pos, memory.full = plain["pos"], plain["full"]
-
-
-def optimizers_of(model: Model) -> dict[str, torch.optim.Optimizer]:
-    """The model's optimisers by name."""
-    if isinstance(model, IndependentPPO):
-        return dict(zip(model.names, (member.optimizer for member in model.policy.policies), strict=True))
-    if isinstance(model, PPO):
-        return {"policy": model.policy.optimizer}
-    found: dict[str, Any] = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
-    if model.ent_coef_optimizer is not None:
-        found["ent_coef"] = model.ent_coef_optimizer
-    return found
 
 
 def _restore_optimizer(optimizer: torch.optim.Optimizer, arrays: Arrays, rate: float) -> None:

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3 import PPO
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.model_state import Model, optimizers_of
+from ethbrake_marl.learning.algorithms.protocol import Algorithm
+from ethbrake_marl.learning.model_state import Model
 from ethbrake_marl.policies.team import Trained
 
 HARM_METRIC: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
@@ -105,6 +106,7 @@ def misleading_return(evaluations: Sequence[Mapping[str, float]], harm: str) -> 
 
 _LOSSES = (
     "loss",
+    "policy_loss",
     "value_loss",
     "policy_gradient_loss",
     "actor_loss",
@@ -117,9 +119,9 @@ class TrainingDiverged(EthBrakeError, ArithmeticError):
     """A reward, a loss or a weight is no longer a finite number; the last good policy was kept."""
 
 
-def watch_gradients(model: Model) -> None:
+def watch_gradients(model: Model, algorithm: Algorithm) -> None:
     """Refuse every optimiser step whose gradients are not finite, so that the weights stay as they were."""
-    hint = "learning_rate or max_grad_norm" if isinstance(model, PPO) else "learning_rate"
+    hint = "learning_rate or max_grad_norm" if hasattr(model, "max_grad_norm") else "learning_rate"
 
     def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
         sums = [p.grad.sum() for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
@@ -128,7 +130,7 @@ def watch_gradients(model: Model) -> None:
                 f"training: the gradient of the loss is not finite at step {model.num_timesteps}; try a smaller {hint}"
             )
 
-    for optimizer in optimizers_of(model).values():
+    for optimizer in algorithm.optimizers(model).values():
         optimizer.register_step_pre_hook(check)
 
 
@@ -144,9 +146,9 @@ def check_losses(model: Model) -> None:
             )
 
 
-def check_weights(model: Model) -> None:
+def check_weights(model: Model, algorithm: Algorithm) -> None:
     """Refuse weights that are not finite."""
-    if not weights_are_finite(model):
+    if not weights_are_finite(model, algorithm):
         raise TrainingDiverged(f"training: a weight is not finite after step {model.num_timesteps}")
 
 
@@ -162,7 +164,7 @@ def check_step(model: Model, rewards: Any, observations: Any) -> None:
             )
 
 
-def check_rollout(model: PPO) -> None:
+def check_rollout(model: OnPolicyAlgorithm) -> None:
     """Refuse a rollout that holds a reward or observation that is not finite; names which."""
     for name in ("observations", "rewards"):
         entries = getattr(model.rollout_buffer, name)
@@ -175,13 +177,11 @@ def check_rollout(model: PPO) -> None:
             )
 
 
-def weights_are_finite(model: Model) -> bool:
+def weights_are_finite(model: Model, algorithm: Algorithm) -> bool:
     """Whether every weight is finite, and the exploration noise a usable one."""
-    numbers = [*model.policy.parameters()]
-    spread = None
-    if isinstance(model, PPO):
-        spread = torch.exp(model.policy.log_std.detach())
-    elif model.log_ent_coef is not None:
-        spread = torch.exp(model.log_ent_coef.detach())
-    finite = all(bool(torch.isfinite(p).all()) for p in numbers)
-    return finite and (spread is None or bool((torch.isfinite(spread) & (spread > 0.0)).all()))
+    finite = all(bool(torch.isfinite(p).all()) for p in model.policy.parameters())
+    logarithm = algorithm.log_noise(model)
+    if logarithm is None:
+        return finite
+    noise = torch.exp(logarithm)
+    return finite and bool((torch.isfinite(noise) & (noise > 0.0)).all())

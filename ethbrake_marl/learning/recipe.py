@@ -5,23 +5,20 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.messages import Wording, explain
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
+from ethbrake_marl.learning.registry import algorithm_names, recipe_class
 from ethbrake_marl.policies.manifest import Activation, NetworkSpec, Width
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario.catalogue import shipped_folder
-from ethbrake_marl.scenario.checks import refuse
-
-ROLLOUT_LIMIT = 2**24  # decisions held in memory between two updates
 
 WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
 
-Algorithm = Literal["ppo", "sac"]
 Scheme = Literal["single", "shared", "independent", "centralised"]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -97,18 +94,19 @@ class EvaluationPlan(_Part):
 class TrainingRecipe(_Part):
     """How to train, whatever the algorithm: its name, reward, seed, and what is saved and measured on the way.
 
-    An update is one round of collecting and learning.
+    An update is one round of collecting and learning. The recipes of an algorithm are a class made from this one.
     """
+
+    schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # under which the algorithm can learn
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")
     title: str = ""
     description: str = ""
     source: str = ""
-    algorithm: Algorithm
+    algorithm: str
     scheme: Scheme | None = None  # None: single for one learner, shared for several
     total_steps: Annotated[int, Field(ge=1)]
     n_envs: Annotated[int, Field(ge=1)]
-    batch_size: Annotated[int, Field(ge=2)]
     learning_rate: LearningRate
     gamma: Fraction
     reward: RewardParams
@@ -138,107 +136,20 @@ class TrainingRecipe(_Part):
         """Updates between two rows of the progress table."""
         return 1
 
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What follows from the recipe and is worth a key of ``config.json``."""
+        return {}
+
+    def check_learners(self, learners: int) -> None:
+        """Raise ``InvalidInput`` where the recipe does not fit a line with that many learners."""
+
     def replace(self, **changes: Any) -> Self:
         """The same recipe with other values in some fields, checked again; raises ``InvalidInput``."""
         content = {**self.model_dump(mode="json"), **changes}
         changed = _checked(Document(f"recipe {self.name!r}", content, {}))
         assert isinstance(changed, type(self)) or "algorithm" in changes
         return changed  # type: ignore[return-value]  # of another class only if another algorithm was asked for
-
-
-class PpoRecipe(TrainingRecipe):
-    """PPO: collect ``n_steps`` decisions of every learner, then go through them ``n_epochs`` times."""
-
-    algorithm: Literal["ppo"]
-    n_steps: Annotated[int, Field(ge=2)]
-    n_epochs: Annotated[int, Field(ge=1, le=1000)]
-    gae_lambda: Fraction
-    clip_range: Rate
-    ent_coef: NonNegative
-    vf_coef: NonNegative
-    max_grad_norm: Positive
-    target_kl: Positive | None = None
-    turns: Annotated[int, Field(ge=1, le=1000)] | None = None  # of independent learners; None: all learn at once
-    network: NetworkShape
-
-    @model_validator(mode="after")
-    def _turns_are_for_independent_learners(self) -> PpoRecipe:
-        if self.turns is not None and self.scheme != "independent":
-            refuse(("turns",), self.turns, "is for scheme: independent only; leave it out")
-        return self
-
-    @model_validator(mode="after")
-    def _whole_batches(self) -> PpoRecipe:
-        rollout = self.n_envs * self.n_steps
-        if not rollout <= ROLLOUT_LIMIT:
-            right = f"n_envs x n_steps = {rollout} decisions per update; at most {ROLLOUT_LIMIT}"
-            refuse(("n_envs",), self.n_envs, right)
-        if rollout % self.batch_size:
-            refuse(("batch_size",), self.batch_size, f"must divide n_envs x n_steps = {rollout}")
-        return self
-
-    def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Actor and critic."""
-        return self.network.spec(observation_size)
-
-    @property
-    def rounds(self) -> int:
-        """Decisions of each learner between two updates."""
-        return self.n_steps
-
-
-class SacRecipe(TrainingRecipe):
-    """SAC: collect ``steps_per_update`` decisions of every learner, then ``gradient_steps`` steps from the memory."""
-
-    algorithm: Literal["sac"]
-    steps_per_update: Annotated[int, Field(ge=1, le=10_000)] = 1
-    gradient_steps: Annotated[int, Field(ge=1, le=100_000)] = 1
-    buffer_size: Annotated[int, Field(ge=1, le=10_000_000)]
-    learning_starts: Annotated[int, Field(ge=0)]
-    tau: Rate
-    ent_coef: float | str = "auto"
-    initial_ent_coef: Positive = 1.0  # where an automatic one starts
-    target_entropy: Annotated[float, Field(allow_inf_nan=False)] | None = None  # None: -1 per action
-    target_update_interval: Annotated[int, Field(ge=1)] = 1
-    network: SquashedShape
-    log_every_updates: Annotated[int, Field(ge=1)]
-
-    @field_validator("ent_coef", mode="plain")
-    @classmethod
-    def _automatic_or_fixed(cls, value: Any) -> float | str:
-        if value == "auto":
-            return "auto"
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
-            raise ValueError("must be auto or a number of at least 0")
-        return float(value)
-
-    @model_validator(mode="after")
-    def _room_for_everybody(self) -> SacRecipe:
-        if not self.buffer_size >= self.n_envs:
-            refuse(("buffer_size",), self.buffer_size, f"must be at least n_envs = {self.n_envs}")
-        return self
-
-    def network_spec(self, observation_size: int) -> NetworkSpec:
-        """The actor alone."""
-        return self.network.spec(observation_size)
-
-    @property
-    def rounds(self) -> int:
-        """Decisions of each learner between two updates."""
-        return self.steps_per_update
-
-    @property
-    def logged_updates(self) -> int:
-        """Updates between two rows of the progress table."""
-        return self.log_every_updates
-
-    @property
-    def update_ratio(self) -> float:
-        """Gradient steps per decision of one learner in each world."""
-        return self.gradient_steps / (self.n_envs * self.steps_per_update)
-
-
-RECIPES: dict[str, type[PpoRecipe] | type[SacRecipe]] = {"ppo": PpoRecipe, "sac": SacRecipe}
 
 
 def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
@@ -270,22 +181,22 @@ def _checked(document: Document) -> TrainingRecipe:
     if not isinstance(content, dict):
         raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance algorithm: ppo")
     name = content.get("algorithm", "ppo")
-    if not isinstance(name, str) or name not in RECIPES:
+    if not isinstance(name, str) or name not in algorithm_names():
         line = document.line_of(("algorithm",))
         where = document.file if line is None else f"{document.file}, line {line}"
-        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {' or '.join(RECIPES)}")
-    model = RECIPES[name]
+        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {' or '.join(algorithm_names())}")
+    model: type[TrainingRecipe] = recipe_class(name)
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        raise explain(error, document, RecipeWording(model)) from None
+        raise explain(error, document, RecipeWording(name, model)) from None
 
 
 class RecipeWording(Wording):
     """The ``Wording`` of messages about a recipe of one algorithm."""
 
-    def __init__(self, model: type[TrainingRecipe] = PpoRecipe) -> None:
-        self._model = model
+    def __init__(self, algorithm: str, model: type[TrainingRecipe]) -> None:
+        self._algorithm, self._model = algorithm, model
 
     def known(self, path: YamlPath) -> list[str]:
         """The keys of the part in which ``path`` ends."""
@@ -298,5 +209,5 @@ class RecipeWording(Wording):
 
     def needed(self, path: YamlPath) -> str:
         """Where an example stands."""
-        name = next(name for name, model in RECIPES.items() if model is self._model)
-        return f"it is needed; every key is in the shipped recipe {name}"
+        shipped = self._algorithm in shipped_recipes()
+        return f"it is needed; every key is in the shipped recipe {self._algorithm}" if shipped else "it is needed"

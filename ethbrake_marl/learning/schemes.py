@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import get_args
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -27,7 +28,7 @@ def scheme_of(recipe: TrainingRecipe, scenario: Scenario) -> Scheme:
         )
     if scheme == "independent" and learners == 1:
         raise InvalidInput(f"scheme independent: {where} has one learner; use single")
-    if scheme in ("independent", "centralised") and recipe.algorithm != "ppo":
+    if scheme not in recipe.schemes:
         raise InvalidInput(
             f"scheme {scheme}: recipe {recipe.name!r} is for {recipe.algorithm.upper()}; it needs one for PPO"
         )
@@ -53,7 +54,7 @@ def driver(scheme: Scheme, vehicle: str) -> str:
     return f"{POLICY}/{vehicle}" if scheme == "independent" else POLICY
 
 
-def who_drives_what(given: dict[str, str]) -> str:
+def who_drives_what(given: Mapping[str, str]) -> str:
     """``drivers`` as a line to read: ``policy drives vehicle_2, vehicle_3``."""
     bundles: dict[str, list[str]] = {}
     for vehicle, bundle in given.items():

@@ -7,8 +7,8 @@ from typing import Any, Literal
 from stable_baselines3.common.logger import Logger
 
 from ethbrake_marl.files.durable import remove_folder
+from ethbrake_marl.learning.algorithms.protocol import Algorithm
 from ethbrake_marl.learning.checkpoint import TrainingState, prune, write_checkpoint
-from ethbrake_marl.learning.kept_training import fingerprint
 from ethbrake_marl.learning.loop import BetweenUpdates, StopRequested
 from ethbrake_marl.learning.model_state import (
     Model,
@@ -19,19 +19,11 @@ from ethbrake_marl.learning.model_state import (
     restore_replay,
 )
 from ethbrake_marl.learning.progress import TrainingDiverged, weights_are_finite
-from ethbrake_marl.learning.recipe import TrainingRecipe
-from ethbrake_marl.learning.run_folder import (
-    EventFile,
-    ProgressTable,
-    RunDirectory,
-    RunRecord,
-    RunStatus,
-    cut_back,
-    event_sizes,
-)
+from ethbrake_marl.learning.run_folder import RunDirectory, RunRecord, RunStatus
+from ethbrake_marl.learning.run_log import EventFile, ProgressTable, cut_back, event_sizes
+from ethbrake_marl.learning.training import Training
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.team import Trained, save_trained, steps_of
-from ethbrake_marl.scenario import Scenario
 
 Ended = Literal["finished", "interrupted"]
 
@@ -39,9 +31,8 @@ Ended = Literal["finished", "interrupted"]
 class Session:
     """Keeps the run's folder complete while a model learns in it."""
 
-    def __init__(self, run: RunDirectory, model: Model, recipe: TrainingRecipe, scenario: Scenario) -> None:
-        self._run, self._model, self._recipe = run, model, recipe
-        self._training = fingerprint(recipe, scenario)
+    def __init__(self, run: RunDirectory, model: Model, algorithm: Algorithm, training: Training) -> None:
+        self._run, self._model, self._algorithm, self._training = run, model, algorithm, training
         self._record = RunRecord(run)
         self._table = ProgressTable(run.progress)
         self._restored: TrainingState | None = None
@@ -52,10 +43,10 @@ class Session:
         if folder.exists():
             return
         assert course.policy is not None
-        arrays, numbers = capture_model(self._model)
+        arrays, numbers = capture_model(self._model, self._algorithm)
         replay, replay_numbers = replay_arrays(self._model)
         numbers |= {
-            "training": self._training,
+            "training": self._training.identity,
             "between": between.state(),
             "replay": replay_numbers,
             "events": event_sizes(self._run.tensorboard),
@@ -80,7 +71,7 @@ class Session:
             self._run.progress.unlink(missing_ok=True)
             cut_back(self._run.tensorboard, {})
             return
-        restore_model(self._model, state.arrays, state.numbers)
+        restore_model(self._model, self._algorithm, state.arrays, state.numbers)
         restore_replay(self._model, state.replay, state.numbers["replay"])
         between.restore(state.numbers["between"], state.steps, state.policy, state.best)
         self._table.restore(state.table)
@@ -96,7 +87,7 @@ class Session:
             restore_log(model, state.numbers)
         status: Ended = "finished"
         try:
-            steps = self._recipe.total_steps - model.num_timesteps
+            steps = self._training.recipe.total_steps - model.num_timesteps
             model.learn(steps, callback=between, log_interval=None, reset_num_timesteps=state is None)  # type: ignore[arg-type]
         except StopRequested:
             status = "interrupted"
@@ -134,7 +125,7 @@ class Session:
 
     def _diverged(self, error: BaseException) -> BaseException:
         """The error to report: torch's own when a distribution gets a NaN says little about a training."""
-        if isinstance(error, ValueError) and not weights_are_finite(self._model):
+        if isinstance(error, ValueError) and not weights_are_finite(self._model, self._algorithm):
             return TrainingDiverged(
                 f"training: a weight or the exploration noise is not finite at step {self._model.num_timesteps};"
                 " try a smaller learning_rate"

@@ -124,7 +124,7 @@ class Manifest(_Strict):
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
     format_version: Literal[2] = 2
-    algorithm: Literal["ppo", "sac"]
+    algorithm: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
     network: NetworkSpec
     observation: ObservationSchema
     action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"

@@ -18,11 +18,9 @@ from ethbrake_marl.evaluation import Evaluation, SummaryRow, evaluate, parameter
 from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, PROGRESS_EVERY, make_agents
 from ethbrake_marl.evaluation.paper import TESTS, other_tests
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
-from ethbrake_marl.learning.loop import Progress
-from ethbrake_marl.learning.measure import measure_on_list
 from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.learning.run_folder import RunDirectory, RunStatus, read_object
-from ethbrake_marl.learning.train import TrainResult, resume, train
+from ethbrake_marl.learning.train import TrainResult, train
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.rewards import RewardParams
@@ -89,39 +87,6 @@ def run_folder(
     return RUNS / (name or f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}")
 
 
-def train_measured(
-    scenario: Scenario,
-    directory: Path,
-    *,
-    recipe: TrainingRecipe,
-    steps: int | None = None,
-    seed: int | None = None,
-    force: bool = False,
-    on_progress: Callable[[Progress], None] | None = None,
-) -> TrainResult:
-    """Train as ``learning.train.train`` does, measuring the policy on the recipe's fixed list while it learns.
-
-    The list is the first part of that seed's evaluation list: metrics are those of ``evaluate`` on it.
-    """
-    return train(
-        recipe,
-        scenario,
-        directory,
-        steps=steps,
-        seed=seed,
-        force=force,
-        evaluate=measure_on_list(recipe, scenario),
-        on_progress=on_progress,
-    )
-
-
-def resume_measured(
-    directory: Path, *, on_progress: Callable[[Progress], None] | None = None, other_versions: bool = False
-) -> TrainResult:
-    """Go on with a training of ``train_measured`` or ``run_experiment``, as ``learning.train.resume`` does."""
-    return resume(directory, evaluate=measure_on_list, on_progress=on_progress, other_versions=other_versions)
-
-
 def run_experiment(
     scenario: Scenario,
     directory: Path,
@@ -147,10 +112,10 @@ def run_experiment(
     tell = on_stage or (lambda stage: None)
     vehicle = controlled_vehicle(scenario, None)
     sample = scenario.sample(episodes, list_seed)
-    trained = train_measured(
+    trained = train(
+        recipe,
         scenario,
         directory,
-        recipe=recipe,
         steps=steps,
         seed=seed,
         force=force,

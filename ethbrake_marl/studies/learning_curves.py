@@ -17,13 +17,13 @@ from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
 from ethbrake_marl.figures.learning_curves import SeedCurve, at_common_steps, seed_curves
 from ethbrake_marl.figures.style import png_bytes
-from ethbrake_marl.learning.kept_training import check_same
-from ethbrake_marl.learning.loop import Progress
+from ethbrake_marl.learning.loop import OnProgress, Progress
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
+from ethbrake_marl.learning.train import resume, train
+from ethbrake_marl.learning.training import Training, check_same, resolve
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.studies.experiment import resume_measured, train_measured
 
 FIGURE, TABLE, SUMMARY = "learning_curves.png", "learning_curves.csv", "learning_curves.json"
 
@@ -65,21 +65,21 @@ def train_all(
     """Train every seed of every recipe into ``folder/RECIPE-seedK``: finished ones are kept, begun ones go on.
 
     Gives False when Ctrl-C stopped it. Raises ``InvalidInput`` for a folder that holds another training than this one
-    would be (``learning.kept_training``), before any is begun, besides what ``train`` raises.
+    would be (``learning.training``), before any is begun, besides what ``train`` raises.
     """
     wanted = {
-        folder / f"{trainings.recipe.name}-seed{seed}": trainings.recipe.replace(
-            seed=seed, total_steps=trainings.recipe.total_steps if steps is None else steps
+        folder / f"{trainings.recipe.name}-seed{seed}": resolve(
+            trainings.recipe, scenario, seed=seed, total_steps=trainings.recipe.total_steps if steps is None else steps
         )
         for trainings in plan
         for seed in range(trainings.seeds)
     }
-    for path, recipe in wanted.items():
+    for path, training in wanted.items():
         if RunDirectory(path).status.is_file():
-            check_same(path, recipe, scenario)
+            check_same(path, training)
     return all(
-        _train_one(scenario, recipe, path, None if tell is None else partial(tell, path.name))
-        for path, recipe in wanted.items()
+        _train_one(training, path, None if tell is None else partial(tell, path.name))
+        for path, training in wanted.items()
     )
 
 
@@ -114,14 +114,14 @@ def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) ->
     return summary
 
 
-def _train_one(scenario: Scenario, recipe: TrainingRecipe, path: Path, tell: Callable[[Progress], None] | None) -> bool:
+def _train_one(training: Training, path: Path, tell: OnProgress | None) -> bool:
     """Whether it is finished now."""
     run = RunDirectory(path)
     if not run.status.is_file():
-        return train_measured(scenario, path, recipe=recipe, on_progress=tell).status == "finished"
+        return train(training.recipe, training.scenario, path, on_progress=tell).status == "finished"
     if read_object(run.status).get("status") == "finished":
         return True
-    return resume_measured(path, on_progress=tell).status == "finished"
+    return resume(path, on_progress=tell).status == "finished"
 
 
 def _table(path: Path) -> list[dict[str, str]]:

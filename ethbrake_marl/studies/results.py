@@ -20,9 +20,9 @@ from ethbrake_marl.evaluation.table import BASELINE
 from ethbrake_marl.figures.episode import trajectories
 from ethbrake_marl.figures.run import harm_against_total_gap, learning_curve
 from ethbrake_marl.figures.style import png_bytes
+from ethbrake_marl.learning.registry import algorithm_names
 
 REFERENCES = ("full_brake", "e_v2x_bm")  # level lines beside the learning curve
-LEARNED = ("ppo", "sac")  # what the trained policy may be called
 SHOWN = ("full_brake", "e_v2x_bm")  # columns of the figure of one episode, and the policy
 
 LEARNING_CURVE = "learning_curve.png"
@@ -119,7 +119,7 @@ FIGURE_TEXTS = {
 
 def learned_name(evaluation: Evaluation) -> str:
     """What the trained policy is called among the agents."""
-    return next(name for name in LEARNED if name in evaluation.outcomes)
+    return next(name for name in algorithm_names() if name in evaluation.outcomes)
 
 
 def telling_world(evaluation: Evaluation) -> int:

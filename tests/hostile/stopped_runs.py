@@ -45,7 +45,8 @@ def stopped(algorithm: str) -> Path:
         return {"first_impact_harm": 1.0, "total_harm": 1.0}
 
     settings = PPO if algorithm == "ppo" else SAC
-    train(load_recipe(algorithm).replace(**settings), load_scenario("paper-random"), folder, evaluate=measure)
+    recipe = load_recipe(algorithm).replace(**settings)
+    train(recipe, load_scenario("paper-random"), folder, measure=lambda training: measure)
     assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
     return folder
 

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.learning.recipe import LearningRate, SacRecipe, load_recipe, recipe_of, shipped_recipes
+from ethbrake_marl.learning.algorithms.sac import SacRecipe
+from ethbrake_marl.learning.recipe import LearningRate, load_recipe, recipe_of, shipped_recipes
 from ethbrake_marl.policies.manifest import NetworkSpec
 
 GOOD = """\

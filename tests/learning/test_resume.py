@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning import session as session_module
 from ethbrake_marl.learning import train as train_module
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.run_folder import create_run
 from ethbrake_marl.learning.train import TrainResult, resume, train
+from ethbrake_marl.learning.training import Training, resolve
 from ethbrake_marl.policies.policy import Policy, load_policy
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_PPO
 
 SCENARIO = load_scenario("paper-random")
@@ -95,7 +96,7 @@ def _interrupt() -> None:
     os.kill(os.getpid(), signal.SIGINT)
 
 
-def _measure(recipe: TrainingRecipe, scenario: Scenario) -> Callable[[Policy], dict[str, float]]:
+def _measure(training: Training) -> Callable[[Policy], dict[str, float]]:
     return _harm
 
 
@@ -107,7 +108,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Pat
     def get(name: str) -> tuple[Path, TrainResult]:
         if name not in made:
             folder = tmp_path_factory.mktemp("whole") / name
-            made[name] = folder, train(RECIPES[name], SCENARIO, folder, evaluate=_harm)
+            made[name] = folder, train(RECIPES[name], SCENARIO, folder, measure=_measure)
         return made[name]
 
     return get
@@ -126,9 +127,9 @@ def test_resume__after_ctrl_c_everything_is_as_if_nobody_had_stopped_it(
     reference, expected = whole(name)
     with monkeypatch.context() as patch:
         _stop_in(patch, step, _interrupt)
-        stopped = train(RECIPES[name], SCENARIO, tmp_path / "run", evaluate=_harm)
+        stopped = train(RECIPES[name], SCENARIO, tmp_path / "run", measure=_measure)
     assert stopped.status == "interrupted" and stopped.steps < expected.steps
-    result = resume(tmp_path / "run", evaluate=_measure)
+    result = resume(tmp_path / "run", measure=_measure)
     assert (result.status, result.steps, result.updates) == ("finished", expected.steps, expected.updates)
     for bundle in ("policy", "policy-last"):
         assert _bundle(tmp_path / "run", bundle) == _bundle(reference, bundle)
@@ -157,7 +158,7 @@ from pathlib import Path
 sys.path.insert(0, {root!r})
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.learning.train import train
-from tests.learning.test_resume import RECIPES, SCENARIO, _harm
+from tests.learning.test_resume import RECIPES, SCENARIO, _measure
 recipe, folder = RECIPES[sys.argv[1]], Path(sys.argv[2])
 step, left = EthBrakeVecEnv.step_wait, [5]
 
@@ -168,7 +169,7 @@ def step_wait(self):
     return step(self)
 
 EthBrakeVecEnv.step_wait = step_wait
-train(recipe, SCENARIO, folder, evaluate=_harm)
+train(recipe, SCENARIO, folder, measure=_measure)
 """
 
 
@@ -189,7 +190,7 @@ def test_resume__after_kill_9_the_weights_are_the_same(
     run = tmp_path / "run"
     assert train_and_die(name, run) == -signal.SIGKILL
     assert json.loads((run / "run.json").read_text())["status"] == "running"
-    resume(run, evaluate=_measure)
+    resume(run, measure=_measure)
     for bundle in ("policy", "policy-last"):
         assert _bundle(run, bundle) == _bundle(reference, bundle)
     assert _rows(run) == _rows(reference)
@@ -199,7 +200,7 @@ def _stopped(folder: Path, monkeypatch: pytest.MonkeyPatch, step: int = 100) -> 
     """A PPO run stopped with two checkpoints, the newest first."""
     with monkeypatch.context() as patch:
         _stop_in(patch, step, _interrupt)
-        train(PPO, SCENARIO, folder, evaluate=_harm)
+        train(PPO, SCENARIO, folder, measure=_measure)
     return sorted(folder.glob("checkpoints/step_*"), reverse=True)
 
 
@@ -230,7 +231,7 @@ def test_resume__a_damaged_checkpoint_is_found_and_the_one_before_is_used(
         middle = len(data) // 2
         path.write_bytes(data[:middle] if damage == "truncated" else data[:middle] + b"\x07" + data[middle + 1 :])
     notes: list[str] = []
-    resume(tmp_path / "run", evaluate=_measure, on_progress=lambda p: notes.append(p.note) if p.note else None)
+    resume(tmp_path / "run", measure=_measure, on_progress=lambda p: notes.append(p.note) if p.note else None)
     assert len(notes) == 1 and notes[0].startswith(f"a damaged checkpoint was left aside: {newest}")
     assert _bundle(tmp_path / "run", "policy-last") == _bundle(reference, "policy-last")
     assert _rows(tmp_path / "run") == _rows(reference)
@@ -243,7 +244,7 @@ def test_resume__without_any_checkpoint_it_starts_again(
     for folder in _stopped(tmp_path / "run", monkeypatch):
         (folder / "state.json").unlink()
     (tmp_path / "run" / ".ethbrake-left.partial").mkdir()
-    resume(tmp_path / "run", evaluate=_measure)
+    resume(tmp_path / "run", measure=_measure)
     assert _bundle(tmp_path / "run", "policy") == _bundle(reference, "policy")
     assert _rows(tmp_path / "run") == _rows(reference)
     assert not (tmp_path / "run" / ".ethbrake-left.partial").exists()
@@ -252,11 +253,11 @@ def test_resume__without_any_checkpoint_it_starts_again(
 def test_resume__a_vehicle_with_a_memory_goes_on_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
     scenario = SCENARIO.replace(roles=roles, early_impacts="keep")
-    train(PPO, scenario, tmp_path / "whole")
+    train(PPO, scenario, tmp_path / "whole", measure=None)
     with monkeypatch.context() as patch:
         _stop_in(patch, 100, _interrupt)
-        train(PPO, scenario, tmp_path / "run")
-    resume(tmp_path / "run")
+        train(PPO, scenario, tmp_path / "run", measure=None)
+    resume(tmp_path / "run", measure=None)
     assert _bundle(tmp_path / "run", "policy") == _bundle(tmp_path / "whole", "policy")
 
 
@@ -288,20 +289,20 @@ def test_resume__an_edited_configuration_is_another_training(
     config = json.loads(asked)
     file.write_text(json.dumps({**config, part: {**config[part], **change}}))
     with pytest.raises(InvalidInput, match=r"config.json: was changed after the checkpoint step_\d+ of this training"):
-        resume(tmp_path / "run", evaluate=_measure)
+        resume(tmp_path / "run", measure=_measure)
     file.write_text(json.dumps({**config, part: {**config[part], "title": "Words change no training"}}))
-    assert resume(tmp_path / "run", evaluate=_measure).status == "finished"
+    assert resume(tmp_path / "run", measure=_measure).status == "finished"
 
 
 def test_resume__a_checkpoint_that_does_not_say_of_which_training_it_is_is_one_of_other_versions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(session_module, "fingerprint", lambda recipe, scenario: None)
+        patch.setattr(train_module, "resolve", lambda *of: replace(resolve(*of), identity=None))
         _stopped(tmp_path / "run", monkeypatch)
     with pytest.raises(InvalidInput, match=r"does not say of which training it is; .*--other-versions"):
-        resume(tmp_path / "run", evaluate=_measure)
-    assert resume(tmp_path / "run", evaluate=_measure, other_versions=True).status == "finished"
+        resume(tmp_path / "run", measure=_measure)
+    assert resume(tmp_path / "run", measure=_measure, other_versions=True).status == "finished"
 
 
 @pytest.mark.parametrize(
@@ -336,10 +337,10 @@ def test_resume__one_process_at_a_time(tmp_path: Path, monkeypatch: pytest.Monke
 
     def second() -> None:
         with pytest.raises(InvalidInput, match="another process is training here") as caught:
-            resume(tmp_path / "run", evaluate=_measure)
+            resume(tmp_path / "run", measure=_measure)
         messages.append(str(caught.value))
 
     with monkeypatch.context() as patch:
         _stop_in(patch, 5, second)
-        resume(tmp_path / "run", evaluate=_measure)
+        resume(tmp_path / "run", measure=_measure)
     assert len(messages) == 1

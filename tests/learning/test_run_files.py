@@ -9,7 +9,8 @@ import pytest
 
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.files.durable import new_folder, write_file
-from ethbrake_marl.learning.run_folder import ProgressTable, create_run
+from ethbrake_marl.learning.run_folder import create_run
+from ethbrake_marl.learning.run_log import ProgressTable
 
 
 def test_write_file__replaces_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,9 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import SACPolicy
 
-from ethbrake_marl.learning.models import ppo_arguments, sac_arguments, tensors_of
+from ethbrake_marl.learning.algorithms.networks import tensors_of
+from ethbrake_marl.learning.algorithms.ppo import ppo_arguments
+from ethbrake_marl.learning.algorithms.sac import sac_arguments
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.manifest import NetworkSpec

@@ -22,9 +22,11 @@ from ethbrake_marl.errors import CorruptBundle, InvalidInput, UnknownName
 from ethbrake_marl.learning import train as train_module
 from ethbrake_marl.learning.models import make_model
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.learning.registry import algorithm_named
 from ethbrake_marl.learning.schemes import check_scheme, drivers, scheme_of, who_drives_what
-from ethbrake_marl.learning.teams import is_team, load_team, resume_team, train_team
-from ethbrake_marl.learning.train import resume, run_training, train
+from ethbrake_marl.learning.team_file import is_team, load_team
+from ethbrake_marl.learning.train import resume, train
+from ethbrake_marl.learning.training import resolve
 from ethbrake_marl.policies.policy import load_policy
 from ethbrake_marl.policies.team import PolicyTeam
 from tests.learning.tiny import TINY_PPO
@@ -59,15 +61,15 @@ def _watched(monkeypatch: pytest.MonkeyPatch, watch: Callable[[int, Any], Any]) 
 
 
 @pytest.mark.parametrize("scheme", ["shared", "independent", "centralised"])
-def test_train_team__leaves_a_folder_that_drives_by_itself(scheme: Any, tmp_path: Path) -> None:
-    result = train_team(TINY, PAIR, tmp_path / "run", scheme=scheme)
-    assert (result.status, result.steps, result.updates, result.scheme) == ("finished", 8 * 256, 8, scheme)
+def test_train__leaves_a_folder_that_drives_by_itself(scheme: Any, tmp_path: Path) -> None:
+    result = train(TINY, PAIR, tmp_path / "run", scheme=scheme)
+    assert (result.status, result.steps, result.updates, result.training.scheme) == ("finished", 8 * 256, 8, scheme)
     assert [entry["updates"] for entry in result.evaluations] == [0, 3, 6, 8]
     separate = scheme == "independent"
     given = {name: f"policy/{name}" if separate else "policy" for name in NAMES}
     content = json.loads((tmp_path / "run" / "team.json").read_text())
     assert (content["scheme"], content["vehicles"], content["drivers"]) == (scheme, 3, given)
-    assert dict(result.drivers) == given and is_team(tmp_path / "run") == separate
+    assert result.training.drivers == given and is_team(tmp_path / "run") == separate
 
     moved = tmp_path / "elsewhere"
     shutil.move(tmp_path / "run", moved)
@@ -84,11 +86,11 @@ def test_train_team__leaves_a_folder_that_drives_by_itself(scheme: Any, tmp_path
         assert len(set(_weights(moved / "policy").values())) == 2
 
 
-def test_train_team__without_a_scheme_one_learner_is_single_and_the_same_as_train(tmp_path: Path) -> None:
-    result = train_team(TINY, ALONE, tmp_path / "team", steps=256)
-    train(TINY, ALONE, tmp_path / "alone", steps=256)
-    assert (result.scheme, dict(result.drivers)) == ("single", {"vehicle_2": "policy"})
-    assert _weights(tmp_path / "team" / "policy-last") == _weights(tmp_path / "alone" / "policy-last")
+def test_train__without_a_scheme_one_learner_is_single_and_measuring_changes_nothing(tmp_path: Path) -> None:
+    result = train(TINY, ALONE, tmp_path / "run", steps=256)
+    assert (result.training.scheme, result.training.drivers) == ("single", {"vehicle_2": "policy"})
+    train(TINY, ALONE, tmp_path / "unmeasured", steps=256, measure=None)
+    assert _weights(tmp_path / "run" / "policy-last") == _weights(tmp_path / "unmeasured" / "policy-last")
 
 
 def _history(recipe: TrainingRecipe, folder: Path) -> list[dict[str, str]]:
@@ -100,7 +102,7 @@ def _history(recipe: TrainingRecipe, folder: Path) -> list[dict[str, str]]:
         return {}
 
     often = recipe.replace(evaluation={"every_updates": 1, "worlds": 1, "seed": 7})
-    run_training(often, PAIR, folder, False, note, None)
+    train(often, PAIR, folder, measure=lambda training: note)
     return seen
 
 
@@ -132,7 +134,7 @@ def test_independent__nobody_learns_from_anothers_reward(tmp_path: Path, monkeyp
 def test_independent__a_row_that_is_cut_off_gets_the_value_of_its_own_learner() -> None:
     recipe = TINY.replace(scheme="independent")
     environment = make_sb3_vec_env(PAIR, 8, appended="number", reward=recipe.reward)
-    policy: Any = make_model(recipe, environment).policy
+    policy: Any = make_model(algorithm_named("ppo"), resolve(recipe, PAIR), environment).policy
     seen = environment.reset()
     assert seen.shape == (16, environment.engine.observation.size + 1)
     assert seen[:, -1].tolist() == [0.0, 1.0] * 8
@@ -148,7 +150,7 @@ def test_independent__a_row_that_is_cut_off_gets_the_value_of_its_own_learner() 
 def test_centralised__the_critic_sees_the_line_and_the_actor_does_not() -> None:
     recipe = TINY.replace(scheme="centralised")
     environment = make_sb3_vec_env(PAIR, 8, appended="state", reward=recipe.reward)
-    policy: Any = make_model(recipe, environment).policy
+    policy: Any = make_model(algorithm_named("ppo"), resolve(recipe, PAIR), environment).policy
     own = environment.engine.observation.size
     seen = policy.obs_to_tensor(environment.reset())[0]
     elsewhere = seen.clone()
@@ -160,12 +162,12 @@ def test_centralised__the_critic_sees_the_line_and_the_actor_does_not() -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("scheme", ["shared", "independent", "turns", "centralised"])
-def test_resume_team__after_a_failure_or_ctrl_c_it_ends_as_if_nothing_had_happened(
+def test_resume__after_a_failure_or_ctrl_c_it_ends_as_if_nothing_had_happened(
     scheme: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     turns = {"scheme": "independent", "turns": 2}
     recipe = TINY.replace(**(turns if scheme == "turns" else {"scheme": scheme}))
-    whole = train_team(recipe, PAIR, tmp_path / "whole")
+    whole = train(recipe, PAIR, tmp_path / "whole")
 
     def fail(step: int, answer: Any) -> Any:
         if step == 5 * 16 + 3:
@@ -180,12 +182,12 @@ def test_resume_team__after_a_failure_or_ctrl_c_it_ends_as_if_nothing_had_happen
     with monkeypatch.context() as patch:
         _watched(patch, fail)
         with pytest.raises(RuntimeError, match="power cut"):
-            train_team(recipe, PAIR, tmp_path / "run")
+            train(recipe, PAIR, tmp_path / "run")
     with monkeypatch.context() as patch:
         _watched(patch, ctrl_c)
-        assert resume_team(tmp_path / "run").status == "interrupted"
+        assert resume(tmp_path / "run").status == "interrupted"
     (tmp_path / "run" / "team.json").write_text("{}")
-    result = resume_team(tmp_path / "run")
+    result = resume(tmp_path / "run")
     assert (result.status, result.updates) == ("finished", 8)
     assert result.evaluations == whole.evaluations
     assert (tmp_path / "run" / "team.json").read_bytes() == (tmp_path / "whole" / "team.json").read_bytes()
@@ -198,21 +200,21 @@ import os, signal, sys
 from pathlib import Path
 from tests.learning.test_teams import TINY, PAIR
 from ethbrake_marl.learning.loop import BetweenUpdates
-from ethbrake_marl.learning.teams import train_team
+from ethbrake_marl.learning.train import train
 def tell(progress):
     if progress.updates == 5:
         os.kill(os.getpid(), signal.SIGKILL)
-train_team(TINY, PAIR, Path(sys.argv[1]), scheme="independent", on_progress=tell)
+train(TINY, PAIR, Path(sys.argv[1]), scheme="independent", on_progress=tell)
 """
 
 
 @pytest.mark.long
-def test_resume_team__after_kill_9_independent_learners_have_the_same_weights(tmp_path: Path) -> None:
+def test_resume__after_kill_9_independent_learners_have_the_same_weights(tmp_path: Path) -> None:
     root = Path(__file__).resolve().parents[2]
     killed = subprocess.run([sys.executable, "-c", KILLED, tmp_path / "run"], cwd=root, check=False, timeout=600)
     assert killed.returncode == -signal.SIGKILL
-    train_team(TINY, PAIR, tmp_path / "whole", scheme="independent")
-    resume_team(tmp_path / "run")
+    train(TINY, PAIR, tmp_path / "whole", scheme="independent")
+    resume(tmp_path / "run")
     for folder in ("policy", "policy-last"):
         assert _weights(tmp_path / "run" / folder) == _weights(tmp_path / "whole" / folder)
 
@@ -225,7 +227,7 @@ def test_independent__stops_at_numbers_that_are_not_finite(tmp_path: Path, monke
 
     _watched(monkeypatch, spoil)
     with pytest.raises(ArithmeticError, match=r"rewards\[step 3, row 1\] = nan"):
-        train_team(TINY, PAIR, tmp_path / "run", scheme="independent")
+        train(TINY, PAIR, tmp_path / "run", scheme="independent")
     assert load_policy(tmp_path / "run" / "policy-last" / "vehicle_3").manifest.steps == 256
 
 
@@ -240,13 +242,11 @@ def test_scheme__that_does_not_fit_is_refused_before_anything_is_made(tmp_path: 
     ]
     for recipe, scenario, scheme, message in cases:
         with pytest.raises(InvalidInput, match=message):
-            train_team(recipe, scenario, tmp_path / "run", scheme=scheme)
+            train(recipe, scenario, tmp_path / "run", scheme=scheme)
     with pytest.raises(InvalidInput, match=r"turns = 3: is for scheme: independent only"):
-        train_team(TINY, PAIR, tmp_path / "run", scheme="shared", turns=3)
+        train(TINY, PAIR, tmp_path / "run", scheme="shared", turns=3)
     with pytest.raises(InvalidInput, match=r"turns = 5: 2 learners need 10 updates, .* are 8"):
-        train_team(TINY, PAIR, tmp_path / "run", scheme="independent", turns=5)
-    with pytest.raises(InvalidInput, match="several policies; use train_team"):
-        train(TINY.replace(scheme="independent"), PAIR, tmp_path / "run")
+        train(TINY, PAIR, tmp_path / "run", scheme="independent", turns=5)
     with pytest.raises(UnknownName, match="did you mean 'centralised'"):
         check_scheme("centralized")
     assert list(tmp_path.iterdir()) == []
@@ -260,23 +260,23 @@ def test_scheme__of_a_recipe_and_who_drives_what() -> None:
     assert who_drives_what(drivers("independent", PAIR)) == told
 
 
-def test_train_team__takes_names_as_the_faces_do(tmp_path: Path) -> None:
+def test_train__takes_names_as_the_faces_do(tmp_path: Path) -> None:
     recipe = tmp_path / "tiny.yaml"
     recipe.write_text(json.dumps(TINY.model_dump(mode="json", exclude_unset=True)))
-    train_team(recipe, "cooperation-3-pair", tmp_path / "named", steps=1)
-    train_team(TINY, PAIR, tmp_path / "loaded", steps=1)
+    train(recipe, "cooperation-3-pair", tmp_path / "named", steps=1)
+    train(TINY, PAIR, tmp_path / "loaded", steps=1)
     assert _weights(tmp_path / "named" / "policy-last") == _weights(tmp_path / "loaded" / "policy-last")
     assert sorted(load_team(tmp_path / "named", "cooperation-3-pair").drivers) == [1, 2]
     with pytest.raises(UnknownName, match="unknown recipe 'cooperatin'; did you mean 'cooperation'"):
-        train_team("cooperatin", PAIR, tmp_path / "no")
+        train("cooperatin", PAIR, tmp_path / "no")
     with pytest.raises(UnknownName, match="unknown scenario"):
-        train_team(TINY, "cooperation-3-pairs", tmp_path / "no")
+        train(TINY, "cooperation-3-pairs", tmp_path / "no")
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("team") / "run"
-    train_team(TINY, PAIR, folder, scheme="independent", steps=256)
+    train(TINY, PAIR, folder, scheme="independent", steps=256)
     return folder
 
 
@@ -335,17 +335,17 @@ def test_load_team__a_damaged_folder_is_refused(
         load_team(tmp_path / "run", PAIR)
 
 
-def test_resume_team__of_another_library_is_refused(trained: Path, tmp_path: Path) -> None:
+def test_resume__of_another_library_is_refused(trained: Path, tmp_path: Path) -> None:
     shutil.copytree(trained, tmp_path / "run")
     config = tmp_path / "run" / "config.json"
     config.write_text(json.dumps({**json.loads(config.read_text()), "library": "benchmarl"}))
     with pytest.raises(InvalidInput, match="was trained by benchmarl, which leaves nothing to go on from"):
-        resume_team(tmp_path / "run")
+        resume(tmp_path / "run")
 
 
 def test_load_team__needs_no_torch(trained: Path) -> None:
     program = (
-        "import sys, ethbrake_marl as eb; from ethbrake_marl.learning.teams import load_team;"
+        "import sys, ethbrake_marl as eb; from ethbrake_marl.learning.team_file import load_team;"
         f"load_team({str(trained)!r}, eb.load_scenario('cooperation-3-pair')); sys.exit('torch' in sys.modules)"
     )
     root = Path(__file__).resolve().parents[2]
@@ -363,7 +363,7 @@ LEARNS = load_recipe("cooperation").replace(
 @pytest.mark.long
 @pytest.mark.parametrize("scheme", ["shared", "independent", "centralised"])
 def test_scheme__learns_to_beat_full_braking(scheme: Any, tmp_path: Path) -> None:
-    train_team(LEARNS, PAIR, tmp_path / "run", scheme=scheme)
+    train(LEARNS, PAIR, tmp_path / "run", scheme=scheme)
     agents = {"full_brake": eb.make_agent("full_brake"), "team": load_team(tmp_path / "run", PAIR)}
     result = eb.evaluate(PAIR.sample(1000, 7), agents, scenario=PAIR)
     harm = {name: result.outcome(name).first_impact_harm.mean() for name in agents}

@@ -6,6 +6,7 @@ import os
 import random
 import signal
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,10 @@ from ethbrake_marl.learning import train as train_module
 from ethbrake_marl.learning.loop import Progress
 from ethbrake_marl.learning.progress import TrainingDiverged
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of, shipped_recipes
-from ethbrake_marl.learning.train import train
 from ethbrake_marl.policies.policy import Policy, load_policy
 from ethbrake_marl.scenario import load_scenario
 
+train = partial(train_module.train, measure=None)
 SCENARIO = load_scenario("paper-random")
 ROLLOUT = 16 * 32
 
@@ -73,7 +74,7 @@ def _spoiled_steps(monkeypatch: pytest.MonkeyPatch, spoil: Callable[[int, tuple[
 
 def test_train__leaves_a_complete_folder(recipe: TrainingRecipe, tmp_path: Path) -> None:
     seen: list[Progress] = []
-    result = train(recipe, SCENARIO, tmp_path / "run", evaluate=_mean_weight, on_progress=seen.append)
+    result = train(recipe, SCENARIO, tmp_path / "run", measure=lambda training: _mean_weight, on_progress=seen.append)
     assert (result.status, result.steps, result.updates) == ("finished", 3 * ROLLOUT, 3)
     assert [e["updates"] for e in result.evaluations] == [0, 2, 3]
     assert [p.steps for p in seen] == [0, ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT]
@@ -235,7 +236,7 @@ def test_train__an_error_of_the_callers_function_is_passed_on(recipe: TrainingRe
         raise RuntimeError("no worlds")
 
     with pytest.raises(RuntimeError, match="no worlds"):
-        train(recipe, SCENARIO, tmp_path / "run", evaluate=broken)
+        train(recipe, SCENARIO, tmp_path / "run", measure=lambda training: broken)
     status = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (status["status"], status["reason"]) == ("failed", "RuntimeError: no worlds")
     assert load_policy(tmp_path / "run").manifest.steps == 0

@@ -172,7 +172,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: Extra inputs"),
     "dotted_algorithm": (
         _edit(algorithm="subprocess.Popen"),
-        r"manifest.json: algorithm: Input should be 'ppo' or 'sac'",
+        r"manifest.json: algorithm: String should match pattern",
     ),
     "dotted_activation": (_edit(network__activation="torch.nn.ReLU"), r"manifest.json: network.activation"),
     "future_version": (_edit(format_version=3), r"manifest.json: format_version: Input should be 2"),

@@ -12,7 +12,8 @@ import numpy as np
 
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.learning.loop import Progress
-from ethbrake_marl.learning.teams import load_team, train_team
+from ethbrake_marl.learning.team_file import load_team
+from ethbrake_marl.learning.train import train
 from ethbrake_marl.limits.best_harm import best_harm
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.studies.ablation.joint_optimum import parts_left, questions
@@ -87,10 +88,10 @@ def _timed(training: Training, sample: Sample) -> tuple[float, float]:
     short = recipe.replace(evaluation={**recipe.evaluation.model_dump(), "worlds": 10, "every_updates": 1000})
     with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
         path = Path(folder) / "timed"
-        train_team(short, scenario, path, steps=1, on_progress=told.append)
+        train(short, scenario, path, steps=1, on_progress=told.append)
         once = told[-1].steps  # decisions of one update
         told.clear()
-        train_team(short, scenario, path, steps=_UPDATES * once, force=True, on_progress=told.append)
+        train(short, scenario, path, steps=_UPDATES * once, force=True, on_progress=told.append)
         return _per_step(told), _driving_s(path, scenario, sample)
 
 

@@ -20,7 +20,7 @@ from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.recipe import WORDS
 from ethbrake_marl.learning.run_folder import RunDirectory
-from ethbrake_marl.learning.teams import is_team
+from ethbrake_marl.learning.team_file import is_team
 from ethbrake_marl.limits.best_harm import best_harm
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.policies.policy import Policy, load_policy

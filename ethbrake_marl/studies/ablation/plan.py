@@ -13,9 +13,9 @@ import numpy as np
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.files.durable import check_writable, write_file
-from ethbrake_marl.learning.kept_training import check_same
-from ethbrake_marl.learning.recipe import WORDS, PpoRecipe, Scheme, TrainingRecipe
+from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
+from ethbrake_marl.learning.training import check_same, resolve
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Sample, Scenario
 
@@ -133,7 +133,7 @@ class Training:
                 raise InvalidInput(f"{self.folder}: is no training; move it away, or give another --output")
             return self.recipe.total_steps
         status = read_kept(run.status, "delete its folder to train anew")
-        check_same(self.folder, self.recipe, self.level.scenario)
+        check_same(self.folder, resolve(self.recipe, self.level.scenario))
         if status.get("status") == "finished":
             return 0
         steps = status.get("steps", 0)
@@ -172,7 +172,7 @@ class Plan:
         learners = len(level.scenario.learners)
         changes: dict[str, Any] = {"seed": seed, "total_steps": self.steps_per_learner * learners}
         if learners == 1:  # the same training whatever the scheme of several learners
-            changes |= dict.fromkeys(("scheme", "turns") if isinstance(recipe, PpoRecipe) else ("scheme",))
+            changes |= dict.fromkeys({"scheme", "turns"} & type(recipe).model_fields.keys())
         name = recipe.name if learners == 1 else _algorithm(recipe)
         folder = self.folder / TRAININGS / f"{level.name}-{name}-seed{seed}"
         return Training(level, _algorithm(recipe), recipe.replace(**changes), folder)

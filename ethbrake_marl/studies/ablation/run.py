@@ -17,9 +17,10 @@ from ethbrake_marl.agents.team import Team
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.rollout import Outcome, evaluate
 from ethbrake_marl.harm import COUNTS, HarmCount
-from ethbrake_marl.learning.loop import Progress
+from ethbrake_marl.learning.loop import OnProgress, Progress
 from ethbrake_marl.learning.run_folder import RunDirectory
-from ethbrake_marl.learning.teams import load_team, resume_team, train_team
+from ethbrake_marl.learning.team_file import load_team
+from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.studies.ablation.joint_optimum import Answer, best_known, search_all
@@ -31,7 +32,7 @@ TellTraining = Callable[[str, int, int], None]  # what, how far, of how much
 def train_all(trainings: Sequence[Training], jobs: int, tell: TellTraining | None = None) -> bool:
     """Bring every training to its end, ``jobs`` at a time; False when Ctrl-C stopped it.
 
-    The policies do not depend on ``jobs`` or on interruptions. Raises what ``Training.steps_left`` and ``train_team``
+    The policies do not depend on ``jobs`` or on interruptions. Raises what ``Training.steps_left`` and ``train``
     raise.
     """
     left = [training for training in trainings if training.steps_left()]
@@ -77,12 +78,12 @@ def _end_with(parent: BaseProcess) -> None:
     os._exit(1)
 
 
-def _train(training: Training, tell: Callable[[Progress], None] | None = None) -> bool:
+def _train(training: Training, tell: OnProgress | None = None) -> bool:
     """Whether it is finished now."""
     if RunDirectory(training.folder).status.is_file():
-        return resume_team(training.folder, on_progress=tell).status == "finished"
+        return resume(training.folder, on_progress=tell).status == "finished"
     training.folder.parent.mkdir(parents=True, exist_ok=True)
-    result = train_team(training.recipe, training.level.scenario, training.folder, on_progress=tell)
+    result = train(training.recipe, training.level.scenario, training.folder, on_progress=tell)
     return result.status == "finished"
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from ethbrake_marl.learning.checkpoint import newest_usable
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.learning.teams import resume_team, train_team
+from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.scenario import load_scenario
 
 SOON_S = 300.0
@@ -55,10 +55,10 @@ FORK = multiprocessing.get_context("fork")  # a fresh interpreter needs seconds;
 def work(what: str, run: Path) -> None:
     """Train from the beginning (``what`` names the recipe), or resume what is there."""
     if run.exists():
-        resume_team(run)
+        resume(run)
     else:
         level = "cooperation-3-pair" if what == "independent" else "paper-random"
-        train_team(RECIPES[what], load_scenario(level), run)
+        train(RECIPES[what], load_scenario(level), run)
 
 
 def start(what: str, run: Path) -> ForkProcess:

@@ -72,9 +72,9 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(ablation, tmp_p
             )
         return keep(recipe, scenario, path, **options)
 
-    keep = trainings.train_team
+    keep = trainings.train
     with monkeypatch.context() as patch:
-        patch.setattr(trainings, "train_team", stop_in_the_second)
+        patch.setattr(trainings, "train", stop_in_the_second)
         patch.setattr(learning_train.BetweenUpdates, "_after_update", learning_train.BetweenUpdates._after_update)
         assert run_command(["ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL]) == 130
     monkeypatch.undo()

@@ -9,12 +9,13 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.kept_training import check_same, fingerprint
 from ethbrake_marl.learning.run_folder import create_run
+from ethbrake_marl.learning.training import check_same, resolve
 from ethbrake_marl.scenario import Scenario, load_scenario
 from tests.learning.tiny import TINY_PPO
 
 SCENARIO = load_scenario("paper-random")
+TRAINING = resolve(TINY_PPO, SCENARIO)
 
 
 def folder_of(path: Path, recipe: dict[str, Any], scenario: dict[str, Any]) -> Path:
@@ -30,9 +31,9 @@ def written(path: Path, **changes: Any) -> Path:
 
 def test_same__words_and_defaults_that_are_spelt_out_change_no_training(tmp_path: Path) -> None:
     words = {"title": "Another", "description": "More.", "source": "Elsewhere."}
-    check_same(written(tmp_path / "words", **words), TINY_PPO, SCENARIO)
-    check_same(written(tmp_path / "defaults", v2x={"preset": "paper"}, speed_limit_mps=40), TINY_PPO, SCENARIO)
-    assert fingerprint(TINY_PPO.replace(**words), SCENARIO.replace(**words)) == fingerprint(TINY_PPO, SCENARIO)
+    check_same(written(tmp_path / "words", **words), TRAINING)
+    check_same(written(tmp_path / "defaults", v2x={"preset": "paper"}, speed_limit_mps=40), TRAINING)
+    assert resolve(TINY_PPO.replace(**words), SCENARIO.replace(**words)).identity == TRAINING.identity
 
 
 def test_same__everything_else_does_and_is_named(tmp_path: Path) -> None:
@@ -46,8 +47,8 @@ def test_same__everything_else_does_and_is_named(tmp_path: Path) -> None:
     ]
     for recipe, scenario, named in other:
         with pytest.raises(InvalidInput, match=rf"run: holds another training \(here other: {named}\); give another"):
-            check_same(folder, recipe, scenario)
-        assert fingerprint(recipe, scenario) != fingerprint(TINY_PPO, SCENARIO)
+            check_same(folder, resolve(recipe, scenario))
+        assert resolve(recipe, scenario).identity != TRAINING.identity
 
 
 def test_same__another_library_trains_other_policies(tmp_path: Path) -> None:
@@ -55,10 +56,10 @@ def test_same__another_library_trains_other_policies(tmp_path: Path) -> None:
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**config, "library": "benchmarl"}))
     with pytest.raises(InvalidInput, match="was trained by benchmarl"):
-        check_same(folder, TINY_PPO, SCENARIO)
+        check_same(folder, TRAINING)
 
 
 def test_same__a_damaged_configuration_is_named(tmp_path: Path) -> None:
     folder = folder_of(tmp_path / "run", {}, {"name": "paper-random"})
     with pytest.raises(InvalidInput, match=r"config.json: .*missing"):
-        check_same(folder, TINY_PPO, SCENARIO)
+        check_same(folder, TRAINING)
