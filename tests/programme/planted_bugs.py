@@ -34,7 +34,8 @@ STATISTICS, SEEDS, TABLE, REGRET, ROLLOUT = (
     f"ethbrake_marl/evaluation/{name}.py" for name in ("statistics", "seed_statistics", "table", "regret", "rollout")
 )
 COURSE, EVENTS, KEPT, INDEPENDENT, RECIPE = (
-    f"ethbrake_marl/learning/{name}.py" for name in ("progress", "run_folder", "kept_training", "independent", "recipe")
+    f"ethbrake_marl/learning/{name}.py"
+    for name in ("progress", "run_log", "training", "algorithms/independent_ppo", "recipe")
 )
 
 
@@ -55,7 +56,7 @@ OF_OPTIMUM = ("tests/studies/ablation/test_joint_optimum.py",)
 OF_STATISTICS = ("tests/evaluation/test_statistics.py", "tests/evaluation/test_seed_statistics.py")
 OF_TABLES = ("tests/evaluation/test_table.py", "tests/evaluation/test_regret.py", "tests/evaluation/test_rollout.py")
 OF_LEARNING = ("tests/learning/test_progress.py", "tests/learning/test_recipe.py", "tests/learning/test_train.py")
-OF_FILES = ("tests/learning/test_kept_training.py", "tests/learning/test_event_files.py")
+OF_FILES = ("tests/learning/test_training.py", "tests/learning/test_event_files.py")
 
 BUGS: dict[str, Bug] = {
     # ------------------------------------------------------------ rewards
