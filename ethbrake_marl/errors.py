@@ -109,3 +109,22 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> UnknownName:
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names)}"
     return UnknownName(f"unknown {kind} {name!r}; {hint}")
+
+
+def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
+    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no end)."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
+        right = f", at least {least}" if most is None else f" in {least}..{most}"
+        raise InvalidInput(f"{what} = {value!r}: must be a whole number{right}")
+
+
+def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> None:
+    """Raise ``InvalidInput``, ending in ``advice``, unless exactly one vehicle of the named scenario learns.
+
+    ``learners``: names of those that do.
+    """
+    if len(learners) != 1:
+        raise InvalidInput(
+            f"scenario {scenario!r} has {len(learners)} learners ({', '.join(learners) or 'none'}); {advice}"
+        )

@@ -19,7 +19,7 @@ PACKAGE = "ethbrake_marl"
 # From the bottom up. A module imports what stands on lower levels, or in its own folder; folders of one level do not
 # import each other.
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("errors",),
+    ("errors", "progress"),
     ("files", "physics"),
     ("harm", "actions"),
     ("objectives",),

@@ -112,7 +112,7 @@ def generalise_command(
     agents = load_runs([each.strip() for each in runs.split(",")], line)
     question = Question(line, lengths, episodes, seed, count, search_episodes, budget)
     with interruptible("nothing was written"), progress_bars() as bars:
-        found = drive_longer(question, agents, bars.show)
+        found = drive_longer(question, agents, bars.show_progress)
     if as_json:
         write_json([one.to_json() for one in found])
     else:
@@ -164,10 +164,10 @@ def _run(plan: Plan, jobs: int, as_json: bool) -> None:
     from ethbrake_marl.studies.ablation.run import measure, train_all
 
     with progress_bars() as bars:
-        if not train_all(list(plan.trainings()), jobs, bars.show):
+        if not train_all(list(plan.trainings()), jobs, bars.show_progress):
             say(f"interrupted; {KEPT}")
             raise typer.Exit(INTERRUPTED)
-        measured = measure(plan, jobs, bars.show)
+        measured = measure(plan, jobs, bars.show_progress)
     found = write_ablation(plan, measured, str(this_machine()))
     if as_json:
         write_json(found)

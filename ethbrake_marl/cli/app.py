@@ -171,7 +171,7 @@ def run(
                 episodes=episodes,
                 list_seed=list_seed,
                 force=force,
-                on_stage=lambda stage: bars.show(stage.name, stage.done, stage.total, stage.metrics, stage.note),
+                on_progress=bars.show_progress,
             )
     show_rows(result.rows, as_json)
     if not as_json:

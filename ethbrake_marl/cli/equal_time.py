@@ -58,7 +58,7 @@ def equal_time_command(
             against=against,
             count=count,
             repeats=repeats,
-            on_progress=lambda agent, done: bars.show(agent, done, repeats),
+            on_progress=bars.show_progress,
         )
     machine = this_machine()
     if as_json:

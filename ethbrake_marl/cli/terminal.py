@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.segment import Segment
 
 from ethbrake_marl.errors import OldSpelling, one_line, plain_text
+from ethbrake_marl.progress import Progress as PartProgress
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
 INTERRUPTED = 130  # 128 + SIGINT, as shells expect
@@ -98,6 +99,10 @@ class Bars:
         if name not in self._tasks:
             self._tasks[name] = self._bars.add_task(label, total=total)
         self._bars.update(self._tasks[name], completed=min(done, total), total=total, description=label)
+
+    def show_progress(self, progress: PartProgress) -> None:
+        """The same of a ``Progress``."""
+        self.show(progress.name, progress.done, progress.total, progress.metrics, progress.note)
 
     def tell(self, text: str) -> None:
         """One line above the bars."""

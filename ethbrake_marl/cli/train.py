@@ -18,8 +18,8 @@ from ethbrake_marl.cli.options import (
     StepsOption,
     TrainingSeedOption,
 )
-from ethbrake_marl.cli.terminal import INTERRUPTED, Bars, interruptible, progress_bars, say, write_json
-from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, write_json
+from ethbrake_marl.errors import AlreadyExists, check_one_learner
 from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.evaluation.per_world import check_target, write_output
 from ethbrake_marl.learning.recipe import load_recipe
@@ -27,9 +27,9 @@ from ethbrake_marl.learning.schemes import check_scheme, who_drives_what
 from ethbrake_marl.policies.onnx import onnx_model
 from ethbrake_marl.policies.policy import save_policy
 from ethbrake_marl.policies.shipped import load_named_policy
+from ethbrake_marl.progress import Progress
 
 if TYPE_CHECKING:
-    from ethbrake_marl.learning.loop import Progress
     from ethbrake_marl.learning.train import TrainResult
 
 
@@ -71,7 +71,7 @@ def train_command(
             def tell(progress: Progress) -> None:
                 if begun:
                     bars.tell(begun.pop())
-                show_progress(bars, progress)
+                bars.show_progress(progress)
 
             result = train(plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell)
     _show_result(result, as_json)
@@ -92,7 +92,7 @@ def resume_command(
         from ethbrake_marl.learning.train import resume
 
         with progress_bars() as bars:
-            result = resume(folder, on_progress=lambda p: show_progress(bars, p), other_versions=other_versions)
+            result = resume(folder, on_progress=bars.show_progress, other_versions=other_versions)
     _show_result(result, as_json)
 
 
@@ -115,17 +115,16 @@ def learning_curves_command(
         from ethbrake_marl.studies.learning_curves import FIGURE, parse_trainings, train_all, write_curves
 
         chosen, plan = load_runnable(scenario), parse_trainings(recipes)
-        if len(chosen.learners) != 1:
-            raise InvalidInput(
-                f"scenario {chosen.name!r}: has {len(chosen.learners)} learners; curves need exactly one"
-            )
+        check_one_learner(
+            chosen.name, [chosen.vehicle_names[i] for i in chosen.learners], "learning curves need exactly one"
+        )
         with progress_bars() as bars:
             finished = train_all(
                 chosen,
                 plan,
                 output,
                 steps=steps,
-                tell=lambda name, p: bars.show(name, p.steps, p.total_steps, p.metrics, p.note),
+                tell=bars.show_progress,
             )
         if not finished:
             say(f"interrupted; the same command goes on with what is in {output}")
@@ -134,11 +133,6 @@ def learning_curves_command(
     if as_json:
         write_json(summary)
     say(f"figure: {output / FIGURE}")
-
-
-def show_progress(bars: Bars, progress: Progress) -> None:
-    """How far a training is, and what it has to say."""
-    bars.show("training", progress.steps, progress.total_steps, progress.metrics, progress.note)
 
 
 def end_of_training(status: str, steps: int, folder: Path) -> None:

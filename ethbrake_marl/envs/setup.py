@@ -13,7 +13,7 @@ from gymnasium.spaces import Box
 from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.rollout import scripted
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number
 from ethbrake_marl.observations import Feature, ObservationSpec
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.rewards import Reward
@@ -45,8 +45,7 @@ def make_engine(
     ``learners`` (names such as ``vehicle_2``, or indices from 0) replace the scenario's own; a vehicle that learned
     and is not listed brakes fully. Scripts come from the scenario's roles.
     """
-    if isinstance(n, bool) or not isinstance(n, int | np.integer) or not n >= 1:
-        raise InvalidInput(f"number of worlds = {n!r}: must be a whole number, at least 1")
+    check_whole_number("number of worlds", n, 1)
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     if observation is not None and not isinstance(observation, ObservationSpec):
         raise InvalidInput(
@@ -69,12 +68,11 @@ def make_engine(
 
 def only_learner(engine: Engine) -> int:
     """Index of the one learner; ``InvalidInput`` when there is none or more than one."""
-    if len(engine.learners) != 1:
-        names = ", ".join(engine.scenario.vehicle_names[i] for i in engine.learners) or "none"
-        raise InvalidInput(
-            f"scenario {engine.scenario.name!r} has {len(engine.learners)} learners ({names}), this environment needs"
-            " exactly one: pass learners=['vehicle_2'], or use parallel_env or make_sb3_vec_env"
-        )
+    check_one_learner(
+        engine.scenario.name,
+        [engine.scenario.vehicle_names[i] for i in engine.learners],
+        "this environment needs exactly one: pass learners=['vehicle_2'], or use parallel_env or make_sb3_vec_env",
+    )
     return engine.learners[0]
 
 

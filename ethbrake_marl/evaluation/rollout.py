@@ -18,7 +18,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.engine.stream import check_alert
-from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_one_learner, check_whole_number, unknown_name
 from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
 from ethbrake_marl.harm import HarmCount, Ledger
 from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
@@ -207,8 +207,7 @@ def _check_request(worlds: object, agents: object, scenario: object, chunk: obje
         if not isinstance(agent, Agent | Team):
             raise InvalidInput(f"evaluate: agent {name!r} = {agent!r}: must be an agent, as make_agent(name) gives")
         knowledge_of(agent)  # refuses what is no statement
-    if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or not chunk >= 1:
-        raise InvalidInput(f"evaluate: chunk = {chunk!r}; a whole number of worlds, at least 1 at a time, is needed")
+    check_whole_number("evaluate: chunk", chunk, 1)
 
 
 def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
@@ -221,13 +220,9 @@ def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mappi
 def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
     """Index of the vehicle to drive: the given one, or the scenario's only learner; raises ``InvalidInput``."""
     learners = scenario.learners
-    names = ", ".join(scenario.vehicle_names[i] for i in learners)
+    names = [scenario.vehicle_names[i] for i in learners]
     if vehicle is None:
-        if len(learners) != 1:
-            raise InvalidInput(
-                f"scenario {scenario.name!r} has {len(learners)} learners ({names or 'none'}); say which vehicle the"
-                " agents drive"
-            )
+        check_one_learner(scenario.name, names, "say which vehicle the agents drive")
         return learners[0]
     if isinstance(vehicle, str):
         if vehicle not in scenario.vehicle_names:
@@ -237,8 +232,8 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
         raise InvalidInput(f"vehicle = {vehicle!r}: must be a name or an index from 0 to {scenario.vehicles - 1}")
     if set(learners) - {vehicle}:
         raise InvalidInput(
-            f"scenario {scenario.name!r}: {names} learn, but only {scenario.vehicle_names[vehicle]} is driven;"
-            " give the others a script"
+            f"scenario {scenario.name!r}: {', '.join(names)} learn, but only {scenario.vehicle_names[vehicle]} is"
+            " driven; give the others a script"
         )
     return int(vehicle)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,6 +15,7 @@ from ethbrake_marl.learning.model_state import Model
 from ethbrake_marl.learning.progress import RETURN, Course, check_losses, check_rollout, check_step, check_weights
 from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.policies.team import Trained
+from ethbrake_marl.progress import OnProgress, Progress
 
 # Column of the log -> info of an episode's end; means over the episodes since the last row, exploration included.
 EPISODE_COLUMNS = {
@@ -29,21 +29,6 @@ Evaluate = Callable[[Any], Mapping[str, float]]  # of what is trained: a ``Polic
 
 class StopRequested(Exception):
     """Raised inside the training loop to leave it between two updates; never seen outside this room."""
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far a training is."""
-
-    steps: int
-    total_steps: int  # at the end: the wanted ones, rounded up to whole updates
-    updates: int
-    wall_s: float
-    metrics: Mapping[str, float]  # of the last evaluation, and the mean return of recent episodes
-    note: str = ""  # to be told once
-
-
-OnProgress = Callable[[Progress], None]
 
 
 class Save(Protocol):
@@ -108,7 +93,9 @@ class BetweenUpdates(BaseCallback):
         recent = self._recent_return()
         if recent is not None:
             metrics[RETURN] = recent
-        self._on_progress(Progress(course.steps, self.planned_steps, course.updates, course.wall_s, metrics, note))
+        self._on_progress(
+            Progress("training", course.steps, self.planned_steps, metrics, note, course.updates, course.wall_s)
+        )
 
     def _on_rollout_start(self) -> None:
         while self.notes:

@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.durable import remove_unfinished
 from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
 from ethbrake_marl.learning.checkpoint_fit import check_fits
-from ethbrake_marl.learning.loop import BetweenUpdates, Evaluate, OnProgress
+from ethbrake_marl.learning.loop import BetweenUpdates, Evaluate
 from ethbrake_marl.learning.measure import measure_on_list
 from ethbrake_marl.learning.model_state import own_random_state
 from ethbrake_marl.learning.models import make_model, policy_maker
@@ -27,6 +27,7 @@ from ethbrake_marl.learning.training import Training, resolve, training_in
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.team import Trained, drivers_of
+from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario import Scenario
 
 _APPENDED: dict[Scheme, Appended] = {"independent": "number", "centralised": "state"}

@@ -11,7 +11,7 @@ import numpy as np
 from ethbrake_marl.agents.protocol import Agent, LookingAhead
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.engine.stream import Script
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import check_one_learner
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.best_harm import scripted_commands, world_identity
 from ethbrake_marl.limits.best_harm_table import BestHarmTable
@@ -33,8 +33,8 @@ def fold_agent(
     those of the profiles, driven again. Where an agent cannot drive a world to its end, the table stays as it is.
     Raises ``InvalidInput`` if the scenario has not exactly one learner.
     """
-    if len(scenario.learners) != 1:
-        raise InvalidInput(f"scenario {scenario.name!r}: agents drive one learner, and it has {len(scenario.learners)}")
+    learners = [scenario.vehicle_names[i] for i in scenario.learners]
+    check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")
     (vehicle,) = scenario.learners
     identity = world_identity(scenario, worlds)
     known = np.max([table.harm(identity, count) for count in table.best], axis=0)

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.events import stopping_distances
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, concatenate, make_worlds
@@ -219,8 +219,7 @@ def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, i
 
 def _check_request(n: int, seed: int, first: int, channel: str) -> None:
     for name, value, least in (("n", n, 1), ("seed", seed, 0), ("first", first, 0)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not value >= least:
-            raise InvalidInput(f"sample: {name} = {value!r}: must be a whole number, at least {least}")
+        check_whole_number(f"sample: {name}", value, least)
     if not n <= MOST_AT_ONCE:
         raise InvalidInput(f"sample: n = {n}: at most {MOST_AT_ONCE:,} worlds at once; draw a longer list in parts")
     if not int(first) + int(n) <= _MOST_WORLDS:

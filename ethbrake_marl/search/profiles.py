@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
@@ -105,8 +105,7 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
     could be followed.
     """
     for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not value >= least:
-            raise InvalidInput(f"{name} = {value!r}: must be a whole number, at least {least}")
+        check_whole_number(name, value, least)
     n, C = problem.n, len(problem.vehicles)
     ends = np.ascontiguousarray(given.ends.reshape(n, -1, MOST_PHASES))
     commands = np.ascontiguousarray(given.commands_mps2.reshape(n, -1, MOST_PHASES, C))

@@ -7,7 +7,7 @@ each is measured with its whole episode: what it does at the alert, every decisi
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,16 +18,15 @@ from rich.text import Text
 
 from ethbrake_marl.agents.knowledge import Knowledge, knowledge_text
 from ethbrake_marl.agents.team import Driver
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import check_whole_number, unknown_name
 from ethbrake_marl.evaluation.rollout import Outcome, evaluate
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Sample, Scenario
 
 CHUNK = 500  # worlds driven together, for every agent alike
 _WARM_UP = 2  # worlds that are driven first and not counted: kernels are compiled, tables are read
-
-Progress = Callable[[str, int], None]  # agent, times that it has driven the whole list
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,16 +58,16 @@ def equal_time(
     against: str,
     count: HarmCount = "first",
     repeats: int = 3,
-    on_progress: Progress | None = None,
+    on_progress: OnProgress | None = None,
 ) -> list[TimedRow]:
     """Time every agent on the list, ``repeats`` times in turn; quickest first.
 
-    ``against`` is the agent that the others' harm under ``count`` is compared with. Harms are the same in every
-    repetition, times are not. Raises ``InvalidInput`` for less than one repetition, ``UnknownName`` for an agent to
-    compare with that is not among them, and what ``evaluate`` raises.
+    ``against`` is the agent that the others' harm under ``count`` is compared with. ``on_progress`` is told how often
+    each agent has driven the whole list. Harms are the same in every repetition, times are not. Raises ``InvalidInput``
+    for less than one repetition, ``UnknownName`` for an agent to compare with that is not among them, and what
+    ``evaluate`` raises.
     """
-    if isinstance(repeats, bool) or not isinstance(repeats, int) or not repeats >= 1:
-        raise InvalidInput(f"equal time: repeats = {repeats!r}: must be a whole number, at least 1")
+    check_whole_number("equal time: repeats", repeats, 1)
     if against not in agents:
         raise unknown_name("agent to compare with", against, agents)
     n = sample.worlds.n
@@ -83,7 +82,7 @@ def equal_time(
             spent[name].append(1e3 * (time.process_time() - begin) / n)
             outcomes[name] = result.outcome(name)
             if on_progress is not None:
-                on_progress(name, repetition + 1)
+                on_progress(Progress(name, repetition + 1, repeats))
     reference = outcomes[against].ledger.world_harm(count)
     rows = [
         TimedRow(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -23,6 +23,7 @@ from ethbrake_marl.learning.run_folder import RunDirectory, RunStatus, read_obje
 from ethbrake_marl.learning.train import TrainResult, train
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.shield import HybridAgent
@@ -34,20 +35,6 @@ BESIDE = ("full_brake", "e_v2x_bm")  # baselines on the other two of the three t
 BESIDE_EPISODES = 2_000  # at most so many worlds of each
 
 Ended = Literal["finished", "interrupted"]
-
-
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """How far an experiment is: ``done`` of ``total`` steps or worlds of the part called ``name``."""
-
-    name: str  # "training", or the agent that is being evaluated, or "figures"
-    done: int
-    total: int
-    metrics: Mapping[str, float] = field(default_factory=dict)  # of the policy, while it is trained
-    note: str = ""  # to be told once
-
-
-OnStage = Callable[[Stage], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +84,7 @@ def run_experiment(
     episodes: int = EPISODES,
     list_seed: int = LIST_SEED,
     force: bool = False,
-    on_stage: OnStage | None = None,
+    on_progress: OnProgress | None = None,
 ) -> ExperimentResult:
     """Train a policy on ``scenario``, evaluate it, its hybrid and the baselines on a fixed list, write everything.
 
@@ -109,7 +96,7 @@ def run_experiment(
     ``train`` and ``evaluate`` raise, ``AlreadyExists`` for an existing run before any work.
     """
     started = time.monotonic()
-    tell = on_stage or (lambda stage: None)
+    tell = on_progress or (lambda progress: None)
     vehicle = controlled_vehicle(scenario, None)
     sample = scenario.sample(episodes, list_seed)
     trained = train(
@@ -119,19 +106,19 @@ def run_experiment(
         steps=steps,
         seed=seed,
         force=force,
-        on_progress=lambda p: tell(Stage("training", p.steps, p.total_steps, p.metrics, p.note)),
+        on_progress=on_progress,
     )
     run = RunDirectory(trained.directory)
     with _status(run, trained.status):
         agents = _agents(trained.policy, scenario)
         evaluation = _evaluated(sample, agents, scenario, vehicle, list_seed, trained, tell)
-        tell(Stage("figures", 0, 1))
+        tell(Progress("figures", 0, 1))
         rows = summarise(evaluation)
         beside = _beside(trained.policy, scenario, min(episodes, BESIDE_EPISODES), list_seed)
         write_results(run.path, evaluation, rows)
         write_beside(run.path, beside)
         report = _shown(run, evaluation, rows, beside, trained, agents, wall_s=time.monotonic() - started)
-        tell(Stage("figures", 1, 1))
+        tell(Progress("figures", 1, 1))
     return ExperimentResult(run.path, trained.status, trained.steps, rows, report, beside)
 
 
@@ -162,13 +149,13 @@ def _evaluated(
     vehicle: int,
     list_seed: int,
     trained: TrainResult,
-    tell: OnStage,
+    tell: OnProgress,
 ) -> Evaluation:
     """Every agent on the list, with its progress told."""
     total = sample.worlds.n
     if trained.status == "interrupted":
         note = f"interrupted after {trained.steps:,} steps: evaluating the policy so far; Ctrl-C again stops at once"
-        tell(Stage(next(iter(agents)), 0, total, note=note))
+        tell(Progress(next(iter(agents)), 0, total, note=note))
     return evaluate(
         sample,
         agents,
@@ -176,7 +163,7 @@ def _evaluated(
         vehicle=vehicle,
         seed=list_seed,
         chunk=PROGRESS_EVERY,
-        on_progress=lambda name, done: tell(Stage(name, done, total)),
+        on_progress=lambda name, done: tell(Progress(name, done, total)),
     )
 
 

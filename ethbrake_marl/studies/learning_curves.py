@@ -6,8 +6,8 @@ import csv
 import io
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,12 @@ from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
 from ethbrake_marl.figures.learning_curves import SeedCurve, at_common_steps, seed_curves
 from ethbrake_marl.figures.style import png_bytes
-from ethbrake_marl.learning.loop import OnProgress, Progress
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
 from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.learning.training import Training, check_same, resolve
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Scenario
 
 FIGURE, TABLE, SUMMARY = "learning_curves.png", "learning_curves.csv", "learning_curves.json"
@@ -33,8 +33,6 @@ _LABELS = {
     "total_harm": "Total harm on the fixed list (m²/s²)",
     "return": "Mean return of training episodes",
 }
-
-Tell = Callable[[str, Progress], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +58,12 @@ def parse_trainings(text: str) -> list[Trainings]:
 
 
 def train_all(
-    scenario: Scenario, plan: Sequence[Trainings], folder: Path, *, steps: int | None = None, tell: Tell | None = None
+    scenario: Scenario,
+    plan: Sequence[Trainings],
+    folder: Path,
+    *,
+    steps: int | None = None,
+    tell: OnProgress | None = None,
 ) -> bool:
     """Train every seed of every recipe into ``folder/RECIPE-seedK``: finished ones are kept, begun ones go on.
 
@@ -78,7 +81,7 @@ def train_all(
         if RunDirectory(path).status.is_file():
             check_same(path, training)
     return all(
-        _train_one(training, path, None if tell is None else partial(tell, path.name))
+        _train_one(training, path, None if tell is None else partial(_named, tell, path.name))
         for path, training in wanted.items()
     )
 
@@ -122,6 +125,10 @@ def _train_one(training: Training, path: Path, tell: OnProgress | None) -> bool:
     if read_object(run.status).get("status") == "finished":
         return True
     return resume(path, on_progress=tell).status == "finished"
+
+
+def _named(tell: OnProgress, name: str, progress: Progress) -> None:
+    tell(replace(progress, name=name))
 
 
 def _table(path: Path) -> list[dict[str, str]]:

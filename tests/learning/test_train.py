@@ -17,10 +17,10 @@ import torch
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.learning import train as train_module
-from ethbrake_marl.learning.loop import Progress
 from ethbrake_marl.learning.progress import TrainingDiverged
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of, shipped_recipes
 from ethbrake_marl.policies.policy import Policy, load_policy
+from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario import load_scenario
 
 train = partial(train_module.train, measure=None)
@@ -77,7 +77,7 @@ def test_train__leaves_a_complete_folder(recipe: TrainingRecipe, tmp_path: Path)
     result = train(recipe, SCENARIO, tmp_path / "run", measure=lambda training: _mean_weight, on_progress=seen.append)
     assert (result.status, result.steps, result.updates) == ("finished", 3 * ROLLOUT, 3)
     assert [e["updates"] for e in result.evaluations] == [0, 2, 3]
-    assert [p.steps for p in seen] == [0, ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT]
+    assert [p.done for p in seen] == [0, ROLLOUT, 2 * ROLLOUT, 3 * ROLLOUT]
     assert seen[-1].metrics["episode_return"] < 0.0
 
     names = sorted(str(p.relative_to(tmp_path / "run")) for p in (tmp_path / "run").rglob("*") if p.is_dir())

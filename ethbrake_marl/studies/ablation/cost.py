@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.learning.loop import Progress
 from ethbrake_marl.learning.team_file import load_team
 from ethbrake_marl.learning.train import train
 from ethbrake_marl.limits.best_harm import best_harm
+from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.studies.ablation.joint_optimum import parts_left, questions
 from ethbrake_marl.studies.ablation.plan import Plan, Training, common_worlds
@@ -89,7 +89,7 @@ def _timed(training: Training, sample: Sample) -> tuple[float, float]:
     with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
         path = Path(folder) / "timed"
         train(short, scenario, path, steps=1, on_progress=told.append)
-        once = told[-1].steps  # decisions of one update
+        once = told[-1].done  # decisions of one update
         told.clear()
         train(short, scenario, path, steps=_UPDATES * once, force=True, on_progress=told.append)
         return _per_step(told), _driving_s(path, scenario, sample)
@@ -108,9 +108,9 @@ def _per_step(told: Sequence[Progress]) -> float:
     """Seconds per decision between the first and the last update that was told."""
     updates = [one for one in told if one.updates >= 1]
     first, last = updates[0], updates[-1]
-    if last.steps == first.steps:
-        return last.wall_s / last.steps
-    return (last.wall_s - first.wall_s) / (last.steps - first.steps)
+    if last.done == first.done:
+        return last.wall_s / last.done
+    return (last.wall_s - first.wall_s) / (last.done - first.done)
 
 
 def _measurements(training: Training) -> int:

@@ -7,7 +7,7 @@ every other whose learners can do the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,10 +28,9 @@ from ethbrake_marl.limits.best_harm import (
 )
 from ethbrake_marl.limits.best_harm_table import BestHarmTable
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Sample
 from ethbrake_marl.studies.ablation.plan import Level, Plan
-
-Tell = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +71,7 @@ def parts_left(plan: Plan, level: Level, part: Sample) -> tuple[int, list[Path]]
     return left, damaged
 
 
-def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: Tell) -> dict[str, BestHarmTable]:
+def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgress) -> dict[str, BestHarmTable]:
     """The search of every level with learners, by its name; parts that were found earlier are kept."""
     found: dict[str, BestHarmTable] = {}
     for level, part, alike in questions(plan, samples):
@@ -82,10 +81,14 @@ def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: Tell) -> 
             budget=plan.budget,
             threads=jobs,
             chunks=plan.optimum_folder(level),
-            on_progress=partial(tell, f"joint optimum of {level.name}"),
+            on_progress=partial(_told, tell, f"joint optimum of {level.name}"),
         )
         found |= {each.name: table for each in alike}
     return found
+
+
+def _told(tell: OnProgress, name: str, done: int, total: int) -> None:
+    tell(Progress(name, done, total))
 
 
 def best_known(own: Answer, answers: Sequence[Answer]) -> dict[HarmCount, Floats]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,14 +24,13 @@ from ethbrake_marl.learning.team_file import is_team
 from ethbrake_marl.limits.best_harm import best_harm
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.policies.policy import Policy, load_policy
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.scenario.quantities import DECLARED
 from ethbrake_marl.scenario.roles import LEARNER
 from ethbrake_marl.studies.ablation.comparison import TOLERANCE
 from ethbrake_marl.studies.ablation.plan import read_kept
 from ethbrake_marl.studies.ablation.run import Harms, harms_of
-
-Tell = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +137,7 @@ def _check_front(path: str, policy: Policy, scenario: Scenario) -> None:
         )
 
 
-def drive_longer(question: Question, agents: Sequence[Agent], tell: Tell | None = None) -> list[LineResult]:
+def drive_longer(question: Question, agents: Sequence[Agent], tell: OnProgress | None = None) -> list[LineResult]:
     """Let every agent drive all learners of lines of each length, on the same worlds as full braking.
 
     All lines are made before the first is driven. Raises ``InvalidInput`` for a length that is given twice or that the
@@ -152,7 +151,7 @@ def drive_longer(question: Question, agents: Sequence[Agent], tell: Tell | None 
 
 
 def _of_length(
-    question: Question, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: Tell | None
+    question: Question, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: OnProgress | None
 ) -> LineResult:
     count = question.count
     braking = _driven([make_single_agent("full_brake")], scenario, sample, tell)
@@ -173,16 +172,16 @@ def _of_length(
     )
 
 
-def _driven(agents: Sequence[Agent], scenario: Scenario, sample: Sample, tell: Tell | None) -> Harms:
+def _driven(agents: Sequence[Agent], scenario: Scenario, sample: Sample, tell: OnProgress | None) -> Harms:
     named = {str(k): agent for k, agent in enumerate(agents)}
     result = evaluate(sample, named, scenario=scenario, chunk=PROGRESS_EVERY).complete()
     if tell is not None:
-        tell(f"{scenario.vehicles} vehicles, {agents[0].name}", sample.worlds.n, sample.worlds.n)
+        tell(Progress(f"{scenario.vehicles} vehicles, {agents[0].name}", sample.worlds.n, sample.worlds.n))
     return harms_of([result.outcome(name) for name in named])
 
 
 def _searched(
-    question: Question, scenario: Scenario, sample: Sample, reached: Floats, tell: Tell | None
+    question: Question, scenario: Scenario, sample: Sample, reached: Floats, tell: OnProgress | None
 ) -> Floats | None:
     """Least harm known of all followers together in the first worlds, [1, search_episodes]."""
     if question.search_episodes == 0:
@@ -190,6 +189,6 @@ def _searched(
     part = sample.worlds.take(np.arange(question.search_episodes))
     table = best_harm(scenario, part, counts=[question.count], budget=question.budget)
     if tell is not None:
-        tell(f"{scenario.vehicles} vehicles, joint optimum", part.n, part.n)
+        tell(Progress(f"{scenario.vehicles} vehicles, joint optimum", part.n, part.n))
     best: Floats = np.minimum(table.best[question.count].harm, reached[:, : part.n].min(axis=0))
     return best[np.newaxis]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
@@ -17,36 +17,34 @@ from ethbrake_marl.agents.team import Team
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.rollout import Outcome, evaluate
 from ethbrake_marl.harm import COUNTS, HarmCount
-from ethbrake_marl.learning.loop import OnProgress, Progress
 from ethbrake_marl.learning.run_folder import RunDirectory
 from ethbrake_marl.learning.team_file import load_team
 from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.physics import Bools, Floats
+from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.studies.ablation.joint_optimum import Answer, best_known, search_all
 from ethbrake_marl.studies.ablation.plan import Level, Plan, Training, common_worlds
 
-TellTraining = Callable[[str, int, int], None]  # what, how far, of how much
 
-
-def train_all(trainings: Sequence[Training], jobs: int, tell: TellTraining | None = None) -> bool:
+def train_all(trainings: Sequence[Training], jobs: int, tell: OnProgress | None = None) -> bool:
     """Bring every training to its end, ``jobs`` at a time; False when Ctrl-C stopped it.
 
     The policies do not depend on ``jobs`` or on interruptions. Raises what ``Training.steps_left`` and ``train``
     raise.
     """
     left = [training for training in trainings if training.steps_left()]
-    say = tell or (lambda name, done, total: None)
+    say = tell or (lambda progress: None)
     if jobs == 1 or len(left) < 2:
         return all(_train(training, partial(_told, say, training.folder.name)) for training in left)
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin_worker) as pool:
         futures = [pool.submit(_train, training) for training in left]
-        say("trainings", 0, len(left))
+        say(Progress("trainings", 0, len(left)))
         try:
             for done, future in enumerate(as_completed(futures)):
                 if not future.result():
                     raise KeyboardInterrupt
-                say("trainings", done + 1, len(left))
+                say(Progress("trainings", done + 1, len(left)))
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
             for worker in active_children():
@@ -87,11 +85,8 @@ def _train(training: Training, tell: OnProgress | None = None) -> bool:
     return result.status == "finished"
 
 
-def _told(tell: TellTraining, name: str, progress: Progress) -> None:
-    tell(name, progress.steps, progress.total_steps)
-
-
-Tell = Callable[[str, int, int], None]
+def _told(tell: OnProgress, name: str, progress: Progress) -> None:
+    tell(Progress(name, progress.done, progress.total))
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,13 +118,13 @@ def load_teams(plan: Plan) -> dict[tuple[str, str], list[Team]]:
     return teams
 
 
-def measure(plan: Plan, jobs: int = 1, tell: Tell | None = None) -> list[Measured]:
+def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
     """Let everything that was trained drive the common worlds, and search the joint optima (parts found are kept).
 
     Level by level in the plan's order, algorithm by algorithm. What some policy does better than the search becomes
     the best known of that world. Raises what loading teams and ``common_worlds`` raise, before any long work.
     """
-    say = tell or (lambda name, done, total: None)
+    say = tell or (lambda progress: None)
     teams = load_teams(plan)
     samples = common_worlds(plan.levels, plan.episodes, plan.list_seed)
     tables = search_all(plan, samples, jobs, say)
@@ -159,13 +154,13 @@ def _all_brake(scenario: Scenario) -> Scenario:
     return scenario.replace(roles=dict.fromkeys(scenario.vehicle_names, "full_brake"))
 
 
-def _driven(scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: Tell) -> Harms:
+def _driven(scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: OnProgress) -> Harms:
     """Harms of several teams of one level."""
     outcomes = []
     for team in teams:
         result = evaluate(sample, {team.name: team}, scenario=scenario, chunk=PROGRESS_EVERY).complete()
         outcomes.append(result.outcome(team.name))
-        tell(f"driving {team.name}", sample.worlds.n, sample.worlds.n)
+        tell(Progress(f"driving {team.name}", sample.worlds.n, sample.worlds.n))
     return harms_of(outcomes)
 
 
