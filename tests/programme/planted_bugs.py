@@ -34,7 +34,7 @@ STATISTICS, SEEDS, TABLE, REGRET, ROLLOUT = (
 COURSE, CALLBACK, CHECKPOINT, EVENTS, KEPT, INDEPENDENT, RECIPE, MODELS = (
     f"ethbrake_marl/learning/{name}.py"
     for name in (
-        "course", "callback", "checkpoint", "event_files", "kept_training", "independent", "recipe", "models",
+        "progress", "loop", "checkpoint", "run_log", "training", "algorithms/independent_ppo", "recipe", "models",
     )
 )  # fmt: skip
 
@@ -56,7 +56,7 @@ OF_OPTIMUM = ("tests/studies/ablation/test_joint_optimum.py",)
 OF_STATISTICS = ("tests/evaluation/test_statistics.py", "tests/evaluation/test_seed_statistics.py")
 OF_TABLES = ("tests/evaluation/test_table.py", "tests/evaluation/test_regret.py", "tests/evaluation/test_rollout.py")
 OF_LEARNING = ("tests/learning/test_progress.py", "tests/learning/test_recipe.py", "tests/learning/test_train.py")
-OF_FILES = ("tests/learning/test_kept_training.py", "tests/learning/test_event_files.py")
+OF_FILES = ("tests/learning/test_training.py", "tests/learning/test_event_files.py")
 
 BUGS: dict[str, Bug] = {
     # ------------------------------------------------------------ rewards
@@ -207,7 +207,7 @@ BUGS: dict[str, Bug] = {
     "the learning rate falls at once": Bug(
         RECIPE, "done = min(max(1.0 - remaining, 0.0), 1.0)", "done = 1.0", OF_LEARNING
     ),
-    "the scenario left out of a training's fingerprint": Bug(
+    "the scenario left out of a training's identity": Bug(
         KEPT, '"scenario": scenario.model_dump(mode="json", exclude=set(WORDS))', '"scenario": {}', OF_FILES
     ),
     "event files named by the clock": Bug(EVENTS, "default=0) + 1", "default=0) * 0 + int(time.time())", OF_FILES),

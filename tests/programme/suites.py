@@ -164,7 +164,7 @@ EVALUATION = Suite(
 
 TRAINED = ("tests/learning/test_train.py", "tests/learning/test_teams.py", "tests/learning/test_resume.py")
 LEARNING = Suite(
-    files=("learning/*.py", "policies/*.py", "files/json.py"),
+    files=("learning/*.py", "learning/algorithms/*.py", "policies/*.py", "files/json.py"),
     quick={
         "learning/progress.py": ("tests/learning/test_progress.py",),
         "learning/recipe.py": ("tests/learning/test_recipe.py",),
@@ -172,9 +172,11 @@ LEARNING = Suite(
         "policies/manifest.py": ("tests/policies/test_policy.py", "tests/policies/test_actor.py"),
         "policies/actor.py": ("tests/policies/test_actor.py",),
         "files/json.py": ("tests/policies/test_policy.py", "tests/learning/test_run_files.py"),
-        "learning/kept_training.py": ("tests/learning/test_kept_training.py", "tests/learning/test_teams.py"),
+        "learning/training.py": ("tests/learning/test_training.py", "tests/learning/test_teams.py"),
         "learning/run_folder.py": ("tests/learning/test_run_files.py", "tests/learning/test_event_files.py", *TRAINED),
-        "learning/independent.py": ("tests/learning/test_teams.py",),
+        "learning/run_log.py": ("tests/learning/test_run_files.py", "tests/learning/test_event_files.py", *TRAINED),
+        "learning/algorithms/independent_ppo.py": ("tests/learning/test_teams.py",),
+        "learning/registry.py": ("tests/learning/test_algorithms.py",),
         "learning/schemes.py": ("tests/learning/test_teams.py", "tests/learning/test_recipe.py"),
         "learning/team_file.py": ("tests/learning/test_teams.py",),
         "policies/team.py": ("tests/learning/test_teams.py",),
