@@ -207,7 +207,7 @@ BUGS: dict[str, Bug] = {
     "the learning rate falls at once": Bug(
         RECIPE, "done = min(max(1.0 - remaining, 0.0), 1.0)", "done = 1.0", OF_LEARNING
     ),
-    "the scenario left out of a training's fingerprint": Bug(
+    "the scenario left out of a training's identity": Bug(
         KEPT, '"scenario": scenario.model_dump(mode="json", exclude=set(WORDS))', '"scenario": {}', OF_FILES
     ),
     "event files named by the clock": Bug(EVENTS, "default=0) + 1", "default=0) * 0 + int(time.time())", OF_FILES),
