@@ -108,7 +108,7 @@ def test_long_command__a_defect_of_the_scenario_is_found_before_any_work(ethbrak
         (["--scenario", "paper-randm"], ["paper-randm", "did you mean 'paper-random'"]),
         (["--scenario", "nowhere/mine.yaml"], ["nowhere/mine.yaml"]),
         (["--agents", "full_brke"], ["full_brke", "did you mean 'full_brake'"]),
-        (["--agents", "hybird@runs/a"], ["hybird", "did you mean 'hybrid'"]),
+        (["--agents", "universl@shipped"], ["universl", "did you mean 'universal'"]),
         (["--agents", "constant"], ["constant", "m/s2"]),
         (["--agents", "constant:nan"], ["constant:nan"]),
         (["--agents", "constant:7.5"], ["constant:7.5", "7"]),
