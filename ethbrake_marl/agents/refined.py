@@ -6,8 +6,9 @@ import copy
 
 import numpy as np
 
-from ethbrake_marl.agents.knowledge import Knowledge, Source, combined
-from ethbrake_marl.agents.protocol import Agent, Divisible, check_agent, place, recall
+from ethbrake_marl.agents.around import AgentAround
+from ethbrake_marl.agents.knowledge import Source
+from ethbrake_marl.agents.protocol import Agent, check_agent, place, recall
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, introduce, scripted
 from ethbrake_marl.errors import InvalidInput
@@ -24,7 +25,7 @@ _SEGMENTS = 64  # of different deviation; the last one goes on
 _BLOCK = 4096  # worlds rolled out together: bounds memory, changes no result
 
 
-class Rehearsed:
+class Rehearsed(AgentAround):
     """Drives by ``policy`` plus the deviation that did the least harm when many were rolled out at the alert.
 
     A deviation is a sequence of accelerations added to what the policy does; the policy goes on reacting to what it
@@ -35,6 +36,9 @@ class Rehearsed:
     bettered drives as it is. A world's choice does not depend on its batch. Raises ``InvalidInput`` for what is not an
     agent, numbers of rehearsals or rounds outside 1 to 10,000, an unknown count.
     """
+
+    adds = Source.MODEL  # in which it rehearses
+    divides_along = ("_deviation", "predicted_harm")
 
     def __init__(
         self,
@@ -50,8 +54,7 @@ class Rehearsed:
             if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= 10_000:
                 raise InvalidInput(f"rehearsed: {name} = {number!r}: must be a whole number in 1..10000")
         check_count(count)
-        self.name = f"{policy.name}+refined"
-        self.policy = policy
+        super().__init__(policy, f"{policy.name}+refined")
         self.scenario = scenario
         self.rehearsals = rehearsals
         self.rounds = rounds
@@ -59,11 +62,6 @@ class Rehearsed:
         self.predicted_harm: Floats = np.empty(0)
         self._deviation: Floats = np.empty((0, _SEGMENTS))  # [n, segments] that is driven
         self._stage = copy.deepcopy(policy)  # rehearsing must not disturb the policy's memory of running episodes
-
-    @property
-    def knows(self) -> Knowledge:
-        """What the policy knows, and the model in which it rehearses."""
-        return combined(self.policy, also=Source.MODEL)
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Rehearse for these rows; ``worlds`` holds those rows only, at the alert."""
@@ -91,15 +89,6 @@ class Rehearsed:
         deviation = recall(self._deviation, worlds.n, self.name)
         return deviated(self.policy.act(worlds, vehicle), deviation, worlds, vehicle)
 
-    def take(self, rows: Ints) -> Rehearsed:
-        """A copy that drives on in some rows of its batch only; raises ``InvalidInput`` if the policy cannot."""
-        if not isinstance(self.policy, Divisible):
-            raise InvalidInput(f"{self.name}: {self.policy.name} has no take(rows), so it cannot go on in some worlds")
-        part = copy.copy(self)
-        part.policy = self.policy.take(rows)
-        part._deviation, part.predicted_harm = self._deviation[rows], self.predicted_harm[rows]
-        return part
-
     def _harm(self, worlds: Worlds, vehicle: int, deviation: Floats) -> Floats:
         """Harm under one deviation per world, [n]."""
         return drive(worlds, _Deviating(self._stage, deviation), self.scenario, vehicle).ledger.world_harm(self.count)
@@ -110,17 +99,12 @@ def refine(policy: Agent, argument: None, settings: AgentSettings) -> Agent:
     return Rehearsed(policy, settings.needed_scenario(), count=settings.harm_count)
 
 
-class _Deviating:
+class _Deviating(AgentAround):
     """A policy plus one given deviation per world."""
 
-    name = "deviating"
-
     def __init__(self, policy: Agent, deviation: Floats) -> None:
-        self.policy = policy
+        super().__init__(policy, "deviating")
         self.deviation = deviation  # [n, segments]
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        self.policy.begin(worlds, vehicle, rows)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         return deviated(self.policy.act(worlds, vehicle), self.deviation, worlds, vehicle)

@@ -8,9 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Agent, LookingAhead
+from ethbrake_marl.agents.around import AgentAround
+from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import check_one_learner
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.best_harm import scripted_commands, world_identity
@@ -73,34 +73,23 @@ def driven_profiles(agent: Agent, scenario: Scenario, worlds: Worlds, vehicle: i
     return _joined(recorder.commands_mps2, last_step)
 
 
-class _Recorder:
+class _Recorder(AgentAround):
     """An agent that drives as another one does and keeps every command."""
 
     def __init__(self, agent: Agent, steps: int, time_step_s: float) -> None:
-        self.agent = agent
-        self.name = agent.name
+        super().__init__(agent)
         self.commands_mps2: Floats = np.empty((0, steps))  # [n, steps], NaN after an episode's end
         self._time_step_s = time_step_s
         self._start_s: Floats = np.empty(0)
-
-    @property
-    def others(self) -> Mapping[int, Script]:
-        """The scripts of the other vehicles, for an agent that looks ahead."""
-        return self.agent.others if isinstance(self.agent, LookingAhead) else {}
-
-    @others.setter
-    def others(self, scripts: Mapping[int, Script]) -> None:
-        if isinstance(self.agent, LookingAhead):
-            self.agent.others = scripts
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """All episodes begin at once here."""
         self._start_s = np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
         self.commands_mps2 = np.full((worlds.n, self.commands_mps2.shape[1]), np.nan)
-        self.agent.begin(worlds, vehicle, rows)
+        super().begin(worlds, vehicle, rows)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        command = self.agent.act(worlds, vehicle)
+        command = self.policy.act(worlds, vehicle)
         step = np.floor((worlds.time_s - self._start_s) / self._time_step_s + 1e-6).astype(np.int64)
         deciding = np.flatnonzero((step >= 0) & (step < self.commands_mps2.shape[1]))
         self.commands_mps2[deciding, step[deciding]] = command[deciding]

@@ -14,8 +14,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ethbrake_marl.actions import action_to_command
+from ethbrake_marl.agents.around import AgentAround
 from ethbrake_marl.agents.e_v2x_bm.agent import EV2XBM
-from ethbrake_marl.agents.knowledge import Knowledge, Source, combined
+from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.protocol import Agent, check_agent, place, recall
 from ethbrake_marl.agents.refined import Rehearsed
 from ethbrake_marl.agents.registry import AgentSettings
@@ -35,7 +36,7 @@ from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty, m
 Bound = Literal["coupled", "pairwise"]
 
 
-class HybridAgent:
+class HybridAgent(AgentAround):
     """Drives by ``policy`` in the worlds where its rolled-out harm is at most ``H*``, else by E-V2X-BM.
 
     ``bound`` says which ``H*`` and ``a*``; ``count`` which harm counts. After ``begin``, ``chosen_policy`` [n] says
@@ -43,25 +44,21 @@ class HybridAgent:
     Raises ``InvalidInput`` for an unknown ``bound`` or ``count``, and for what is not an agent.
     """
 
+    adds = Source.MODEL  # in which both are compared
+
     def __init__(
         self, policy: Agent, scenario: Scenario, *, bound: Bound = "coupled", count: HarmCount = "first"
     ) -> None:
         check_agent(policy, "hybrid")
         check_scenario(scenario, "hybrid")
-        self.policy = policy
+        super().__init__(policy, f"{policy.name}+episode{'' if bound == 'coupled' else ':pairwise'}")
         self.backup = EV2XBM(bound, count=count, horizon_s=scenario.horizon_s)
         self.scenario = scenario
         self.bound: Bound = bound
         self.count: HarmCount = count
-        self.name = f"{policy.name}+episode{'' if bound == 'coupled' else ':pairwise'}"
         self.policy_harm: Floats = np.zeros(0)
         self.bound_harm: Floats = np.zeros(0)
         self._rehearsal = copy.deepcopy(policy)  # predicting must not disturb the policy's memory of running episodes
-
-    @property
-    def knows(self) -> Knowledge:
-        """What the policy knows, and the model in which both are compared."""
-        return combined(self.policy, also=Source.MODEL)
 
     @property
     def chosen_policy(self) -> Bools:
@@ -129,7 +126,7 @@ class _Asked(NamedTuple):
     wanted: Floats  # [n] m/s2
 
 
-class StepShieldAgent:
+class StepShieldAgent(AgentAround):
     """Drives by ``policy`` as far as ``StepShield`` certifies it.
 
     At the alert the policy is rolled out once: where it harms no more than the coupled optimum, it drives unhindered,
@@ -142,6 +139,8 @@ class StepShieldAgent:
     With an ``uncertainty`` this is robust mode: what is certified must hold in every member. ``believed`` (row k for
     row k of the batch) is what the shield takes for the worlds at the alert; the policy sees the worlds themselves.
     """
+
+    adds = Source.MODEL  # in which actions are certified
 
     def __init__(
         self,
@@ -159,8 +158,7 @@ class StepShieldAgent:
         if not (believed is None or isinstance(believed, Worlds)):
             raise InvalidInput(f"step: believed = {believed!r}: must be worlds at the alert, or None")
         uncertainty = checked_uncertainty(uncertainty)
-        self.name = f"{policy.name}+{'step' if uncertainty is None else 'robust'}"
-        self.policy = policy
+        super().__init__(policy, f"{policy.name}+{'step' if uncertainty is None else 'robust'}")
         self.scenario = scenario
         self.shield: StepShield | None = None
         self.predicted_harm: Floats = np.zeros(0)
@@ -171,11 +169,6 @@ class StepShieldAgent:
         self._first_s: Floats = np.zeros(0)  # [n] time of the first decision
         self._asked: _Asked | None = None
         self._make(0)  # refuses bad settings at once
-
-    @property
-    def knows(self) -> Knowledge:
-        """What the policy knows, and the model in which its actions are certified."""
-        return combined(self.policy, also=Source.MODEL)
 
     @property
     def chosen_policy(self) -> Bools:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command
+from ethbrake_marl.agents.around import AgentAround
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
@@ -105,17 +106,16 @@ def operating_curve(
     return points
 
 
-class _Released:
+class _Released(AgentAround):
     """Given actions [m, L] up to a step, and from that step on a policy."""
 
-    name = "released"
-
     def __init__(self, policy: Agent, actions: Floats, release: Ints, time_step_s: float) -> None:
-        self.policy, self._actions, self._release, self._time_step_s = policy, actions, release, time_step_s
+        super().__init__(policy, "released")
+        self._actions, self._release, self._time_step_s = actions, release, time_step_s
         self._first_s: Floats = np.zeros(0)  # [m] time of the first decision
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        self.policy.begin(worlds, vehicle, rows)
+        super().begin(worlds, vehicle, rows)
         self._first_s = first_decision_s(worlds, vehicle)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:

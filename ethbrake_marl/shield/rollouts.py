@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from typing import NamedTuple, TypeGuard, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command, command_to_action
-from ethbrake_marl.agents.protocol import Agent, Divisible
-from ethbrake_marl.agents.refined import Rehearsed
+from ethbrake_marl.agents.around import AgentAround, is_divisible
+from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive, introduce, scripted
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.physics import Floats, Ints, Worlds
@@ -104,14 +104,9 @@ def _or_braking(action: Floats) -> Floats:
     return np.where(np.isnan(action), -1.0, action)
 
 
-def _is_divisible(policy: Agent) -> TypeGuard[Divisible]:
-    """Whether a policy can go on in some worlds apart; a rehearsed one can where what it rehearses can."""
-    return _is_divisible(policy.policy) if isinstance(policy, Rehearsed) else isinstance(policy, Divisible)
-
-
 def _apart(policy: Agent, rows: Ints, n: int) -> tuple[Agent, Ints]:
     """A policy that goes on without changing this one, and the rows of the batch that it drives: all, if it must."""
-    if _is_divisible(policy):
+    if is_divisible(policy):
         return policy.take(rows), rows
     return copy.deepcopy(policy), np.arange(n)
 
@@ -139,18 +134,16 @@ def _seen(worlds: Worlds, running: Running, command_mps2: Floats) -> Worlds:
     )
 
 
-class _Recorder:
+class _Recorder(AgentAround):
     """A policy whose actions are written down, and applied as they are written."""
 
     def __init__(self, policy: Agent, problem: ProfileProblem, width: int) -> None:
-        self.policy, self.name = policy, policy.name  # what is refused is the policy's
+        super().__init__(policy)
         self.actions = np.full((problem.n, width), -1.0)
         self._clock = problem.clock
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        self.policy.begin(worlds, vehicle, rows)
-
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The policy's action, rounded as it is written."""
         action = _or_braking(proposed_action(self.policy, worlds, vehicle))
         step = np.rint((worlds.time_s - self._clock[:, START]) / self._clock[:, TIME_STEP]).astype(np.int64)
         rows = np.flatnonzero((step >= 0) & (step < self.actions.shape[1]))
