@@ -165,9 +165,9 @@ def test_make_agent__refuses_bad_arguments(spec):
         make_agent(spec)
 
 
-@pytest.mark.parametrize("settings", [{"count": "both"}, {"horizon_s": 0.0}, {"horizon_s": math.nan}])
+@pytest.mark.parametrize("settings", [{"harm_count": "both"}, {"horizon_s": 0.0}, {"horizon_s": math.nan}])
 def test_make_agent__refuses_bad_settings(settings):
-    with pytest.raises(InvalidInput, match=next(iter(settings))):
+    with pytest.raises(InvalidInput, match=next(iter(settings)).removeprefix("harm_")):
         make_agent("e_v2x_bm", **settings)
 
 
