@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -199,7 +200,7 @@ def _known_columns(header: list[str], scenario: Scenario, where: str) -> list[En
             hint = suggestion(name, known) or f"known: {', '.join(known)}"
             separator = "; columns are separated by commas" if ";" in name or "\t" in name else ""
             raise InvalidInput(f"{where}: unknown column {name!r}; {hint}{separator}")
-    if twice := [name for name in header if header.count(name) > 1]:
+    if twice := [name for name, times in Counter(header).items() if times > 1]:
         raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
     for name, (field, _) in known.items():
         if field in _ALWAYS_IN_A_TABLE and name not in header:

@@ -47,8 +47,11 @@ def main() -> int:
     parser.add_argument("--category", help="categories whose name contains this")
     parser.add_argument("--sample", type=int, help="so many cases of each kind")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--list", action="store_true", help="how many cases there are, and run none")
     parser.add_argument("--verbose", action="store_true", help="also print each case's message")
     arguments = parser.parse_args()
+    if arguments.list:
+        return show_counts(arguments.seed)
     started, broken = time.monotonic(), 0
     with tempfile.TemporaryDirectory(prefix="hostile-") as name:
         warm_up(Path(name))
@@ -77,6 +80,17 @@ def main() -> int:
         count = sum(map(len, totals.values()))
     print(f"{count} cases, {broken} broke a rule; {time.monotonic() - started:.0f} s")
     return 1 if broken or not count else 0
+
+
+def show_counts(seed: int) -> int:
+    """One line per kind."""
+    total = 0
+    for kind, generator in KINDS.items():
+        cases = cases_of(kind, generator, seed, None)
+        total += len(cases)
+        print(f"| {kind} | {len({case.category for case in cases})} | {len(cases):,} |")
+    print(f"| in all | | {total:,} |")
+    return 0
 
 
 def row(kind: str, category: str, verdicts: list[Verdict]) -> str:

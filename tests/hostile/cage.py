@@ -14,7 +14,6 @@ import shutil
 import signal
 import stat
 import sys
-import time
 import traceback
 import typing
 from dataclasses import dataclass
@@ -222,16 +221,14 @@ def _fork_meanwhile(case: Case, inside: Path) -> int:
 
 def _wait(child: int) -> tuple[int, float]:
     """Exit status (negative: signal) and processor time; what takes too long is killed."""
-    end = time.monotonic() + WALL_LIMIT_S
-    pause = 0.001
-    while True:
-        found, status, used = os.wait4(child, os.WNOHANG)
-        if found:
-            return os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime
-        if time.monotonic() > end:
-            os.kill(child, signal.SIGKILL)
-        time.sleep(pause)
-        pause = min(2 * pause, 0.05)
+    before = signal.signal(signal.SIGALRM, lambda *_: os.kill(child, signal.SIGKILL))
+    signal.setitimer(signal.ITIMER_REAL, WALL_LIMIT_S)
+    try:
+        _, status, used = os.wait4(child, 0)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    return os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime
 
 
 def _faults_of_end(case: Case, status: int, out: str, err: str) -> list[str]:

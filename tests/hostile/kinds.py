@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import gc
 import io
 import shutil
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import torch
+import typer.main
 
 from ethbrake_marl.cli.app import run_command
 from tests.hostile.archives import good_bytes
@@ -38,6 +41,7 @@ KINDS: dict[str, Generator] = {
 def warm_up(folder: Path) -> None:
     """Import what commands import late and compile the kernels, so that only what a case does itself is seen."""
     torch.set_num_threads(1)
+    typer.main.get_command = functools.cache(typer.main.get_command)  # built anew for every command line otherwise
     write(folder / "mine.yaml", SCENARIO)
     write(folder / "bad" / "mine.yaml", RECIPE)
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
@@ -60,3 +64,5 @@ def warm_up(folder: Path) -> None:
         for place in (".", "bad"):
             run_command([*COMMAND[:-2], str(folder / place / "t.npz"), "--json"])
             run_command(["evaluate", "--agents", "ppo@shipped", "--initial-states", str(folder / place / "worlds.csv")])
+    gc.collect()
+    gc.freeze()  # so that children share these pages

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,14 @@ def test_csv__beyond_the_limit_is_not_read_to_its_end(tmp_path: Path, monkeypatc
     for file, reason in ((larger, "larger than 0 KiB, the limit for such a file"), (Path("/dev/zero"), "a device")):
         with pytest.raises(InvalidInput, match=reason):
             read_initial_states(file, PAPER)
+
+
+def test_csv__of_a_hundred_thousand_columns_is_refused_at_once(tmp_path: Path):
+    path = write(tmp_path, ",".join(["gap_1_m"] * 100_000) + "\n1\n")
+    began = time.process_time()
+    with pytest.raises(InvalidInput, match="column 'gap_1_m' is given twice"):
+        read_initial_states(path, PAPER)
+    assert time.process_time() - began < 2.0  # more than 10 s when every column was counted anew
 
 
 def test_csv__that_is_missing_or_not_text(tmp_path: Path):
