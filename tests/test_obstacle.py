@@ -24,7 +24,7 @@ from ethbrake_marl.limits.best_harm import best_harm, realised_harm
 from ethbrake_marl.limits.lower_bound import lower_bound
 from ethbrake_marl.physics import advance, concatenate
 from ethbrake_marl.policies.manifest import observation_schema
-from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario, worlds_from_table
+from ethbrake_marl.scenario import Scenario, Task, initial_state_worlds, load_scenario, worlds_from_table
 from ethbrake_marl.search.problem import profile_problem
 from ethbrake_marl.search.profiles import constant_profiles, follow_profiles
 from ethbrake_marl.shield.agents import StepShieldAgent
@@ -117,7 +117,7 @@ def test_best_harm__of_the_whole_line_is_no_worse_than_of_its_followers():
     followers = best_harm(level_3, worlds, counts=("total",), budget=3_000, threads=1)
     whole, part = together.best["total"].harm, followers.best["total"].harm
     assert whole.mean() < part.mean()
-    _, again = realised_harm(ALL, worlds, together.best["total"], (0, 1, 2))
+    _, again = realised_harm(worlds, Task(ALL, (0, 1, 2)), together.best["total"])
     assert again.tobytes() == whole.tobytes()
 
 

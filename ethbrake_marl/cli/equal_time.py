@@ -16,7 +16,7 @@ from ethbrake_marl.evaluation.inputs import check_agents, load_driven, make_line
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.shipped import best_known
 from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.studies.equal_time import equal_time, timed_table
 
 REFINED = "ppo@shipped+refined+episode"
@@ -71,7 +71,7 @@ def equal_time_command(
 
 def _check_unknown(worlds: Worlds, scenario: Scenario, count: HarmCount, seed: int) -> None:
     """Refuse worlds of a shipped table: ``best_harm`` would look them up, and its time would be no search's."""
-    kept = int(np.isfinite(best_known(worlds, scenario, count)).sum())
+    kept = int(np.isfinite(best_known(worlds, Task(scenario, scenario.learners))[count]).sum())
     if kept:
         raise InvalidInput(
             f"--seed {seed}: a shipped table holds {kept:,} of these {worlds.n:,} worlds, so best_harm would look them"

@@ -40,7 +40,7 @@ from ethbrake_marl.evaluation.paper import TESTS
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty
 
 
@@ -199,8 +199,6 @@ def measured_modes(agents: str, scenario: Scenario, episodes: int, count: HarmCo
         return compare_modes(
             lineup,
             worlds,
-            scenario,
-            scenario.learners[0],
-            count=count,
+            Task(scenario, scenario.learners, count),
             on_progress=lambda name, done: bars.show(name, done, episodes),
         )

@@ -13,7 +13,7 @@ import numpy as np
 from ethbrake_marl.physics import Floats, Worlds, advance, advance_sampled
 from ethbrake_marl.physics.events import solo_motion
 from ethbrake_marl.physics.obstacle import obstacle_ahead
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.scenario.roles import constant_command
 
 
@@ -30,9 +30,9 @@ class ShovedFront:
         self._way_m = np.zeros(worlds.n)
 
     @classmethod
-    def of(cls, worlds: Worlds, scenario: Scenario, driven: tuple[int, ...]) -> ShovedFront | None:
+    def of(cls, worlds: Worlds, task: Task) -> ShovedFront | None:
         """What watches these worlds (at the alert); None where Vehicle 1 is driven, or its script needs the state."""
-        script = None if 0 in driven else scenario.scripts.get(0)
+        script = None if 0 in task.vehicles else task.scenario.scripts.get(0)
         vehicles = worlds.vehicles
         command = None if script is None else constant_command(script, vehicles.braking_capacity_mps2[:, 0])
         if command is None:
@@ -40,7 +40,8 @@ class ShovedFront:
         columns = (worlds.speeds_mps, vehicles.latency_s, vehicles.speed_limit_mps)
         speed, latency, limit = (column[:, 0] for column in columns)
         alone = zip(speed, command, latency, limit, strict=True)
-        return cls(worlds, np.array([solo_motion(v, u, tau, most, scenario.horizon_s)[1] for v, u, tau, most in alone]))
+        horizon_s = task.scenario.horizon_s
+        return cls(worlds, np.array([solo_motion(v, u, tau, most, horizon_s)[1] for v, u, tau, most in alone]))
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Add the way of one step."""
@@ -93,12 +94,14 @@ class SampledHarm:
         self._samples = -1  # steps of the map so far; the time before its first sample is the first
 
     @classmethod
-    def of(cls, worlds: Worlds, scenario: Scenario, driven: tuple[int, ...]) -> SampledHarm | None:
+    def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
         """What watches these worlds (at the alert); None with an obstacle, or if not just Vehicle 2 is driven.
 
         The map knows no obstacle, and its samples are the decisions of Vehicle 2.
         """
-        return None if driven != (VEHICLE_2,) or obstacle_ahead(worlds).any() else cls(worlds, scenario)
+        if task.vehicles != (VEHICLE_2,) or obstacle_ahead(worlds).any():
+            return None
+        return cls(worlds, task.scenario)
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Replay one step; the commands of a world whose episode has ended stay what they were."""

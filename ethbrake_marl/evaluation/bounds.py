@@ -49,7 +49,7 @@ def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> Proven 
 
     def of(rows: Ints) -> Proven | None:
         some = worlds.take(rows)
-        identity = world_identity(task.scenario, some, task.vehicles)
+        identity = world_identity(some, task)
         return proven_of(some, task, table.harm(identity, "first"), table.harm(identity, "total"))
 
     return leaving_out_failed(of, np.arange(worlds.n))[0]
@@ -96,7 +96,7 @@ def bounds_of(table: BestHarmTable) -> ShippedBounds:
     names, seed, episodes = tuple(header["vehicles"]), int(header["list_seed"]), int(header["episodes"])
     task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
     worlds = scenario.sample(episodes, seed).worlds
-    table.check_holds_any(world_identity(scenario, worlds, task.vehicles))
+    table.check_holds_any(world_identity(worlds, task))
     first, total = (float(table.best[count].harm.mean()) if count in table.best else None for count in COUNTS)
     why = unproven_because(worlds, task)
     if why is None and obstacle_ahead(worlds).any():

@@ -70,7 +70,7 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
     chosen = optimise_pairwise(world, vehicle).deceleration_mps2
     special = np.append(pairwise_breakpoints(world, vehicle)[0], chosen)
     at = np.union1d(np.linspace(0.0, capacity, points), special)
-    others = scripted_commands(scenario, world, [vehicle])
+    others = scripted_commands(world, task)
     first, total = forecast(world, others, vehicle, -at[None, :], scenario.horizon_s)
     deceleration = np.repeat(world.vehicles.braking_capacity_mps2, at.size, axis=0)
     deceleration[:, vehicle] = at

@@ -286,9 +286,9 @@ class _Chunk(NamedTuple):
 
 def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -> Outcome:
     """Outcome of a fresh team; what an agent says about a world counts where it drives alone."""
-    driven = tuple(team.drivers)
-    shoved = ShovedFront.of(worlds, scenario, driven) if aftermath else None
-    sampled = SampledHarm.of(worlds, scenario, driven) if aftermath else None
+    task = Task(scenario, tuple(team.drivers))
+    shoved = ShovedFront.of(worlds, task) if aftermath else None
+    sampled = SampledHarm.of(worlds, task) if aftermath else None
     episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled) if w is not None])
     alone = next(iter(team.drivers.values())) if len(team.drivers) == 1 else None
     predicted, chosen = (_said(alone, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))

@@ -14,9 +14,8 @@ from rich.table import Table
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Floats, Worlds
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Task
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
 from ethbrake_marl.shield.review import VERDICTS, review
 
@@ -56,13 +55,11 @@ class ModeRow:
 def compare_modes(
     agents: Mapping[str, Agent],
     worlds: Worlds,
-    scenario: Scenario,
-    vehicle: int,
+    task: Task,
     *,
-    count: HarmCount = "first",
     on_progress: Progress | None = None,
 ) -> list[ModeRow]:
-    """Let every agent drive ``vehicle`` alone, in episode mode and in step mode, through every world; see ``ModeRow``.
+    """Let every agent drive the vehicle alone, in episode mode and in step mode, through every world; see ``ModeRow``.
 
     Each replaced decision of step mode is simulated again without the shield (``shield.review.review``). The given
     agents are left as they are. Raises ``InvalidInput`` where a shield refuses the scenario.
@@ -72,7 +69,7 @@ def compare_modes(
         parts = []
         for first in range(0, worlds.n, CHUNK):
             part = worlds.take(np.arange(first, min(first + CHUNK, worlds.n)))
-            parts.append(_measured(part, agent, scenario, vehicle, count))
+            parts.append(_measured(part, agent, task))
             if on_progress is not None:
                 on_progress(name, min(first + CHUNK, worlds.n))
         rows += _rows(name, parts)
@@ -100,8 +97,9 @@ def modes_table(rows: list[ModeRow]) -> Table:
     return table
 
 
-def _measured(worlds: Worlds, agent: Agent, scenario: Scenario, vehicle: int, count: HarmCount) -> dict[str, Any]:
+def _measured(worlds: Worlds, agent: Agent, task: Task) -> dict[str, Any]:
     """Of one chunk: harm per world under each mode, and what step mode replaced."""
+    scenario, vehicle, count = task.scenario, task.vehicle, task.harm_count
     found: dict[str, Any] = {}
     drivers: dict[str, Agent] = {NONE: copy.deepcopy(agent), EPISODE: HybridAgent(agent, scenario, count=count)}
     for name, later in ((STEP, True), (STEP_ALERT, False)):

@@ -22,7 +22,7 @@ from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm_table import Best, BestHarmTable, join_tables, load_table, save_table
 from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
-from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.search.kernel import MOST_PHASES
 from ethbrake_marl.search.motion import Words
 from ethbrake_marl.search.problem import ProfileProblem, profile_problem
@@ -68,7 +68,7 @@ def best_harm(
         raise InvalidInput(f"counts {tuple(counts)}: must be first, total, or both")
     chosen = scenario.learners if vehicles is None else tuple(vehicles)
     workers = _cores() if threads is None else threads
-    search = _Search(scenario, worlds, scripted_commands(scenario, worlds, chosen), budget, seed, workers)
+    search = _Search(scenario, worlds, scripted_commands(worlds, Task(scenario, chosen)), budget, seed, workers)
     found: list[Found] = []
     identity = search.problem(chosen).identity
     if known is not None:
@@ -125,18 +125,16 @@ def search_list(
     """
     parts: list[BestHarmTable] = []
     left_out: dict[int, str] = {}
-    n = sample.worlds.n
+    n, task = sample.worlds.n, Task(scenario, scenario.learners if vehicles is None else tuple(vehicles))
     if known is not None:
-        every, _, _ = leaving_out_failed(
-            lambda at: world_identity(scenario, sample.worlds.take(at), vehicles), np.arange(n)
-        )
+        every, _, _ = leaving_out_failed(lambda at: world_identity(sample.worlds.take(at), task), np.arange(n))
         if every is not None:
             known.check_holds_any(every)
     options = {"counts": counts, "budget": budget, "seed": seed, "threads": threads, "known": known}
     for first in range(0, n, CHUNK):
         rows = np.arange(first, min(first + CHUNK, n))
         file = None if chunks is None else chunk_file(chunks, first)
-        work = partial(_kept_or_searched, scenario, sample.worlds, file, vehicles, options)
+        work = partial(_kept_or_searched, task, sample.worlds, file, options)
         part, _, failed = leaving_out_failed(work, rows)
         parts += [] if part is None else [part]
         left_out |= {int(sample.index[row]): reason for row, reason in failed.items()}
@@ -150,9 +148,8 @@ def search_list(
 
 
 def _kept_or_searched(
-    scenario: Scenario, every: Worlds, file: Path | None, vehicles: Sequence[int] | None, options: dict[str, Any],
-    rows: Ints,
-) -> BestHarmTable:  # fmt: skip
+    task: Task, every: Worlds, file: Path | None, options: dict[str, Any], rows: Ints
+) -> BestHarmTable:
     """A chunk of a list, its ``rows``: from its file where that answers the same question, else searched, and kept."""
     worlds = every.take(rows)
     known = options["known"]
@@ -160,10 +157,10 @@ def _kept_or_searched(
     question |= {} if known is None else {"after": dict(known.header)}
     if file is not None:
         with suppress(CorruptBundle):
-            part = kept_chunk(file, world_identity(scenario, worlds, vehicles), question)
+            part = kept_chunk(file, world_identity(worlds, task), question)
             if part is not None:
                 return part
-    part = best_harm(scenario, worlds, vehicles=vehicles, **options)
+    part = best_harm(task.scenario, worlds, vehicles=task.vehicles, **options)
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         save_table(file, part)
@@ -184,25 +181,27 @@ def kept_chunk(file: Path, identity: Words, question: Mapping[str, object]) -> B
     return table if asked == question and np.array_equal(table.identity, identity) else None
 
 
-def world_identity(scenario: Scenario, worlds: Worlds, vehicles: Sequence[int] | None = None) -> Words:
+def world_identity(worlds: Worlds, task: Task) -> Words:
     """What tells the problem in one world (at t = 0) from that in any other, [n]: ``search.profiles.identities``."""
-    chosen = scenario.learners if vehicles is None else tuple(vehicles)
-    return _Search(scenario, worlds, scripted_commands(scenario, worlds, chosen), 1, 0, 1).problem(chosen).identity
+    return _problem(worlds, task).identity
 
 
-def realised_harm(scenario: Scenario, worlds: Worlds, best: Best, vehicles: Sequence[int]) -> tuple[Floats, Floats]:
+def realised_harm(worlds: Worlds, task: Task, best: Best) -> tuple[Floats, Floats]:
     """First-impact and total harm [n] of the stored profiles, driven again in these worlds."""
-    others = scripted_commands(scenario, worlds, vehicles)
-    return follow_profiles(_Search(scenario, worlds, others, 1, 0, 1).problem(vehicles), best.profiles)
+    return follow_profiles(_problem(worlds, task), best.profiles)
 
 
-def scripted_commands(scenario: Scenario, worlds: Worlds, vehicles: Sequence[int]) -> Floats:
-    """The commands [n, N] of all vehicles but ``vehicles``; full braking in the columns of these.
+def scripted_commands(worlds: Worlds, task: Task) -> Floats:
+    """The commands [n, N] of all vehicles but those of the task; full braking in the columns of these.
 
     Raises ``InvalidInput`` for a script whose command is not fixed at the alert.
     """
-    others = {i: script for i, script in scripted(scenario).items() if i not in vehicles}
-    return fixed_commands(others, worlds, f"scenario {scenario.name!r}, search for the best profiles")
+    others = {i: script for i, script in scripted(task.scenario).items() if i not in task.vehicles}
+    return fixed_commands(others, worlds, f"scenario {task.scenario.name!r}, search for the best profiles")
+
+
+def _problem(worlds: Worlds, task: Task) -> ProfileProblem:
+    return _Search(task.scenario, worlds, scripted_commands(worlds, task), 1, 0, 1).problem(task.vehicles)
 
 
 def _cores() -> int:

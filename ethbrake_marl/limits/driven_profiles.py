@@ -16,7 +16,7 @@ from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.best_harm import scripted_commands, world_identity
 from ethbrake_marl.limits.best_harm_table import BestHarmTable
 from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.search.problem import profile_problem
 from ethbrake_marl.search.profiles import Profiles, follow_profiles
 
@@ -35,8 +35,8 @@ def fold_agent(
     """
     learners = [scenario.vehicle_names[i] for i in scenario.learners]
     check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")
-    (vehicle,) = scenario.learners
-    identity = world_identity(scenario, worlds)
+    task = Task(scenario, scenario.learners)
+    identity = world_identity(worlds, task)
     known = np.max([table.harm(identity, count) for count in table.best], axis=0)
     hard = np.flatnonzero(known > 0.0)
     lowered = dict.fromkeys(table.best, 0)
@@ -44,13 +44,13 @@ def fold_agent(
         worlds, identity = worlds.take(hard), identity[hard]
         problem = profile_problem(
             worlds,
-            [vehicle],
+            task.vehicles,
             horizon_s=scenario.horizon_s,
             time_step_s=scenario.time_step_s,
-            others_mps2=scripted_commands(scenario, worlds, scenario.learners),
+            others_mps2=scripted_commands(worlds, task),
         )
         for agent in agents.values():
-            work = partial(_driven_in, agent, scenario, worlds, vehicle, problem.last_step)
+            work = partial(_driven_in, agent, worlds, task, problem.last_step)
             profiles, rows, _ = leaving_out_failed(work, np.arange(worlds.n))
             if profiles is None:
                 continue
@@ -62,14 +62,14 @@ def fold_agent(
     return replace(table, header={**table.header, LOWERED: {**before, name: lowered}})
 
 
-def _driven_in(agent: Agent, scenario: Scenario, every: Worlds, vehicle: int, last_step: Ints, rows: Ints) -> Profiles:
-    return driven_profiles(agent, scenario, every.take(rows), vehicle, last_step[rows])
+def _driven_in(agent: Agent, every: Worlds, task: Task, last_step: Ints, rows: Ints) -> Profiles:
+    return driven_profiles(agent, every.take(rows), task, last_step[rows])
 
 
-def driven_profiles(agent: Agent, scenario: Scenario, worlds: Worlds, vehicle: int, last_step: Ints) -> Profiles:
-    """What ``agent`` commands ``vehicle`` in every step of its episodes, as profiles; equal neighbours are joined."""
-    recorder = _Recorder(agent, int(last_step.max()), scenario.time_step_s)
-    drive(worlds, recorder, scenario, vehicle)
+def driven_profiles(agent: Agent, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
+    """What ``agent`` commands the vehicle in every step of its episodes, as profiles; equal neighbours are joined."""
+    recorder = _Recorder(agent, int(last_step.max()), task.scenario.time_step_s)
+    drive(worlds, recorder, task.scenario, task.vehicle)
     return _joined(recorder.commands_mps2, last_step)
 
 

@@ -65,8 +65,9 @@ def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
     proof = prove(worlds, task)
     if isinstance(proof, Unproven):
         return proof
-    first, total = (best_known(worlds, task.scenario, count, vehicles=task.vehicles) for count in COUNTS)
-    return Limits(proof, np.where(proof.avoidable, 0.0, first), np.where(proof.avoidable, 0.0, total))
+    found = best_known(worlds, task)
+    first, total = (np.where(proof.avoidable, 0.0, found[count]) for count in COUNTS)
+    return Limits(proof, first, total)
 
 
 def prove(worlds: Worlds, task: Task) -> Proof | Unproven:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -14,11 +13,11 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm import world_identity
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table
 from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Task
 from ethbrake_marl.search.problem import ProfileProblem
 from ethbrake_marl.search.profiles import Profiles, pad_profiles
 
@@ -31,20 +30,17 @@ def shipped_tables() -> tuple[BestHarmTable, ...]:
     return tuple(load_table(path) for path in sorted(TABLES.glob("*.npz")))
 
 
-def best_known(
-    worlds: Worlds, scenario: Scenario, count: HarmCount, *, vehicles: Sequence[int] | None = None
-) -> Floats:
-    """The least harm known in each world (at t = 0), [n] m2/s2; NaN where no shipped table holds it.
+def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
+    """The least harm known in each world (at t = 0) under each count, [n] m2/s2; NaN where no shipped table holds it.
 
     Worlds are recognised by everything their harm depends on: state, parameters, the others' scripts, time step,
-    horizon and the controlled ``vehicles`` (default: the scenario's learners). Raises ``InvalidInput`` for a script
-    whose command is not fixed at the alert, as no search knows it.
+    horizon and the driven vehicles. Raises ``InvalidInput`` for a script whose command is not fixed at the alert, as no
+    search knows it.
     """
-    check_count(count)
-    identity = world_identity(scenario, worlds, vehicles)
-    known = np.full(worlds.n, np.nan)
+    identity = world_identity(worlds, task)
+    known = {count: np.full(worlds.n, np.nan) for count in COUNTS}
     for table in shipped_tables():
-        known = np.fmin(known, table.harm(identity, count))
+        known = {count: np.fmin(harm, table.harm(identity, count)) for count, harm in known.items()}
     return known
 
 

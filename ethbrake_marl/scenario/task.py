@@ -25,7 +25,7 @@ class Task:
         known = set(range(self.scenario.vehicles))
         if len(set(self.vehicles)) != len(self.vehicles) or not set(self.vehicles) <= known:
             raise InvalidInput(
-                f"task: vehicles {self.vehicles}: must be different indices from 0 to {self.scenario.vehicles - 1}"
+                f"task: vehicles {self.vehicles}: must be indices from 0 to {self.scenario.vehicles - 1}, each once"
             )
 
     @property

@@ -20,7 +20,7 @@ from ethbrake_marl.evaluation import (
 from ethbrake_marl.evaluation.aftermath import ShovedFront
 from ethbrake_marl.evaluation.table import FAR_M
 from ethbrake_marl.physics import advance_sampled
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
 
 # Two vehicles at rest and in touch; the rear one pushes with 5.5 t x 6 m/s2 = 33 kN against brakes of 27 kN, plastic.
 # Together they gain 6 kN / 10 t = 0.6 m/s2: after 2 s they stand 1.2 m further on.
@@ -72,7 +72,7 @@ def test_shoved__has_no_meaning_where_vehicle_1_is_driven_or_reacts() -> None:
     driven = PUSH.replace(hazard_gap_m=9.0).with_learners(["vehicle_1"])
     assert alone(driven, "full_brake").outcome("full_brake").shoved_m is None
     reacts = PUSH.replace(roles={"vehicle_1": "planner", "vehicle_2": "learner"})
-    assert ShovedFront.of(reacts.sample(1, 7).worlds, reacts, (1,)) is None
+    assert ShovedFront.of(reacts.sample(1, 7).worlds, Task(reacts, (1,))) is None
 
 
 def test_sampled__one_impact_is_counted_once(pair: Scenario) -> None:

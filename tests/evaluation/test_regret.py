@@ -61,7 +61,9 @@ def four(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> Evaluation:
             contact=SimpleNamespace(avoidable=AVOIDABLE[: worlds.n], reason_name=REASON[: worlds.n]),
         ),
     )
-    monkeypatch.setattr(limits_module, "best_known", lambda worlds, scenario, count, vehicles: TABLE[count][: worlds.n])
+    monkeypatch.setattr(
+        limits_module, "best_known", lambda worlds, task: {count: harm[: worlds.n] for count, harm in TABLE.items()}
+    )
     return first_worlds(evaluation, 4)
 
 

@@ -11,7 +11,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.shield_modes import ModeRow, compare_modes, modes_table
 from ethbrake_marl.evaluation.statistics import paired_difference
 from ethbrake_marl.figures.shield import shield_modes_figure
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
 
 PAPER = load_scenario("paper-random")
@@ -20,7 +20,7 @@ WORLDS = PAPER.sample(60, 3).worlds
 
 @pytest.fixture(scope="module")
 def rows() -> list[ModeRow]:
-    return compare_modes({"full_brake": make_agent("full_brake")}, WORLDS, PAPER, 1)
+    return compare_modes({"full_brake": make_agent("full_brake")}, WORLDS, Task(PAPER, (1,)))
 
 
 def test_rows__are_what_driving_each_mode_gives(rows: list[ModeRow]) -> None:
@@ -47,7 +47,7 @@ def test_rows__do_not_depend_on_the_size_of_a_chunk(rows: list[ModeRow], monkeyp
     monkeypatch.setattr("ethbrake_marl.evaluation.shield_modes.CHUNK", 25)
     done: list[tuple[str, int]] = []
     again = compare_modes(
-        {"full_brake": make_agent("full_brake")}, WORLDS, PAPER, 1, on_progress=lambda *a: done.append(a)
+        {"full_brake": make_agent("full_brake")}, WORLDS, Task(PAPER, (1,)), on_progress=lambda *a: done.append(a)
     )
     assert again == rows
     assert done == [("full_brake", 25), ("full_brake", 50), ("full_brake", 60)]

@@ -16,7 +16,7 @@ from ethbrake_marl.limits.best_harm import LEFT_OUT, best_harm, realised_harm, s
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table, save_table
 from ethbrake_marl.limits.shipped import TABLES, best_known, shipped_profiles, shipped_tables
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.search.problem import profile_problem
 from ethbrake_marl.search.profiles import Profiles, constant_profiles, even_grid, follow_profiles, search_profiles
 from tests.failing_worlds import planted_list, without
@@ -112,7 +112,7 @@ def test_best_harm__two_vehicles_together_are_not_worse_than_one_of_them(
     assert (joint.best["first"].harm <= alone + 1e-6).all()
     assert joint.best["first"].harm.sum() < 0.9 * alone.sum()
     assert joint.best["first"].profiles.commands_mps2.shape[2] == 2
-    assert np.array_equal(realised_harm(scenario, few, joint.best["first"], (0, 1))[0], joint.best["first"].harm)
+    assert np.array_equal(realised_harm(few, Task(scenario, (0, 1)), joint.best["first"])[0], joint.best["first"].harm)
 
 
 def test_best_harm__joint_optimum_of_two_cars_by_hand() -> None:
@@ -155,7 +155,7 @@ def test_best_harm_agent__searches_a_world_that_no_table_holds(scenario: Scenari
 
 def test_table__finds_worlds_by_what_they_are(scenario: Scenario, worlds: Worlds, table: BestHarmTable) -> None:
     order = np.random.default_rng(1).permutation(worlds.n)
-    identity = world_identity(scenario, worlds.take(order))
+    identity = world_identity(worlds.take(order), Task(scenario, scenario.learners))
     assert np.array_equal(table.harm(identity, "total"), table.best["total"].harm[order])
 
 
@@ -176,7 +176,7 @@ def test_table__does_not_know_a_world_that_differs_in_anything(
         scenario = scenario.replace(roles={**scenario.roles, "vehicle_3": "constant:5"})
     else:
         vehicles = (2,)
-    assert np.isnan(table.harm(world_identity(scenario, worlds, vehicles), "first")).all()
+    assert np.isnan(table.harm(world_identity(worlds, Task(scenario, vehicles)), "first")).all()
 
 
 def test_improved__takes_only_what_undercuts_by_more_than_the_tolerance(table: BestHarmTable) -> None:
@@ -264,7 +264,7 @@ def test_shipped_tables__hold_the_shipped_lists_and_their_profiles_do_the_stored
         for first in (0, n - 5):
             worlds = scenario.sample(5, seed=7, first=first).worlds
             for count in COUNTS:
-                known = best_known(worlds, scenario, count)
+                known = best_known(worlds, Task(scenario, scenario.learners))[count]
                 assert np.isfinite(known).all()
                 problem = profile_problem(worlds, [1], count=count)
                 profiles, found = shipped_profiles(problem, count)
@@ -275,7 +275,7 @@ def test_shipped_tables__hold_the_shipped_lists_and_their_profiles_do_the_stored
 
 
 def test_best_known__is_nan_where_no_table_holds_the_world(scenario: Scenario) -> None:
-    known = best_known(scenario.sample(2, seed=8).worlds, scenario, "first")
+    known = best_known(scenario.sample(2, seed=8).worlds, Task(scenario, scenario.learners))["first"]
     assert np.isnan(known).all()
 
 

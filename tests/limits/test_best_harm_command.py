@@ -10,7 +10,7 @@ from ethbrake_marl.evaluation.inputs import LADDER
 from ethbrake_marl.limits.best_harm import realised_harm
 from ethbrake_marl.limits.best_harm_table import load_table
 from ethbrake_marl.limits.shipped import TABLES
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.scenario import Task, load_scenario
 
 SMALL = ["best-harm", "--scenario", "paper-random", "--episodes", "4", "--budget", "60", "--threads", "1"]
 
@@ -57,7 +57,7 @@ def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path, capsys: 
         assert (after.best[count].harm <= before.best[count].harm).all()
         lowered = after.header["lowered_by"]["planner:60"][count]
         assert lowered >= changed.sum() > 5  # in some worlds by the agents of both counts
-        again = realised_harm(scenario, scenario.sample(30, 7).worlds, after.best[count], [1])[k]
+        again = realised_harm(scenario.sample(30, 7).worlds, Task(scenario, (1,)), after.best[count])[k]
         assert again.tolist() == after.best[count].harm.tolist()
 
 

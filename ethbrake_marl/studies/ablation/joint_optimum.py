@@ -29,7 +29,7 @@ from ethbrake_marl.limits.best_harm import (
 from ethbrake_marl.limits.best_harm_table import BestHarmTable
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.scenario import Sample
+from ethbrake_marl.scenario import Sample, Task
 from ethbrake_marl.studies.ablation.plan import Level, Plan
 
 
@@ -50,7 +50,7 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
     for level, sample in zip(plan.levels, samples, strict=True):
         if level.trained:
             part = Sample(sample.worlds.take(rows), sample.index[rows], 0)
-            identity = world_identity(level.scenario, part.worlds).tobytes()
+            identity = world_identity(part.worlds, Task(level.scenario, level.scenario.learners)).tobytes()
             found.setdefault(identity, (level, part, []))[2].append(level)
     return list(found.values())
 
@@ -58,7 +58,7 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
 def parts_left(plan: Plan, level: Level, part: Sample) -> tuple[int, list[Path]]:
     """Worlds of a question that ``search_list`` will search, not finding them kept; and what it finds damaged."""
     left, damaged = 0, []
-    identity = world_identity(level.scenario, part.worlds)
+    identity = world_identity(part.worlds, Task(level.scenario, level.scenario.learners))
     question = {"counts": list(COUNTS), "budget": plan.budget, "search_seed": 0}
     for first in range(0, part.worlds.n, CHUNK):
         file, wanted = chunk_file(plan.optimum_folder(level), first), identity[first : first + CHUNK]
@@ -123,11 +123,11 @@ def _can_imitate(own: Answer, other: Answer) -> Bools:
 
 def _harms(own: Answer, other: Answer, rows: Ints) -> Iterator[dict[HarmCount, Floats]]:
     """Harm of both counts that the search and every team of ``other`` do in some worlds of ``own``."""
-    scenario = other.level.scenario
+    scenario, task = other.level.scenario, Task(other.level.scenario, other.level.scenario.learners)
     worlds = replace(other.worlds, hazard_gap_m=own.worlds.hazard_gap_m).take(rows)
     for best in other.searched.best.values():
         kept = best._replace(harm=best.harm[rows], profiles=best.profiles.take(rows))
-        yield dict(zip(COUNTS, realised_harm(scenario, worlds, kept, scenario.learners), strict=True))
+        yield dict(zip(COUNTS, realised_harm(worlds, task, kept), strict=True))
     for team in other.teams:
         driven = evaluate(worlds, {team.name: team}, scenario=scenario, aftermath=False).complete()
         ledger = driven.outcome(team.name).ledger
