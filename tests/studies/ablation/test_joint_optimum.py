@@ -12,6 +12,7 @@ from ethbrake_marl.agents.team import Team
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.limits.best_harm import best_harm
+from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.ablation.cost import Cost
 from ethbrake_marl.studies.ablation.joint_optimum import Answer, best_known, parts_left, questions, search_all
@@ -99,8 +100,8 @@ def test_questions__each_is_searched_once_and_what_is_kept_is_not_searched_again
     assert [[level.name for level in alike] for *_, alike in asked] == [list(NAMES[:2]), [NAMES[2]], [NAMES[3]]]
     assert [parts_left(plan, level, part) for level, part, _ in asked] == [(5, [])] * 3
     told = []
-    search_all(plan, samples, 1, lambda *progress: told.append(progress))
-    assert told == [(f"joint optimum of {name}", 5, 5) for name in (NAMES[0], *NAMES[2:])]
+    search_all(plan, samples, 1, told.append)
+    assert told == [Progress(f"joint optimum of {name}", 5, 5) for name in (NAMES[0], *NAMES[2:])]
     assert [parts_left(plan, level, part) for level, part, _ in asked] == [(0, [])] * 3
     assert parts_left(replace(plan, budget=11), *asked[0][:2]) == (5, [])
     fewer = questions(replace(plan, search_episodes=4), samples)[0]
