@@ -62,7 +62,7 @@ class CorruptBundle(EthBrakeError, ValueError):
 
 
 class PhysicsError(EthBrakeError, ArithmeticError):
-    """Some worlds of a batch could not be advanced: a defect of the kernel, or more impacts at once than it plays out.
+    """Some worlds of a batch could not be advanced: a defect of the kernel, never of the input.
 
     ``worlds``: what is wrong, by the world's row in the batch that was given. All others are well, and a world's result
     does not depend on its batch: who has a list may leave these out and go on (``physics.leaving_out_failed``).
