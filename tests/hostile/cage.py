@@ -178,7 +178,7 @@ def _keep_inside(event: str, arguments: tuple[Any, ...], own: str, seen: int) ->
         places = [] if inside_a_folder else [_entry(os.fsdecode(path)) for path in given]
     for place in places:
         if place != os.devnull and not f"{place}{os.sep}".startswith(own):
-            if not place.startswith(("/dev/", "/proc/")):  # asked for, and impossible for everybody
+            if not f"{place}/".startswith(("/dev/", "/proc/")):  # asked for, and impossible for everybody
                 _tell(seen, f"would have changed what is outside: {event} {place}"[:300])
             raise PermissionError(errno.EPERM, "outside the case's folder", place)
 

@@ -58,6 +58,8 @@ def warm_up(folder: Path) -> None:
         run_command(["export", "x", "--onnx", "x"])
         run_command(["picture", "criticality", "--output", str(folder / "mine.yaml")])
         run_command(["shield", "--agents", "x"])
+        few = ["evaluate", "--agents", "coast,full_brake", "--episodes", "3"]
+        run_command([*few, "--per-world", str(folder / "worlds-out.csv")])
         write(folder / "t.npz", good_bytes())
         write(folder / "bad" / "t.npz", b"")
         write(folder / "worlds.csv", f"{HEADER}\n{ROW}\n")
