@@ -3,7 +3,7 @@
 Harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2/s2), shared by mass (the paper's
 eq. harm): ``H_i = m_{i+1} / (m_i + m_{i+1}) w^2`` and ``H_{i+1} = w^2 - H_i``, so the shares add up exactly.
 
-An impact of Vehicle 1 with an obstacle ahead (``hazard_gap_m``), which nothing moves, does harm ``v_1^2``, all of it to
+An impact of Vehicle 1 with an obstacle ahead (``obstacle_gap_m``), which nothing moves, does harm ``v_1^2``, all to
 Vehicle 1.
 
 *First-impact harm* counts each pair's first impact only (the paper's protocol); *total harm* counts every impact.
@@ -18,7 +18,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics.advance import Impacts, no_hazard_harm
+from ethbrake_marl.physics.advance import Impacts, no_obstacle_harm
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
 
@@ -42,9 +42,9 @@ class Ledger:
     first_impact_harm: Floats  # [n, P] m2/s2
     total_harm: Floats  # [n, P] m2/s2
     count: Ints  # [n, P] impacts
-    hazard_first_harm: Floats  # [n] of Vehicle 1's impacts with the obstacle ahead, all its own (m2/s2)
-    hazard_total_harm: Floats  # [n] likewise
-    hazard_count: Ints  # [n] impacts
+    obstacle_first_harm: Floats  # [n] of Vehicle 1's impacts with the obstacle ahead, all its own (m2/s2)
+    obstacle_total_harm: Floats  # [n] likewise
+    obstacle_count: Ints  # [n] impacts
     mass_t: Floats  # [n, N]
 
     def add(self, impacts: Impacts) -> Ledger:
@@ -53,9 +53,9 @@ class Ledger:
             self.first_impact_harm + impacts.first_impact_harm,
             self.total_harm + impacts.total_harm,
             self.count + impacts.count,
-            self.hazard_first_harm + impacts.hazard_first_harm,
-            self.hazard_total_harm + impacts.hazard_total_harm,
-            self.hazard_count + impacts.hazard_count,
+            self.obstacle_first_harm + impacts.obstacle_first_harm,
+            self.obstacle_total_harm + impacts.obstacle_total_harm,
+            self.obstacle_count + impacts.obstacle_count,
             self.mass_t,
         )
 
@@ -64,25 +64,25 @@ class Ledger:
         check_count(count)
         return self.first_impact_harm if count == "first" else self.total_harm
 
-    def hazard_harm(self, count: HarmCount) -> Floats:
+    def obstacle_harm(self, count: HarmCount) -> Floats:
         """Harm of Vehicle 1's impacts with the obstacle ahead, [n]. Raises ``InvalidInput`` for an unknown rule."""
         check_count(count)
-        return self.hazard_first_harm if count == "first" else self.hazard_total_harm
+        return self.obstacle_first_harm if count == "first" else self.obstacle_total_harm
 
     def vehicle_harm(self, count: HarmCount) -> Floats:
         """Harm of each vehicle, from both its pairs, [n, N]; see ``split``. That of an obstacle is all Vehicle 1's."""
         harm = split(self.pair_harm(count), self.mass_t)
-        harm[:, 0] += self.hazard_harm(count)
+        harm[:, 0] += self.obstacle_harm(count)
         return harm
 
     def world_harm(self, count: HarmCount) -> Floats:
         """Harm of all vehicles of a world together, [n]: the obstacle's, then the pairs' front to rear."""
-        return line_sum(self.pair_harm(count), self.hazard_harm(count))
+        return line_sum(self.pair_harm(count), self.obstacle_harm(count))
 
     @property
     def impacts(self) -> Ints:
         """Number of impacts of all pairs and with the obstacle, [n]."""
-        number: Ints = self.count.sum(axis=1) + self.hazard_count
+        number: Ints = self.count.sum(axis=1) + self.obstacle_count
         return number
 
     @property
@@ -92,12 +92,12 @@ class Ledger:
 
 
 @compiled
-def line_sum(pair_values: Floats, hazard_values: Floats) -> Floats:
+def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
     """Sum of a world's obstacle and its pairs, [n], in this order, front to rear: the same bits in any batch."""
     n, pairs = pair_values.shape
     total = np.zeros(n)
     for k in range(n):
-        total[k] += hazard_values[k]
+        total[k] += obstacle_values[k]
         for p in range(pairs):
             total[k] += pair_values[k, p]
     return total
@@ -107,7 +107,7 @@ def empty_ledger(worlds: Worlds) -> Ledger:
     """The ledger at the alert: no harm yet."""
     shape = worlds.gaps_m.shape
     pairs = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
-    return Ledger(*pairs, *no_hazard_harm(worlds.n), worlds.vehicles.mass_t)
+    return Ledger(*pairs, *no_obstacle_harm(worlds.n), worlds.vehicles.mass_t)
 
 
 @compiled

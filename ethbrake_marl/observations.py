@@ -85,7 +85,7 @@ ROLE_FEATURES = (
     Feature("vehicles_ahead", "1", 1.0, 0.0, 2.0, "how many vehicles are ahead in the line; 2 stands for 2 or more"),
     Feature("vehicles_behind", "1", 1.0, 0.0, 2.0, "how many are behind"),
 )
-HAZARD_FEATURES = (
+OBSTACLE_FEATURES = (
     Feature("known", "1", 1.0, 0.0, 1.0, "1 if there is an obstacle ahead of the line and this vehicle knows of it"),
     Feature("gap", "m", 10.0, 0.0, 10.0, "free distance to it, vehicles between not counted as length"),
     Feature("hit", "1", 1.0, 0.0, 1.0, "1 if Vehicle 1 has had an impact with it"),
@@ -94,7 +94,7 @@ HAZARD_FEATURES = (
 )
 
 _OWN, _NEIGHBOUR = len(OWN_FEATURES), len(NEIGHBOUR_FEATURES)
-_ROLE, _HAZARD = len(ROLE_FEATURES), len(HAZARD_FEATURES)
+_ROLE, _OBSTACLE = len(ROLE_FEATURES), len(OBSTACLE_FEATURES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,14 +104,14 @@ class ObservationSpec:
     front: int = 1
     rear: int = 1
     role: bool = False  # ROLE_FEATURES
-    hazard: bool = False  # HAZARD_FEATURES
+    obstacle: bool = False  # OBSTACLE_FEATURES
 
     def __post_init__(self) -> None:
         """Refuse what is not a number of neighbours."""
         for side, count in (("front", self.front), ("rear", self.rear)):
             if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= 64:
                 raise InvalidInput(f"observation: {side} = {count!r}; must be a whole number in 0..64")
-        for name, shown in (("role", self.role), ("hazard", self.hazard)):
+        for name, shown in (("role", self.role), ("obstacle", self.obstacle)):
             if not isinstance(shown, bool):
                 raise InvalidInput(f"observation: {name} = {shown!r}; must be True or False")
 
@@ -126,7 +126,7 @@ class ObservationSpec:
         """Every number of an observation in order; names are unique (``own.speed``, ``front_1.gap``)."""
         groups = [("own", OWN_FEATURES), *((prefix, NEIGHBOUR_FEATURES) for prefix, _ in self.sides)]
         groups += [("role", ROLE_FEATURES)] if self.role else []
-        groups += [("hazard", HAZARD_FEATURES)] if self.hazard else []
+        groups += [("obstacle", OBSTACLE_FEATURES)] if self.obstacle else []
         return tuple(
             Feature(f"{prefix}.{f.name}", f.unit, f.scale, f.low, f.high, f.meaning)
             for prefix, group in groups
@@ -136,7 +136,7 @@ class ObservationSpec:
     @property
     def size(self) -> int:
         """Length F of an observation."""
-        further = self.role * len(ROLE_FEATURES) + self.hazard * len(HAZARD_FEATURES)
+        further = self.role * len(ROLE_FEATURES) + self.obstacle * len(OBSTACLE_FEATURES)
         return _OWN + (self.front + self.rear) * _NEIGHBOUR + further
 
 
@@ -145,7 +145,7 @@ def observation_for(scenario: Scenario) -> ObservationSpec:
 
     Where Vehicle 1 has an obstacle ahead, also the own place in the line and the obstacle.
     """
-    return ObservationSpec(role=scenario.has_obstacle, hazard=scenario.has_obstacle)
+    return ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)
 
 
 def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
@@ -161,7 +161,7 @@ class Scaling(NamedTuple):
 
     offsets: Ints  # of the neighbours in the line
     role: bool
-    hazard: bool
+    obstacle: bool
     features: Floats  # [3, F] 1 / scale, low, high
 
 
@@ -172,7 +172,7 @@ def scaling(spec: ObservationSpec) -> Scaling:
     return Scaling(
         np.array([offset for _, offset in spec.sides], np.int64),
         spec.role,
-        spec.hazard,
+        spec.obstacle,
         np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]]),
     )
 
@@ -186,7 +186,7 @@ def observe_packed(state: Floats, params: Floats, vehicles: Ints, scale: Scaling
 
 @compiled
 def _observe_rows(  # noqa: C901
-    state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, hazard: bool, features: Floats,
+    state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, features: Floats,
     out: Observations,
 ) -> None:  # fmt: skip
     """Fill ``out`` with the clipped features of each observer, in the order of the lists of features above.
@@ -245,9 +245,9 @@ def _observe_rows(  # noqa: C901
                 value[c] = i
                 value[c + 1] = N - 1 - i
                 c += _ROLE
-            if hazard:
+            if with_obstacle:
                 told = i == 0 or time >= params[k, news + i * N if by_link else latency + i]
-                for absent in range(c, c + _HAZARD):
+                for absent in range(c, c + _OBSTACLE):
                     value[absent] = 0.0
                 if told and some_obstacle and state[k, obstacle] < math.inf:
                     gap = state[k, obstacle]

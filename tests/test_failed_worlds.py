@@ -55,9 +55,9 @@ def test_every_search_and_forecast__names_all_of_them(worlds):
 
 
 def test_mixed_batches__name_them_by_the_rows_of_the_whole(worlds):
-    hazard = np.full(N, np.inf)
-    hazard[[1, 2, 4]] = 300.0
-    mixed = replace(worlds, hazard_gap_m=hazard)
+    obstacle = np.full(N, np.inf)
+    obstacle[[1, 2, 4]] = 300.0
+    mixed = replace(worlds, obstacle_gap_m=obstacle)
     lost = failed_rows(lambda: advance(mixed, braking(mixed), until_s=8.0))
     assert lost == [6]  # those without an obstacle go first
     well, rows, failed = leaving_out_failed(

@@ -121,34 +121,38 @@ def test_bad_input__is_refused(call):
 def test_observation_for__adds_place_and_obstacle_only_where_there_is_one():
     assert observation_for(load_scenario("paper-random")) == ObservationSpec(1, 1)
     spec = observation_for(load_scenario("cooperation-4-all"))
-    assert spec == ObservationSpec(1, 1, role=True, hazard=True)
+    assert spec == ObservationSpec(1, 1, role=True, obstacle=True)
     assert [f.name for f in spec.features][: ObservationSpec().size] == [f.name for f in ObservationSpec().features]
     assert [f.name for f in spec.features][ObservationSpec().size :] == [
-        "role.vehicles_ahead", "role.vehicles_behind", "hazard.known", "hazard.gap", "hazard.hit",
-        "hazard.stopping_margin", "hazard.fitting_deceleration",
+        "role.vehicles_ahead", "role.vehicles_behind", "obstacle.known", "obstacle.gap", "obstacle.hit",
+        "obstacle.stopping_margin", "obstacle.fitting_deceleration",
     ]  # fmt: skip
     assert spec.size == len(spec.features) == 34
 
 
 def test_observe__place_and_obstacle_by_hand():
-    spec = ObservationSpec(0, 0, role=True, hazard=True)
+    spec = ObservationSpec(0, 0, role=True, obstacle=True)
     start = make_worlds(
         [[8.0, 6.0, 10.0]], [[20.0, 18.0, 22.0, 10.0]], braking_capacity_mps2=8.0, driving_capacity_mps2=1.0,
-        latency_s=[0.0, 0.5, 1.0, 1.0], mass_t=1.0, restitution=0.1, hazard_gap_m=42.0,
+        latency_s=[0.0, 0.5, 1.0, 1.0], mass_t=1.0, restitution=0.1, obstacle_gap_m=42.0,
     )  # fmt: skip
     names = [f.name for f in spec.features]
     now = [dict(zip(names, observe(start, i, spec)[0].tolist(), strict=True)) for i in (0, 1)]
-    assert now[0]["hazard.known"] == 1.0 and now[0]["hazard.gap"] == pytest.approx(4.2)
-    assert now[0]["hazard.stopping_margin"] == pytest.approx((42.0 - 400 / 16) / 10)
-    assert now[0]["hazard.fitting_deceleration"] == pytest.approx(400 / 84 / 10)
+    assert now[0]["obstacle.known"] == 1.0 and now[0]["obstacle.gap"] == pytest.approx(4.2)
+    assert now[0]["obstacle.stopping_margin"] == pytest.approx((42.0 - 400 / 16) / 10)
+    assert now[0]["obstacle.fitting_deceleration"] == pytest.approx(400 / 84 / 10)
     assert [now[1][name] for name in names[-5:]] == [0.0] * 5
     later = advance(start, 0.0, until_s=1.0)[0]
     seen = [dict(zip(names, observe(later, i, spec)[0].tolist(), strict=True)) for i in range(4)]
     assert [s["role.vehicles_ahead"] for s in seen] == [0.0, 1.0, 2.0, 2.0]
     assert [s["role.vehicles_behind"] for s in seen] == [2.0, 2.0, 1.0, 0.0]
     # all have coasted for 1 s: Vehicle 3 was 8 + 6 m behind Vehicle 1 and drove 22 m, Vehicle 1 has 22 m left
-    assert seen[0]["hazard.gap"] == pytest.approx(2.2) and seen[2]["hazard.gap"] == pytest.approx((42 + 14 - 22) / 10)
-    assert seen[2]["hazard.stopping_margin"] == pytest.approx((34 - 22**2 / 16) / 10) and seen[2]["hazard.hit"] == 0.0
+    assert seen[0]["obstacle.gap"] == pytest.approx(2.2) and seen[2]["obstacle.gap"] == pytest.approx(
+        (42 + 14 - 22) / 10
+    )
+    assert (
+        seen[2]["obstacle.stopping_margin"] == pytest.approx((34 - 22**2 / 16) / 10) and seen[2]["obstacle.hit"] == 0.0
+    )
     struck = advance(start, 0.0, until_s=2.2)[0]
     assert observe(struck, 3, spec)[0, -3] == 1.0
     nothing_ahead = observe(worlds(), 0, spec)[0]
@@ -156,5 +160,5 @@ def test_observe__place_and_obstacle_by_hand():
 
 
 def test_observation_spec__what_follows_is_true_or_false():
-    with pytest.raises(InvalidInput, match="observation: hazard = 1; must be True or False"):
-        ObservationSpec(hazard=1)
+    with pytest.raises(InvalidInput, match="observation: obstacle = 1; must be True or False"):
+        ObservationSpec(obstacle=1)

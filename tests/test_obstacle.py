@@ -31,17 +31,21 @@ from ethbrake_marl.shield.agents import StepShieldAgent
 from tests.reference.avoidability_lp import avoidable_by_lp
 
 ALL = load_scenario("cooperation-4-all")
-NEAR = ALL.replace(hazard_gap_m={"uniform": [10, 45]})  # within the way of full braking in many worlds
+NEAR = ALL.replace(obstacle_gap_m={"uniform": [10, 45]})  # within the way of full braking in many worlds
 
 
 def test_sample__an_obstacle_leaves_all_other_draws_alone_and_has_its_own_for_each_world():
     pair, near = load_scenario("cooperation-3-pair").sample(50, 7).worlds, NEAR.sample(50, 7).worlds
     for name in ("gaps_m", "speeds_mps"):
         assert getattr(near, name).tobytes() == getattr(pair, name).tobytes()
-    assert np.isinf(pair.hazard_gap_m).all() and not pair.hazard_hit.any()
-    assert (near.hazard_gap_m >= 10.0).all() and (near.hazard_gap_m <= 45.0).all() and np.ptp(near.hazard_gap_m) > 20.0
-    assert NEAR.sample(1, 7, first=31).worlds.hazard_gap_m[0] == near.hazard_gap_m[31]
-    assert (NEAR.sample(50, 7, channel="training").worlds.hazard_gap_m != near.hazard_gap_m).all()
+    assert np.isinf(pair.obstacle_gap_m).all() and not pair.obstacle_hit.any()
+    assert (
+        (near.obstacle_gap_m >= 10.0).all()
+        and (near.obstacle_gap_m <= 45.0).all()
+        and np.ptp(near.obstacle_gap_m) > 20.0
+    )
+    assert NEAR.sample(1, 7, first=31).worlds.obstacle_gap_m[0] == near.obstacle_gap_m[31]
+    assert (NEAR.sample(50, 7, channel="training").worlds.obstacle_gap_m != near.obstacle_gap_m).all()
 
 
 @pytest.mark.parametrize(
@@ -49,8 +53,8 @@ def test_sample__an_obstacle_leaves_all_other_draws_alone_and_has_its_own_for_ea
     [(0, "must be finite and in (0, 10000] m (metres)"), (-3.0, "(0, 10000]"), (2e4, "(0, 10000]"), (None, "left out")],
 )
 def test_scenario__refuses_an_obstacle_at_no_distance(value, right):
-    with pytest.raises(InvalidInput, match=r"hazard_gap_m = .*" + re.escape(right)):
-        ALL.replace(hazard_gap_m=value)
+    with pytest.raises(InvalidInput, match=r"obstacle_gap_m = .*" + re.escape(right)):
+        ALL.replace(obstacle_gap_m=value)
 
 
 def test_scenario__vehicle_1_learns_only_with_something_to_lose():
@@ -61,17 +65,17 @@ def test_scenario__vehicle_1_learns_only_with_something_to_lose():
 
 def test_initial_state__may_place_the_obstacle_where_the_scenario_has_one():
     state = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
-    assert initial_state_worlds(state, ALL).hazard_gap_m.tolist() == [42.0]
-    assert initial_state_worlds({**state, "hazard_gap_m": 30}, NEAR).hazard_gap_m.tolist() == [30.0]
-    with pytest.raises(InvalidInput, match="hazard_gap_m is missing, and random in scenario"):
+    assert initial_state_worlds(state, ALL).obstacle_gap_m.tolist() == [42.0]
+    assert initial_state_worlds({**state, "obstacle_gap_m": 30}, NEAR).obstacle_gap_m.tolist() == [30.0]
+    with pytest.raises(InvalidInput, match="obstacle_gap_m is missing, and random in scenario"):
         initial_state_worlds(state, NEAR)
-    with pytest.raises(InvalidInput, match="hazard_gap_m is not of this scenario: 'paper-random' has no"):
-        initial_state_worlds({**state, "hazard_gap_m": 30}, load_scenario("paper-random"))
-    with pytest.raises(InvalidInput, match=r"initial_state: hazard_gap_m = 0: must be finite and in \(0, 10000\] m"):
-        initial_state_worlds({**state, "hazard_gap_m": 0}, ALL)
+    with pytest.raises(InvalidInput, match="obstacle_gap_m is not of this scenario: 'paper-random' has no"):
+        initial_state_worlds({**state, "obstacle_gap_m": 30}, load_scenario("paper-random"))
+    with pytest.raises(InvalidInput, match=r"initial_state: obstacle_gap_m = 0: must be finite and in \(0, 10000\] m"):
+        initial_state_worlds({**state, "obstacle_gap_m": 0}, ALL)
     columns = {"gap_1_m": [7, 8], "gap_2_m": [7, 8], "speed_1_mps": [20, 19], "speed_2_mps": 2 * [18]}
-    table = worlds_from_table({**columns, "speed_3_mps": [20, 20], "hazard_gap_m": [30, 35]}, NEAR)
-    assert table.hazard_gap_m.tolist() == [30.0, 35.0]
+    table = worlds_from_table({**columns, "speed_3_mps": [20, 20], "obstacle_gap_m": [30, 35]}, NEAR)
+    assert table.obstacle_gap_m.tolist() == [30.0, 35.0]
 
 
 def test_profiles__are_followed_with_the_obstacle_as_the_engine_drives_them():
@@ -85,9 +89,9 @@ def test_profiles__are_followed_with_the_obstacle_as_the_engine_drives_them():
         engine.step({})
     assert first.tobytes() == engine.ledger.world_harm("first").tobytes()
     assert total.tobytes() == engine.ledger.world_harm("total").tobytes()
-    assert (engine.ledger.hazard_count > 0).sum() > 10
+    assert (engine.ledger.obstacle_count > 0).sum() > 10
     words = problem.identity
-    moved = profile_problem(NEAR.replace(hazard_gap_m=44).sample(30, 7).worlds, [0, 1, 2], horizon_s=NEAR.horizon_s)
+    moved = profile_problem(NEAR.replace(obstacle_gap_m=44).sample(30, 7).worlds, [0, 1, 2], horizon_s=NEAR.horizon_s)
     assert (words != moved.identity).all()
 
 
@@ -126,11 +130,11 @@ def test_proofs__cover_an_obstacle_that_full_braking_never_meets_and_refuse_the_
     plain = load_scenario("cooperation-2-paper").sample(200, 7).worlds
     assert avoidability(worlds).reason.tolist() == avoidability(plain).reason.tolist()
     near = NEAR.sample(200, 7).worlds
-    with pytest.raises(InvalidInput, match=r"hazard_gap_m\[\d+\] = .*: must be beyond full braking of vehicle_1"):
+    with pytest.raises(InvalidInput, match=r"obstacle_gap_m\[\d+\] = .*: must be beyond full braking of vehicle_1"):
         avoidability(near)
     with pytest.raises(InvalidInput, match="lower_bound: worlds with an obstacle ahead"):
         lower_bound(worlds)
-    with pytest.raises(InvalidInput, match="avoidable_by_lp: hazard_gap_m 42: the programme knows no obstacle"):
+    with pytest.raises(InvalidInput, match="avoidable_by_lp: obstacle_gap_m 42: the programme knows no obstacle"):
         avoidable_by_lp(worlds.take([0]), [1], 0.1)
 
 
@@ -146,19 +150,19 @@ def test_per_world__the_table_tells_the_obstacles_part(near_one, tmp_path: Path)
     with (tmp_path / "worlds.csv").open() as file:
         rows = list(csv.DictReader(file))
     ledger = result.outcome("coast").ledger
-    for row, first, total in zip(rows, ledger.hazard_first_harm, ledger.hazard_total_harm, strict=True):
-        assert float(row["hazard_first_impact_harm"]) == first and float(row["hazard_total_harm"]) == total > 0.0
-        assert 10.0 <= float(row["hazard_gap_m"]) <= 45.0 and float(row["final_hazard_gap_m"]) >= 0.0
+    for row, first, total in zip(rows, ledger.obstacle_first_harm, ledger.obstacle_total_harm, strict=True):
+        assert float(row["obstacle_first_impact_harm"]) == first and float(row["obstacle_total_harm"]) == total > 0.0
+        assert 10.0 <= float(row["obstacle_gap_m"]) <= 45.0 and float(row["final_obstacle_gap_m"]) >= 0.0
         assert float(row["first_impact_harm_1"]) >= first
     assert [int(row["impacts"]) for row in rows] == ledger.impacts.tolist()
 
 
 def test_record__positions_end_at_the_obstacle_and_the_figure_draws_it(near_one):
     record = record_episode(near_one.sample(1, 7).worlds, make_agent("coast"), scenario=near_one)
-    gap = float(record.initial.hazard_gap_m[0])
+    gap = float(record.initial.obstacle_gap_m[0])
     assert record.positions_m[:, 0].max() == pytest.approx(gap, abs=1e-9) and (record.positions_m <= gap + 1e-9).all()
     struck = record.impacts.pair == -1
-    assert struck.any() and record.impacts.closing_speed_mps[struck][0] ** 2 == record.ledger.hazard_first_harm[0]
+    assert struck.any() and record.impacts.closing_speed_mps[struck][0] ** 2 == record.ledger.obstacle_first_harm[0]
     figure = trajectories({"coast": record})
     assert "obstacle" in figure.axes[0].get_legend_handles_labels()[1]
 
@@ -172,7 +176,7 @@ def test_shield__step_mode_bounds_the_harm_of_the_obstacle_too_to_the_last_bit(v
     harm = episodes.ledger.world_harm("total")
     assert agent.shield is not None and not agent.shield.distrusted.any()
     assert (harm <= agent.predicted_harm).all() and np.array_equal(harm, agent.shield.bound)
-    assert (agent.shield.interventions > 0).sum() > 5 and (episodes.ledger.hazard_count > 0).any()
+    assert (agent.shield.interventions > 0).sum() > 5 and (episodes.ledger.obstacle_count > 0).any()
 
 
 def test_shield__wrapped_around_an_environment_sees_what_it_predicted():

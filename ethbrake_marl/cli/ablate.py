@@ -99,7 +99,7 @@ def generalise_command(
     They drive every follower, and Vehicle 1 where it learns in the scenario.
     """
     # scipy's statistics take a second to load
-    from ethbrake_marl.studies.ablation.longer_lines import Question, drive_longer, load_runs
+    from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, drive_longer, load_runs
     from ethbrake_marl.studies.ablation.report import lines_markdown
 
     lengths = _lengths(vehicles)
@@ -110,7 +110,7 @@ def generalise_command(
         )
     line = load_runnable(scenario)
     agents = load_runs([each.strip() for each in runs.split(",")], line)
-    question = Question(line, lengths, episodes, seed, count, search_episodes, budget)
+    question = LineQuestion(line, lengths, episodes, seed, count, search_episodes, budget)
     with interruptible("nothing was written"), progress_bars() as bars:
         found = drive_longer(question, agents, bars.show_progress)
     if as_json:

@@ -36,15 +36,15 @@ from ethbrake_marl.physics.rows import (
     Packed,
     command_at,
     gap_at,
-    has_hazard,
-    hazard_ledger_columns,
+    has_obstacle,
     ledger_columns,
+    obstacle_ledger_columns,
     pack,
     params_at,
     previous_at,
     speed_at,
     unpack,
-    with_hazard_columns,
+    with_obstacle_columns,
 )
 from ethbrake_marl.physics.segment import DONE
 from ethbrake_marl.rewards import (
@@ -95,7 +95,7 @@ class Engine:
     _clock: Floats  # [n, CLOCK_WIDTH]
     _wanted: Floats  # [n, N] m/s2
     _potential: Floats  # [n, N]
-    _hazard: bool  # the rows have columns of an obstacle
+    _obstacle: bool  # the rows have columns of an obstacle
 
     def __init__(
         self,
@@ -168,7 +168,7 @@ class Engine:
         vehicles = self.scenario.vehicles
         first, total, count = ledger_columns(self._state, vehicles)
         mass = self._params[:, params_at(3, vehicles) : params_at(4, vehicles)].copy()
-        return Ledger(first, total, count, *hazard_ledger_columns(self._state, vehicles), mass)
+        return Ledger(first, total, count, *obstacle_ledger_columns(self._state, vehicles), mass)
 
     @property
     def known_from_s(self) -> Floats:
@@ -218,7 +218,7 @@ class Engine:
         start = stream.take(self.n) if worlds is None else stream.prepare(worlds)
         new = copy.copy(self)
         new._stream, new.roster = stream, Roster(self.n, stream.seed, first)
-        new._hazard = self.scenario.has_obstacle or has_hazard(start.packed.state, self.scenario.vehicles)
+        new._obstacle = self.scenario.has_obstacle or has_obstacle(start.packed.state, self.scenario.vehicles)
         new._state, new._params = new._kept(start.packed.state).copy(), start.packed.params.copy()
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
         new._potential = np.zeros(start.wanted.shape)
@@ -257,7 +257,7 @@ class Engine:
 
     def _kept(self, state: Floats) -> Floats:
         """Rows as wide as they are kept: with an obstacle's columns if the stream or the given worlds have one."""
-        return with_hazard_columns(state, self.scenario.vehicles) if self._hazard else state
+        return with_obstacle_columns(state, self.scenario.vehicles) if self._obstacle else state
 
     def observe(self, vehicle: int) -> Observations:
         """Current observation of one vehicle, [n, F]."""

@@ -12,7 +12,7 @@ from ethbrake_marl.engine.step import CLOCK_WIDTH, LAST_STEP, START
 from ethbrake_marl.errors import FailedWorld, InvalidInput, PhysicsError
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
 from ethbrake_marl.physics.failed import failure
-from ethbrake_marl.physics.rows import Packed, harm_at, has_hazard, pack, state_width
+from ethbrake_marl.physics.rows import Packed, harm_at, has_obstacle, pack, state_width
 from ethbrake_marl.physics.segment import DONE
 from ethbrake_marl.scenario import Scenario
 
@@ -174,7 +174,7 @@ def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
     """Refuse worlds, with ``InvalidInput``, that are not ``n`` lines of ``vehicles`` at the alert: t = 0, no impact."""
     if (worlds.n, worlds.N) != (n, vehicles):
         raise InvalidInput(f"reset: {worlds.n} worlds of {worlds.N} vehicles given; {n} of {vehicles} needed")
-    at_alert = (worlds.time_s == 0.0) & ~worlds.pair_hit.any(axis=1) & ~worlds.hazard_hit
+    at_alert = (worlds.time_s == 0.0) & ~worlds.pair_hit.any(axis=1) & ~worlds.obstacle_hit
     if not at_alert.all():
         k = int(np.argmin(at_alert))
         what = "after an impact" if worlds.time_s[k] == 0.0 else f"at {worlds.time_s[k]:g} s"
@@ -193,9 +193,9 @@ def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
     at, pairs = harm_at(alert.N), alert.N - 1
     for group, harm in enumerate((impacts.first_impact_harm, impacts.total_harm, impacts.count)):
         packed.state[:, at + group * pairs : at + (group + 1) * pairs] = harm
-    if has_hazard(packed.state, alert.N):
-        hazard = (impacts.hazard_first_harm, impacts.hazard_total_harm, impacts.hazard_count)
-        packed.state[:, state_width(alert.N) + 2 :] = np.column_stack(hazard)
+    if has_obstacle(packed.state, alert.N):
+        obstacle = (impacts.obstacle_first_harm, impacts.obstacle_total_harm, impacts.obstacle_count)
+        packed.state[:, state_width(alert.N) + 2 :] = np.column_stack(obstacle)
     return packed
 
 

@@ -59,14 +59,14 @@ def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -
 def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
     """Fill ``out`` [n, N, ...] with the columns of AFTER_A_STEP."""
     n, N = wanted.shape
-    P, harm, mass, hazard = N - 1, harm_at(N), params_at(3, N), state_width(N)
+    P, harm, mass, obstacle = N - 1, harm_at(N), params_at(3, N), state_width(N)
     for k in range(n):
         first, total, impacts = 0.0, 0.0, 0.0
         for i in range(N):
             out[k, i, 2] = 0.0
             out[k, i, 3] = 0.0
-        if state.shape[1] > hazard:
-            first, total, impacts = state[k, hazard + 2], state[k, hazard + 3], state[k, hazard + 4]
+        if state.shape[1] > obstacle:
+            first, total, impacts = state[k, obstacle + 2], state[k, obstacle + 3], state[k, obstacle + 4]
         for p in range(P):
             for count in range(2):
                 value = state[k, harm + count * P + p]
@@ -76,9 +76,9 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
             first += state[k, harm + p]
             total += state[k, harm + P + p]
             impacts += state[k, harm + 2 * P + p]
-        if state.shape[1] > hazard:  # after the pairs, as in the ledger
-            out[k, 0, 2] += state[k, hazard + 2]
-            out[k, 0, 3] += state[k, hazard + 3]
+        if state.shape[1] > obstacle:  # after the pairs, as in the ledger
+            out[k, 0, 2] += state[k, obstacle + 2]
+            out[k, 0, 3] += state[k, obstacle + 3]
         for i in range(N):
             out[k, i, 0] = state[k, TIME]
             out[k, i, 1] = state[k, command_at(N) + i]

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from ethbrake_marl.observations import (
-    HAZARD_FEATURES,
     NEIGHBOUR_FEATURES,
+    OBSTACLE_FEATURES,
     OWN_FEATURES,
     Feature,
     Observations,
@@ -23,9 +23,9 @@ from ethbrake_marl.scenario import Scenario
 
 _OWN_ONLY = ObservationSpec(front=0, rear=0)
 _PAIR_MEANING = {"gap": "free distance between the two", "hit": "1 if the pair has had an impact"}
-_HAZARD_FEATURES = tuple(
-    replace(f, name=f"hazard.{f.name}", meaning=meaning)
-    for f in HAZARD_FEATURES
+_OBSTACLE_FEATURES = tuple(
+    replace(f, name=f"obstacle.{f.name}", meaning=meaning)
+    for f in OBSTACLE_FEATURES
     for name, meaning in (("gap", "distance from Vehicle 1 to the obstacle"), ("hit", f.meaning))
     if f.name == name
 )
@@ -40,8 +40,8 @@ def state_features(scenario: Scenario) -> tuple[Feature, ...]:
     vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in OWN_FEATURES]
     pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
     time = Feature("time", "s", scenario.horizon_s, 0.0, 1.0, "time since Vehicle 1 began to brake; scale: the horizon")
-    hazard = _HAZARD_FEATURES if scenario.has_obstacle else ()
-    return (*vehicles, *pairs, time, *hazard)
+    obstacle = _OBSTACLE_FEATURES if scenario.has_obstacle else ()
+    return (*vehicles, *pairs, time, *obstacle)
 
 
 def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
@@ -52,7 +52,7 @@ def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
     columns = [pair_values[f.name][:, p] for p in range(worlds.N - 1) for f in _PAIR_FEATURES]
     columns.append(worlds.time_s)
     if scenario.has_obstacle:
-        columns += [worlds.hazard_gap_m, worlds.hazard_hit.astype(np.float64)]
+        columns += [worlds.obstacle_gap_m, worlds.obstacle_hit.astype(np.float64)]
     features = state_features(scenario)[-len(columns) :]
     rest = [np.clip(c / f.scale, f.low, f.high) for c, f in zip(columns, features, strict=True)]
     return np.concatenate([*vehicles, np.stack(rest, axis=1)], axis=1, dtype=np.float32)

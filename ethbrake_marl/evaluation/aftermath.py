@@ -48,7 +48,7 @@ class ShovedFront:
         moving = np.flatnonzero(until_s > before.time_s)
         post = with_post_ahead(before.take(moving), until_s[moving] - before.time_s[moving])
         after, _ = advance(post, command_mps2[moving], until_s=until_s[moving])
-        self._way_m[moving] += post.hazard_gap_m - after.hazard_gap_m
+        self._way_m[moving] += post.obstacle_gap_m - after.obstacle_gap_m
 
     @property
     def metres(self) -> Floats:
@@ -60,7 +60,7 @@ class ShovedFront:
 def with_post_ahead(worlds: Worlds, duration_s: Floats) -> Worlds:
     """These worlds, each with an obstacle ahead: its own, or one that Vehicle 1 cannot reach in ``duration_s`` [n]."""
     out_of_reach = _farthest(worlds, duration_s) + 1.0
-    return replace(worlds, hazard_gap_m=np.where(obstacle_ahead(worlds), worlds.hazard_gap_m, out_of_reach))
+    return replace(worlds, obstacle_gap_m=np.where(obstacle_ahead(worlds), worlds.obstacle_gap_m, out_of_reach))
 
 
 def _farthest(worlds: Worlds, duration_s: Floats) -> Floats:

@@ -20,7 +20,7 @@ _SYMBOLS = {
     "latency_s": ("τ", "s"),
     "mass_t": ("m", "t"),
     "restitution": ("e", ""),
-    "hazard_gap_m": ("obstacle at", "m"),
+    "obstacle_gap_m": ("obstacle at", "m"),
 }
 _STAY = "\u00a0"  # a blank at which no line is broken
 
@@ -34,7 +34,7 @@ def quantity(worlds: Worlds, field: str) -> Floats:
 
 def quantity_rules(worlds: Worlds) -> dict[str, QuantityRule]:
     """The quantities that these worlds have: the distance to an obstacle only where there is one."""
-    return {**QUANTITIES, **OPTIONAL} if np.isfinite(worlds.hazard_gap_m).all() else QUANTITIES
+    return {**QUANTITIES, **OPTIONAL} if np.isfinite(worlds.obstacle_gap_m).all() else QUANTITIES
 
 
 def quantities(worlds: Worlds) -> dict[str, Any]:

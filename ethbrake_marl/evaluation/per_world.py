@@ -71,7 +71,7 @@ REGRET_COLUMNS = (
     "regret_total_harm",
 )
 
-_ALWAYS = ("gaps_m", "speeds_mps", "hazard_gap_m")
+_ALWAYS = ("gaps_m", "speeds_mps", "obstacle_gap_m")
 
 
 def write_per_world_csv(
@@ -157,10 +157,10 @@ def outcome_columns(outcome: Outcome) -> Columns:
     for name, column in (("sampled_harm", outcome.sampled_harm), ("vehicle_1_shoved_m", outcome.shoved_m)):
         columns[name] = [""] * n if column is None else column.tolist()
     final = outcome.final
-    if np.isfinite(final.hazard_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
-        columns |= {"hazard_first_impact_harm": outcome.ledger.hazard_harm("first").tolist()}
-        columns |= {"hazard_total_harm": outcome.ledger.hazard_harm("total").tolist()}
-        columns |= {"final_hazard_gap_m": final.hazard_gap_m.tolist()}
+    if np.isfinite(final.obstacle_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
+        columns |= {"obstacle_first_impact_harm": outcome.ledger.obstacle_harm("first").tolist()}
+        columns |= {"obstacle_total_harm": outcome.ledger.obstacle_harm("total").tolist()}
+        columns |= {"final_obstacle_gap_m": final.obstacle_gap_m.tolist()}
     columns |= {f"final_gap_{p + 1}_m": final.gaps_m[:, p].tolist() for p in range(final.N - 1)}
     columns |= {f"final_speed_{i + 1}_mps": final.speeds_mps[:, i].tolist() for i in range(final.N)}
     columns |= {"end_s": final.time_s.tolist(), "ended": outcome.ended.tolist()}

@@ -92,7 +92,7 @@ def _samples(segments: list[Segment], sample_s: float) -> Iterator[tuple[Floats,
         post = with_post_ahead(before, np.array([end - start]))
         copies = post.take(np.zeros(count + 1, np.int64))
         moved, _ = advance(copies, command, until_s=times)
-        position, gaps, speeds = front + (post.hazard_gap_m - moved.hazard_gap_m), moved.gaps_m, moved.speeds_mps
+        position, gaps, speeds = front + (post.obstacle_gap_m - moved.obstacle_gap_m), moved.gaps_m, moved.speeds_mps
         in_force = np.where(before.vehicles.latency_s <= times[:, np.newaxis], command, 0.0)
         rows = slice(None) if number == len(segments) - 1 else slice(count)
         columns = (times, gaps, speeds, _positions(position, gaps), in_force)

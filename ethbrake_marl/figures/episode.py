@@ -67,8 +67,8 @@ def _positions(axes: Axes, record: EpisodeRecord) -> None:
             linewidth=1.6,
             label=f"Vehicle {i + 1}",
         )
-    if np.isfinite(record.initial.hazard_gap_m[0]):
-        axes.axhline(float(record.initial.hazard_gap_m[0]), color="black", linewidth=2.5, label="obstacle")
+    if np.isfinite(record.initial.obstacle_gap_m[0]):
+        axes.axhline(float(record.initial.obstacle_gap_m[0]), color="black", linewidth=2.5, label="obstacle")
     rows = record.impacts
     at = _at(record, rows.time_s, rows.pair)
     for first, fill, size, label in ((True, "black", 60.0, "first impact"), (False, "white", 26.0, "later impact")):

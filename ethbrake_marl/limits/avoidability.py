@@ -72,8 +72,8 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
     of the deciding trajectories of up to 1e-12 m counts as a touch, hence as avoided.
 
     Raises ``InvalidInput`` for another line, another script than full_brake, a front vehicle that may brake only after
-    the controlled one acts, a vehicle that moves backward, or an obstacle (``hazard_gap_m``) that vehicle_1 could reach
-    before any contact.
+    the controlled one acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1 could
+    reach before any contact.
     """
     _check(worlds, vehicle, scripts or {})
     v = worlds.vehicles
@@ -101,9 +101,15 @@ def _check(worlds: Worlds, vehicle: int, scripts: Mapping[int, str]) -> None:
     """
     own = np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
     way = stopping_distances(worlds.speeds_mps[:, 0], own, worlds.vehicles.braking_capacity_mps2[:, 0])
-    _refuse(~(way < worlds.hazard_gap_m), worlds.hazard_gap_m, "hazard_gap_m", None, "beyond full braking of vehicle_1")
-    if vehicle == 0 and np.isfinite(worlds.hazard_gap_m).any():
-        raise InvalidInput("avoidability: vehicle_1 controlled, with an obstacle ahead (hazard_gap_m): not decided")
+    _refuse(
+        ~(way < worlds.obstacle_gap_m),
+        worlds.obstacle_gap_m,
+        "obstacle_gap_m",
+        None,
+        "beyond full braking of vehicle_1",
+    )
+    if vehicle == 0 and np.isfinite(worlds.obstacle_gap_m).any():
+        raise InvalidInput("avoidability: vehicle_1 controlled, with an obstacle ahead (obstacle_gap_m): not decided")
     if (worlds.N, vehicle) not in ((3, 1), (2, 0), (2, 1)):
         raise InvalidInput(
             f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles; it is decided exactly for vehicle_2 of 3 and"

@@ -20,15 +20,15 @@ from ethbrake_marl.agents.protocol import fixed_commands
 from ethbrake_marl.agents.rollout import scripted
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.harm import COUNTS, HarmCount
-from ethbrake_marl.limits.best_harm_table import Best, BestHarmTable, join_tables, load_table, save_table
+from ethbrake_marl.limits.best_harm_table import BestHarmTable, BestKnown, join_tables, load_table, save_table
 from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.search.kernel import MOST_PHASES
-from ethbrake_marl.search.motion import Words
+from ethbrake_marl.search.motion import UInt64s
 from ethbrake_marl.search.problem import ProfileProblem, profile_problem
 from ethbrake_marl.search.profiles import (
-    Found,
     Profiles,
+    SearchResult,
     constant_profiles,
     even_grid,
     follow_profiles,
@@ -69,7 +69,7 @@ def best_harm(
     chosen = scenario.learners if vehicles is None else tuple(vehicles)
     workers = _cores() if threads is None else threads
     search = _Search(scenario, worlds, scripted_commands(worlds, Task(scenario, chosen)), budget, seed, workers)
-    found: list[Found] = []
+    found: list[SearchResult] = []
     identity = search.problem(chosen).identity
     if known is not None:
         known.check_fits(search.problem(chosen))
@@ -79,13 +79,13 @@ def best_harm(
             given.append(_startable(known.profiles(identity, count, search.problem(chosen).last_step)[0]))
         found.append(search.best(chosen, count, given))
     rows = np.arange(worlds.n)
-    best: dict[HarmCount, Best] = {}
+    best: dict[HarmCount, BestKnown] = {}
     for count in counts:
         harms = np.stack([result.harm(count) for result in found])
         pick = np.argmin(harms, axis=0)
         ends = np.stack([result.profiles.ends for result in found])[pick, rows]
         commands = np.stack([result.profiles.commands_mps2 for result in found])[pick, rows]
-        best[count] = Best(harms[pick, rows], Profiles(ends, commands))
+        best[count] = BestKnown(harms[pick, rows], Profiles(ends, commands))
     names = [scenario.vehicle_names[i] for i in chosen]
     header = {"scenario": scenario.name, "vehicles": names, "budget": budget, "search_seed": seed}
     table = BestHarmTable(identity, best, header)
@@ -172,7 +172,7 @@ def chunk_file(chunks: Path, first: int) -> Path:
     return chunks / f"{first:07d}.npz"
 
 
-def kept_chunk(file: Path, identity: Words, question: Mapping[str, object]) -> BestHarmTable | None:
+def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) -> BestHarmTable | None:
     """A kept chunk, if it is there and answers this very question; raises ``CorruptBundle`` for a damaged one."""
     if not file.is_file():
         return None
@@ -181,12 +181,12 @@ def kept_chunk(file: Path, identity: Words, question: Mapping[str, object]) -> B
     return table if asked == question and np.array_equal(table.identity, identity) else None
 
 
-def world_identity(worlds: Worlds, task: Task) -> Words:
+def world_identity(worlds: Worlds, task: Task) -> UInt64s:
     """What tells the problem in one world (at t = 0) from that in any other, [n]: ``search.profiles.identities``."""
     return _problem(worlds, task).identity
 
 
-def realised_harm(worlds: Worlds, task: Task, best: Best) -> tuple[Floats, Floats]:
+def realised_harm(worlds: Worlds, task: Task, best: BestKnown) -> tuple[Floats, Floats]:
     """First-impact and total harm [n] of the stored profiles, driven again in these worlds."""
     return follow_profiles(_problem(worlds, task), best.profiles)
 
@@ -238,7 +238,7 @@ class _Search:
         count: HarmCount,
         given: Sequence[Profiles] = (),
         deciders: Sequence[int] | None = None,
-    ) -> Found:
+    ) -> SearchResult:
         """The best profiles that start from constants, from ``given``, and from each vehicle's own best profile."""
         problem = self.problem(vehicles, count, deciders)
         starts = [constant_profiles(problem, even_grid(problem, CONSTANTS)), *given]

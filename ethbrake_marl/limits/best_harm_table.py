@@ -21,7 +21,7 @@ from ethbrake_marl.files.json import parse_strict_json
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints
-from ethbrake_marl.search.motion import Words
+from ethbrake_marl.search.motion import UInt64s
 from ethbrake_marl.search.problem import ProfileProblem
 from ethbrake_marl.search.profiles import Profiles, check_profiles, pad_profiles
 
@@ -34,7 +34,7 @@ _ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # of the header, in 
 _COUNTS: tuple[HarmCount, ...] = ("first", "total")
 
 
-class Best(NamedTuple):
+class BestKnown(NamedTuple):
     """The least harm known under one count."""
 
     harm: Floats  # [n] m2/s2
@@ -45,18 +45,18 @@ class Best(NamedTuple):
 class BestHarmTable:
     """The least harm known in n worlds, for one or both counts, and how it was found (``header``)."""
 
-    identity: Words  # [n]
-    best: Mapping[HarmCount, Best]
+    identity: UInt64s  # [n]
+    best: Mapping[HarmCount, BestKnown]
     header: Mapping[str, Any]
 
-    def rows(self, identity: Words) -> NDArray[np.int64]:
+    def rows(self, identity: UInt64s) -> NDArray[np.int64]:
         """Row of each world, -1 where it is not in the table."""
         order = np.argsort(self.identity, kind="stable")
         place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
         rows = order[place]
         return np.where(self.identity[rows] == identity, rows, -1)
 
-    def check_holds_any(self, identity: Words) -> None:
+    def check_holds_any(self, identity: UInt64s) -> None:
         """Raise ``InvalidInput`` if none of these worlds is in the table: it is of another list."""
         if not (self.rows(identity) >= 0).any():
             made = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
@@ -73,14 +73,14 @@ class BestHarmTable:
             except InvalidInput as error:
                 raise InvalidInput(f"table of best known harm, {count}: {error}") from None
 
-    def harm(self, identity: Words, count: HarmCount) -> Floats:
+    def harm(self, identity: UInt64s, count: HarmCount) -> Floats:
         """Best known harm of each world (m2/s2), NaN where it is not in the table."""
         rows = self.rows(identity)
         if count not in self.best:
             return np.full(rows.shape, np.nan)
         return np.where(rows >= 0, self.best[count].harm[rows], np.nan)
 
-    def profiles(self, identity: Words, count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
+    def profiles(self, identity: UInt64s, count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
         """Kept profiles [n], and where there is one [n]; coasting elsewhere. ``last_step`` [n] ends each of them."""
         rows = self.rows(identity)
         if count not in self.best:
@@ -93,7 +93,7 @@ class BestHarmTable:
         return Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], kept.commands_mps2, 0.0)), known
 
     def improved(
-        self, identity: Words, count: HarmCount, harm: Floats, profiles: Profiles | None = None
+        self, identity: UInt64s, count: HarmCount, harm: Floats, profiles: Profiles | None = None
     ) -> tuple[BestHarmTable, Bools]:
         """The table with every value replaced that ``harm`` [m] undercuts by more than ``TOLERANCE``; and where it did.
 
@@ -117,17 +117,17 @@ class BestHarmTable:
         kept, new = pad_profiles([old.profiles, profiles], 1)
         kept.ends[at] = new.ends[better]
         kept.commands_mps2[at] = new.commands_mps2[better]
-        return replace(self, best={**self.best, count: Best(new_harm, kept)}), better
+        return replace(self, best={**self.best, count: BestKnown(new_harm, kept)}), better
 
 
 def join_tables(parts: list[BestHarmTable]) -> BestHarmTable:
     """One table of all the worlds; the header is the first one's."""
     counts = [count for count in _COUNTS if all(count in part.best for part in parts)]
-    best: dict[HarmCount, Best] = {}
+    best: dict[HarmCount, BestKnown] = {}
     for count in counts:
         padded = pad_profiles([part.best[count].profiles for part in parts], 1)
         profiles = Profiles(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
-        best[count] = Best(np.concatenate([part.best[count].harm for part in parts]), profiles)
+        best[count] = BestKnown(np.concatenate([part.best[count].harm for part in parts]), profiles)
     return BestHarmTable(np.concatenate([part.identity for part in parts]), best, parts[0].header)
 
 
@@ -215,7 +215,7 @@ def _header(data: bytes) -> dict[str, Any]:
     return dict(content)
 
 
-def _read_best(arrays: Mapping[str, NDArray[Any]], count: HarmCount) -> Best:
+def _read_best(arrays: Mapping[str, NDArray[Any]], count: HarmCount) -> BestKnown:
     """One count of a table whose arrays have the right shapes; raises ``ValueError`` for numbers that cannot be."""
     harm = arrays[f"{count}_harm"].astype(np.float64)
     used = arrays[f"{count}_phases"].astype(np.int64)
@@ -242,7 +242,7 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], count: HarmCount) -> Best:
     commands = np.where(inside[..., np.newaxis], commands, commands[rows, last][:, np.newaxis])
     if not ((np.diff(ends, axis=1) >= 0).all() and ((ends[:, -1] > 0) == (used > 0)).all()):
         raise ValueError(f"{count}_ends: the phases of a world must end in order, the last one after step 0")
-    return Best(harm, Profiles(ends, commands))
+    return BestKnown(harm, Profiles(ends, commands))
 
 
 def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:

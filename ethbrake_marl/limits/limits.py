@@ -98,7 +98,7 @@ def unproven_because(worlds: Worlds, task: Task) -> str | None:
             return f"{names[i]} follows {script}; avoidability is proven where it follows full_brake"
     latency_s = worlds.vehicles.latency_s
     way_m = stopping_distances(worlds.speeds_mps[:, 0], latency_s[:, 0], worlds.vehicles.braking_capacity_mps2[:, 0])
-    if not (way_m < worlds.hazard_gap_m).all():
+    if not (way_m < worlds.obstacle_gap_m).all():
         return "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"
     if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():
         return f"{names[0]} may brake later than {names[_DRIVEN]}; nothing is proven then"

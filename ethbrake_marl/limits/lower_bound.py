@@ -87,8 +87,8 @@ def lower_bound(
     unknown ``count``, and for a horizon that is not finite or lies before the vehicle may act.
     """
     check_count(count)
-    if np.isfinite(worlds.hazard_gap_m).any():
-        raise InvalidInput("lower_bound: worlds with an obstacle ahead (hazard_gap_m); the proofs know none")
+    if np.isfinite(worlds.obstacle_gap_m).any():
+        raise InvalidInput("lower_bound: worlds with an obstacle ahead (obstacle_gap_m); the proofs know none")
     verdict = avoidability(worlds, vehicle, scripts=scripts)
     start = np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):

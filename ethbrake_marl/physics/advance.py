@@ -65,9 +65,9 @@ class Impacts:
     first_impact_harm: Floats  # [n, P] only impacts of pairs that had none before
     total_harm: Floats  # [n, P] every impact
     count: Ints  # [n, P]
-    hazard_first_harm: Floats  # [n] the same of Vehicle 1's impacts with the obstacle ahead
-    hazard_total_harm: Floats  # [n]
-    hazard_count: Ints  # [n]
+    obstacle_first_harm: Floats  # [n] the same of Vehicle 1's impacts with the obstacle ahead
+    obstacle_total_harm: Floats  # [n]
+    obstacle_count: Ints  # [n]
     rows: ImpactRows | None = None  # only when recorded
 
 
@@ -143,13 +143,13 @@ def advance(
         raise InvalidInput("advance: give either duration_s or until_s")
     end = until_s if duration_s is None else worlds.time_s + _shaped("duration_s", duration_s, (worlds.n,))
     until = _shaped("until_s", end, (worlds.n,))
-    hazard = obstacle_ahead(worlds)
-    if not hazard.any():
+    obstacle = obstacle_ahead(worlds)
+    if not obstacle.any():
         return _advance(worlds, command, until, record, threads)
     _refuse_bad(worlds, command, until)
-    if hazard.all():
+    if obstacle.all():
         return _advance_with_obstacle(worlds, command, until, record, threads)
-    return _advance_mixed(worlds, command, until, record, threads, hazard)
+    return _advance_mixed(worlds, command, until, record, threads, obstacle)
 
 
 def _advance(worlds: Worlds, command: Floats, until: Floats, record: bool, threads: int) -> tuple[Worlds, Impacts]:
@@ -159,7 +159,7 @@ def _advance(worlds: Worlds, command: Floats, until: Floats, record: bool, threa
     while True:
         after = Worlds(
             vehicles, worlds.gaps_m.copy(), worlds.speeds_mps.copy(), worlds.time_s.copy(), worlds.pair_hit.copy(),
-            np.empty(worlds.speeds_mps.shape), worlds.hazard_gap_m.copy(), worlds.hazard_hit.copy(),
+            np.empty(worlds.speeds_mps.shape), worlds.obstacle_gap_m.copy(), worlds.obstacle_hit.copy(),
         )  # fmt: skip
         shape = worlds.gaps_m.shape
         first_harm, total_harm, count = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
@@ -176,7 +176,7 @@ def _advance(worlds: Worlds, command: Floats, until: Floats, record: bool, threa
                 raise _refusal(worlds, command, until, part.world, part.status)
         if (failed != DONE).any():
             raise failure(failed, worlds.time_s, until)
-        impacts = Impacts(first_harm, total_harm, count, *no_hazard_harm(worlds.n))
+        impacts = Impacts(first_harm, total_harm, count, *no_obstacle_harm(worlds.n))
         if not record:
             return after, impacts
         most = max(part.recorded for part in parts)
@@ -199,10 +199,10 @@ def _advance_with_obstacle(
 
 
 def _advance_mixed(
-    worlds: Worlds, command: Floats, until: Floats, record: bool, threads: int, hazard: Bools
+    worlds: Worlds, command: Floats, until: Floats, record: bool, threads: int, obstacle: Bools
 ) -> tuple[Worlds, Impacts]:
     """``advance`` of worlds of which only those marked have an obstacle."""
-    places = [np.flatnonzero(~hazard), np.flatnonzero(hazard)]
+    places = [np.flatnonzero(~obstacle), np.flatnonzero(obstacle)]
     parts = []
     for run, at in zip((_advance, _advance_with_obstacle), places, strict=True):
         with renumbered(at):
@@ -215,8 +215,8 @@ def _advance_mixed(
         return np.concatenate([getattr(impacts, name) for impacts in found])[order]
 
     impacts = Impacts(
-        joined("first_impact_harm"), joined("total_harm"), joined("count"), joined("hazard_first_harm"),
-        joined("hazard_total_harm"), joined("hazard_count"),
+        joined("first_impact_harm"), joined("total_harm"), joined("count"), joined("obstacle_first_harm"),
+        joined("obstacle_total_harm"), joined("obstacle_count"),
     )  # fmt: skip
     lists = [each.rows for each in found if each.rows is not None]
     if not lists:
@@ -227,7 +227,7 @@ def _advance_mixed(
     return after, replace(impacts, rows=ImpactRows(world[by_world], *(column[by_world] for column in columns)))
 
 
-def no_hazard_harm(n: int) -> tuple[Floats, Floats, Ints]:
+def no_obstacle_harm(n: int) -> tuple[Floats, Floats, Ints]:
     """Harm, by both counts, and impacts of ``n`` worlds without an obstacle."""
     return np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
 

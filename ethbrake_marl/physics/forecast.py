@@ -52,11 +52,11 @@ def forecast(
         raise InvalidInput(
             f"forecast: candidate {candidates_mps2[~good][0]:g} m/s2 is beyond vehicle_{vehicle + 1}'s capacity"
         )
-    hazard = obstacle_ahead(worlds)
-    if not hazard.any():
+    obstacle = obstacle_ahead(worlds)
+    if not obstacle.any():
         return _forecast(worlds, command_mps2, vehicle, candidates_mps2, until_s)
     first, total = np.empty(candidates_mps2.shape), np.empty(candidates_mps2.shape)
-    with_one, without = np.flatnonzero(hazard), np.flatnonzero(~hazard)
+    with_one, without = np.flatnonzero(obstacle), np.flatnonzero(~obstacle)
     lines, command = with_obstacle(worlds.take(with_one)), ahead(0.0, command_mps2[with_one])
     with renumbered(with_one):
         first[with_one], total[with_one] = _forecast(lines, command, vehicle + 1, candidates_mps2[with_one], until_s)

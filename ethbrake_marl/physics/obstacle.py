@@ -25,7 +25,7 @@ FAR_AWAY_M = 1e300  # stands for no obstacle where others of a batch have one: n
 
 def obstacle_ahead(worlds: Worlds) -> Bools:
     """Which worlds have an obstacle ahead of Vehicle 1, [n]."""
-    return np.isfinite(worlds.hazard_gap_m)
+    return np.isfinite(worlds.obstacle_gap_m)
 
 
 def with_obstacle(worlds: Worlds) -> Worlds:
@@ -42,10 +42,10 @@ def with_obstacle(worlds: Worlds) -> Worlds:
     )
     return Worlds(
         written_out,
-        np.concatenate([worlds.hazard_gap_m[:, np.newaxis], worlds.gaps_m], axis=1),
+        np.concatenate([worlds.obstacle_gap_m[:, np.newaxis], worlds.gaps_m], axis=1),
         ahead(0.0, worlds.speeds_mps),
         worlds.time_s,
-        np.concatenate([worlds.hazard_hit[:, np.newaxis], worlds.pair_hit], axis=1),
+        np.concatenate([worlds.obstacle_hit[:, np.newaxis], worlds.pair_hit], axis=1),
         ahead(0.0, worlds.command_mps2),
         np.full(worlds.n, np.inf),
         np.zeros(worlds.n, np.bool_),
@@ -61,8 +61,8 @@ def without_obstacle(written_out: Worlds, vehicles: Vehicles) -> Worlds:
         speeds_mps=written_out.speeds_mps[:, 1:].copy(),
         pair_hit=written_out.pair_hit[:, 1:].copy(),
         command_mps2=written_out.command_mps2[:, 1:].copy(),
-        hazard_gap_m=written_out.gaps_m[:, 0].copy(),
-        hazard_hit=written_out.pair_hit[:, 0].copy(),
+        obstacle_gap_m=written_out.gaps_m[:, 0].copy(),
+        obstacle_hit=written_out.pair_hit[:, 0].copy(),
     )
 
 

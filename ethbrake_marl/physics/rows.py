@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.physics.advance import no_hazard_harm
+from ethbrake_marl.physics.advance import no_obstacle_harm
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.physics.segment import ROW_WIDTH
@@ -26,7 +26,7 @@ from ethbrake_marl.physics.worlds import Floats, Ints, Vehicles, Worlds
 
 TIME = 0
 RESTITUTION = 0
-HAZARD_WIDTH = 5
+OBSTACLE_WIDTH = 5
 
 
 @compiled
@@ -61,7 +61,7 @@ def harm_at(vehicles: int) -> int:
 
 @compiled
 def state_width(vehicles: int) -> int:
-    """Columns of the state without an obstacle; with one, HAZARD_WIDTH more follow."""
+    """Columns of the state without an obstacle; with one, OBSTACLE_WIDTH more follow."""
     return 1 + 3 * vehicles + 5 * (vehicles - 1)
 
 
@@ -107,21 +107,21 @@ def pack(worlds: Worlds) -> Packed:
         axis=1,
     )
     if obstacle_ahead(worlds).any():
-        none = np.zeros((n, HAZARD_WIDTH - 2))
-        state = np.concatenate([state, np.column_stack([worlds.hazard_gap_m, worlds.hazard_hit]), none], axis=1)
+        none = np.zeros((n, OBSTACLE_WIDTH - 2))
+        state = np.concatenate([state, np.column_stack([worlds.obstacle_gap_m, worlds.obstacle_hit]), none], axis=1)
     return Packed(state, params)
 
 
-def has_hazard(state: Floats, vehicles: int) -> bool:
+def has_obstacle(state: Floats, vehicles: int) -> bool:
     """Whether these rows have columns of an obstacle."""
     return bool(state.shape[1] > state_width(vehicles))
 
 
-def with_hazard_columns(state: Floats, vehicles: int) -> Floats:
+def with_obstacle_columns(state: Floats, vehicles: int) -> Floats:
     """The rows with columns of an obstacle; where there were none, they say that there is none."""
-    if has_hazard(state, vehicles):
+    if has_obstacle(state, vehicles):
         return state
-    return np.concatenate([state, np.full((len(state), 1), np.inf), np.zeros((len(state), HAZARD_WIDTH - 1))], axis=1)
+    return np.concatenate([state, np.full((len(state), 1), np.inf), np.zeros((len(state), OBSTACLE_WIDTH - 1))], axis=1)
 
 
 def unpack(packed: Packed) -> Worlds:
@@ -130,7 +130,7 @@ def unpack(packed: Packed) -> Worlds:
     N = vehicles_in(state)
     braking, driving, latency, mass, limit = (params[:, params_at(g, N) : params_at(g + 1, N)].copy() for g in range(5))
     gaps, news = gap_at(N), params[:, params_at(5, N) :].copy()
-    hazard = with_hazard_columns(state, N)[:, state_width(N) :]
+    obstacle = with_obstacle_columns(state, N)[:, state_width(N) :]
     return Worlds(
         Vehicles(braking, driving, latency, mass, limit, params[:, RESTITUTION].copy(), news),
         state[:, gaps : gaps + N - 1].copy(),
@@ -138,8 +138,8 @@ def unpack(packed: Packed) -> Worlds:
         state[:, TIME].copy(),
         state[:, gaps + N - 1 : harm_at(N)] == 1.0,
         state[:, command_at(N) : previous_at(N)].copy(),
-        hazard[:, 0].copy(),
-        hazard[:, 1] == 1.0,
+        obstacle[:, 0].copy(),
+        obstacle[:, 1] == 1.0,
     )
 
 
@@ -150,10 +150,10 @@ def ledger_columns(state: Floats, vehicles: int) -> tuple[Floats, Floats, Ints]:
     return groups[0], groups[1], groups[2].astype(np.int64)
 
 
-def hazard_ledger_columns(state: Floats, vehicles: int) -> tuple[Floats, Floats, Ints]:
+def obstacle_ledger_columns(state: Floats, vehicles: int) -> tuple[Floats, Floats, Ints]:
     """The same of the impacts with the obstacle, [n] each."""
-    if not has_hazard(state, vehicles):
-        return no_hazard_harm(len(state))
+    if not has_obstacle(state, vehicles):
+        return no_obstacle_harm(len(state))
     first, total, count = (state[:, state_width(vehicles) + g].copy() for g in (2, 3, 4))
     return first, total, count.astype(np.int64)
 

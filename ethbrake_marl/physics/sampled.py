@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics.advance import Impacts, no_hazard_harm
+from ethbrake_marl.physics.advance import Impacts, no_obstacle_harm
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.events import TOUCH_SPEED_MPS, solo_motion
 from ethbrake_marl.physics.obstacle import obstacle_ahead
@@ -166,8 +166,8 @@ def advance_sampled(
     if obstacle_ahead(worlds).any():
         k = int(np.argmax(obstacle_ahead(worlds)))
         raise InvalidInput(
-            f"advance_sampled: world {k} has an obstacle ahead (hazard_gap_m = {worlds.hazard_gap_m[k]:g}); the paper's"
-            " fixed-step map knows none, use advance"
+            f"advance_sampled: world {k} has an obstacle ahead (obstacle_gap_m = {worlds.obstacle_gap_m[k]:g}); the"
+            " paper's fixed-step map knows none, use advance"
         )
     command = _checked_command(worlds, command_mps2)
     until = _shaped("until_s", until_s, (worlds.n,))
@@ -182,9 +182,9 @@ def advance_sampled(
     )  # fmt: skip
     in_force = np.where(vehicles.latency_s <= time[:, None] + _ON_SAMPLE * step_s, command, 0.0)
     after = Worlds(
-        vehicles, gaps, speeds, time, hit, in_force, worlds.hazard_gap_m.copy(), worlds.hazard_hit.copy()
+        vehicles, gaps, speeds, time, hit, in_force, worlds.obstacle_gap_m.copy(), worlds.obstacle_hit.copy()
     )  # fmt: skip
-    return after, Impacts(first_harm, total_harm, count, *no_hazard_harm(worlds.n))
+    return after, Impacts(first_harm, total_harm, count, *no_obstacle_harm(worlds.n))
 
 
 def _samples(worlds: Worlds, until: Floats, step_s: float) -> tuple[Ints, Ints]:

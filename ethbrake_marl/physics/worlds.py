@@ -59,8 +59,8 @@ class Worlds:
     time_s: Floats  # [n] since Vehicle 1 began to brake
     pair_hit: Bools  # [n, P] this pair has had an impact
     command_mps2: Floats  # [n, N] signed acceleration in force at this time; 0 before the latency has elapsed
-    hazard_gap_m: Floats  # [n] from Vehicle 1's front to an unmovable obstacle ahead, >= 0; infinite: there is none
-    hazard_hit: Bools  # [n] Vehicle 1 has had an impact with it
+    obstacle_gap_m: Floats  # [n] from Vehicle 1's front to an unmovable obstacle ahead, >= 0; infinite: there is none
+    obstacle_hit: Bools  # [n] Vehicle 1 has had an impact with it
 
     @property
     def n(self) -> int:
@@ -112,13 +112,13 @@ def make_worlds(
     mass_t: ArrayLike,
     restitution: ArrayLike,
     speed_limit_mps: ArrayLike = 40.0,
-    hazard_gap_m: ArrayLike | None = None,
+    obstacle_gap_m: ArrayLike | None = None,
 ) -> Worlds:
     """Build checked worlds at ``t = 0``; every parameter broadcasts to its full shape.
 
     ``speeds_mps`` is [n, N] or [N]; ``gaps_m`` is [n, P], [P] or a scalar; vehicle parameters broadcast to
-    [n, N]; ``restitution`` to [n], and so does ``hazard_gap_m``, the distance to an obstacle ahead of Vehicle 1 (None:
-    there is none). Raises ``InvalidInput`` naming the field, the first bad entry and its range.
+    [n, N]; ``restitution`` to [n], and so does ``obstacle_gap_m``, the distance to an obstacle ahead of Vehicle 1
+    (None: there is none). Raises ``InvalidInput`` naming the field, the first bad entry and its range.
     """
     speeds = np.atleast_2d(np.asarray(speeds_mps, dtype=np.float64))
     if speeds.ndim != 2 or speeds.shape[1] < 2:
@@ -150,7 +150,7 @@ def make_worlds(
         np.zeros(n),
         np.zeros((n, N - 1), dtype=np.bool_),
         np.zeros((n, N)),
-        np.full(n, np.inf) if hazard_gap_m is None else _full("hazard_gap_m", hazard_gap_m, (n,), 0.0, np.inf),
+        np.full(n, np.inf) if obstacle_gap_m is None else _full("obstacle_gap_m", obstacle_gap_m, (n,), 0.0, np.inf),
         np.zeros(n, dtype=np.bool_),
     )
 

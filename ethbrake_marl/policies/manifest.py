@@ -116,7 +116,7 @@ class ObservationSchema(_Strict):
     def spec(self) -> ObservationSpec:
         """The observation as the environment builds it; what follows the neighbours is told by the features' names."""
         groups = {name.partition(".")[0] for name in self.features}
-        return ObservationSpec(front=self.front, rear=self.rear, role="role" in groups, hazard="hazard" in groups)
+        return ObservationSpec(front=self.front, rear=self.rear, role="role" in groups, obstacle="obstacle" in groups)
 
 
 class Manifest(_Strict):

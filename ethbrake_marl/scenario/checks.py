@@ -26,7 +26,7 @@ from ethbrake_marl.scenario.roles import (
     is_state_free,
     parse_agent_spec,
 )
-from ethbrake_marl.scenario.sampling import farthest_hazard_m, quantity_bounds
+from ethbrake_marl.scenario.sampling import farthest_obstacle_m, quantity_bounds
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
@@ -98,11 +98,13 @@ def check_whole(scenario: ScenarioFields) -> None:
     _check_speeds(scenario)
     if scenario.time_gaps_s is not None:
         _check_time_gaps(scenario)
-    if scenario.hazard_margin_m is not None:
-        _check_hazard_margin(scenario)
+    if scenario.obstacle_margin_m is not None:
+        _check_obstacle_margin(scenario)
     _check_constant_scripts(scenario)
     if 0 in scenario.learners and not scenario.has_obstacle:
-        right = "has nothing to lose without an obstacle ahead; give hazard_gap_m too, for instance hazard_gap_m: 42"
+        right = (
+            "has nothing to lose without an obstacle ahead; give obstacle_gap_m too, for instance obstacle_gap_m: 42"
+        )
         refuse(("roles", "vehicle_1"), LEARNER, right)
     if scenario.early_impacts == "reject" and scenario.learners:
         _check_rejection(scenario)
@@ -142,14 +144,14 @@ def _check_time_gaps(scenario: ScenarioFields) -> None:
             refuse(_path(scenario, "time_gaps_s", pair), scenario.quantities("time_gaps_s")[pair], right)
 
 
-def _check_hazard_margin(scenario: ScenarioFields) -> None:
-    farthest = farthest_hazard_m(scenario)
-    if not farthest <= OPTIONAL["hazard_gap_m"].high:
+def _check_obstacle_margin(scenario: ScenarioFields) -> None:
+    farthest = farthest_obstacle_m(scenario)
+    if not farthest <= OPTIONAL["obstacle_gap_m"].high:
         right = (
             f"puts the obstacle up to {farthest:g} m ahead of vehicle_1; that distance must not be above"
-            f" {OPTIONAL['hazard_gap_m'].high:g} m"
+            f" {OPTIONAL['obstacle_gap_m'].high:g} m"
         )
-        refuse(("hazard_margin_m",), scenario.hazard_margin_m, right)
+        refuse(("obstacle_margin_m",), scenario.obstacle_margin_m, right)
 
 
 def _check_constant_scripts(scenario: ScenarioFields) -> None:

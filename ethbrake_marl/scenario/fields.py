@@ -56,8 +56,8 @@ class ScenarioFields(BaseModel):
         default_factory=lambda data: complete_roles(None, data.get("vehicles", 3)),
         description="learner or a script for each vehicle; vehicles left out of a given mapping brake fully",
     )
-    hazard_gap_m: Quantity | None = Field(default=None, description=DECLARED["hazard_gap_m"].meaning)
-    hazard_margin_m: Quantity | None = Field(default=None, description=DECLARED["hazard_margin_m"].meaning)
+    obstacle_gap_m: Quantity | None = Field(default=None, description=DECLARED["obstacle_gap_m"].meaning)
+    obstacle_margin_m: Quantity | None = Field(default=None, description=DECLARED["obstacle_margin_m"].meaning)
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="what happens to worlds with an impact before the first learner may act"
     )
@@ -88,7 +88,7 @@ class ScenarioFields(BaseModel):
     @property
     def has_obstacle(self) -> bool:
         """Whether an obstacle stands ahead of Vehicle 1, however its distance is declared."""
-        return self.hazard_gap_m is not None or self.hazard_margin_m is not None
+        return self.obstacle_gap_m is not None or self.obstacle_margin_m is not None
 
     def quantities(self, field: str) -> tuple[AnyQuantity, ...]:
         """What is declared under a key, one entry per vehicle (gaps: per pair; restitution, line speed: one).

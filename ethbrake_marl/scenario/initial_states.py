@@ -19,8 +19,15 @@ from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds, make_worlds
 from ethbrake_marl.scenario.distributions import support
-from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OPTIONAL, QUANTITIES, QuantityRule
-from ethbrake_marl.scenario.sampling import hazard_gap
+from ethbrake_marl.scenario.quantities import (
+    ALTERNATIVES,
+    DECLARED,
+    OPTIONAL,
+    QUANTITIES,
+    QuantityRule,
+    rename_old_keys,
+)
+from ethbrake_marl.scenario.sampling import obstacle_gap
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.v2x import fixed_news
 
@@ -92,7 +99,7 @@ def worlds_from_table(columns: Mapping[str, ArrayLike], scenario: Scenario) -> W
     """Worlds from columns of equal length n: ``gap_1_m`` ..., ``speed_1_mps`` ..., and optionally the others.
 
     Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``,
-    ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``hazard_gap_m`` where the scenario has it.
+    ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``obstacle_gap_m`` where the scenario has it.
     What is left out comes from the scenario, where it must be a fixed number. Raises ``InvalidInput`` naming the column
     and the row (from 0).
     """
@@ -118,7 +125,7 @@ def initial_state_worlds(initial_state: Mapping[str, Any], scenario: Scenario) -
         raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
     given: dict[Entry, Floats] = {}
     known = _quantities(scenario)
-    for field, value in initial_state.items():
+    for field, value in rename_old_keys(initial_state, "initial_state").items():
         if field not in known:
             if field in OPTIONAL:
                 raise InvalidInput(f"initial_state: {field} is not of this scenario: {scenario.name!r} has no {field}")
@@ -166,7 +173,7 @@ def _fixed(scenario: Scenario, field: str, index: int, full: Mapping[str, Floats
     if field in OPTIONAL:
         declared = ALTERNATIVES[field] if getattr(scenario, field) is None else field
         low, high = support(scenario.quantities(declared)[0])
-        return hazard_gap(scenario, full, lambda key: np.array([low])) if low == high else None
+        return obstacle_gap(scenario, full, lambda key: np.array([low])) if low == high else None
     by_time = field == "gaps_m" and scenario.time_gaps_s is not None
     low, high = support(scenario.quantities("time_gaps_s")[index]) if by_time else scenario.bounds(field)[index]
     if low != high:
@@ -195,13 +202,14 @@ def _require(good: Bools, naming: _Naming, entry: Entry, column: Floats, right: 
 def _known_columns(header: list[str], scenario: Scenario, where: str) -> list[Entry]:
     """The entry of each column; unknown, repeated and missing columns are errors."""
     known = table_columns(scenario)
+    if twice := [name for name, times in Counter(header).items() if times > 1]:
+        raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
+    header = list(rename_old_keys(dict.fromkeys(header), where))
     for name in header:
         if name not in known:
             hint = suggestion(name, known) or f"known: {', '.join(known)}"
             separator = "; columns are separated by commas" if ";" in name or "\t" in name else ""
             raise InvalidInput(f"{where}: unknown column {name!r}; {hint}{separator}")
-    if twice := [name for name, times in Counter(header).items() if times > 1]:
-        raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
     for name, (field, _) in known.items():
         if field in _ALWAYS_IN_A_TABLE and name not in header:
             raise InvalidInput(f"{where}: column {name!r} is missing; {scenario.vehicles} vehicles need it")

@@ -6,9 +6,12 @@ the tables of initial states and the sampling.
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
+from ethbrake_marl.errors import OldSpelling
 from ethbrake_marl.files.messages import UNITS
 
 BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the numbers of one Philox counter
@@ -118,7 +121,7 @@ OTHERWISE = {
             "what each vehicle adds to line_speed_mps", "[0, -2, 0]", low=-200.0,
         ),
         QuantityRule(
-            "hazard_margin_m", "m", "world", 1e4, True, 0, "",
+            "obstacle_margin_m", "m", "world", 1e4, True, 0, "",
             "distance of that obstacle from where vehicle_1 stops by full braking as soon as it can", "1.7",
         ),
     )
@@ -128,11 +131,27 @@ OPTIONAL = {
     rule.name: rule
     for rule in (
         QuantityRule(
-            "hazard_gap_m", "m", "world", 1e4, True, 0, "hazard_gap_m",
+            "obstacle_gap_m", "m", "world", 1e4, True, 0, "obstacle_gap_m",
             "distance from the front of vehicle_1 to an unmovable obstacle ahead, at the alert", "42",
         ),
     )
 }  # fmt: skip
 DECLARED = {**QUANTITIES, **OTHERWISE, **OPTIONAL}  # every key that declares a quantity
 # A scenario has exactly one of each two, or at most one where what they declare is optional.
-ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "hazard_gap_m": "hazard_margin_m"}
+ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "obstacle_gap_m": "obstacle_margin_m"}
+
+OLD_KEYS = {"hazard_gap_m": "obstacle_gap_m", "hazard_margin_m": "obstacle_margin_m"}  # accepted, with a warning
+
+
+def rename_old_keys(given: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The same mapping with every key of the version before as it is written today, and an ``OldSpelling`` warning.
+
+    An old key beside its new one stays, and is refused like any unknown key.
+    """
+    renamed: dict[str, Any] = {}
+    for key, value in given.items():
+        new = OLD_KEYS.get(key, key)
+        if new != key and new not in given:
+            warnings.warn(OldSpelling(f"{where}: {key} is written {new} now"), stacklevel=4)
+        renamed[new if new not in given else key] = value
+    return renamed

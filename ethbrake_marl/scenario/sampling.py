@@ -36,26 +36,26 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
     return {key: found[key] for key in QUANTITIES}
 
 
-def hazard_gap(
+def obstacle_gap(
     scenario: ScenarioFields, found: Mapping[str, Floats], declared: Callable[[str], Floats]
 ) -> Floats | None:
     """Distance from Vehicle 1 to the obstacle ahead, [k], of worlds with the quantities ``found``; None without one.
 
     As declared, or ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: so far beyond where Vehicle 1 stops by itself.
     """
-    if scenario.hazard_gap_m is not None:
-        return declared("hazard_gap_m")
-    if scenario.hazard_margin_m is None:
+    if scenario.obstacle_gap_m is not None:
+        return declared("obstacle_gap_m")
+    if scenario.obstacle_margin_m is None:
         return None
     speed, latency, capacity = (found[key][:, 0] for key in ("speeds_mps", "latency_s", "braking_capacity_mps2"))
-    return declared("hazard_margin_m") + stopping_distances(speed, latency, capacity)
+    return declared("obstacle_margin_m") + stopping_distances(speed, latency, capacity)
 
 
-def farthest_hazard_m(scenario: ScenarioFields) -> float:
+def farthest_obstacle_m(scenario: ScenarioFields) -> float:
     """Upper bound of the distance to an obstacle that is declared by its margin."""
     low, high = ({key: bounds[[row]] for key, bounds in _all_bounds(scenario).items()} for row in (0, 1))
     slowest = high | {"braking_capacity_mps2": low["braking_capacity_mps2"]}
-    farthest = hazard_gap(scenario, slowest, lambda key: np.array([support(scenario.quantities(key)[0])[1]]))
+    farthest = obstacle_gap(scenario, slowest, lambda key: np.array([support(scenario.quantities(key)[0])[1]]))
     assert farthest is not None
     return float(farthest[0])
 
@@ -87,8 +87,8 @@ Channel = Literal["list", "training"]
 
 CHANNELS: dict[str, int] = {"list": 0, "training": 1}
 V2X_NEWS = (1,)  # the stream of the links' delays and losses
-HAZARD = (2,)  # the stream of the obstacle's distance
-HAZARD_WIDTH = 4  # its numbers per world, of which the first is used
+OBSTACLE = (2,)  # the stream of the obstacle's distance
+OBSTACLE_WIDTH = 4  # its numbers per world, of which the first is used
 MOST_ATTEMPTS = 1000  # draws of one world before its scenario is declared unusable
 _PATIENCE = 10  # attempts of a whole list before one world is tried to its end
 
@@ -152,7 +152,7 @@ def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
         command[:, i] = scripted
     first_action_s = vehicles.latency_s[:, list(scenario.learners)].min(axis=1)
     _, impacts = advance(worlds, command, until_s=first_action_s)
-    return np.asarray(impacts.count.sum(axis=1) + impacts.hazard_count > 0)
+    return np.asarray(impacts.count.sum(axis=1) + impacts.obstacle_count > 0)
 
 
 def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints, worlds: Worlds, early: Bools) -> Sample:
@@ -201,14 +201,14 @@ def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, i
         u = u[index - first]
     drawn = drawn_quantities(scenario, u)
 
-    def drawn_hazard(key: str) -> Floats:
-        u_hazard = uniform_numbers(seed, channel, attempt, first, last - first + 1, HAZARD_WIDTH, of=HAZARD)
-        return values(scenario.quantities(key)[0], u_hazard[index - first, 0])
+    def drawn_obstacle(key: str) -> Floats:
+        u_obstacle = uniform_numbers(seed, channel, attempt, first, last - first + 1, OBSTACLE_WIDTH, of=OBSTACLE)
+        return values(scenario.quantities(key)[0], u_obstacle[index - first, 0])
 
-    hazard_gap_m = hazard_gap(scenario, drawn, drawn_hazard)
+    obstacle_gap_m = obstacle_gap(scenario, drawn, drawn_obstacle)
     restitution = drawn.pop("restitution")[:, 0]
     worlds = make_worlds(
-        drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, hazard_gap_m=hazard_gap_m, **drawn
+        drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, obstacle_gap_m=obstacle_gap_m, **drawn
     )
     if not scenario.v2x.by_link:
         return worlds

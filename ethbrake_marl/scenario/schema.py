@@ -22,7 +22,7 @@ from ethbrake_marl.scenario.checks import (
     refuse,
 )
 from ethbrake_marl.scenario.fields import ScenarioFields
-from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OPTIONAL
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OLD_KEYS, OPTIONAL, rename_old_keys
 from ethbrake_marl.scenario.roles import LEARNER, complete_roles
 from ethbrake_marl.scenario.sampling import Channel, Sample, draw_list, quantity_bounds
 from ethbrake_marl.scenario.wording import ScenarioWording
@@ -107,6 +107,7 @@ class Scenario(ScenarioFields):
 
         A new way to declare gaps or speeds takes the place of the old one.
         """
+        changes = rename_old_keys(changes, f"scenario {self.name!r}")
         old = {key for pair in ALTERNATIVES.items() for key in pair if changes.keys() & set(pair)}
         if "speeds_mps" in changes:
             old.add("speed_deviations_mps")
@@ -171,10 +172,20 @@ def _build(scenario: Scenario, document: Document) -> None:
     """Validate the document's content into ``scenario``."""
     if not isinstance(document.content, dict):
         raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance name: my-scenario")
+    document = _of_today(document)
     try:
         BaseModel.__init__(scenario, **document.content)
     except ValidationError as error:
         raise explain(error, document, ScenarioWording(Scenario.model_fields)) from None
+
+
+def _of_today(document: Document) -> Document:
+    """The document with the keys of the version before renamed, each on its line."""
+    content = rename_old_keys(document.content, document.file)
+    lines = {
+        (OLD_KEYS.get(str(path[0]), path[0]), *path[1:]) if path else path: n for path, n in document.lines.items()
+    }
+    return Document(document.file, content, {**lines, **document.lines})
 
 
 def _plain(value: Any) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.physics import Floats, Ints
 from ethbrake_marl.physics.compiled import compiled, compiled_apart
-from ethbrake_marl.search.motion import LAST_STEP, STEPWISE, Setting, follow, follow_whole
+from ethbrake_marl.search.motion import LAST_STEP, STEPWISE, SearchWorld, follow, follow_whole
 from ethbrake_marl.search.moves import (
     AMOUNT,
     CHANGE_WIDTH,
@@ -39,7 +39,7 @@ SAME = 1e-6  # values (m2/s2) closer than this belong to the same profile
 ATTENTION_STEPS = 30  # phases are divided within these first steps
 
 
-class Field(NamedTuple):
+class Population(NamedTuple):
     """Profiles that are improved together."""
 
     ends: Ints  # [M, K]
@@ -50,7 +50,7 @@ class Field(NamedTuple):
 
 @compiled
 def search_world(
-    world: Setting, start: Floats, seed_ends: Ints, seed_commands: Floats, budget: int, ends: Ints, commands: Floats
+    world: SearchWorld, start: Floats, seed_ends: Ints, seed_commands: Floats, budget: int, ends: Ints, commands: Floats
 ) -> int:
     """Fill ``ends`` [K] and ``commands`` [K, C] with the best profile found; its number of phases.
 
@@ -64,7 +64,7 @@ def search_world(
     while budget >= 2 * M * PER_PROFILE and M < LARGEST_FIELD:
         M *= 2
         rounds += 1
-    field = Field(np.zeros((M, K), np.int64), np.zeros((M, K, C)), np.zeros(M, np.int64), np.full(M, math.inf))
+    field = Population(np.zeros((M, K), np.int64), np.zeros((M, K, C)), np.zeros(M, np.int64), np.full(M, math.inf))
     drawn = max(int(DRAWN_SHARE * budget) - seed_ends.shape[0], 0)
     in_rounds, stepwise = int(ROUNDS_SHARE * budget), int(STEPWISE_SHARE * budget)
     gather(world, seed_ends, seed_commands, states, drawn, field)
@@ -111,7 +111,7 @@ def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
 
 
 @compiled_apart
-def improve(world: Setting, ends: Ints, commands: Floats, states: Floats, budget: int) -> float:
+def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, budget: int) -> float:
     """Better and better neighbours of a profile, in place, until ``budget`` candidates have run; its value."""
     new_ends, new_commands, new_states = ends.copy(), commands.copy(), states.copy()
     change = np.zeros(CHANGE_WIDTH)
@@ -144,7 +144,9 @@ def improve(world: Setting, ends: Ints, commands: Floats, states: Floats, budget
 
 
 @compiled_apart
-def gather(world: Setting, seed_ends: Ints, seed_commands: Floats, states: Floats, drawn: int, field: Field) -> None:
+def gather(
+    world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, drawn: int, field: Population
+) -> None:
     """Fill the field with the best of the given profiles and of ``drawn`` random ones, all of different value."""
     Q, K = seed_ends.shape
     last = int(world.clock[LAST_STEP])
@@ -172,7 +174,7 @@ def gather(world: Setting, seed_ends: Ints, seed_commands: Floats, states: Float
 
 
 @compiled_apart
-def sort(field: Field, left: int) -> None:
+def sort(field: Population, left: int) -> None:
     """Put the first ``left`` places of the field in order of value."""
     for here in range(1, left):
         m = here
@@ -182,7 +184,7 @@ def sort(field: Field, left: int) -> None:
 
 
 @compiled
-def swap(field: Field, m: int) -> None:
+def swap(field: Population, m: int) -> None:
     """Exchange place m of the field with the one before it."""
     field.values[m], field.values[m - 1] = field.values[m - 1], field.values[m]
     field.phases[m], field.phases[m - 1] = field.phases[m - 1], field.phases[m]
@@ -214,7 +216,7 @@ def largest(values: Floats) -> int:
 
 
 @compiled_apart
-def divide(world: Setting, field: Field) -> None:
+def divide(world: SearchWorld, field: Population) -> None:
     """Give the best of the field as many phases as there may be."""
     used = field.phases[0]
     if used > 0 and field.values[0] > 0.0:
@@ -225,7 +227,9 @@ def divide(world: Setting, field: Field) -> None:
 
 
 @compiled_apart
-def select_stepwise(world: Setting, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Field) -> None:
+def select_stepwise(
+    world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Population
+) -> None:
     """From now on advance decision by decision; put the best of the field and the given profiles in the first place.
 
     Rounding may decide on which side of a jump a profile lands.

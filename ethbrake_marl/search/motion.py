@@ -31,7 +31,7 @@ from ethbrake_marl.physics.segment import (
     advance_table,
 )
 
-Words = NDArray[np.uint64]
+UInt64s = NDArray[np.uint64]
 
 OTHER_WEIGHT = 1e-8  # of the other count in the value that is minimised: it decides between equal harms
 # columns of clock: first decision (s), time step (s), number of steps, horizon (s), restitution, 1 to minimise total
@@ -40,7 +40,7 @@ START, TIME_STEP, LAST_STEP, HORIZON, RESTITUTION, HARM_IS_TOTAL, STEPWISE = ran
 CLOCK_WIDTH = 7
 
 
-class Setting(NamedTuple):
+class SearchWorld(NamedTuple):
     """One world as candidates run in it."""
 
     table: Floats  # of physics.segment, with masses, speed limits and the other vehicles' commands
@@ -49,7 +49,7 @@ class Setting(NamedTuple):
     clock: Floats  # [CLOCK_WIDTH]
     controlled: Ints  # [C] vehicles
     bounds: Floats  # [C, 2] smallest and largest command (m/s2)
-    random: Words  # [1] state of the world's random numbers
+    random: UInt64s  # [1] state of the world's random numbers
 
 
 @compiled
@@ -128,14 +128,16 @@ def at_rest(table: Floats) -> bool:
 
 
 @compiled_apart
-def follow_whole(world: Setting, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
+def follow_whole(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
     """``follow`` a profile from its first phase on."""
     phase = min(0, ends.shape[0])  # 0, but no literal, for which everything would be compiled a second time
     return follow(world, ends, commands, states, phase, bound)
 
 
 @compiled
-def follow(world: Setting, ends: Ints, commands: Floats, states: Floats, phase: int, bound: float) -> tuple[float, int]:
+def follow(
+    world: SearchWorld, ends: Ints, commands: Floats, states: Floats, phase: int, bound: float
+) -> tuple[float, int]:
     """Follow a profile from the start of ``phase`` on; ``states[k]`` [K + 1, S] is the state at the start of phase k.
 
     ``ends`` [K], ``commands`` [K, C]. Gives up as soon as the value is not below ``bound``: harm never falls again.

@@ -10,7 +10,7 @@ import numpy as np
 
 from ethbrake_marl.physics import Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.search.motion import Words
+from ethbrake_marl.search.motion import UInt64s
 
 RESOLUTION = 1048576.0  # commands are multiples of 1 / 2^20 m/s2: short to store, exact to repeat, and off any edge
 LONGEST_DRAWN = 25.0  # steps of a phase that is drawn
@@ -24,7 +24,7 @@ CHANGE_WIDTH = 4
 
 
 @compiled
-def draw(random: Words) -> float:
+def draw(random: UInt64s) -> float:
     """The next number of the stream (splitmix64; its state is one word), uniform in [0, 1)."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)
     z = random[0]
@@ -35,7 +35,7 @@ def draw(random: Words) -> float:
 
 
 @compiled
-def draw_below(random: Words, n: int) -> int:
+def draw_below(random: UInt64s, n: int) -> int:
     """A whole number from 0 to n - 1."""
     return min(int(draw(random) * n), n - 1)
 
@@ -48,7 +48,7 @@ def allowed(command: float, low: float, high: float) -> float:
 
 
 @compiled
-def draw_command(random: Words, low: float, high: float) -> float:
+def draw_command(random: UInt64s, low: float, high: float) -> float:
     """A command: often a bound or none, else anything between."""
     u = draw(random)
     if u < 0.35:
@@ -61,7 +61,7 @@ def draw_command(random: Words, low: float, high: float) -> float:
 
 
 @compiled
-def draw_profile(random: Words, bounds: Floats, ends: Ints, commands: Floats, last: int) -> None:
+def draw_profile(random: UInt64s, bounds: Floats, ends: Ints, commands: Floats, last: int) -> None:
     """Fill ``ends`` [K] and ``commands`` [K, C] at random; phases are short rather than long."""
     step = 0
     for k in range(ends.shape[0]):
@@ -74,7 +74,7 @@ def draw_profile(random: Words, bounds: Floats, ends: Ints, commands: Floats, la
 
 
 @compiled
-def draw_change(random: Words, bounds: Floats, active: int, change: Floats) -> int:
+def draw_change(random: UInt64s, bounds: Floats, active: int, change: Floats) -> int:
     """Fill ``change`` [CHANGE_WIDTH] at random, for one of the first ``active`` phases; returns the phase."""
     u = draw(random)
     phase, vehicle = draw_below(random, active), draw_below(random, bounds.shape[0])

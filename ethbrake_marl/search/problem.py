@@ -23,7 +23,7 @@ from ethbrake_marl.search.motion import (
     START,
     STEPWISE,
     TIME_STEP,
-    Words,
+    UInt64s,
 )
 
 TIME_STEP_S = 0.1  # between two decisions, where nobody says otherwise
@@ -43,7 +43,7 @@ class ProfileProblem:
     latency: Floats  # [n, N]
     mass: Floats  # [n, N]
     limit: Floats  # [n, N]
-    identity: Words  # [n]
+    identity: UInt64s  # [n]
 
     @property
     def n(self) -> int:
@@ -91,7 +91,7 @@ def profile_problem(
     hazard = obstacle_ahead(worlds)
     if hazard.any():
         if not hazard.all():
-            raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (hazard_gap_m), not all")
+            raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (obstacle_gap_m), not all")
         return profile_problem(
             with_obstacle(worlds),
             [i + 1 for i in chosen.tolist()],
@@ -126,7 +126,7 @@ def state_columns(worlds: Worlds) -> Floats:
     hazard = obstacle_ahead(worlds)
     if hazard.any():
         if not hazard.all():
-            raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (hazard_gap_m), not all")
+            raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (obstacle_gap_m), not all")
         worlds = with_obstacle(worlds)
     return np.concatenate([worlds.speeds_mps, worlds.gaps_m, worlds.pair_hit], axis=1)
 
@@ -141,12 +141,12 @@ def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
         speeds_mps=states[:, added:N].copy(),
         gaps_m=gaps[:, added:].copy(),
         pair_hit=hit[:, added:].copy(),
-        hazard_gap_m=gaps[:, 0].copy() if added else worlds.hazard_gap_m,
-        hazard_hit=hit[:, 0].copy() if added else worlds.hazard_hit,
+        obstacle_gap_m=gaps[:, 0].copy() if added else worlds.obstacle_gap_m,
+        obstacle_hit=hit[:, 0].copy() if added else worlds.obstacle_hit,
     )
 
 
-def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> Words:
+def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:
     """What tells one world's problem from another's, [n]: 8 bytes of BLAKE2b over all that the harm depends on.
 
     State and parameters of the world, the other vehicles' commands, the decisions (first, step, number), the horizon
@@ -170,7 +170,7 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
     return np.frombuffer(b"".join(digests), "<u8").astype(np.uint64)
 
 
-def seeded(identity: Words, seed: int) -> Words:
+def seeded(identity: UInt64s, seed: int) -> UInt64s:
     """The first state of each world's random numbers, [n]: a function of its identity and the seed alone."""
     with np.errstate(over="ignore"):
         z = identity ^ np.uint64((int(seed) * _MIX) % 2**64)

@@ -20,7 +20,7 @@ from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import MASS
 from ethbrake_marl.physics.segment import COMMAND, LIMIT, TABLE_ROWS
 from ethbrake_marl.search.kernel import MOST_PHASES, copy_rows, search_world
-from ethbrake_marl.search.motion import STEPWISE, Setting, Words, follow_whole
+from ethbrake_marl.search.motion import STEPWISE, SearchWorld, UInt64s, follow_whole
 from ethbrake_marl.search.problem import ProfileProblem, seeded
 
 
@@ -49,7 +49,7 @@ class Profiles(NamedTuple):
         return Profiles(np.pad(self.ends, ((0, more), (0, 0))), np.pad(self.commands_mps2, ((0, more), (0, 0), (0, 0))))
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """What a search found in each world."""
 
     profiles: Profiles
@@ -97,7 +97,9 @@ def pad_profiles(parts: Sequence[Profiles], least: int) -> list[Profiles]:
     ]
 
 
-def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> Found:
+def search_profiles(
+    problem: ProfileProblem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1
+) -> SearchResult:
     """The best profiles of at most ``MOST_PHASES`` phases that about ``budget`` candidates per world find.
 
     ``given`` [n * Q]: Q profiles of each world, world by world, from which to start; the result is never worse than
@@ -126,7 +128,7 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
             used = list(pool.map(work, range(n)))
     if 0 in used:
         raise PhysicsError({k: "no profile could be followed" for k in range(n) if used[k] == 0})
-    return Found(best, *follow_profiles(problem, best))
+    return SearchResult(best, *follow_profiles(problem, best))
 
 
 def follow_profiles(problem: ProfileProblem, profiles: Profiles) -> tuple[Floats, Floats]:
@@ -173,14 +175,14 @@ def check_profiles(problem: ProfileProblem, profiles: Profiles) -> None:
 @compiled
 def make_setting(
     clock: Floats, bounds: Floats, command: Floats, latency: Floats, mass: Floats, limit: Floats, vehicles: Ints,
-    random: Words,
-) -> Setting:  # fmt: skip
+    random: UInt64s,
+) -> SearchWorld:  # fmt: skip
     """One world's setting, with room to work in."""
     N = mass.shape[0]
     table = np.zeros((TABLE_ROWS, N))
     for i in range(N):
         table[COMMAND, i], table[MASS, i], table[LIMIT, i] = command[i], mass[i], limit[i]
-    return Setting(table, np.zeros((2, N - 1)), latency, clock.copy(), vehicles, bounds, random)
+    return SearchWorld(table, np.zeros((2, N - 1)), latency, clock.copy(), vehicles, bounds, random)
 
 
 @compiled

@@ -6,7 +6,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Bools, Floats
-from ethbrake_marl.physics.rows import Packed, command_at, gap_at, has_hazard, speed_at, state_width, vehicles_in
+from ethbrake_marl.physics.rows import Packed, command_at, gap_at, has_obstacle, speed_at, state_width, vehicles_in
 from ethbrake_marl.shield.certify import Running
 
 SLACK = 1e-9  # by more than this (m, m/s) a world lies outside what several members predict; one member is exact
@@ -22,9 +22,9 @@ def seen_columns(packed: Packed) -> Floats:
     state = packed.state
     N = vehicles_in(state)
     speeds, first, pairs = state[:, speed_at(N) : command_at(N)], gap_at(N), N - 1
-    if has_hazard(state, N) and (ahead := np.isfinite(state[:, state_width(N)])).any():
+    if has_obstacle(state, N) and (ahead := np.isfinite(state[:, state_width(N)])).any():
         if not ahead.all():
-            raise InvalidInput("shield: only some of the worlds have an obstacle ahead (hazard_gap_m), not all")
+            raise InvalidInput("shield: only some of the worlds have an obstacle ahead (obstacle_gap_m), not all")
         groups = [state[:, first + g * pairs : first + (g + 1) * pairs] for g in range(len(GROUPS))]
         at = state_width(N)
         whole = [part for g, group in enumerate(groups) for part in (state[:, at + g : at + g + 1], group)]

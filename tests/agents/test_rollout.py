@@ -75,7 +75,7 @@ def test_e_v2x_bm__refuses_others_whose_command_is_not_fixed():
 
 def test_e_v2x_bm__two_that_wait_for_each_other_are_refused():
     roles = {"vehicle_1": "learner", "vehicle_2": "e_v2x_bm", "vehicle_3": "e_v2x_bm"}
-    ahead = PAPER.replace(hazard_gap_m=42, early_impacts="keep")
+    ahead = PAPER.replace(obstacle_gap_m=42, early_impacts="keep")
     with pytest.raises(InvalidInput, match="vehicle_3 is driven by 'e_v2x_bm'"):
         make_engine(ahead.replace(roles=roles), 1)
     make_engine(ahead.replace(roles=roles | {"vehicle_3": "e_v2x_bm:pairwise"}), 1)

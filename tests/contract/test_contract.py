@@ -323,7 +323,7 @@ def test_learners__these_faces_need_exactly_one(name: str) -> None:
 @each_face
 @pytest.mark.parametrize("learner", ["vehicle_1", "vehicle_3", "vehicle_5"])
 def test_learners__any_vehicle_may_be_the_one(name: str, learner: str) -> None:
-    five = FIVE.replace(hazard_gap_m=30) if learner == "vehicle_1" else FIVE
+    five = FIVE.replace(obstacle_gap_m=30) if learner == "vehicle_1" else FIVE
     face, same = make(name, five, learners=[learner]), make(name, five, learners=[int(learner[-1]) - 1])
     turns = list(play(face, 5, steps=30))
     assert [turn.bits() for turn in turns] == [turn.bits() for turn in play(same, 5, steps=30)]
@@ -333,5 +333,5 @@ def test_learners__any_vehicle_may_be_the_one(name: str, learner: str) -> None:
 
 @each_face
 def test_learners__vehicle_1_needs_an_obstacle_ahead(name: str) -> None:
-    with pytest.raises(InvalidInput, match=r"roles\.vehicle_1 = learner: has nothing to lose .* hazard_gap_m: 42"):
+    with pytest.raises(InvalidInput, match=r"roles\.vehicle_1 = learner: has nothing to lose .* obstacle_gap_m: 42"):
         make(name, FIVE, learners=["vehicle_1"])

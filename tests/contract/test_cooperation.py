@@ -26,7 +26,7 @@ def line(vehicles: int, v2x: str = "congested", horizon_s: int = 12) -> Scenario
         name=f"line-{vehicles}-{v2x}", vehicles=vehicles, gaps_m={"uniform": [5, 10]}, speeds_mps={"uniform": [18, 22]},
         braking_capacity_mps2={"uniform": [5, 9]}, driving_capacity_mps2=3, mass_t={"uniform": [1, 8]},
         latency_s=[0] + [0.3] * (vehicles - 1), horizon_s=horizon_s, v2x=v2x, objective="social:30",
-        roles={f"vehicle_{i}": "learner" for i in range(1, vehicles + 1)}, hazard_gap_m={"uniform": [35, 45]},
+        roles={f"vehicle_{i}": "learner" for i in range(1, vehicles + 1)}, obstacle_gap_m={"uniform": [35, 45]},
     )  # fmt: skip
 
 
@@ -111,28 +111,28 @@ def test_stable_baselines3__tells_the_news_of_each_learner_at_an_episodes_start(
 @pytest.mark.parametrize("name", ["cooperation-3-pair", "cooperation-3-five"])
 def test_level_4__has_the_lines_of_level_3_and_full_braking_never_meets_its_obstacle(name: str) -> None:
     level_3, level_4 = load_scenario(name), load_scenario(name.replace("3-pair", "4-all").replace("3-five", "4-five"))
-    assert level_4.learners == tuple(range(level_4.vehicles)) and level_4.hazard_gap_m == 42.0
+    assert level_4.learners == tuple(range(level_4.vehicles)) and level_4.obstacle_gap_m == 42.0
     worlds = {"3": level_3.sample(2_000, 7).worlds, "4": level_4.sample(2_000, 7).worlds}
     assert worlds["4"].gaps_m.tobytes() == worlds["3"].gaps_m.tobytes()
     ledgers = {}
     for key, at_alert in worlds.items():
         _, impacts = advance(at_alert, -at_alert.vehicles.braking_capacity_mps2, until_s=8.0)
         ledgers[key] = empty_ledger(at_alert).add(impacts)
-    assert not ledgers["4"].hazard_count.any() and ledgers["3"].collided.sum() > 1_000
+    assert not ledgers["4"].obstacle_count.any() and ledgers["3"].collided.sum() > 1_000
     for count in COUNTS:
         assert ledgers["4"].vehicle_harm(count).tobytes() == ledgers["3"].vehicle_harm(count).tobytes()
     v, a = worlds["4"].speeds_mps[:, 0], worlds["4"].vehicles.braking_capacity_mps2[:, 0]
-    assert (v * v / (2.0 * a) < worlds["4"].hazard_gap_m).all()
+    assert (v * v / (2.0 * a) < worlds["4"].obstacle_gap_m).all()
 
 
-def test_hazard__changes_nothing_in_a_level_whose_line_does_not_reach_it() -> None:
+def test_obstacle__changes_nothing_in_a_level_whose_line_does_not_reach_it() -> None:
     plain = load_scenario("cooperation-3-pair")
-    runs = [make_engine(scenario, 200, seed=3) for scenario in (plain, plain.replace(hazard_gap_m=42))]
+    runs = [make_engine(scenario, 200, seed=3) for scenario in (plain, plain.replace(obstacle_gap_m=42))]
     for _ in range(80):
         steps = [run.step(np.full((200, 2), -1.0)) for run in runs]
         assert steps[0].reward.tobytes() == steps[1].reward.tobytes()
         assert steps[0].ended.tobytes() == steps[1].ended.tobytes()
     without, with_it = (run.worlds for run in runs)
-    assert without.gaps_m.tobytes() == with_it.gaps_m.tobytes() and with_it.hazard_gap_m.min() > 0.0
+    assert without.gaps_m.tobytes() == with_it.gaps_m.tobytes() and with_it.obstacle_gap_m.min() > 0.0
     assert runs[0].ledger.total_harm.tobytes() == runs[1].ledger.total_harm.tobytes()
     assert runs[0].ledger.collided.sum() > 100

@@ -11,7 +11,7 @@ from ethbrake_marl.physics import advance, concatenate
 from ethbrake_marl.scenario import load_scenario
 
 ALL = load_scenario("cooperation-4-all")
-NEAR = ALL.replace(hazard_gap_m={"uniform": [10, 45]})  # within the way of full braking in many worlds
+NEAR = ALL.replace(obstacle_gap_m={"uniform": [10, 45]})  # within the way of full braking in many worlds
 
 
 def test_engine__steps_as_advance_does_and_its_ledger_counts_the_obstacle():
@@ -24,15 +24,15 @@ def test_engine__steps_as_advance_does_and_its_ledger_counts_the_obstacle():
         until = np.where(running, engine.worlds.time_s, worlds.time_s)
         worlds, impacts = advance(worlds, engine.wanted_mps2, until_s=until)
         ledger, rewards = ledger.add(impacts), rewards + step.reward[:, 0]
-    assert engine.worlds.hazard_gap_m.tobytes() == worlds.hazard_gap_m.tobytes()
-    assert engine.worlds.hazard_hit.tobytes() == worlds.hazard_hit.tobytes()
+    assert engine.worlds.obstacle_gap_m.tobytes() == worlds.obstacle_gap_m.tobytes()
+    assert engine.worlds.obstacle_hit.tobytes() == worlds.obstacle_hit.tobytes()
     for count in COUNTS:
-        assert engine.ledger.hazard_harm(count).tobytes() == ledger.hazard_harm(count).tobytes()
+        assert engine.ledger.obstacle_harm(count).tobytes() == ledger.obstacle_harm(count).tobytes()
         shares = engine.ledger.vehicle_harm(count)
         np.testing.assert_allclose(shares.sum(axis=1), engine.ledger.world_harm(count), rtol=1e-12)
-    assert (engine.ledger.hazard_count > 0).sum() > 20 and (engine.ledger.hazard_count == 0).any()
+    assert (engine.ledger.obstacle_count > 0).sum() > 20 and (engine.ledger.obstacle_count == 0).any()
     np.testing.assert_allclose(rewards, -engine.ledger.world_harm("total"), rtol=1e-12)
-    untouched = (engine.ledger.count.sum(axis=1) == 0) & (engine.ledger.hazard_count > 0)
+    untouched = (engine.ledger.count.sum(axis=1) == 0) & (engine.ledger.obstacle_count > 0)
     assert engine.ledger.collided[untouched].all()
 
 
@@ -42,11 +42,11 @@ def test_infos__tell_the_same_shares_as_the_ledger():
     while env.agents:
         infos = env.step({name: np.array([-0.1], np.float32) for name in env.agents})[4]
     ledger = env.engine.ledger
-    assert ledger.hazard_count[0] > 0
+    assert ledger.obstacle_count[0] > 0
     for count, key in (("first", "first_impact_harm"), ("total", "total_harm")):
         assert [infos[f"vehicle_{i + 1}"][key] for i in range(3)] == ledger.vehicle_harm(count)[0].tolist()
         assert infos["vehicle_3"][f"world_{key}"] == ledger.world_harm(count)[0]
-    gap = np.float32(env.engine.worlds.hazard_gap_m[0] / 10.0)
+    gap = np.float32(env.engine.worlds.obstacle_gap_m[0] / 10.0)
     assert env.state()[-2:].tolist() == [gap, 1.0]
     assert env.state_space.contains(env.state()) and len(env.state()) == 28
 
@@ -59,7 +59,7 @@ def test_engine__worlds_that_are_given_may_have_an_obstacle_or_none_whatever_the
         engine.reset(worlds=given)
         for _ in range(30):
             engine.step(np.zeros((4, 2)))
-        assert np.isfinite(engine.worlds.hazard_gap_m).tolist() == [True, True, False, False]
+        assert np.isfinite(engine.worlds.obstacle_gap_m).tolist() == [True, True, False, False]
         engine.renew(np.array([0, 3]))
-        expected = [scenario.hazard_gap_m is not None, True, False, scenario.hazard_gap_m is not None]
-        assert np.isfinite(engine.worlds.hazard_gap_m).tolist() == expected
+        expected = [scenario.obstacle_gap_m is not None, True, False, scenario.obstacle_gap_m is not None]
+        assert np.isfinite(engine.worlds.obstacle_gap_m).tolist() == expected

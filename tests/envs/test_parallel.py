@@ -60,7 +60,7 @@ def test_agents__the_list_given_out_is_not_the_environments_own() -> None:
 
 def test_reset__starts_at_the_first_moment_a_learner_may_act() -> None:
     assert started(CRASH).engine.worlds.time_s == [0.5]
-    assert started(CRASH.replace(hazard_gap_m=30), learners=["vehicle_1"]).engine.worlds.time_s == [0.0]
+    assert started(CRASH.replace(obstacle_gap_m=30), learners=["vehicle_1"]).engine.worlds.time_s == [0.0]
     observations, infos = parallel_env(FIVE, learners=["vehicle_5", "vehicle_4"]).reset(seed=0)
     assert {info["time_s"] for info in infos.values()} == {0.51}
     assert list(observations) == [f"vehicle_{i}" for i in range(1, 6)]

@@ -135,7 +135,7 @@ def test_seed__anything_but_a_whole_number_from_0_is_refused(seed: Any) -> None:
 
 
 def test_set_options__gives_each_world_its_own_start_once() -> None:
-    env = make_sb3_vec_env(CRASH.replace(hazard_gap_m=30), 2, learners=["vehicle_1", "vehicle_2"])
+    env = make_sb3_vec_env(CRASH.replace(obstacle_gap_m=30), 2, learners=["vehicle_1", "vehicle_2"])
     far, near_ = ({"initial_state": {"gaps_m": gap, "speeds_mps": 10}} for gap in (40, 4))
     env.set_options([far, far, near_, near_])
     env.reset()
@@ -147,7 +147,7 @@ def test_set_options__gives_each_world_its_own_start_once() -> None:
 
 @pytest.mark.parametrize("order", [(0, 1, 1, 1), (0, None, 1, 1), (None, None, 1, 1), (0, 0)])
 def test_set_options__rows_that_do_not_fit_together_are_refused(order: tuple[int | None, ...]) -> None:
-    env = make_sb3_vec_env(CRASH.replace(hazard_gap_m=30), 2, learners=["vehicle_1", "vehicle_2"])
+    env = make_sb3_vec_env(CRASH.replace(obstacle_gap_m=30), 2, learners=["vehicle_1", "vehicle_2"])
     starts = [{"initial_state": {"gaps_m": np.array([gap])}} for gap in (40.0, 4.0)]
     env.set_options([{} if k is None else starts[k] for k in order])
     with pytest.raises(InvalidInput, match="set_options: "):

@@ -54,7 +54,7 @@ def test_shoved__is_zero_where_nobody_comes_near_whatever_the_script() -> None:
 
 
 def test_shoved__ends_at_the_obstacle() -> None:
-    wall = PUSH.replace(hazard_gap_m=0.5, horizon_s=8.0)
+    wall = PUSH.replace(obstacle_gap_m=0.5, horizon_s=8.0)
     assert alone(wall, "constant:-6").outcome("constant:-6").shoved_m == pytest.approx([0.5], abs=1e-12)
 
 
@@ -69,7 +69,7 @@ def test_shoved__is_where_the_record_ends(evaluation: Evaluation, gap_agent: obj
 
 
 def test_shoved__has_no_meaning_where_vehicle_1_is_driven_or_reacts() -> None:
-    driven = PUSH.replace(hazard_gap_m=9.0).with_learners(["vehicle_1"])
+    driven = PUSH.replace(obstacle_gap_m=9.0).with_learners(["vehicle_1"])
     assert alone(driven, "full_brake").outcome("full_brake").shoved_m is None
     reacts = PUSH.replace(roles={"vehicle_1": "planner", "vehicle_2": "learner"})
     assert ShovedFront.of(reacts.sample(1, 7).worlds, Task(reacts, (1,))) is None
@@ -96,7 +96,7 @@ def test_sampled__of_a_constant_is_that_of_the_map(evaluation: Evaluation, spec:
 
 
 def test_sampled__knows_no_obstacle_and_only_vehicle_2_driven() -> None:
-    assert alone(PUSH.replace(hazard_gap_m=9.0), "coast").outcome("coast").sampled_harm is None
+    assert alone(PUSH.replace(obstacle_gap_m=9.0), "coast").outcome("coast").sampled_harm is None
     third = load_scenario("paper-random").with_learners(["vehicle_3"])
     assert alone(third, "coast").outcome("coast").sampled_harm is None
 
@@ -135,7 +135,7 @@ def test_both__are_in_json_csv_and_the_table(evaluation: Evaluation, tmp_path: P
 
 
 def test_none__is_null_in_json_empty_in_csv_and_a_dash_in_the_table(tmp_path: Path) -> None:
-    result = alone(PUSH.replace(hazard_gap_m=9.0).with_learners(["vehicle_1"]), "coast")
+    result = alone(PUSH.replace(obstacle_gap_m=9.0).with_learners(["vehicle_1"]), "coast")
     (row,) = summarise(result)
     found = row.to_json()
     assert found["vehicle_1_shoved_m"] is found["vehicle_1_shoved_far_rate"] is found["sampled_harm"] is None

@@ -22,7 +22,7 @@ from ethbrake_marl.evaluation.regret import assess, distance
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.limits import limits as limits_module
 from ethbrake_marl.limits.limits import Unproven, known_limits, unproven_because
-from ethbrake_marl.physics.advance import no_hazard_harm
+from ethbrake_marl.physics.advance import no_obstacle_harm
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 
 # Four worlds by hand: the first is avoidable, the second is in the table, in the third the agent is below the table,
@@ -46,7 +46,7 @@ def outcome(evaluation: Evaluation, harms: tuple[list[float], list[float]]) -> O
     first, total = (np.column_stack([harm, np.zeros(len(harm))]) for harm in harms)
     count = (total > 0.0).astype(np.int64)
     final = evaluation.worlds.take(np.arange(len(first)))
-    ledger = Ledger(first, total, count, *no_hazard_harm(final.n), final.vehicles.mass_t)
+    ledger = Ledger(first, total, count, *no_obstacle_harm(final.n), final.vehicles.mass_t)
     return Outcome(ledger, final, np.ones(len(first), np.bool_), None, None)
 
 
@@ -188,7 +188,7 @@ def test_limits__an_obstacle_out_of_vehicle_1_s_own_reach_leaves_avoidability_an
         lines = list(csv.DictReader(stream))
     assert {line["proven_harm"] + line["impact_proven"] for line in lines} == {""}
     assert {line["avoidable"] for line in lines} == {"0", "1"}
-    near = scenario.replace(hazard_gap_m=30.0)
+    near = scenario.replace(obstacle_gap_m=30.0)
     found = unproven_because(near.sample(50, 7).worlds, Task(near, (1,)))
     assert found == "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"
 

@@ -41,7 +41,7 @@ class Line:
     mass: Rationals
     limit: Rationals
     restitution: Fraction
-    hazard: Fraction | None = None  # distance to an obstacle ahead
+    obstacle: Fraction | None = None  # distance to an obstacle ahead
 
 
 class Hit(NamedTuple):
@@ -63,15 +63,15 @@ class Outcome:
     speeds: Rationals
     hits: list[Hit] = field(default_factory=list)
     kinds: Counter[str] = field(default_factory=Counter)
-    hazard: Fraction | None = None
+    obstacle: Fraction | None = None
 
 
 def line_of(worlds: Worlds, command: list[float], k: int) -> Line:
     """World ``k`` of a batch, exactly."""
     v = worlds.vehicles
     rows = (worlds.gaps_m[k], worlds.speeds_mps[k], command, v.latency_s[k], v.mass_t[k], v.speed_limit_mps[k])
-    hazard = Fraction(float(worlds.hazard_gap_m[k])) if worlds.hazard_gap_m[k] < inf else None
-    return Line(*(tuple(Fraction(float(x)) for x in row) for row in rows), Fraction(float(v.restitution[k])), hazard)
+    obstacle = Fraction(float(worlds.obstacle_gap_m[k])) if worlds.obstacle_gap_m[k] < inf else None
+    return Line(*(tuple(Fraction(float(x)) for x in row) for row in rows), Fraction(float(v.restitution[k])), obstacle)
 
 
 def simulate(
@@ -90,7 +90,7 @@ class _Run:
         self.n = len(line.speeds)
         self.g = list(line.gaps)
         self.v = list(line.speeds)
-        self.h = line.hazard
+        self.h = line.obstacle
         self.leaning = False  # the front vehicle rests against the obstacle
         self.hit: set[int] = set()
         self.joined: list[bool] = [False] * (self.n - 1)
@@ -105,7 +105,7 @@ class _Run:
             self.step(until)
         self.out.gaps = tuple(self.g)
         self.out.speeds = tuple(self.v)
-        self.out.hazard = self.h
+        self.out.obstacle = self.h
         return self.out
 
     def check_grid(self, numbers: Iterable[Fraction]) -> None:

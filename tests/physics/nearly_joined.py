@@ -29,7 +29,7 @@ def nearly_joined(key: int, n: int, N: int, *, obstacle: bool = False) -> Worlds
         mass_t=10.0 ** draws.uniform(-1.3, 2.0, (n, N)),
         restitution=draws.choice([0.0, 0.1, 0.3, 1.0], (n,)),
     )
-    return replace(worlds, speeds_mps=ulps, hazard_gap_m=np.zeros(n)) if obstacle else worlds
+    return replace(worlds, speeds_mps=ulps, obstacle_gap_m=np.zeros(n)) if obstacle else worlds
 
 
 def thrown_lines(key: int, n: int, N: int) -> Batch:
@@ -44,7 +44,7 @@ def thrown_lines(key: int, n: int, N: int) -> Batch:
         latency_s=draws.uniform(0.0, 1.5, (n, N)),
         mass_t=10.0 ** draws.uniform(-1.3, 2.0, (n, N)),
         restitution=draws.choice([0.0, 0.1, 0.3, 0.6], (n,)),
-        hazard_gap_m=draws.uniform(10.0, 40.0, (n,)),
+        obstacle_gap_m=draws.uniform(10.0, 40.0, (n,)),
     )
     command = np.maximum(draws.uniform(-12.0, 4.0, (n, N)), -capacity)
     return Batch(worlds, command)

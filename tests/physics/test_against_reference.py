@@ -116,7 +116,7 @@ def test_obstacle__is_what_a_braked_vehicle_becomes_that_is_far_too_heavy_to_mov
     n = 80
     case = random_case(24, n, N, 0.1)
     gap = np.random.default_rng([25, N]).uniform(5.0, 40.0, n)
-    end, impacts = advance(replace(case.worlds, hazard_gap_m=gap), case.command_mps2, until_s=case.horizon_s)
+    end, impacts = advance(replace(case.worlds, obstacle_gap_m=gap), case.command_mps2, until_s=case.horizon_s)
     vehicles = case.worlds.vehicles
     outcome = simulate(
         _in_front(gap, case.worlds.gaps_m),
@@ -129,14 +129,14 @@ def test_obstacle__is_what_a_braked_vehicle_becomes_that_is_far_too_heavy_to_mov
         horizon_s=case.horizon_s,
         step_s=STEP_S,
     )
-    apart = np.abs(impacts.hazard_first_harm - outcome.first_impact_harm[:, 0]) > HARM_M2PS2
-    apart |= np.abs(impacts.hazard_total_harm - outcome.total_harm[:, 0]) > HARM_M2PS2
-    apart |= (impacts.hazard_count > 0) != (outcome.count[:, 0] > 0)
+    apart = np.abs(impacts.obstacle_first_harm - outcome.first_impact_harm[:, 0]) > HARM_M2PS2
+    apart |= np.abs(impacts.obstacle_total_harm - outcome.total_harm[:, 0]) > HARM_M2PS2
+    apart |= (impacts.obstacle_count > 0) != (outcome.count[:, 0] > 0)
     apart |= np.any(np.abs(impacts.total_harm - outcome.total_harm[:, 1:]) > HARM_M2PS2, axis=1)
-    apart |= np.abs(end.hazard_gap_m - outcome.gaps_m[:, 0]) > STATE
+    apart |= np.abs(end.obstacle_gap_m - outcome.gaps_m[:, 0]) > STATE
     apart |= np.any(np.abs(end.gaps_m - outcome.gaps_m[:, 1:]) > STATE, axis=1)
     apart |= np.any(np.abs(end.speeds_mps - outcome.speeds_mps[:, 1:]) > STATE, axis=1)
-    assert not apart.any() and (impacts.hazard_count > 0).sum() > n / 2
+    assert not apart.any() and (impacts.obstacle_count > 0).sum() > n / 2
 
 
 def _in_front(value: float | Floats, columns: Floats) -> Floats:

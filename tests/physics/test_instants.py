@@ -52,4 +52,4 @@ def test_thrown_lines__against_an_obstacle_come_to_their_end(N, n):
     worlds, command = thrown_lines(93, n, N)
     after, impacts = advance(worlds, command, until_s=8.0)
     assert np.isfinite(after.speeds_mps).all()
-    assert (impacts.hazard_count > 0).mean() > 0.3
+    assert (impacts.obstacle_count > 0).mean() > 0.3

@@ -47,8 +47,8 @@ def numbered(n: int, first: int = 0) -> Worlds:
         time_s=number + 0.75,
         pair_hit=hit,
         command_mps2=wide - [1.0, 2.0, 3.0],
-        hazard_gap_m=number + 40.0,
-        hazard_hit=number % 2 == 1,
+        obstacle_gap_m=number + 40.0,
+        obstacle_hit=number % 2 == 1,
     )
 
 
@@ -65,7 +65,7 @@ def test_make_worlds__broadcasts_every_parameter_to_its_shape():
     shapes = {name: column.shape for name, column in columns(worlds).items()}
     wide = {name for name, shape in shapes.items() if shape == (4, 3)}
     assert shapes["gaps_m"] == shapes["pair_hit"] == (4, 2)
-    of_worlds = {"time_s", "restitution", "hazard_gap_m", "hazard_hit"}
+    of_worlds = {"time_s", "restitution", "obstacle_gap_m", "obstacle_hit"}
     assert all(shapes[name] == (4,) for name in of_worlds)
     assert wide == set(shapes) - {"gaps_m", "pair_hit", "known_from_s"} - of_worlds
     assert shapes["known_from_s"] == (4, 0)
@@ -90,7 +90,7 @@ def test_make_worlds__accepts_the_ends_of_every_range():
     worlds = build(gaps=[0.0, 0.0], speeds=[0.0, 30.0, 0.0], driving_capacity_mps2=0.0, latency_s=0.0, restitution=0.0)
     assert worlds.vehicles.restitution.tolist() == [0.0] and worlds.gaps_m.tolist() == [[0.0, 0.0]]
     assert build(restitution=1.0).vehicles.restitution.tolist() == [1.0]
-    assert build(hazard_gap_m=0.0).hazard_gap_m.tolist() == [0.0]
+    assert build(obstacle_gap_m=0.0).obstacle_gap_m.tolist() == [0.0]
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_make_worlds__accepts_the_ends_of_every_range():
         ({"speed_limit_mps": 0.0}, "speed_limit_mps[0, 0] = 0: must be finite and in (0, inf]"),
         ({"restitution": 1.5}, "restitution[0] = 1.5: must be finite and in [0, 1]"),
         ({"restitution": -0.5}, "restitution[0] = -0.5: must be finite and in [0, 1]"),
-        ({"hazard_gap_m": -0.5}, "hazard_gap_m[0] = -0.5: must be finite and in [0, inf]"),
+        ({"obstacle_gap_m": -0.5}, "obstacle_gap_m[0] = -0.5: must be finite and in [0, inf]"),
         ({"mass_t": [1.0, 2.0]}, "mass_t: shape (2,) does not fit (1, 3)"),
         ({"speeds": [10.0]}, "speeds_mps: shape (1, 1); a line needs at least 2 vehicles, as [n, N]"),
         ({"speeds": np.zeros((1, 1, 3))}, "speeds_mps: shape (1, 1, 3)"),

@@ -202,5 +202,7 @@ def _check(world: Worlds, controlled: Sequence[int]) -> None:
         )
     if not np.all(world.speeds_mps >= 0.0):
         raise InvalidInput(f"avoidable_by_lp: speeds_mps {world.speeds_mps[0].tolist()}: all must be >= 0")
-    if np.isfinite(world.hazard_gap_m[0]):
-        raise InvalidInput(f"avoidable_by_lp: hazard_gap_m {world.hazard_gap_m[0]:g}: the programme knows no obstacle")
+    if np.isfinite(world.obstacle_gap_m[0]):
+        raise InvalidInput(
+            f"avoidable_by_lp: obstacle_gap_m {world.obstacle_gap_m[0]:g}: the programme knows no obstacle"
+        )

@@ -32,7 +32,7 @@ def environment_tables() -> dict[str, str]:
     """Every table of docs/environment.md by its marker."""
     return {
         "observation": feature_table(ObservationSpec().features),
-        "hazard": feature_table(ObservationSpec(role=True, hazard=True).features, ObservationSpec().size),
+        "obstacle": feature_table(ObservationSpec(role=True, obstacle=True).features, ObservationSpec().size),
         "state": feature_table(state_features(load_scenario("paper-random"))),
         "rewards": reward_table(REWARDS),
     }

@@ -40,8 +40,8 @@ def not_used(scenario: Scenario) -> set[str]:
     """The keys of the ways to declare gaps, speeds and an obstacle that the scenario does not use."""
     gaps = "gaps_m" if scenario.gaps_m is None else "time_gaps_s"
     speeds = {"speeds_mps"} if scenario.speeds_mps is None else {"line_speed_mps", "speed_deviations_mps"}
-    hazard = {key for key in ("hazard_gap_m", "hazard_margin_m") if getattr(scenario, key) is None}
-    return {gaps, *speeds, *hazard}
+    obstacle = {key for key in ("obstacle_gap_m", "obstacle_margin_m") if getattr(scenario, key) is None}
+    return {gaps, *speeds, *obstacle}
 
 
 def test_list__is_sorted_and_has_the_papers_scenarios():
@@ -160,7 +160,7 @@ def test_json_schema__asks_for_one_of_two_ways_and_knows_no_null():
     schema = scenario_json_schema()
     pairs = [[way["required"] for way in pair["oneOf"]] for pair in schema["allOf"][:2]]
     assert pairs == [[["gaps_m"], ["time_gaps_s"]], [["speeds_mps"], ["line_speed_mps"]]]
-    assert schema["allOf"][2:] == [{"not": {"required": ["hazard_gap_m", "hazard_margin_m"]}}]  # optional: not both
+    assert schema["allOf"][2:] == [{"not": {"required": ["obstacle_gap_m", "obstacle_margin_m"]}}]  # optional: not both
     assert schema["dependentRequired"] == {"speed_deviations_mps": ["line_speed_mps"]}
     assert "null" not in json.dumps(schema)
     assert schema["properties"]["time_step_s"]["default"] == 0.1
@@ -177,7 +177,7 @@ def test_docs__the_table_of_keys_has_every_field_with_its_default():
         elif field.default is None:
             other = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps"}
             other |= {new: usual for usual, new in other.items()}
-            assert cells[0] == ("none" if key.startswith("hazard_") else f"this or `{other[key]}`")
+            assert cells[0] == ("none" if key.startswith("obstacle_") else f"this or `{other[key]}`")
         elif field.default_factory is None:
             assert cells[0] == (f"`{flow_text(field.default)}`" if field.default != "" else "empty"), key
 

@@ -245,8 +245,8 @@ def shuffled(worlds, vehicle):
         speeds_mps=np.where(unknown, worlds.speeds_mps[lines] * 0.5, worlds.speeds_mps),
         command_mps2=np.where(unknown, -1.0, worlds.command_mps2),
         pair_hit=np.where(unknown[:, [0, 2]], True, worlds.pair_hit),
-        hazard_gap_m=np.where(unknown[:, 0], worlds.hazard_gap_m[lines] + 5.0, worlds.hazard_gap_m),
-        hazard_hit=unknown[:, 0] | worlds.hazard_hit,
+        obstacle_gap_m=np.where(unknown[:, 0], worlds.obstacle_gap_m[lines] + 5.0, worlds.obstacle_gap_m),
+        obstacle_hit=unknown[:, 0] | worlds.obstacle_hit,
     )
 
 
@@ -292,11 +292,11 @@ def test_observe__writing_the_papers_news_out_by_link_changes_no_bit():
 
 
 @pytest.mark.parametrize("latency", [0, [0, {"uniform": [0.3, 0.7]}, {"uniform": [0.5, 1.0]}]])
-@pytest.mark.parametrize("hazard", [False, True])
+@pytest.mark.parametrize("obstacle", [False, True])
 @pytest.mark.parametrize("name", ["blocked", "congested", "sensors-only"])
-def test_observe__what_is_not_known_changes_no_bit(name, hazard, latency):
+def test_observe__what_is_not_known_changes_no_bit(name, obstacle, latency):
     scenario = channel_of(name).replace(latency_s=latency)
-    scenario = scenario.replace(hazard_gap_m={"uniform": [30, 50]}) if hazard else scenario
+    scenario = scenario.replace(obstacle_gap_m={"uniform": [30, 50]}) if obstacle else scenario
     start, spec = scenario.sample(400, 5).worlds, observation_for(scenario)
     seen = 0
     for time in (0.0, 0.5, 0.8, 1.0, 1.5):
@@ -310,8 +310,8 @@ def test_observe__what_is_not_known_changes_no_bit(name, hazard, latency):
             assert observe(worlds, i, spec).tobytes() == observe(later, i, spec).tobytes()
         flags = observe(worlds, 1, spec)[:, [7, 17]]
         assert (flags == ~unknown).all()
-        if hazard:
-            at = [f.name for f in spec.features].index("hazard.known")
+        if obstacle:
+            at = [f.name for f in spec.features].index("obstacle.known")
             assert (observe(worlds, 1, spec)[:, at] == ~unknown[:, 0]).all()
         seen += int(unknown.sum())
     assert seen > 400

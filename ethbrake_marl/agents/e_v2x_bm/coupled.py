@@ -117,9 +117,9 @@ class _Search:
             command[:, self._vehicle] = -deceleration[part]
             with renumbered(rows[part]):
                 _, impacts = advance(self._worlds.take(rows[part]), command, until_s=self._horizon_s)
-            first[part] = impacts.first_impact_harm.sum(axis=1) + impacts.hazard_first_harm
-            total[part] = impacts.total_harm.sum(axis=1) + impacts.hazard_total_harm
-            course[part] = impacts.count @ digits[:-1] + impacts.hazard_count * digits[-1]
+            first[part] = impacts.first_impact_harm.sum(axis=1) + impacts.obstacle_first_harm
+            total[part] = impacts.total_harm.sum(axis=1) + impacts.obstacle_total_harm
+            course[part] = impacts.count @ digits[:-1] + impacts.obstacle_count * digits[-1]
         return first, total, course
 
     def evaluate(self, rows: Ints, deceleration: Floats) -> Samples:

@@ -34,7 +34,7 @@ from ethbrake_marl.studies.ablation.plan import Level, Plan
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class LevelOptimum:
     """What is known of one level: its search, and what its teams (of all recipes and seeds) do in the same worlds."""
 
     level: Level
@@ -91,7 +91,7 @@ def _told(tell: OnProgress, name: str, done: int, total: int) -> None:
     tell(Progress(name, done, total))
 
 
-def best_known(own: Answer, answers: Sequence[Answer]) -> dict[HarmCount, Floats]:
+def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmCount, Floats]:
     """The least harm [n] of each count in all ``answers`` (its own is among them) that these learners can give too."""
     best = {count: np.full(own.worlds.n, np.inf) for count in COUNTS}
     for other in answers:
@@ -103,7 +103,7 @@ def best_known(own: Answer, answers: Sequence[Answer]) -> dict[HarmCount, Floats
     return best
 
 
-def _can_imitate(own: Answer, other: Answer) -> Bools:
+def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
     """In which worlds the learners of ``own`` can do what those of ``other`` do, [n].
 
     They are the same vehicles or more, all others follow the same scripts, latencies are equal, and the decisions of
@@ -113,18 +113,18 @@ def _can_imitate(own: Answer, other: Answer) -> Bools:
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
     if not (set(theirs.learners) <= set(mine.learners) and same_scripts):
         return np.zeros(own.worlds.n, np.bool_)
-    latency_s, hazard_m = own.worlds.vehicles.latency_s, other.worlds.hazard_gap_m
+    latency_s, obstacle_m = own.worlds.vehicles.latency_s, other.worlds.obstacle_gap_m
     later_s = latency_s[:, theirs.learners].min(axis=1) - latency_s[:, mine.learners].min(axis=1)
     steps = later_s / mine.time_step_s
     same = (latency_s == other.worlds.vehicles.latency_s).all(axis=1)
     on_grid = np.abs(steps - np.rint(steps)) < 1e-9
-    return np.asarray(same & on_grid & ((hazard_m == own.worlds.hazard_gap_m) | np.isinf(hazard_m)), np.bool_)
+    return np.asarray(same & on_grid & ((obstacle_m == own.worlds.obstacle_gap_m) | np.isinf(obstacle_m)), np.bool_)
 
 
-def _harms(own: Answer, other: Answer, rows: Ints) -> Iterator[dict[HarmCount, Floats]]:
+def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[HarmCount, Floats]]:
     """Harm of both counts that the search and every team of ``other`` do in some worlds of ``own``."""
     scenario, task = other.level.scenario, Task(other.level.scenario, other.level.scenario.learners)
-    worlds = replace(other.worlds, hazard_gap_m=own.worlds.hazard_gap_m).take(rows)
+    worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
     for best in other.searched.best.values():
         kept = best._replace(harm=best.harm[rows], profiles=best.profiles.take(rows))
         yield dict(zip(COUNTS, realised_harm(worlds, task, kept), strict=True))

@@ -34,7 +34,7 @@ from ethbrake_marl.studies.ablation.run import Harms, harms_of
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class LineQuestion:
     """On which lines the policies are measured."""
 
     scenario: Scenario  # of any length; see ``lengthened``
@@ -137,7 +137,7 @@ def _check_front(path: str, policy: Policy, scenario: Scenario) -> None:
         )
 
 
-def drive_longer(question: Question, agents: Sequence[Agent], tell: OnProgress | None = None) -> list[LineResult]:
+def drive_longer(question: LineQuestion, agents: Sequence[Agent], tell: OnProgress | None = None) -> list[LineResult]:
     """Let every agent drive all learners of lines of each length, on the same worlds as full braking.
 
     All lines are made before the first is driven. Raises ``InvalidInput`` for a length that is given twice or that the
@@ -151,7 +151,7 @@ def drive_longer(question: Question, agents: Sequence[Agent], tell: OnProgress |
 
 
 def _of_length(
-    question: Question, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: OnProgress | None
+    question: LineQuestion, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: OnProgress | None
 ) -> LineResult:
     count = question.count
     braking = _driven([make_single_agent("full_brake")], scenario, sample, tell)
@@ -181,7 +181,7 @@ def _driven(agents: Sequence[Agent], scenario: Scenario, sample: Sample, tell: O
 
 
 def _searched(
-    question: Question, scenario: Scenario, sample: Sample, reached: Floats, tell: OnProgress | None
+    question: LineQuestion, scenario: Scenario, sample: Sample, reached: Floats, tell: OnProgress | None
 ) -> Floats | None:
     """Least harm known of all followers together in the first worlds, [1, search_episodes]."""
     if question.search_episodes == 0:

@@ -31,7 +31,7 @@ STANDARD = (*LADDER, "cooperation-2-blocked")
 _LINE = ("vehicles", "time_step_s", "horizon_s")
 _WORLD = ("gaps_m", "speeds_mps")
 _VEHICLE = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps", "restitution")
-_MAY_DIFFER = "roles, objective, hazard_gap_m, v2x and, where v2x differs, latency_s"
+_MAY_DIFFER = "roles, objective, obstacle_gap_m, v2x and, where v2x differs, latency_s"
 _ABOUT = {"name", "title", "description", "source"}
 
 

@@ -15,7 +15,7 @@ from ethbrake_marl.figures.ablation import change_figure, harm_curve, who_pays
 from ethbrake_marl.figures.style import png_bytes
 from ethbrake_marl.harm import COUNTS, HarmCount
 from ethbrake_marl.studies.ablation.comparison import compare
-from ethbrake_marl.studies.ablation.longer_lines import LineResult, Question
+from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, LineResult
 from ethbrake_marl.studies.ablation.plan import Plan
 from ethbrake_marl.studies.ablation.run import Measured
 
@@ -75,7 +75,7 @@ def interval_words(seeds: int) -> str:
     return f"95 % intervals for other seeds and other worlds{rough}"
 
 
-def lines_markdown(found: Sequence[LineResult], question: Question, runs: int) -> str:
+def lines_markdown(found: Sequence[LineResult], question: LineQuestion, runs: int) -> str:
     """One row per length of the line."""
     head = ["Vehicles", "All brake fully", "Reached", "Decrease", "Somebody worse off"]
     head += ["Best known", "Share of the joint optimum"] if question.search_episodes else []

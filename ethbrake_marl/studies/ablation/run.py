@@ -23,7 +23,7 @@ from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Sample, Scenario
-from ethbrake_marl.studies.ablation.joint_optimum import Answer, best_known, search_all
+from ethbrake_marl.studies.ablation.joint_optimum import LevelOptimum, best_known, search_all
 from ethbrake_marl.studies.ablation.plan import Level, Plan, Training, common_worlds
 
 
@@ -133,7 +133,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
         if level.trained:
             own = [team for algorithm in plan.algorithms for team in teams[level.name, algorithm]]
             part = sample.worlds.take(np.arange(plan.search_episodes))
-            answers[level.name] = Answer(level, part, tables[level.name], tuple(own))
+            answers[level.name] = LevelOptimum(level, part, tables[level.name], tuple(own))
     found: list[Measured] = []
     for level, sample in zip(plan.levels, samples, strict=True):
         braking = _driven(_all_brake(level.scenario), sample, [Team({}, f"full braking in {level.name}")], say)

@@ -14,7 +14,7 @@ from tests.physics.programme.gates import Figure, gate
 from tests.physics.random_worlds import driving_lines, touching_lines
 from tests.physics.runs import HORIZON_S, state_bytes
 from tests.physics.test_clusters import law_error_eps
-from tests.physics.test_obstacle import with_hazard
+from tests.physics.test_obstacle import place_ahead
 from tests.reference.tolerances import CLUSTER_EPS, EXACT_RUN
 
 
@@ -25,9 +25,9 @@ def clusters() -> Figure:
     for N, n in {2: 1_500, 3: 1_500, 5: 800, 10: 200, 20: 80, 50: 15}.items():
         for ratio in (1.0, 1e3):
             batch = touching_lines(182, n, N, heaviest_ratio=ratio)
-            before = replace(batch.worlds, hazard_gap_m=np.zeros(n))
+            before = replace(batch.worlds, obstacle_gap_m=np.zeros(n))
             after, impacts = advance(before, batch.command, 0.0)
-            rounds = np.maximum(np.maximum(impacts.count.max(axis=1), impacts.hazard_count), 1)
+            rounds = np.maximum(np.maximum(impacts.count.max(axis=1), impacts.obstacle_count), 1)
             worst = max(worst, *(law_error_eps(before, after, k, int(rounds[k])) for k in range(n)))
             worlds += n
     return Figure(worst, CLUSTER_EPS, f"{worlds:,} clusters of 2 to 50 vehicles")
@@ -46,9 +46,9 @@ def run_difference(end: Worlds, found: Floats, k: int, line: Worlds, command: li
     pairs, true_pairs = found[:, 0].tolist(), [hit.pair for hit in exact.hits]
     if pairs != true_pairs:
         return np.nan if pairs[:CASCADE] == true_pairs[:CASCADE] else np.inf
-    assert exact.hazard is not None
-    mine = [*end.gaps_m[k], *end.speeds_mps[k], end.hazard_gap_m[k], *found[:, 1:].ravel()]
-    truth = [*exact.gaps, *exact.speeds, exact.hazard, *(x for hit in exact.hits for x in (hit.time, hit.closing))]
+    assert exact.obstacle is not None
+    mine = [*end.gaps_m[k], *end.speeds_mps[k], end.obstacle_gap_m[k], *found[:, 1:].ravel()]
+    truth = [*exact.gaps, *exact.speeds, exact.obstacle, *(x for hit in exact.hits for x in (hit.time, hit.closing))]
     return max(abs(float(x) - float(y)) for x, y in zip(mine, truth, strict=True))
 
 
@@ -57,7 +57,7 @@ def differences() -> tuple[Floats, int]:
     """``run_difference`` of every world, and how many impacts with the obstacle there were."""
     worst, with_it = [], 0
     for N, n in {2: 1_500, 3: 1_000, 5: 300, 10: 40}.items():
-        batch = with_hazard(driving_lines(183, n, N), 184)
+        batch = place_ahead(driving_lines(183, n, N), 184)
         end, impacts = advance(batch.worlds, batch.command, HORIZON_S, record=True)
         rows = impacts.rows
         assert rows is not None
@@ -65,7 +65,7 @@ def differences() -> tuple[Floats, int]:
         for k in range(n):
             command = batch.command[k].tolist()
             worst.append(run_difference(end, columns[rows.world == k], k, batch.worlds, command))
-        with_it += int(impacts.hazard_count.sum())
+        with_it += int(impacts.obstacle_count.sum())
     return np.array(worst), with_it
 
 
@@ -91,6 +91,6 @@ def out_of_reach() -> Figure:
     for N in (2, 3, 5):
         worlds, command = driving_lines(185, n, N)
         plain, harm = advance(worlds, command, until_s=HORIZON_S)
-        far, same = advance(replace(worlds, hazard_gap_m=np.full(n, 1e4)), command, until_s=HORIZON_S)
-        changed += state_bytes(replace(far, hazard_gap_m=plain.hazard_gap_m), same) != state_bytes(plain, harm)
+        far, same = advance(replace(worlds, obstacle_gap_m=np.full(n, 1e4)), command, until_s=HORIZON_S)
+        changed += state_bytes(replace(far, obstacle_gap_m=plain.obstacle_gap_m), same) != state_bytes(plain, harm)
     return Figure(changed, 0, f"{3 * n:,} worlds of 2, 3 and 5 vehicles")

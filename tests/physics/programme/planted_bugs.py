@@ -130,13 +130,13 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     ),
     "obstacle that gives way a little": (Patch(OBSTACLE, "UNMOVABLE_T = math.inf", "UNMOVABLE_T = 1e9"),),
     "harm of an impact with the obstacle shared as with a vehicle": (
-        Patch(HARM, "harm[:, 0] += self.hazard_harm(count)", "harm[:, 0] += 0.5 * self.hazard_harm(count)"),
+        Patch(HARM, "harm[:, 0] += self.obstacle_harm(count)", "harm[:, 0] += 0.5 * self.obstacle_harm(count)"),
     ),
     "later impacts with the obstacle counted as first ones": (
         Patch(
             OBSTACLE,
-            "np.concatenate([worlds.hazard_hit[:, np.newaxis], worlds.pair_hit], axis=1)",
-            "np.concatenate([False & worlds.hazard_hit[:, np.newaxis], worlds.pair_hit], axis=1)",
+            "np.concatenate([worlds.obstacle_hit[:, np.newaxis], worlds.pair_hit], axis=1)",
+            "np.concatenate([False & worlds.obstacle_hit[:, np.newaxis], worlds.pair_hit], axis=1)",
         ),
     ),
     "plastic cluster left out of order by a last digit": (

@@ -15,21 +15,21 @@ from ethbrake_marl.limits.best_harm import best_harm
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.ablation.cost import Cost
-from ethbrake_marl.studies.ablation.joint_optimum import Answer, best_known, parts_left, questions, search_all
+from ethbrake_marl.studies.ablation.joint_optimum import LevelOptimum, best_known, parts_left, questions, search_all
 from ethbrake_marl.studies.ablation.plan import Level, Plan, common_worlds, read_levels, with_scheme
 
 WORLDS = 30
 NAMES = ("cooperation-1-front", "cooperation-2-paper", "cooperation-3-pair", "cooperation-4-all")
 
 
-def answer(level: Level, budget: int, agent: str = "full_brake") -> Answer:
+def answer(level: Level, budget: int, agent: str = "full_brake") -> LevelOptimum:
     worlds = level.scenario.sample(WORLDS, 7).worlds
     table = best_harm(level.scenario, worlds, budget=budget, threads=1)
-    return Answer(level, worlds, table, (Team.copies(make_agent(agent), level.scenario.learners),))
+    return LevelOptimum(level, worlds, table, (Team.copies(make_agent(agent), level.scenario.learners),))
 
 
 @pytest.fixture(scope="module")
-def answers() -> dict[str, Answer]:
+def answers() -> dict[str, LevelOptimum]:
     """Front does well by its policy alone, the paper by a long search, the pair and all three by neither."""
     front, paper, pair, everybody = read_levels(NAMES)
     found = [answer(front, 1, "e_v2x_bm"), answer(paper, 500), answer(pair, 1), answer(everybody, 1)]
@@ -47,7 +47,7 @@ def test_best_known__is_one_for_levels_that_ask_one_question(answers):
 
 def test_best_known__more_learners_are_never_worse_world_by_world(answers):
     """With the obstacle so far away that nobody reaches it."""
-    far = load_scenario("cooperation-4-all").replace(hazard_gap_m=200)
+    far = load_scenario("cooperation-4-all").replace(obstacle_gap_m=200)
     every = [*list(answers.values())[:3], answer(Level(far), 1)]
     paper, pair, everybody = (best_known(each, every) for each in every[1:])
     for count, harm in pair.items():
@@ -61,7 +61,7 @@ def test_best_known__more_learners_are_never_worse_world_by_world(answers):
 def test_best_known__an_obstacle_that_is_reached_counts():
     """All brake fully: without an obstacle it is harmless; one 20 m ahead stands where Vehicle 1 runs into it."""
     pair = load_scenario("cooperation-3-pair").replace(gaps_m=60)
-    near = pair.replace(name="near", roles=dict.fromkeys(pair.vehicle_names, "learner"), hazard_gap_m=20)
+    near = pair.replace(name="near", roles=dict.fromkeys(pair.vehicle_names, "learner"), obstacle_gap_m=20)
     answers = [answer(Level(pair), 1), answer(Level(near), 1)]
     assert best_known(answers[0], answers)["total"].max() == 0.0
     assert best_known(answers[1], answers)["total"].min() > 0.0

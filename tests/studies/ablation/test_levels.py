@@ -74,7 +74,7 @@ def test_common_worlds__other_physics_are_refused(changes, what):
 
 def test_common_worlds__news_roles_objectives_and_an_obstacle_may_differ():
     roles = {"vehicle_1": "learner", "vehicle_3": "coast"}
-    free = PAPER.replace(name="mine", roles=roles, objective="own", hazard_gap_m=42, v2x="blocked")
+    free = PAPER.replace(name="mine", roles=roles, objective="own", obstacle_gap_m=42, v2x="blocked")
     late = PAPER.replace(name="late", v2x="blocked")
     assert len(common_worlds([Level(PAPER), Level(free), Level(late)], 5, 7)) == 3
     with pytest.raises(InvalidInput, match="level 'late': its latency_s differs from that of 'mine'"):

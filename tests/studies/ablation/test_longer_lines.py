@@ -19,7 +19,7 @@ from ethbrake_marl.policies.manifest import Manifest
 from ethbrake_marl.policies.policy import load_policy, make_policy, save_policy
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.ablation import longer_lines
-from ethbrake_marl.studies.ablation.longer_lines import Question, drive_longer, lengthened
+from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, drive_longer, lengthened
 
 PAIR = load_scenario("cooperation-3-pair")
 
@@ -48,7 +48,7 @@ def test_lengthened__lists_of_pairs_and_objectives_go_on_too():
 
 
 def test_drive_longer__full_braking_gains_nothing_on_itself():
-    question = Question(PAIR, (3, 4), 20, 7, "total", 3, 50)
+    question = LineQuestion(PAIR, (3, 4), 20, 7, "total", 3, 50)
     found = drive_longer(question, [make_agent("full_brake")])
     assert [one.vehicles for one in found] == [3, 4]
     for one in found:
@@ -61,7 +61,7 @@ def test_drive_longer__all_lines_are_made_before_one_is_driven(monkeypatch):
     driven = []
     monkeypatch.setattr(longer_lines, "evaluate", lambda *_, **__: driven.append(1))
     weighted = PAIR.replace(name="mine", objective="weighted:1,2,3")
-    question = Question(weighted, (3, 4), 20, 7, "total", 0, 50)
+    question = LineQuestion(weighted, (3, 4), 20, 7, "total", 0, 50)
     with pytest.raises(InvalidInput, match="mine-n4"):
         drive_longer(question, [make_agent("full_brake")])
     with pytest.raises(InvalidInput, match="vehicles 3, 3: each length once"):
