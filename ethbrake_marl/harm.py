@@ -23,16 +23,16 @@ from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
 
 HarmCount = Literal["first", "total"]
-COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
+HARM_COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
 
 _INJURY_SLOPE = 0.177  # per m/s of speed change
 _INJURY_OFFSET = {"front": -4.457, "rear": -4.888}  # side of the car that is hit
 
 
-def check_count(count: str) -> None:
+def check_harm_count(harm_count: str) -> None:
     """Refuse a name that is not a counting rule with ``InvalidInput``."""
-    if count not in COUNTS:
-        raise InvalidInput(f"count {count!r}: must be {' or '.join(repr(known) for known in COUNTS)}")
+    if harm_count not in HARM_COUNTS:
+        raise InvalidInput(f"harm_count {harm_count!r}: must be {' or '.join(repr(known) for known in HARM_COUNTS)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,25 +59,25 @@ class Ledger:
             self.mass_t,
         )
 
-    def pair_harm(self, count: HarmCount) -> Floats:
+    def pair_harm(self, harm_count: HarmCount) -> Floats:
         """Harm of each pair under a counting rule, [n, P]. Raises ``InvalidInput`` for an unknown one."""
-        check_count(count)
-        return self.first_impact_harm if count == "first" else self.total_harm
+        check_harm_count(harm_count)
+        return self.first_impact_harm if harm_count == "first" else self.total_harm
 
-    def obstacle_harm(self, count: HarmCount) -> Floats:
+    def obstacle_harm(self, harm_count: HarmCount) -> Floats:
         """Harm of Vehicle 1's impacts with the obstacle ahead, [n]. Raises ``InvalidInput`` for an unknown rule."""
-        check_count(count)
-        return self.obstacle_first_harm if count == "first" else self.obstacle_total_harm
+        check_harm_count(harm_count)
+        return self.obstacle_first_harm if harm_count == "first" else self.obstacle_total_harm
 
-    def vehicle_harm(self, count: HarmCount) -> Floats:
+    def vehicle_harm(self, harm_count: HarmCount) -> Floats:
         """Harm of each vehicle, from both its pairs, [n, N]; see ``split``. That of an obstacle is all Vehicle 1's."""
-        harm = split(self.pair_harm(count), self.mass_t)
-        harm[:, 0] += self.obstacle_harm(count)
+        harm = split(self.pair_harm(harm_count), self.mass_t)
+        harm[:, 0] += self.obstacle_harm(harm_count)
         return harm
 
-    def world_harm(self, count: HarmCount) -> Floats:
+    def world_harm(self, harm_count: HarmCount) -> Floats:
         """Harm of all vehicles of a world together, [n]: the obstacle's, then the pairs' front to rear."""
-        return line_sum(self.pair_harm(count), self.obstacle_harm(count))
+        return line_sum(self.pair_harm(harm_count), self.obstacle_harm(harm_count))
 
     @property
     def impacts(self) -> Ints:

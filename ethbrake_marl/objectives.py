@@ -92,14 +92,14 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
     return parsed
 
 
-def objective_harm(ledger: Ledger, count: HarmCount, objectives: Sequence[Objective]) -> Floats:
+def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
     """What the objective of each vehicle makes of the harm so far, [n, N] (m2/s2): less is better."""
-    borne, whole = ledger.vehicle_harm(count), ledger.world_harm(count)
+    borne, whole = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
     columns = [_of_vehicle(o, i, borne, whole, ledger.mass_t) for i, o in enumerate(objectives)]
     return np.stack(columns, axis=1)
 
 
-def scored(ledger: Ledger, count: HarmCount, declared: Sequence[Declared] = STANDARD) -> dict[str, Floats]:
+def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] = STANDARD) -> dict[str, Floats]:
     """The same ledger under several objectives: objective -> what it is for each vehicle, [n, N] (m2/s2).
 
     So one policy, whatever it was trained for, is told under all of them. ``InvalidInput`` for a name without its list.
@@ -108,7 +108,9 @@ def scored(ledger: Ledger, count: HarmCount, declared: Sequence[Declared] = STAN
         raise InvalidInput(f"scored: {declared!r}: must be a list of objectives, for instance [{declared!r}]")
     vehicles = ledger.mass_t.shape[1]
     return {
-        each if isinstance(each, str) else ", ".join(each): objective_harm(ledger, count, objectives_of(each, vehicles))
+        each if isinstance(each, str) else ", ".join(each): objective_harm(
+            ledger, harm_count, objectives_of(each, vehicles)
+        )
         for each in declared
     }
 

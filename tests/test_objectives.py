@@ -73,10 +73,10 @@ def played(reward, scenario=PAPER, n=60):
 
 @pytest.mark.parametrize("count", ["first", "total"])
 @pytest.mark.parametrize("objective", EACH)
-def test_rewards__add_up_to_minus_the_objective_of_the_ledger(objective, count):
-    total, engine = played({"objective": objective, "harm_count": count})
+def test_rewards__add_up_to_minus_the_objective_of_the_ledger(objective, harm_count):
+    total, engine = played({"objective": objective, "harm_count": harm_count})
     assert engine.ledger.collided.sum() > 20
-    expected = -scored(engine.ledger, count, [objective])[objective]
+    expected = -scored(engine.ledger, harm_count, [objective])[objective]
     assert total == pytest.approx(expected, abs=1e-9)
 
 

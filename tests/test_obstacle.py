@@ -103,7 +103,7 @@ def test_profiles__refuse_worlds_of_which_only_some_have_an_obstacle():
 
 def test_coupled__vehicle_1_stops_short_of_the_obstacle_if_it_can():
     worlds = ALL.sample(6, 7).worlds
-    found = optimise_coupled(worlds, 0, count="total")
+    found = optimise_coupled(worlds, 0, harm_count="total")
     for k in range(6):
         command = -worlds.vehicles.braking_capacity_mps2[[k]]
         harms = []
@@ -171,7 +171,7 @@ def test_record__positions_end_at_the_obstacle_and_the_figure_draws_it(near_one)
 def test_shield__step_mode_bounds_the_harm_of_the_obstacle_too_to_the_last_bit(vehicle):
     scenario = NEAR.with_learners([vehicle])
     worlds = scenario.sample(40, 7).worlds
-    agent = StepShieldAgent(make_agent("coast"), scenario, count="total")
+    agent = StepShieldAgent(make_agent("coast"), scenario, harm_count="total")
     episodes = drive(worlds, agent, scenario, vehicle)
     harm = episodes.ledger.world_harm("total")
     assert agent.shield is not None and not agent.shield.distrusted.any()

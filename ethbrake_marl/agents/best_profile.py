@@ -11,7 +11,7 @@ from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.protocol import fixed_commands, place
 from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, renumbered
-from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.search.kernel import MOST_PHASES
 from ethbrake_marl.search.motion import START
@@ -36,17 +36,17 @@ class BestHarm:
     knows = Source.MODEL
 
     def __init__(
-        self, recall: Recall, *, count: HarmCount = "first", horizon_s: float = 8.0, budget: int = SEARCH_BUDGET
+        self, recall: Recall, *, harm_count: HarmCount = "first", horizon_s: float = 8.0, budget: int = SEARCH_BUDGET
     ) -> None:
         if not budget >= 1:
             raise InvalidInput(f"best_harm: budget = {budget}; at least 1 candidate is needed")
-        check_count(count)
+        check_harm_count(harm_count)
         self.name = "best_harm"
         self.others: Mapping[int, Script] = {}
         self.predicted_harm: Floats = np.empty(0)
         self.searched: Floats = np.empty(0)  # [n] 1 where nothing was kept
         self._recall = recall
-        self._count: HarmCount = count
+        self._harm_count: HarmCount = harm_count
         self._horizon_s = horizon_s
         self._budget = budget
         self._start_s: Floats = np.empty(0)
@@ -56,12 +56,12 @@ class BestHarm:
         """Look these rows' worlds up, and search those that are not known."""
         others = fixed_commands(self.others, worlds, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._problem(worlds, vehicle, others)
-        profiles, known = self._recall(problem, self._count)
+        profiles, known = self._recall(problem, self._harm_count)
         unknown = np.flatnonzero(~known)
         if unknown.size:
             profiles = self._search(worlds, vehicle, others, profiles, unknown)
         first, total = follow_profiles(problem, profiles)
-        self.predicted_harm = place(self.predicted_harm, rows, first if self._count == "first" else total)
+        self.predicted_harm = place(self.predicted_harm, rows, first if self._harm_count == "first" else total)
         self.searched = place(self.searched, rows, (~known).astype(np.float64))
         self._start_s = place(self._start_s, rows, problem.clock[:, START])
         self._profiles = _placed(self._profiles, rows, profiles, self._start_s.size)
@@ -75,15 +75,17 @@ class BestHarm:
         return self._profiles.take(slice(worlds.n)).at(step)[:, 0]
 
     def _problem(self, worlds: Worlds, vehicle: int, others: Floats) -> ProfileProblem:
-        return profile_problem(worlds, [vehicle], count=self._count, horizon_s=self._horizon_s, others_mps2=others)
+        return profile_problem(
+            worlds, [vehicle], harm_count=self._harm_count, horizon_s=self._horizon_s, others_mps2=others
+        )
 
     def _search(self, worlds: Worlds, vehicle: int, others: Floats, profiles: Profiles, unknown: Ints) -> Profiles:
         """The given profiles with those of ``unknown`` worlds replaced by searched ones."""
         part, theirs = worlds.take(unknown), others[unknown]
         problem = self._problem(part, vehicle, theirs)
-        horizon_s, count = self._horizon_s, self._count
+        horizon_s, count = self._horizon_s, self._harm_count
         with renumbered(unknown):
-            coupled = optimise_coupled(part, vehicle, count=count, horizon_s=horizon_s, others_mps2=theirs)
+            coupled = optimise_coupled(part, vehicle, harm_count=count, horizon_s=horizon_s, others_mps2=theirs)
             given = constant_profiles(problem, -coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
             found = search_profiles(problem, given, budget=self._budget).profiles
         whole, found = pad_profiles([profiles, found], MOST_PHASES)

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.protocol import Agent, fixed_commands, place
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.search.kernel import MOST_PHASES
 from ethbrake_marl.search.problem import TIME_STEP_S, ProfileProblem, profile_problem
@@ -45,18 +45,18 @@ class Planner:
         self,
         argument: str | None = None,
         *,
-        count: HarmCount = "first",
+        harm_count: HarmCount = "first",
         horizon_s: float = 8.0,
         most_candidates: int | None = None,
     ) -> None:
-        check_count(count)
+        check_harm_count(harm_count)
         self.others: Mapping[int, Script] = {}
         self.name = "planner" if argument is None else f"planner:{argument}"
         self.predicted_harm: Floats = np.empty(0)
         self._candidates, self._milliseconds = _budget(argument)
         if most_candidates is not None:
             self._candidates, self._milliseconds = min(self._candidates, most_candidates), 0.0
-        self._count: HarmCount = count
+        self._harm_count: HarmCount = harm_count
         self._horizon_s = horizon_s
         self._latency_s: Floats = np.empty(0)
         self._others_mps2: Floats = np.empty((0, 0))  # [n, N]
@@ -96,7 +96,9 @@ class Planner:
         return self._plan.commands_mps2[:n, 0, 0].copy()
 
     def _problem(self, worlds: Worlds, vehicle: int, others: Floats) -> ProfileProblem:
-        return profile_problem(worlds, [vehicle], count=self._count, horizon_s=self._horizon_s, others_mps2=others)
+        return profile_problem(
+            worlds, [vehicle], harm_count=self._harm_count, horizon_s=self._horizon_s, others_mps2=others
+        )
 
     def _rest(self, rows: Ints, time_s: Floats, problem: ProfileProblem) -> Profiles:
         """What is left of the plans of ``rows`` from ``time_s`` on."""
@@ -119,7 +121,7 @@ class Planner:
             found = search_profiles(problem, given, budget=self._candidates, seed=seed)
             plan, seed = found.profiles, seed + 1
             if time.perf_counter() >= stop:
-                return plan, found.harm(self._count)
+                return plan, found.harm(self._harm_count)
 
 
 def _with_constants(problem: ProfileProblem, plan: Profiles) -> Profiles:
@@ -152,5 +154,5 @@ def _budget(argument: str | None) -> tuple[int, float]:
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
     """``planner``, ``planner:CANDIDATES`` or ``planner:20ms``."""
     return Planner(
-        argument, count=settings.harm_count, horizon_s=settings.horizon_s, most_candidates=settings.most_candidates
+        argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s, most_candidates=settings.most_candidates
     )

@@ -12,7 +12,7 @@ from ethbrake_marl.agents.protocol import Agent, check_agent, place, recall
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, introduce, scripted
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 
@@ -31,7 +31,7 @@ class Rehearsed(AgentAround):
     A deviation is a sequence of accelerations added to what the policy does; the policy goes on reacting to what it
     observes. The first one is none. In each of ``rounds`` rounds ``rehearsals`` fixed changes, the same in every world,
     are added to the best deviation so far, and the least harm of all is kept: a random local search around the policy.
-    ``predicted_harm`` [n] is that least harm (m2/s2, under ``count``), never above the policy's own, and what is
+    ``predicted_harm`` [n] is that least harm (m2/s2, under ``harm_count``), never above the policy's own, and what is
     realised if the other vehicles follow their scripts. Equal harms: the earlier one, so a policy that cannot be
     bettered drives as it is. A world's choice does not depend on its batch. Raises ``InvalidInput`` for what is not an
     agent, numbers of rehearsals or rounds outside 1 to 10,000, an unknown count.
@@ -47,18 +47,18 @@ class Rehearsed(AgentAround):
         *,
         rehearsals: int = REHEARSALS,
         rounds: int = ROUNDS,
-        count: HarmCount = "first",
+        harm_count: HarmCount = "first",
     ) -> None:
         check_agent(policy, "rehearsed")
         for name, number in (("rehearsals", rehearsals), ("rounds", rounds)):
             if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= 10_000:
                 raise InvalidInput(f"rehearsed: {name} = {number!r}: must be a whole number in 1..10000")
-        check_count(count)
+        check_harm_count(harm_count)
         super().__init__(policy, f"{policy.name}+refined")
         self.scenario = scenario
         self.rehearsals = rehearsals
         self.rounds = rounds
-        self.count: HarmCount = count
+        self.harm_count: HarmCount = harm_count
         self.predicted_harm: Floats = np.empty(0)
         self._deviation: Floats = np.empty((0, _SEGMENTS))  # [n, segments] that is driven
         self._stage = copy.deepcopy(policy)  # rehearsing must not disturb the policy's memory of running episodes
@@ -91,12 +91,14 @@ class Rehearsed(AgentAround):
 
     def _harm(self, worlds: Worlds, vehicle: int, deviation: Floats) -> Floats:
         """Harm under one deviation per world, [n]."""
-        return drive(worlds, _Deviating(self._stage, deviation), self.scenario, vehicle).ledger.world_harm(self.count)
+        return drive(worlds, _Deviating(self._stage, deviation), self.scenario, vehicle).ledger.world_harm(
+            self.harm_count
+        )
 
 
 def refine(policy: Agent, argument: None, settings: AgentSettings) -> Agent:
     """``+refined`` around an agent."""
-    return Rehearsed(policy, settings.needed_scenario(), count=settings.harm_count)
+    return Rehearsed(policy, settings.needed_scenario(), harm_count=settings.harm_count)
 
 
 class _Deviating(AgentAround):

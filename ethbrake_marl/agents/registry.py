@@ -19,7 +19,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.spelling import AROUND, OLD_NAMES, OLD_SPELLINGS, AgentSpec, parse_spec
 from ethbrake_marl.agents.team import Driver, Team
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, OldSpelling, unknown_name
-from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.scenario import Scenario
 
 HORIZON_S = 8.0  # until when an agent looks ahead that knows no scenario
@@ -169,7 +169,7 @@ def make_agent(
     horizon, and for a scenario that is missing.
 
     """
-    check_count(harm_count)
+    check_harm_count(harm_count)
     if not (scenario is None or isinstance(scenario, Scenario)):
         raise InvalidInput(f"scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")
     if horizon_s is None:

@@ -89,7 +89,7 @@ def generalise_command(
     ] = "3,4,5,6,7,8,9,10",
     episodes: Annotated[int, typer.Option(help="Worlds of each length.")] = 1000,
     seed: Annotated[int, typer.Option(help="Seed of the lists.")] = LIST_SEED,
-    count: Annotated[HarmCount, typer.Option(help="Harm: first impacts only, or all.")] = "total",
+    harm_count: Annotated[HarmCount, typer.Option(help="Harm: first impacts only, or all.")] = "total",
     search_episodes: Annotated[int, typer.Option(help="Worlds of the joint optimum; 0: none.")] = 0,
     budget: Annotated[int, typer.Option(help="Candidates per world of that search.")] = 20_000,
     as_json: JsonOption = False,
@@ -110,7 +110,7 @@ def generalise_command(
         )
     line = load_runnable(scenario)
     agents = load_runs([each.strip() for each in runs.split(",")], line)
-    question = LineQuestion(line, lengths, episodes, seed, count, search_episodes, budget)
+    question = LineQuestion(line, lengths, episodes, seed, harm_count, search_episodes, budget)
     with interruptible("nothing was written"), progress_bars() as bars:
         found = drive_longer(question, agents, bars.show_progress)
     if as_json:

@@ -28,6 +28,7 @@ from ethbrake_marl.cli.options import (
     StepsOption,
     TrainingSeedOption,
     VehicleOption,
+    rename_old_options,
 )
 from ethbrake_marl.cli.picture import picture_app
 from ethbrake_marl.cli.terminal import (
@@ -119,7 +120,7 @@ def run_command(arguments: Sequence[str]) -> int:
     Other errors, which are defects, pass through.
     """
     try:
-        status = app(list(arguments), prog_name="ethbrake", standalone_mode=False)
+        status = app(rename_old_options(arguments), prog_name="ethbrake", standalone_mode=False)
         sys.stdout.flush()
     except TyperException as error:
         context = getattr(error, "ctx", None)

@@ -18,7 +18,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.bounds import proven_of_table, shipped_bounds, shipped_lines
 from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, load_runnable, make_agents
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm import BUDGET, search_list
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table, save_table
 from ethbrake_marl.limits.driven_profiles import fold_agent
@@ -32,7 +32,7 @@ def best_harm_command(
     scenario: ScenarioOption = "paper-random",
     episodes: Annotated[int, typer.Option(help="Worlds of the list.")] = EPISODES,
     seed: Annotated[int, typer.Option(help="Seed of the list.")] = LIST_SEED,
-    count: Annotated[
+    harm_count: Annotated[
         HarmCount | None, typer.Option(help="Harm to minimise: first impacts only, or all.", show_default="both")
     ] = None,
     vehicles: Annotated[
@@ -76,7 +76,7 @@ def best_harm_command(
         raise InvalidInput(f"scenario {chosen.name!r} has no learner; say who is controlled: --vehicles vehicle_2")
     known = None if start is None else load_table(start)
     sample = chosen.sample(episodes, seed)
-    counts: Sequence[HarmCount] = COUNTS if count is None else (count,)
+    counts: Sequence[HarmCount] = HARM_COUNTS if harm_count is None else (harm_count,)
     specs = _agent_specs(agents, chosen, controlled)
     lineups = {each: make_agents(specs, chosen, harm_count=each) for each in counts}
     drivers = {name: {each: lineups[each][name] for each in counts} for name in lineups[counts[0]]}
@@ -85,7 +85,7 @@ def best_harm_command(
         chosen, sample, parts, drivers, counts=counts, vehicles=controlled, budget=budget, seed=search_seed,
         threads=threads, known=known,
     )  # fmt: skip
-    text = _command_text(scenario, episodes, seed, count, names, budget, search_seed, start, specs)
+    text = _command_text(scenario, episodes, seed, harm_count, names, budget, search_seed, start, specs)
     table = replace(table, header={**table.header, "episodes": episodes, "list_seed": seed, "command": text})
     if output is not None and parts is not None:
         save_table(output, table)
@@ -148,20 +148,20 @@ def _show(figures: dict[str, object], *, as_json: bool) -> None:
 def best_harm_figures(table: BestHarmTable) -> dict[str, object]:
     """What was asked, the mean best known harm under each count (m2/s2), and the share of worlds without any."""
     figures: dict[str, object] = {key: value for key, value in table.header.items() if key != "after"}
-    for count, best in table.best.items():
-        name = "best_known_first_impact_harm" if count == "first" else "best_known_total_harm"
+    for harm_count, best in table.best.items():
+        name = "best_known_first_impact_harm" if harm_count == "first" else "best_known_total_harm"
         figures[name] = float(best.harm.mean())
         figures["harmless_rate"] = float((best.harm == 0.0).mean())
     return figures
 
 
 def _command_text(
-    scenario: str, episodes: int, seed: int, count: HarmCount | None, vehicles: Sequence[str] | None, budget: int,
+    scenario: str, episodes: int, seed: int, harm_count: HarmCount | None, vehicles: Sequence[str] | None, budget: int,
     search_seed: int, start: Path | None, agents: Sequence[str],
 ) -> str:  # fmt: skip
     """The command that makes the same table, for its header: every option that changes a result."""
     words = ["ethbrake", "best-harm", "--scenario", scenario, "--episodes", str(episodes), "--seed", str(seed)]
-    words += [] if count is None else ["--count", count]
+    words += [] if harm_count is None else ["--harm-count", harm_count]
     words += [] if vehicles is None else ["--vehicles", ",".join(vehicles)]
     words += ["--budget", str(budget), "--search-seed", str(search_seed)]
     words += [] if start is None else ["--start", start.name]

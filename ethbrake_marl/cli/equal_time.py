@@ -35,7 +35,9 @@ def equal_time_command(
     against: Annotated[str, typer.Option(metavar="A", help="Whose harm the others' is compared with.")] = REFINED,
     episodes: Annotated[int, typer.Option(help="Worlds of the list.")] = 1000,
     seed: Annotated[int, typer.Option(help="Seed of the list; not one of which a table ships.")] = LIST_SEED,
-    count: Annotated[HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")] = "first",
+    harm_count: Annotated[
+        HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")
+    ] = "first",
     repeats: Annotated[int, typer.Option(help="How often each agent is timed; the median is told.")] = 3,
     as_json: JsonOption = False,
 ) -> None:
@@ -46,32 +48,38 @@ def equal_time_command(
     """
     chosen = load_driven(scenario, None)
     worlds = chosen.sample(episodes, seed)
-    lineup = make_lineup(agents.split(","), chosen, harm_count=count)
+    lineup = make_lineup(agents.split(","), chosen, harm_count=harm_count)
     check_agents(lineup, worlds.worlds, chosen)
     if any(spec.startswith("best_harm") for spec in lineup):
-        _check_unknown(worlds.worlds, chosen, count, seed)
+        _check_unknown(worlds.worlds, chosen, harm_count, seed)
     with interruptible("nothing was written"), progress_bars() as bars:
         rows = equal_time(
             worlds,
             lineup,
             scenario=chosen,
             against=against,
-            count=count,
+            harm_count=harm_count,
             repeats=repeats,
             on_progress=bars.show_progress,
         )
     machine = this_machine()
     if as_json:
-        conditions = {"scenario": chosen.name, "seed": seed, "episodes": episodes, "count": count, "against": against}
+        conditions = {
+            "scenario": chosen.name,
+            "seed": seed,
+            "episodes": episodes,
+            "harm_count": harm_count,
+            "against": against,
+        }
         write_json({"machine": asdict(machine), **conditions, "agents": [row.to_json() for row in rows]})
         return
     result_console().print(timed_table(rows, against))
-    typer.echo(f"{chosen.name}: {episodes:,} worlds, seed {seed}; {count} harm minimised. Machine: {machine}")
+    typer.echo(f"{chosen.name}: {episodes:,} worlds, seed {seed}; {harm_count} harm minimised. Machine: {machine}")
 
 
-def _check_unknown(worlds: Worlds, scenario: Scenario, count: HarmCount, seed: int) -> None:
+def _check_unknown(worlds: Worlds, scenario: Scenario, harm_count: HarmCount, seed: int) -> None:
     """Refuse worlds of a shipped table: ``best_harm`` would look them up, and its time would be no search's."""
-    kept = int(np.isfinite(best_known(worlds, Task(scenario, scenario.learners))[count]).sum())
+    kept = int(np.isfinite(best_known(worlds, Task(scenario, scenario.learners))[harm_count]).sum())
     if kept:
         raise InvalidInput(
             f"--seed {seed}: a shipped table holds {kept:,} of these {worlds.n:,} worlds, so best_harm would look them"

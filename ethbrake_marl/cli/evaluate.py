@@ -51,7 +51,9 @@ def evaluate_command(
     ] = "full_brake,e_v2x_bm,e_v2x_bm:pairwise",
     episodes: Annotated[int | None, typer.Option(help="Worlds of the list.", show_default=str(EPISODES))] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the list.", show_default=str(LIST_SEED))] = None,
-    count: Annotated[HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")] = "first",
+    harm_count: Annotated[
+        HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")
+    ] = "first",
     shield: Annotated[
         str,
         typer.Option(metavar="|".join(OLD_SHIELDS), help="Old: now +SHIELD behind an agent, such as ppo@shipped+step."),
@@ -89,7 +91,7 @@ def evaluate_command(
     objectives = declared_objectives(objective or (), chosen.vehicles)
     sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
     intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
-    lineup = make_lineup(agents.split(","), chosen, harm_count=count, shield=shield, uncertainty=intervals)
+    lineup = make_lineup(agents.split(","), chosen, harm_count=harm_count, shield=shield, uncertainty=intervals)
     check_agents(lineup, sample.worlds, chosen)
     with interruptible("nothing was written"), progress_bars() as bars:
         evaluation = evaluate(
@@ -110,7 +112,7 @@ def evaluate_command(
     if note := horizon_note(moving, sample.worlds.n, chosen.horizon_s):
         say(note)
     if told and not as_json:
-        result_console().print(rescored_table(told, count))
+        result_console().print(rescored_table(told, harm_count))
 
 
 def show_rows(rows: Sequence[SummaryRow], as_json: bool, told: Sequence[Rescored] = ()) -> None:
@@ -138,14 +140,14 @@ ProposersOption = Annotated[
     typer.Option("--agents", metavar="A,B,...", help="Who proposes; agents of `ethbrake evaluate` without a shield."),
 ]
 EpisodesOption = Annotated[int, typer.Option("--episodes", help="Worlds of the list.", min=1)]
-CountOption = Annotated[HarmCount, typer.Option("--count", help="Harm that is guaranteed.")]
+CountOption = Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")]
 
 
 def shield_command(
     agents: ProposersOption = "ppo@shipped,full_brake,constant:3",
     scenario: ScenarioOption = "paper-random",
     episodes: EpisodesOption = SHIELD_EPISODES,
-    count: CountOption = "first",
+    harm_count: CountOption = "first",
     vehicle: VehicleOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -155,7 +157,7 @@ def shield_command(
     (the same), costly (lower).
     """
     chosen = load_driven(scenario, vehicle)
-    rows = measured_modes(agents, chosen, episodes, count)
+    rows = measured_modes(agents, chosen, episodes, harm_count)
     if as_json:
         write_json([row.to_json() for row in rows])
     else:
@@ -171,7 +173,7 @@ def picture_shield_modes(
     agents: ProposersOption = "ppo@shipped,full_brake,constant:3",
     scenario: ScenarioOption = "paper-random",
     episodes: EpisodesOption = SHIELD_EPISODES,
-    count: CountOption = "first",
+    harm_count: CountOption = "first",
     vehicle: VehicleOption = None,
     force: ForceOption = False,
 ) -> None:
@@ -182,23 +184,23 @@ def picture_shield_modes(
     from ethbrake_marl.figures.style import png_bytes
 
     chosen = load_driven(scenario, vehicle)
-    rows = measured_modes(agents, chosen, episodes, count)
+    rows = measured_modes(agents, chosen, episodes, harm_count)
     caption = (
-        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}, {count} harm; mean and 95 % interval of the"
-        " difference, paired by world."
+        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}, {harm_count} harm; mean and 95 %"
+        " interval of the difference, paired by world."
     )
     write_output(target, png_bytes(shield_modes_figure(rows, caption=caption)), force=force)
     say(f"picture: {target}")
 
 
-def measured_modes(agents: str, scenario: Scenario, episodes: int, count: HarmCount) -> list[ModeRow]:
+def measured_modes(agents: str, scenario: Scenario, episodes: int, harm_count: HarmCount) -> list[ModeRow]:
     """The rows of these agents, with progress on stderr."""
     worlds = scenario.sample(episodes, LIST_SEED).worlds
-    lineup = make_proposers(agents.split(","), scenario, harm_count=count)
+    lineup = make_proposers(agents.split(","), scenario, harm_count=harm_count)
     with interruptible("nothing was written"), progress_bars() as bars:
         return compare_modes(
             lineup,
             worlds,
-            Task(scenario, scenario.learners, count),
+            Task(scenario, scenario.learners, harm_count),
             on_progress=lambda name, done: bars.show(name, done, episodes),
         )

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from ethbrake_marl.errors import OldSpelling
 
 ScenarioOption = Annotated[
     str, typer.Option("--scenario", metavar="NAME|PATH", help="A shipped scenario, or a path to a YAML file.")
@@ -34,3 +38,17 @@ VehicleOption = Annotated[
     str | None, typer.Option(help="Who is driven; other learners brake fully.", show_default="the learner")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout.")]
+
+OLD_OPTIONS = {"--count": "--harm-count"}
+
+
+def rename_old_options(arguments: Sequence[str]) -> list[str]:
+    """The same command line with every option of the version before as it is written today, and a warning."""
+    renamed = []
+    for argument in arguments:
+        option, equals, value = argument.partition("=")
+        new = OLD_OPTIONS.get(option, option)
+        if new != option:
+            warnings.warn(OldSpelling(f"{option} is written {new} now"), stacklevel=2)
+        renamed.append(f"{new}{equals}{value}")
+    return renamed

@@ -38,7 +38,7 @@ def picture_criticality(
     output: PictureOption,
     scenario: ScenarioOption = "paper-distance",
     agent: Annotated[str, typer.Option(help="Who drives; any agent of `ethbrake evaluate`.")] = "e_v2x_bm",
-    count: Annotated[HarmCount, typer.Option(help="Harm that the agent minimises, if it does.")] = "first",
+    harm_count: Annotated[HarmCount, typer.Option(help="Harm that the agent minimises, if it does.")] = "first",
     cells: Annotated[int | None, typer.Option(help="Worlds along each gap.", show_default="81")] = None,
     gaps: Annotated[
         tuple[float, float] | None,
@@ -56,7 +56,7 @@ def picture_criticality(
     from ethbrake_marl.figures.style import png_bytes
 
     chosen = load_driven(scenario, None)
-    lineup = make_agents([agent], chosen, harm_count=count)
+    lineup = make_agents([agent], chosen, harm_count=harm_count)
     with interruptible("nothing was written"), progress_bars() as bars:
         found = criticality_map(
             chosen,
@@ -102,7 +102,7 @@ def picture_shield(
     agents: Annotated[str, typer.Option(metavar="A,B,...", help="Who proposes.")] = "full_brake,constant:3",
     scenario: ScenarioOption = "paper-random",
     episodes: Annotated[int, typer.Option(help="Worlds of the list.", min=1)] = 500,
-    count: Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")] = "first",
+    harm_count: Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")] = "first",
     vehicle: VehicleOption = None,
     force: ForceOption = False,
 ) -> None:
@@ -116,11 +116,13 @@ def picture_shield(
     worlds = chosen.sample(episodes, LIST_SEED).worlds
     curves = []
     with interruptible("nothing was written"), progress_bars() as bars:
-        for name, agent in make_proposers(agents.split(","), chosen, harm_count=count).items():
-            curves.append((name, operating_curve(worlds, agent, chosen, chosen.learners[0], ALLOWANCES, count=count)))
+        for name, agent in make_proposers(agents.split(","), chosen, harm_count=harm_count).items():
+            curves.append(
+                (name, operating_curve(worlds, agent, chosen, chosen.learners[0], ALLOWANCES, harm_count=harm_count))
+            )
             bars.show(name, episodes, episodes)
     caption = (
-        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; step shield, {count} harm. Beside the"
+        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; step shield, {harm_count} harm. Beside the"
         " points: what certificates may reach above the bound (m²/s²)."
     )
     write_output(target, png_bytes(operating_figure(curves, caption=caption)), force=force)
@@ -140,7 +142,7 @@ def picture_robustness(
     ] = "braking_capacity_mps2=10%,gaps_m=0.5",
     scenario: ScenarioOption = "paper-random",
     episodes: Annotated[int, typer.Option(help="Worlds of the list.", min=1)] = 200,
-    count: Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")] = "first",
+    harm_count: Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")] = "first",
     vehicle: VehicleOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -156,14 +158,14 @@ def picture_robustness(
 
     chosen = load_driven(scenario, vehicle)
     worlds = chosen.sample(episodes, LIST_SEED).worlds
-    (policy,) = make_proposers([agent], chosen, harm_count=count).values()
+    (policy,) = make_proposers([agent], chosen, harm_count=harm_count).values()
     with interruptible("nothing was written"), progress_bars() as bars:
         points = robustness(
-            worlds, policy, chosen, chosen.learners[0], intervals, count=count,
+            worlds, policy, chosen, chosen.learners[0], intervals, harm_count=harm_count,
             on_progress=lambda what, done: bars.show(what, done, episodes),
         )  # fmt: skip
     caption = (
-        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; {agent} proposes; {count} harm."
+        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; {agent} proposes; {harm_count} harm."
         f" Intervals of width 1: {intervals}."
     )
     write_output(target, png_bytes(robustness_figure(points, caption=caption)), force=force)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.evaluation.regret import Between, between
-from ethbrake_marl.harm import COUNTS
+from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.limits.best_harm import world_identity
 from ethbrake_marl.limits.best_harm_table import BestHarmTable
 from ethbrake_marl.limits.limits import Unproven, prove, unproven_because
@@ -97,7 +97,9 @@ def bounds_of(table: BestHarmTable) -> ShippedBounds:
     task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
     worlds = scenario.sample(episodes, seed).worlds
     table.check_holds_any(world_identity(worlds, task))
-    first, total = (float(table.best[count].harm.mean()) if count in table.best else None for count in COUNTS)
+    first, total = (
+        float(table.best[harm_count].harm.mean()) if harm_count in table.best else None for harm_count in HARM_COUNTS
+    )
     why = unproven_because(worlds, task)
     if why is None and obstacle_ahead(worlds).any():
         why = "an obstacle stands ahead; no least harm is proven"

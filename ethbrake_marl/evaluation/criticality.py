@@ -37,10 +37,10 @@ class CriticalityMap:
     boundary_gap_1_m: Floats | None  # [B] None where nothing is proven for this line-up
     boundary_gap_2_m: Floats | None  # [B] above it worlds are avoidable; NaN where it leaves the range
 
-    def harm(self, count: HarmCount) -> Floats:
+    def harm(self, harm_count: HarmCount) -> Floats:
         """Harm of the agent in each cell, [G (gap 2), G (gap 1)] m2/s2."""
         outcome: Outcome = next(iter(self.evaluation.outcomes.values()))
-        return outcome.world_harm(count).reshape(self.gap_2_m.size, self.gap_1_m.size)
+        return outcome.world_harm(harm_count).reshape(self.gap_2_m.size, self.gap_1_m.size)
 
 
 def criticality_map(

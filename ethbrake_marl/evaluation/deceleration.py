@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_breakpoints, pairwise_harm
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm import scripted_commands
 from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
 from ethbrake_marl.physics import Floats, Worlds, advance, forecast, make_worlds
@@ -50,9 +50,9 @@ class DecelerationCurve:
     coupled: Mapping[HarmCount, Choice]  # minimising either count in the simulation
     limits: Limits | Unproven  # what is known of the world over all time-varying commands
 
-    def harm(self, count: HarmCount) -> Floats:
+    def harm(self, harm_count: HarmCount) -> Floats:
         """The realised harm under a counting rule, [K] m2/s2."""
-        return self.first_impact_harm if count == "first" else self.total_harm
+        return self.first_impact_harm if harm_count == "first" else self.total_harm
 
 
 def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> DecelerationCurve:
@@ -83,13 +83,13 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
     closed_form = Choice(float(chosen[0]), float(predicted[np.searchsorted(at, chosen[0])]))
     return DecelerationCurve(
         task, world, at, predicted, first[0], total[0], regimes, closed_form,
-        {count: _coupled(world, task, count, others) for count in COUNTS}, known_limits(world, task),
+        {rule: _coupled(world, task, rule, others) for rule in HARM_COUNTS}, known_limits(world, task),
     )  # fmt: skip
 
 
-def _coupled(world: Worlds, task: Task, count: HarmCount, others_mps2: Floats) -> Choice:
+def _coupled(world: Worlds, task: Task, harm_count: HarmCount, others_mps2: Floats) -> Choice:
     best = optimise_coupled(
-        world, task.vehicle, count=count, horizon_s=task.scenario.horizon_s, others_mps2=others_mps2
+        world, task.vehicle, harm_count=harm_count, horizon_s=task.scenario.horizon_s, others_mps2=others_mps2
     )
     return Choice(float(best.deceleration_mps2[0]), float(best.harm[0]))
 

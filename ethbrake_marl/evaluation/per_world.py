@@ -17,7 +17,7 @@ from ethbrake_marl.evaluation.conditions import quantity, quantity_rules
 from ethbrake_marl.evaluation.regret import Regrets, assess
 from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
 from ethbrake_marl.files.durable import check_writable, write_file
-from ethbrake_marl.harm import COUNTS
+from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.objectives import Declared, scored
 
 
@@ -136,10 +136,10 @@ def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
 def objective_columns(outcome: Outcome, objectives: Sequence[Declared]) -> Columns:
     """What each objective is for each vehicle under both counts (m2/s2): ``social:45_first_2``."""
     return {
-        f"{objective}_{count}_{i + 1}": values[:, i].tolist()
+        f"{objective}_{harm_count}_{i + 1}": values[:, i].tolist()
         for objective in objectives
-        for count in COUNTS
-        for values in scored(outcome.ledger, count, [objective]).values()
+        for harm_count in HARM_COUNTS
+        for values in scored(outcome.ledger, harm_count, [objective]).values()
         for i in range(values.shape[1])
     }
 

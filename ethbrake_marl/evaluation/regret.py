@@ -32,13 +32,13 @@ class Regrets:
     total_harm: Floats
     source: NDArray[np.str_]  # where these come from; see ``Source``
 
-    def best(self, count: HarmCount) -> Floats:
+    def best(self, harm_count: HarmCount) -> Floats:
         """Best known harm under one count, [n] m2/s2."""
-        return self.first_impact_harm if count == "first" else self.total_harm
+        return self.first_impact_harm if harm_count == "first" else self.total_harm
 
-    def regret(self, outcome: Outcome, count: HarmCount) -> Floats:
+    def regret(self, outcome: Outcome, harm_count: HarmCount) -> Floats:
         """The outcome's harm minus the best known, [n] m2/s2, never negative."""
-        return outcome.ledger.world_harm(count) - self.best(count)
+        return outcome.ledger.world_harm(harm_count) - self.best(harm_count)
 
     def below(self, outcome: Outcome) -> Bools:
         """Worlds in which the outcome is below what was known before, in either count, by more than rounding, [n]."""

@@ -61,9 +61,9 @@ class Outcome:
         """Number of impacts of all pairs, and with an obstacle ahead, [n]."""
         return self.ledger.impacts
 
-    def world_harm(self, count: HarmCount) -> Floats:
+    def world_harm(self, harm_count: HarmCount) -> Floats:
         """Harm of all vehicles under a counting rule, [n] m2/s2."""
-        return self.ledger.world_harm(count)
+        return self.ledger.world_harm(harm_count)
 
     @property
     def first_impact_harm(self) -> Floats:
@@ -75,9 +75,9 @@ class Outcome:
         """Harm of all vehicles, every impact, [n] m2/s2."""
         return self.ledger.world_harm("total")
 
-    def vehicle_harm(self, count: HarmCount) -> Floats:
+    def vehicle_harm(self, harm_count: HarmCount) -> Floats:
         """Harm of each vehicle, [n, N] m2/s2."""
-        return self.ledger.vehicle_harm(count)
+        return self.ledger.vehicle_harm(harm_count)
 
     @property
     def ended(self) -> NDArray[np.str_]:

@@ -99,14 +99,19 @@ def modes_table(rows: list[ModeRow]) -> Table:
 
 def _measured(worlds: Worlds, agent: Agent, task: Task) -> dict[str, Any]:
     """Of one chunk: harm per world under each mode, and what step mode replaced."""
-    scenario, vehicle, count = task.scenario, task.vehicle, task.harm_count
+    scenario, vehicle, harm_count = task.scenario, task.vehicle, task.harm_count
     found: dict[str, Any] = {}
-    drivers: dict[str, Agent] = {NONE: copy.deepcopy(agent), EPISODE: HybridAgent(agent, scenario, count=count)}
+    drivers: dict[str, Agent] = {
+        NONE: copy.deepcopy(agent),
+        EPISODE: HybridAgent(agent, scenario, harm_count=harm_count),
+    }
     for name, later in ((STEP, True), (STEP_ALERT, False)):
-        drivers[name] = StepShieldAgent(copy.deepcopy(agent), scenario, count=count, logging=True, later_rollouts=later)
+        drivers[name] = StepShieldAgent(
+            copy.deepcopy(agent), scenario, harm_count=harm_count, logging=True, later_rollouts=later
+        )
     for name, driver in drivers.items():
         episodes = drive(worlds, driver, scenario, vehicle)
-        harm = episodes.ledger.world_harm(count)
+        harm = episodes.ledger.world_harm(harm_count)
         found[name], found[f"{name} moving"] = harm, int((~episodes.at_rest).sum())
         if isinstance(driver, StepShieldAgent):
             shield = driver.shield

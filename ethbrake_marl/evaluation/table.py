@@ -24,7 +24,7 @@ from ethbrake_marl.evaluation.statistics import (
     rate,
     relative_decrease,
 )
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.objectives import STANDARD, Declared, objectives_of, scored
 
 ALL = "standard"
@@ -36,13 +36,13 @@ class Rescored:
 
     agent: str
     objective: str
-    count: HarmCount
+    harm_count: HarmCount
     each: tuple[Estimate, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for JSON: objective, count, and each vehicle's mean with its interval."""
+        """Plain data for JSON: objective, harm count, and each vehicle's mean with its interval."""
         each = estimates_to_json({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
-        return {"objective": self.objective, "count": self.count, **each}
+        return {"objective": self.objective, "harm_count": self.harm_count, **each}
 
 
 def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
@@ -61,17 +61,17 @@ def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
 def rescored(evaluation: Evaluation, declared: Sequence[Declared] = STANDARD) -> list[Rescored]:
     """Every agent under every objective and both counts, in that order."""
     return [
-        Rescored(agent, objective, count, tuple(mean(column) for column in values.T))
+        Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
         for agent, outcome in evaluation.outcomes.items()
-        for count in COUNTS
-        for objective, values in scored(outcome.ledger, count, declared).items()
+        for harm_count in HARM_COUNTS
+        for objective, values in scored(outcome.ledger, harm_count, declared).items()
     ]
 
 
-def rescored_table(rows: Sequence[Rescored], count: HarmCount) -> Table:
+def rescored_table(rows: Sequence[Rescored], harm_count: HarmCount) -> Table:
     """The means under one count for a terminal: one line per agent and objective, one column per vehicle."""
-    shown = [row for row in rows if row.count == count]
-    harm = "first-impact" if count == "first" else "total"
+    shown = [row for row in rows if row.harm_count == harm_count]
+    harm = "first-impact" if harm_count == "first" else "total"
     table = Table(
         box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, title=f"Objectives, {harm} harm", title_justify="left"
     )

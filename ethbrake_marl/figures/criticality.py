@@ -11,7 +11,7 @@ from matplotlib.patheffects import Normal, Stroke
 from ethbrake_marl.evaluation.conditions import parameter_line, parameters
 from ethbrake_marl.evaluation.criticality import CriticalityMap
 from ethbrake_marl.figures.style import COLOURS, GREY, add_caption, new_figure
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics import Floats
 
 LABELLED = 0.02  # share of the cells that a region needs to have its name written in it
@@ -23,10 +23,10 @@ def criticality_figure(found: CriticalityMap) -> Figure:
     """Both harms as colour over both gaps, on one scale; the boundary of avoidability as a line."""
     figure = new_figure(10.0, 4.9)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    largest = max(float(found.harm(count).max()) for count in COUNTS)
+    largest = max(float(found.harm(harm_count).max()) for harm_count in HARM_COUNTS)
     (agent,) = found.evaluation.outcomes
-    for axes, (count, label) in zip(panels, _TITLES.items(), strict=True):
-        mesh = _draw_harm(axes, found, found.harm(count), largest)
+    for axes, (harm_count, label) in zip(panels, _TITLES.items(), strict=True):
+        mesh = _draw_harm(axes, found, found.harm(harm_count), largest)
         _draw_boundary(axes, found)
         axes.set_title(f"{label} of {agent}", loc="left", fontsize=10)
         axes.set_xlabel("Gap 1, Vehicle 1 to Vehicle 2 (m)", fontsize=9)

@@ -74,8 +74,8 @@ def _draw_curves(axes: Axes, curve: DecelerationCurve) -> None:
     axes.plot(
         at, curve.predicted, color=_PREDICTED, linestyle="-.", linewidth=1.4, zorder=4, label="predicted (pairwise)"
     )
-    for count, name, colour, dashes in _COUNTS:
-        axes.plot(at, curve.harm(count), color=colour, linestyle=dashes, linewidth=1.5, label=f"realised {name}")
+    for harm_count, name, colour, dashes in _COUNTS:
+        axes.plot(at, curve.harm(harm_count), color=colour, linestyle=dashes, linewidth=1.5, label=f"realised {name}")
     for names in curve.regimes.values():
         for k in np.flatnonzero(names[1:] != names[:-1]):
             axes.axvline(float(at[k + 1]), color=GREY, linewidth=0.6, linestyle=(0, (1, 3)))
@@ -92,8 +92,8 @@ def _mark_chosen(axes: Axes, curve: DecelerationCurve) -> None:
         [chosen], [predicted], color=_PREDICTED, marker="D", markersize=6, linestyle="none", clip_on=False, zorder=6,
         label=f"a* = {chosen:.3f} m/s², closed form: predicts {predicted:.2f}, realises {realised:.2f}",
     )  # fmt: skip
-    for (count, name, colour, _), marker, size in zip(_COUNTS, ("o", "s"), (6, 10), strict=True):
-        best = curve.coupled[count]
+    for (harm_count, name, colour, _), marker, size in zip(_COUNTS, ("o", "s"), (6, 10), strict=True):
+        best = curve.coupled[harm_count]
         axes.plot(
             [best.deceleration_mps2], [best.harm], color=colour, marker=marker, markersize=size, markerfacecolor="none",
             linestyle="none", markeredgewidth=1.4, clip_on=False, zorder=5,

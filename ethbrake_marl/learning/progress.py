@@ -29,11 +29,11 @@ RISEN = 0.05  # by this share of its size the return must have grown to count as
 class Course:
     """The last good policy, the best one, and the evaluations on the way.
 
-    The best is that of least harm on the fixed list, in the ``count`` that the reward is about, not that of highest
+    The best is that of least harm on the fixed list, in the ``harm_count`` of the reward, not that of highest
     return; where no harm is measured there is none.
     """
 
-    count: HarmCount = "first"
+    harm_count: HarmCount = "first"
     policy: Trained | None = None  # none until the first weights were checked
     best: Trained | None = None
     best_harm: float = math.inf
@@ -58,7 +58,7 @@ class Course:
         """Take in an evaluation of ``policy``; gives the alarm, if this one raises it."""
         extra = {} if episode_return is None else {RETURN: episode_return}
         self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **extra})
-        name = HARM_METRIC[self.count]
+        name = HARM_METRIC[self.harm_count]
         if name in metrics and metrics[name] < self.best_harm:
             self.best, self.best_harm = policy, metrics[name]
         alarm = misleading_return(self.evaluations, name)

@@ -19,7 +19,7 @@ from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.protocol import fixed_commands
 from ethbrake_marl.agents.rollout import scripted
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, BestKnown, join_tables, load_table, save_table
 from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
 from ethbrake_marl.scenario import Sample, Scenario, Task
@@ -48,7 +48,7 @@ def best_harm(
     scenario: Scenario,
     worlds: Worlds,
     *,
-    counts: Sequence[HarmCount] = COUNTS,
+    counts: Sequence[HarmCount] = HARM_COUNTS,
     vehicles: Sequence[int] | None = None,
     budget: int = BUDGET,
     seed: int = 0,
@@ -64,7 +64,7 @@ def best_harm(
     (default: every core) or on the batch. Raises ``InvalidInput`` for no vehicle, a script whose command is not fixed
     at the alert, no count, or a budget below 1.
     """
-    if not counts or not set(counts) <= set(COUNTS) or len(set(counts)) != len(counts):
+    if not counts or not set(counts) <= set(HARM_COUNTS) or len(set(counts)) != len(counts):
         raise InvalidInput(f"counts {tuple(counts)}: must be first, total, or both")
     chosen = scenario.learners if vehicles is None else tuple(vehicles)
     workers = _cores() if threads is None else threads
@@ -94,11 +94,11 @@ def best_harm(
 
 def _merged(table: BestHarmTable, known: BestHarmTable) -> BestHarmTable:
     """The table, with what is ``known`` to do less harm; its header says what came before."""
-    for count in [count for count in table.best if count in known.best]:
+    for harm_count in [harm_count for harm_count in table.best if harm_count in known.best]:
         nowhere = np.zeros(len(table.identity), np.int64)
-        kept, has_profile = known.profiles(table.identity, count, nowhere + 1)
+        kept, has_profile = known.profiles(table.identity, harm_count, nowhere + 1)
         kept.ends[~has_profile] = 0
-        table, _ = table.improved(table.identity, count, known.harm(table.identity, count), kept)
+        table, _ = table.improved(table.identity, harm_count, known.harm(table.identity, harm_count), kept)
     return replace(table, header={**table.header, "after": dict(known.header)})
 
 
@@ -106,7 +106,7 @@ def search_list(
     scenario: Scenario,
     sample: Sample,
     *,
-    counts: Sequence[HarmCount] = COUNTS,
+    counts: Sequence[HarmCount] = HARM_COUNTS,
     vehicles: Sequence[int] | None = None,
     budget: int = BUDGET,
     seed: int = 0,
@@ -220,12 +220,12 @@ class _Search:
     threads: int
 
     def problem(
-        self, vehicles: Sequence[int], count: HarmCount = "first", deciders: Sequence[int] | None = None
+        self, vehicles: Sequence[int], harm_count: HarmCount = "first", deciders: Sequence[int] | None = None
     ) -> ProfileProblem:
         return profile_problem(
             self.worlds,
             vehicles,
-            count=count,
+            harm_count=harm_count,
             horizon_s=self.scenario.horizon_s,
             time_step_s=self.scenario.time_step_s,
             others_mps2=self.others,
@@ -235,21 +235,25 @@ class _Search:
     def best(
         self,
         vehicles: Sequence[int],
-        count: HarmCount,
+        harm_count: HarmCount,
         given: Sequence[Profiles] = (),
         deciders: Sequence[int] | None = None,
     ) -> SearchResult:
         """The best profiles that start from constants, from ``given``, and from each vehicle's own best profile."""
-        problem = self.problem(vehicles, count, deciders)
+        problem = self.problem(vehicles, harm_count, deciders)
         starts = [constant_profiles(problem, even_grid(problem, CONSTANTS)), *given]
         if len(vehicles) == 1:
             coupled = optimise_coupled(
-                self.worlds, vehicles[0], count=count, horizon_s=self.scenario.horizon_s, others_mps2=self.others
+                self.worlds,
+                vehicles[0],
+                harm_count=harm_count,
+                horizon_s=self.scenario.horizon_s,
+                others_mps2=self.others,
             )
             starts.insert(0, constant_profiles(problem, -coupled.deceleration_mps2[:, np.newaxis, np.newaxis]))
         else:
             for c, vehicle in enumerate(vehicles):
-                alone = self.best([vehicle], count, (), vehicles if deciders is None else deciders).profiles
+                alone = self.best([vehicle], harm_count, (), vehicles if deciders is None else deciders).profiles
                 least = problem.bounds[:, np.newaxis, :, 0]
                 commands = np.broadcast_to(least, (*alone.ends.shape, len(vehicles))).copy()
                 commands[..., c] = alone.commands_mps2[..., 0]

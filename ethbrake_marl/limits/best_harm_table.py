@@ -67,45 +67,45 @@ class BestHarmTable:
 
     def check_fits(self, problem: ProfileProblem) -> None:
         """Raise ``InvalidInput`` if a profile kept for one of these worlds cannot be driven there."""
-        for count in self.best:
+        for harm_count in self.best:
             try:
-                check_profiles(problem, self.profiles(problem.identity, count, problem.last_step)[0])
+                check_profiles(problem, self.profiles(problem.identity, harm_count, problem.last_step)[0])
             except InvalidInput as error:
-                raise InvalidInput(f"table of best known harm, {count}: {error}") from None
+                raise InvalidInput(f"table of best known harm, {harm_count}: {error}") from None
 
-    def harm(self, identity: UInt64s, count: HarmCount) -> Floats:
+    def harm(self, identity: UInt64s, harm_count: HarmCount) -> Floats:
         """Best known harm of each world (m2/s2), NaN where it is not in the table."""
         rows = self.rows(identity)
-        if count not in self.best:
+        if harm_count not in self.best:
             return np.full(rows.shape, np.nan)
-        return np.where(rows >= 0, self.best[count].harm[rows], np.nan)
+        return np.where(rows >= 0, self.best[harm_count].harm[rows], np.nan)
 
-    def profiles(self, identity: UInt64s, count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
+    def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
         """Kept profiles [n], and where there is one [n]; coasting elsewhere. ``last_step`` [n] ends each of them."""
         rows = self.rows(identity)
-        if count not in self.best:
+        if harm_count not in self.best:
             controlled = next(iter(self.best.values())).profiles.commands_mps2.shape[2]
             coasting = Profiles(last_step[:, np.newaxis].copy(), np.zeros((len(rows), 1, controlled)))
             return coasting, np.zeros(len(rows), np.bool_)
-        kept = self.best[count].profiles.take(rows)
+        kept = self.best[harm_count].profiles.take(rows)
         known = (rows >= 0) & (kept.ends[:, -1] > 0)
         ends = np.where(known[:, np.newaxis], kept.ends, last_step[:, np.newaxis])
         return Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], kept.commands_mps2, 0.0)), known
 
     def improved(
-        self, identity: UInt64s, count: HarmCount, harm: Floats, profiles: Profiles | None = None
+        self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
     ) -> tuple[BestHarmTable, Bools]:
         """The table with every value replaced that ``harm`` [m] undercuts by more than ``TOLERANCE``; and where it did.
 
         ``profiles`` [m] are what did it; without them only the harm is known there. Worlds that are not in the table
         change nothing. Raises ``InvalidInput`` for a count that the table does not hold, or shapes that do not fit.
         """
-        if count not in self.best:
-            raise InvalidInput(f"table of {', '.join(self.best)}: holds no {count!r} harm")
+        if harm_count not in self.best:
+            raise InvalidInput(f"table of {', '.join(self.best)}: holds no {harm_count!r} harm")
         if harm.shape != identity.shape:
             raise InvalidInput(f"improve: {harm.shape} harms for {identity.shape} worlds")
         rows = self.rows(identity)
-        old = self.best[count]
+        old = self.best[harm_count]
         better = (rows >= 0) & (harm < old.harm[rows] - TOLERANCE)
         at = rows[better]
         new_harm = old.harm.copy()
@@ -117,17 +117,17 @@ class BestHarmTable:
         kept, new = pad_profiles([old.profiles, profiles], 1)
         kept.ends[at] = new.ends[better]
         kept.commands_mps2[at] = new.commands_mps2[better]
-        return replace(self, best={**self.best, count: BestKnown(new_harm, kept)}), better
+        return replace(self, best={**self.best, harm_count: BestKnown(new_harm, kept)}), better
 
 
 def join_tables(parts: list[BestHarmTable]) -> BestHarmTable:
     """One table of all the worlds; the header is the first one's."""
-    counts = [count for count in _COUNTS if all(count in part.best for part in parts)]
+    counts = [harm_count for harm_count in _COUNTS if all(harm_count in part.best for part in parts)]
     best: dict[HarmCount, BestKnown] = {}
-    for count in counts:
-        padded = pad_profiles([part.best[count].profiles for part in parts], 1)
+    for harm_count in counts:
+        padded = pad_profiles([part.best[harm_count].profiles for part in parts], 1)
         profiles = Profiles(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
-        best[count] = BestKnown(np.concatenate([part.best[count].harm for part in parts]), profiles)
+        best[harm_count] = BestKnown(np.concatenate([part.best[harm_count].harm for part in parts]), profiles)
     return BestHarmTable(np.concatenate([part.identity for part in parts]), best, parts[0].header)
 
 
@@ -137,15 +137,15 @@ def table_bytes(table: BestHarmTable) -> bytes:
         "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
         "identity": table.identity.astype("<u8"),
     }
-    for count, best in table.best.items():
+    for harm_count, best in table.best.items():
         ends, commands = best.profiles
         used = _used(ends)
         inside = np.arange(ends.shape[1]) < used[:, np.newaxis]
-        arrays[f"{count}_harm"] = best.harm.astype("<f8")
-        arrays[f"{count}_phases"] = used.astype("<u2")
-        arrays[f"{count}_ends"] = ends[inside].astype("<u2")
+        arrays[f"{harm_count}_harm"] = best.harm.astype("<f8")
+        arrays[f"{harm_count}_phases"] = used.astype("<u2")
+        arrays[f"{harm_count}_ends"] = ends[inside].astype("<u2")
         flat = np.ascontiguousarray(commands[inside], "<f8")
-        arrays[f"{count}_commands"] = flat.view(np.uint8).reshape(*flat.shape, 8).transpose(2, 0, 1).copy()
+        arrays[f"{harm_count}_commands"] = flat.view(np.uint8).reshape(*flat.shape, 8).transpose(2, 0, 1).copy()
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
@@ -167,24 +167,24 @@ def load_table(path: Path) -> BestHarmTable:
     data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
     try:
         archive = ArrayArchive(data, UNPACKED_LIMIT_BYTES)
-        counts = [count for count in _COUNTS if f"{count}_harm" in archive.headers]
-        arrays = archive.unpack([row for count in counts or _COUNTS for row in _rows(count)])
+        counts = [harm_count for harm_count in _COUNTS if f"{harm_count}_harm" in archive.headers]
+        arrays = archive.unpack([row for harm_count in counts or _COUNTS for row in _rows(harm_count)])
         header = _header(arrays["header"].tobytes())
-        best = {count: _read_best(arrays, count) for count in counts}
+        best = {harm_count: _read_best(arrays, harm_count) for harm_count in counts}
     except ValueError as error:
         raise CorruptBundle(f"{path}: is not a table of best known harm: {error}") from None
     return BestHarmTable(arrays["identity"].astype(np.uint64), best, header)
 
 
-def _rows(count: HarmCount) -> list[ArrayRow]:
+def _rows(harm_count: HarmCount) -> list[ArrayRow]:
     """What a table holds of one count: n worlds, m phases in all, C controlled vehicles."""
     return [
         ArrayRow("header", "|u1", ("bytes",)),
         ArrayRow("identity", "<u8", ("n",)),
-        ArrayRow(f"{count}_harm", "<f8", ("n",)),
-        ArrayRow(f"{count}_phases", "<u2", ("n",)),
-        ArrayRow(f"{count}_ends", "<u2", (f"m of {count}",)),
-        ArrayRow(f"{count}_commands", "|u1", (8, f"m of {count}", "C")),
+        ArrayRow(f"{harm_count}_harm", "<f8", ("n",)),
+        ArrayRow(f"{harm_count}_phases", "<u2", ("n",)),
+        ArrayRow(f"{harm_count}_ends", "<u2", (f"m of {harm_count}",)),
+        ArrayRow(f"{harm_count}_commands", "|u1", (8, f"m of {harm_count}", "C")),
     ]
 
 
@@ -215,33 +215,33 @@ def _header(data: bytes) -> dict[str, Any]:
     return dict(content)
 
 
-def _read_best(arrays: Mapping[str, NDArray[Any]], count: HarmCount) -> BestKnown:
+def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> BestKnown:
     """One count of a table whose arrays have the right shapes; raises ``ValueError`` for numbers that cannot be."""
-    harm = arrays[f"{count}_harm"].astype(np.float64)
-    used = arrays[f"{count}_phases"].astype(np.int64)
-    planes = arrays[f"{count}_commands"]
+    harm = arrays[f"{harm_count}_harm"].astype(np.float64)
+    used = arrays[f"{harm_count}_phases"].astype(np.int64)
+    planes = arrays[f"{harm_count}_commands"]
     flat = np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f8")[..., 0].astype(np.float64)
     if not len(harm):
         raise ValueError("it holds no world")
     if not (np.isfinite(harm).all() and (harm >= 0.0).all()):
-        raise ValueError(f"{count}_harm: a harm must be a finite number of at least 0 m2/s2")
+        raise ValueError(f"{harm_count}_harm: a harm must be a finite number of at least 0 m2/s2")
     if not np.isfinite(flat).all():
-        raise ValueError(f"{count}_commands: a command must be a finite number")
+        raise ValueError(f"{harm_count}_commands: a command must be a finite number")
     if used.sum() != len(flat):
-        raise ValueError(f"{count}_phases: {used.sum()} phases in all, but there are {len(flat)} commands")
+        raise ValueError(f"{harm_count}_phases: {used.sum()} phases in all, but there are {len(flat)} commands")
     width, controlled = max(int(used.max()), 1), flat.shape[1]
     if not 1 <= controlled <= 64 or len(used) * width * (controlled + 1) > DECODED_LIMIT:
         raise ValueError(f"{len(used)} worlds of {width} phases of {controlled} vehicles are beyond what is kept")
     inside = np.arange(width) < used[:, np.newaxis]
     ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, controlled))
-    ends[inside] = arrays[f"{count}_ends"]
+    ends[inside] = arrays[f"{harm_count}_ends"]
     commands[inside] = flat
     last = np.maximum(used - 1, 0)
     rows = np.arange(len(used))
     ends = np.where(inside, ends, ends[rows, last][:, np.newaxis])
     commands = np.where(inside[..., np.newaxis], commands, commands[rows, last][:, np.newaxis])
     if not ((np.diff(ends, axis=1) >= 0).all() and ((ends[:, -1] > 0) == (used > 0)).all()):
-        raise ValueError(f"{count}_ends: the phases of a world must end in order, the last one after step 0")
+        raise ValueError(f"{harm_count}_ends: the phases of a world must end in order, the last one after step 0")
     return BestKnown(harm, Profiles(ends, commands))
 
 

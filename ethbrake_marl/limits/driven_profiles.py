@@ -37,7 +37,7 @@ def fold_agent(
     check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")
     task = Task(scenario, scenario.learners)
     identity = world_identity(worlds, task)
-    known = np.max([table.harm(identity, count) for count in table.best], axis=0)
+    known = np.max([table.harm(identity, harm_count) for harm_count in table.best], axis=0)
     hard = np.flatnonzero(known > 0.0)
     lowered = dict.fromkeys(table.best, 0)
     if hard.size:
@@ -55,9 +55,11 @@ def fold_agent(
             if profiles is None:
                 continue
             first, total = follow_profiles(problem.take(rows), profiles)
-            for count in table.best:
-                table, better = table.improved(identity[rows], count, first if count == "first" else total, profiles)
-                lowered[count] += int(better.sum())
+            for harm_count in table.best:
+                table, better = table.improved(
+                    identity[rows], harm_count, first if harm_count == "first" else total, profiles
+                )
+                lowered[harm_count] += int(better.sum())
     before = table.header.get(LOWERED, {})
     return replace(table, header={**table.header, LOWERED: {**before, name: lowered}})
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.harm import COUNTS
+from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.limits.avoidability import avoidability
 from ethbrake_marl.limits.lower_bound import lower_bound
 from ethbrake_marl.limits.shipped import best_known
@@ -66,7 +66,7 @@ def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
     if isinstance(proof, Unproven):
         return proof
     found = best_known(worlds, task)
-    first, total = (np.where(proof.avoidable, 0.0, found[count]) for count in COUNTS)
+    first, total = (np.where(proof.avoidable, 0.0, found[harm_count]) for harm_count in HARM_COUNTS)
     return Limits(proof, first, total)
 
 
@@ -78,7 +78,7 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
     if obstacle_ahead(worlds).any():
         contact, harm = avoidability(worlds, task.vehicle), None
     else:
-        bound = lower_bound(worlds, task.vehicle, count="first", horizon_s=task.scenario.horizon_s)
+        bound = lower_bound(worlds, task.vehicle, harm_count="first", horizon_s=task.scenario.horizon_s)
         contact, harm = bound.contact, bound.harm
     return Proof(contact.avoidable, contact.reason_name, harm)
 

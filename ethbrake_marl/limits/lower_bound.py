@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount, check_count, empty_ledger
+from ethbrake_marl.harm import HarmCount, check_harm_count, empty_ledger
 from ethbrake_marl.limits.avoidability import Avoidability, avoidability
 from ethbrake_marl.limits.lower_bound_kernel import BOUNDS, COMBINED_BOUND, FRONT_BOUND, REAR_BOUND, bound_worlds
 from ethbrake_marl.limits.meetings import (
@@ -72,7 +72,7 @@ def lower_bound(
     worlds: Worlds,
     vehicle: int = 1,
     *,
-    count: HarmCount = "first",
+    harm_count: HarmCount = "first",
     horizon_s: float = 8.0,
     scripts: Mapping[int, str] | None = None,
 ) -> LowerBound:
@@ -81,12 +81,12 @@ def lower_bound(
     ``harm = early + max(front_pair + rear_pair, combined)``, each part rounded outward (``rounding``). The combined
     bound is proven for a controlled vehicle that brakes at least as hard as both neighbours; elsewhere it is 0. What
     may come only after the horizon counts as 0, and so does the next impact of a pair that was hit before where
-    ``count`` is "first".
+    ``harm_count`` is "first".
 
     Covers the same lines as ``avoidability``, without an obstacle ahead, and raises ``InvalidInput`` for others, for an
-    unknown ``count``, and for a horizon that is not finite or lies before the vehicle may act.
+    unknown ``harm_count``, and for a horizon that is not finite or lies before the vehicle may act.
     """
-    check_count(count)
+    check_harm_count(harm_count)
     if np.isfinite(worlds.obstacle_gap_m).any():
         raise InvalidInput("lower_bound: worlds with an obstacle ahead (obstacle_gap_m); the proofs know none")
     verdict = avoidability(worlds, vehicle, scripts=scripts)
@@ -94,8 +94,8 @@ def lower_bound(
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
         raise InvalidInput(f"lower_bound: horizon_s {horizon_s!r}: must be finite and at least {start.max():g} s")
     at_onset, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=start)
-    early = empty_ledger(worlds).add(impacts).world_harm(count)
-    counts = ~at_onset.pair_hit if count == "first" else np.ones_like(at_onset.pair_hit)
+    early = empty_ledger(worlds).add(impacts).world_harm(harm_count)
+    counts = ~at_onset.pair_hit if harm_count == "first" else np.ones_like(at_onset.pair_hit)
     forward = at_onset.speeds_mps >= 0.0
     open_pair = counts & forward[:, 1:] & forward[:, :-1]
     none = np.zeros(worlds.n, dtype=np.bool_)

@@ -13,7 +13,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm import world_identity
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table
 from ethbrake_marl.physics import Bools, Floats, Worlds
@@ -38,18 +38,18 @@ def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
     search knows it.
     """
     identity = world_identity(worlds, task)
-    known = {count: np.full(worlds.n, np.nan) for count in COUNTS}
+    known = {harm_count: np.full(worlds.n, np.nan) for harm_count in HARM_COUNTS}
     for table in shipped_tables():
-        known = {count: np.fmin(harm, table.harm(identity, count)) for count, harm in known.items()}
+        known = {harm_count: np.fmin(harm, table.harm(identity, harm_count)) for harm_count, harm in known.items()}
     return known
 
 
-def shipped_profiles(problem: ProfileProblem, count: HarmCount) -> tuple[Profiles, Bools]:
+def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Profiles, Bools]:
     """Kept profiles of a problem with one controlled vehicle, [n], and where there is one, [n]."""
     last_step = problem.last_step
     profiles, known = Profiles(last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, 1))), np.zeros(problem.n, bool)
     for table in shipped_tables():
-        kept, here = table.profiles(problem.identity, count, last_step)
+        kept, here = table.profiles(problem.identity, harm_count, last_step)
         profiles, kept = pad_profiles([profiles, kept], 1)
         profiles.ends[here] = kept.ends[here]
         profiles.commands_mps2[here] = kept.commands_mps2[here]
@@ -66,4 +66,4 @@ def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
             f" at most {MOST_CANDIDATES:,}"
         )
     budget = int(number) if settings.most_candidates is None else min(int(number), settings.most_candidates)
-    return BestHarm(shipped_profiles, count=settings.harm_count, horizon_s=settings.horizon_s, budget=budget)
+    return BestHarm(shipped_profiles, harm_count=settings.harm_count, horizon_s=settings.horizon_s, budget=budget)

@@ -27,8 +27,8 @@ def shipped_policies() -> dict[str, Path]:
     return {path.parent.name: path.parent for path in sorted(_FOLDER.glob(f"*/{BUNDLE}"))}
 
 
-def shipped_name(kind: PolicyKind, scenario: str | None, count: HarmCount) -> str:
-    """Name of the policy of this kind for ``scenario``, of those trained for ``count`` if there is one.
+def shipped_name(kind: PolicyKind, scenario: str | None, harm_count: HarmCount) -> str:
+    """Name of the policy of this kind for ``scenario``, of those trained for ``harm_count`` if there is one.
 
     ``universal`` is for all scenarios, ``ppo`` and ``sac`` are for the one that they were trained on, ``ppo-SCENARIO``
     and ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. Raises
@@ -37,7 +37,7 @@ def shipped_name(kind: PolicyKind, scenario: str | None, count: HarmCount) -> st
     names = shipped_policies()
     plain = [kind] if kind == "universal" or scenario is None else [f"{kind}-{scenario}", kind]
     for stem in plain:
-        for name in (f"{stem}-total", stem) if count == "total" else (stem,):
+        for name in (f"{stem}-total", stem) if harm_count == "total" else (stem,):
             if name in names and (stem != kind or scenario is None or _is_for(kind, names[name], scenario)):
                 return name
     wanted = kind if scenario is None or kind == "universal" else f"{kind} for scenario {scenario!r}"
@@ -58,7 +58,7 @@ def load_shipped(name: str) -> Policy:
 
 
 def load_named_policy(
-    path: str, kind: PolicyKind = "ppo", scenario: Scenario | None = None, count: HarmCount = "first"
+    path: str, kind: PolicyKind = "ppo", scenario: Scenario | None = None, harm_count: HarmCount = "first"
 ) -> Policy:
     """The policy of a run or bundle at ``path``; ``shipped``: the one of this kind for ``scenario``; ``shipped/NAME``.
 
@@ -69,7 +69,7 @@ def load_named_policy(
         return load_policy(path)
     if slash:
         return load_shipped(name)
-    return load_shipped(shipped_name(kind, None if scenario is None else scenario.name, count))
+    return load_shipped(shipped_name(kind, None if scenario is None else scenario.name, harm_count))
 
 
 def algorithm_of(path: str, scenario: Scenario | None, harm_count: HarmCount) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.scenario.schema import Scenario
 
 
@@ -21,7 +21,7 @@ class Task:
     harm_count: HarmCount = "first"  # harm that is minimised; what is told under both counts ignores it
 
     def __post_init__(self) -> None:
-        check_count(self.harm_count)
+        check_harm_count(self.harm_count)
         known = set(range(self.scenario.vehicles))
         if len(set(self.vehicles)) != len(self.vehicles) or not set(self.vehicles) <= known:
             raise InvalidInput(

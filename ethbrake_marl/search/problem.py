@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance
 from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle
 from ethbrake_marl.physics.rows import TIME, command_at, gap_at, harm_at, pack, params_at, speed_at
@@ -64,7 +64,7 @@ def profile_problem(
     worlds: Worlds,
     vehicles: Sequence[int],
     *,
-    count: HarmCount = "first",
+    harm_count: HarmCount = "first",
     horizon_s: float = 8.0,
     time_step_s: float = TIME_STEP_S,
     others_mps2: Floats | None = None,
@@ -80,7 +80,7 @@ def profile_problem(
     worlds of which only some have an obstacle.
     """
     chosen = _checked_vehicles(vehicles, worlds.N)
-    check_count(count)
+    check_harm_count(harm_count)
     if not (0.0 < time_step_s < math.inf and 0.0 < horizon_s < math.inf):
         raise InvalidInput(f"time_step_s {time_step_s!r}, horizon_s {horizon_s!r}: must be positive numbers of seconds")
     v = worlds.vehicles
@@ -95,7 +95,7 @@ def profile_problem(
         return profile_problem(
             with_obstacle(worlds),
             [i + 1 for i in chosen.tolist()],
-            count=count,
+            harm_count=harm_count,
             horizon_s=horizon_s,
             time_step_s=time_step_s,
             others_mps2=ahead(0.0, command),
@@ -108,7 +108,7 @@ def profile_problem(
     clock = np.empty((worlds.n, CLOCK_WIDTH))
     clock[:, START], clock[:, TIME_STEP], clock[:, HORIZON] = first, time_step_s, horizon_s
     clock[:, LAST_STEP] = np.ceil((horizon_s - first) / time_step_s - 1e-9)
-    clock[:, RESTITUTION], clock[:, HARM_IS_TOTAL], clock[:, STEPWISE] = v.restitution, count == "total", 0.0
+    clock[:, RESTITUTION], clock[:, HARM_IS_TOTAL], clock[:, STEPWISE] = v.restitution, harm_count == "total", 0.0
     bounds = np.stack([-v.braking_capacity_mps2[:, chosen], v.driving_capacity_mps2[:, chosen]], axis=2)
     after, impacts = advance(worlds, command, until_s=first)
     start = [after.speeds_mps, after.gaps_m, after.pair_hit, impacts.first_impact_harm, impacts.total_harm]

@@ -56,9 +56,9 @@ class SearchResult(NamedTuple):
     first_impact_harm: Floats  # [n] of the profile, as the engine counts it (m2/s2)
     total_harm: Floats  # [n] likewise
 
-    def harm(self, count: HarmCount) -> Floats:
+    def harm(self, harm_count: HarmCount) -> Floats:
         """Harm under one count, [n] m2/s2."""
-        return self.first_impact_harm if count == "first" else self.total_harm
+        return self.first_impact_harm if harm_count == "first" else self.total_harm
 
 
 def constant_profiles(problem: ProfileProblem, commands_mps2: Floats) -> Profiles:

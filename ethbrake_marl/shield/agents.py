@@ -39,23 +39,23 @@ Bound = Literal["coupled", "pairwise"]
 class HybridAgent(AgentAround):
     """Drives by ``policy`` in the worlds where its rolled-out harm is at most ``H*``, else by E-V2X-BM.
 
-    ``bound`` says which ``H*`` and ``a*``; ``count`` which harm counts. After ``begin``, ``chosen_policy`` [n] says
-    who drives; ``policy_harm`` [n] and ``bound_harm`` [n] were compared and ``predicted_harm`` [n] is the lower one.
-    Raises ``InvalidInput`` for an unknown ``bound`` or ``count``, and for what is not an agent.
+    ``bound`` says which ``H*`` and ``a*``; ``harm_count`` which harm counts. After ``begin``, ``chosen_policy`` [n]
+    says who drives; ``policy_harm`` [n] and ``bound_harm`` [n] were compared, ``predicted_harm`` [n] is the lower one.
+    Raises ``InvalidInput`` for an unknown ``bound`` or ``harm_count``, and for what is not an agent.
     """
 
     adds = Source.MODEL  # in which both are compared
 
     def __init__(
-        self, policy: Agent, scenario: Scenario, *, bound: Bound = "coupled", count: HarmCount = "first"
+        self, policy: Agent, scenario: Scenario, *, bound: Bound = "coupled", harm_count: HarmCount = "first"
     ) -> None:
         check_agent(policy, "hybrid")
         check_scenario(scenario, "hybrid")
         super().__init__(policy, f"{policy.name}+episode{'' if bound == 'coupled' else ':pairwise'}")
-        self.backup = EV2XBM(bound, count=count, horizon_s=scenario.horizon_s)
+        self.backup = EV2XBM(bound, harm_count=harm_count, horizon_s=scenario.horizon_s)
         self.scenario = scenario
         self.bound: Bound = bound
-        self.count: HarmCount = count
+        self.harm_count: HarmCount = harm_count
         self.policy_harm: Floats = np.zeros(0)
         self.bound_harm: Floats = np.zeros(0)
         self._rehearsal = copy.deepcopy(policy)  # predicting must not disturb the policy's memory of running episodes
@@ -94,7 +94,7 @@ class HybridAgent(AgentAround):
         return np.where(self.chosen_policy, self.policy.act(worlds, vehicle), self.backup.act(worlds, vehicle))
 
     def _harm(self, worlds: Worlds, agent: Agent, vehicle: int) -> Floats:
-        return drive(worlds, agent, self.scenario, vehicle).ledger.world_harm(self.count)
+        return drive(worlds, agent, self.scenario, vehicle).ledger.world_harm(self.harm_count)
 
 
 class FixedCommand:
@@ -132,7 +132,7 @@ class StepShieldAgent(AgentAround):
     At the alert the policy is rolled out once: where it harms no more than the coupled optimum, it drives unhindered,
     and its harm is the bound. Elsewhere each of its actions must be certified: by the rest of the plan, by a constant,
     or (``later_rollouts``) by the policy itself, rolled out from the state after the action. After ``begin``,
-    ``predicted_harm`` [n] is the bound: realised harm (``count``) is at most that. ``chosen_policy`` [n]: no
+    ``predicted_harm`` [n] is the bound: realised harm (``harm_count``) is at most that. ``chosen_policy`` [n]: no
     intervention so far; ``shield`` holds the rest. Raises ``InvalidInput`` for what is not an agent, and what
     ``StepShield`` raises.
 
@@ -147,7 +147,7 @@ class StepShieldAgent(AgentAround):
         policy: Agent,
         scenario: Scenario,
         *,
-        count: HarmCount = "first",
+        harm_count: HarmCount = "first",
         allowance: float = 0.0,
         logging: bool = False,
         later_rollouts: bool = True,
@@ -163,7 +163,12 @@ class StepShieldAgent(AgentAround):
         self.shield: StepShield | None = None
         self.predicted_harm: Floats = np.zeros(0)
         self._believed = believed
-        self._settings = {"count": count, "allowance": allowance, "logging": logging, "uncertainty": uncertainty}
+        self._settings = {
+            "harm_count": harm_count,
+            "allowance": allowance,
+            "logging": logging,
+            "uncertainty": uncertainty,
+        }
         self._later_rollouts = later_rollouts
         self._wanted: Floats = np.zeros(0)
         self._first_s: Floats = np.zeros(0)  # [n] time of the first decision
@@ -274,16 +279,16 @@ class StepShieldAgent(AgentAround):
 def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
     """``+episode`` or ``+episode:pairwise`` around an agent."""
     bound: Bound = "coupled" if argument is None else "pairwise"
-    return HybridAgent(policy, settings.needed_scenario(), bound=bound, count=settings.harm_count)
+    return HybridAgent(policy, settings.needed_scenario(), bound=bound, harm_count=settings.harm_count)
 
 
 def shield_steps(policy: Agent, argument: None, settings: AgentSettings) -> Agent:
     """``+step`` around an agent."""
-    return StepShieldAgent(policy, settings.needed_scenario(), count=settings.harm_count)
+    return StepShieldAgent(policy, settings.needed_scenario(), harm_count=settings.harm_count)
 
 
 def shield_steps_robustly(policy: Agent, argument: None, settings: AgentSettings) -> Agent:
     """``+robust`` around an agent, against the uncertainty of the settings."""
     scenario, where = settings.needed_scenario(), f"agent {settings.spec!r}"
     uncertainty = mode_uncertainty("robust", settings.uncertainty, where)
-    return StepShieldAgent(policy, scenario, count=settings.harm_count, uncertainty=uncertainty)
+    return StepShieldAgent(policy, scenario, harm_count=settings.harm_count, uncertainty=uncertainty)

@@ -31,7 +31,7 @@ class AttachedHybrid(Attached):
 
     def __init__(self, engine: Engine, policy: Agent | LearnedPolicy | None, options: ShieldOptions) -> None:
         agent = proposing_agent(policy, options.where)
-        hybrid = HybridAgent(agent, engine.scenario, bound=options.bound, count=options.count)
+        hybrid = HybridAgent(agent, engine.scenario, bound=options.bound, harm_count=options.harm_count)
         super().__init__(engine, options, EpisodeChoice(hybrid))
 
     @property

@@ -161,7 +161,7 @@ class AttachedShield(Attached):
         vehicle = only_shielded(engine, options.where)
         self.policy = None if policy is None else proposing_agent(policy, options.where)
         shield = StepShield(
-            engine.scenario, vehicle, count=options.count, allowance=options.allowance, others=engine.scripts,
+            engine.scenario, vehicle, harm_count=options.harm_count, allowance=options.allowance, others=engine.scripts,
             uncertainty=checked_uncertainty(options.uncertainty), logging=options.logging,
         )  # fmt: skip
         self._warned = False

@@ -40,7 +40,7 @@ class ShieldOptions:
 
     mode: str | None = None
     bound: Bound = "coupled"
-    count: HarmCount = "first"
+    harm_count: HarmCount = "first"
     allowance: float = 0.0
     uncertainty: Uncertainty | str | None = None
     intervention_penalty: float = 0.0

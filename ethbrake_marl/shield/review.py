@@ -71,7 +71,7 @@ def _harm_released(driver: StepShieldAgent, worlds: Worlds, vehicle: int, world:
     """Harm in some worlds [m] when what was applied is applied again up to decision ``step`` [m], then the policy."""
     assert driver.shield is not None
     again = _Released(copy.deepcopy(driver.policy), driver.shield.backup.plan[world], step, driver.scenario.time_step_s)
-    return drive(worlds.take(world), again, driver.scenario, vehicle).ledger.world_harm(driver.shield.count)
+    return drive(worlds.take(world), again, driver.scenario, vehicle).ledger.world_harm(driver.shield.harm_count)
 
 
 class OperatingPoint(NamedTuple):
@@ -90,13 +90,13 @@ def operating_curve(
     vehicle: int,
     allowances: Sequence[float],
     *,
-    count: HarmCount = "first",
+    harm_count: HarmCount = "first",
 ) -> list[OperatingPoint]:
     """Interventions against residual harm: one point per allowance, from none (the bound itself) to very large."""
     points = []
     for allowance in allowances:
-        driver = StepShieldAgent(copy.deepcopy(policy), scenario, count=count, allowance=allowance)
-        harm = drive(worlds, driver, scenario, vehicle).ledger.world_harm(count)
+        driver = StepShieldAgent(copy.deepcopy(policy), scenario, harm_count=harm_count, allowance=allowance)
+        harm = drive(worlds, driver, scenario, vehicle).ledger.world_harm(harm_count)
         shield = driver.shield
         assert shield is not None and shield.running is not None
         decisions = int(shield.running.steps.sum())

@@ -45,7 +45,7 @@ def robustness(
     uncertainty: Uncertainty,
     *,
     widths: Sequence[float] = WIDTHS,
-    count: HarmCount = "first",
+    harm_count: HarmCount = "first",
     seed: int = 0,
     on_progress: Progress | None = None,
 ) -> list[RobustnessPoint]:
@@ -73,19 +73,19 @@ def robustness(
                 key = (0.0, "as told", "step") if alike else (width, truth, mode)
                 if key not in known:
                     shielded = StepShieldAgent(
-                        copy.deepcopy(policy), scenario, count=count, believed=worlds,
+                        copy.deepcopy(policy), scenario, harm_count=harm_count, believed=worlds,
                         uncertainty=intervals if mode == "robust" else None,
                     )  # fmt: skip
-                    known[key] = _means(driven, shielded, vehicle, count)
+                    known[key] = _means(driven, shielded, vehicle, harm_count)
                 points.append(RobustnessPoint(mode, truth, float(width), *known[key]))
                 if on_progress is not None:
                     on_progress(f"{mode}, {truth}, width {width:g}", worlds.n)
     return points
 
 
-def _means(worlds: Worlds, shielded: StepShieldAgent, vehicle: int, count: HarmCount) -> tuple[float, ...]:
+def _means(worlds: Worlds, shielded: StepShieldAgent, vehicle: int, harm_count: HarmCount) -> tuple[float, ...]:
     """What a shield makes of the worlds that it is driven through: the last columns of its point."""
-    harm = drive(worlds, shielded, shielded.scenario, vehicle).ledger.world_harm(count)
+    harm = drive(worlds, shielded, shielded.scenario, vehicle).ledger.world_harm(harm_count)
     bound, shield = shielded.predicted_harm, shielded.shield
     assert shield is not None
     above = np.maximum(harm - bound, 0.0)

@@ -16,7 +16,7 @@ from ethbrake_marl.agents.protocol import Agent, fixed_commands
 from ethbrake_marl.agents.rollout import scripted
 from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, renumbered
-from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import PER_WORLD as OF_PROBLEM
@@ -87,18 +87,18 @@ class StepShield:
         scenario: Scenario,
         vehicle: int,
         *,
-        count: HarmCount = "first",
+        harm_count: HarmCount = "first",
         allowance: float = 0.0,
         others: Mapping[int, Script] | None = None,
         uncertainty: Uncertainty | None = None,
         logging: bool = False,
     ) -> None:
-        check_count(count)
+        check_harm_count(harm_count)
         check_scenario(scenario, "shield")
         check_amount("allowance", allowance, "shield", " m2/s2")
         if vehicle not in range(scenario.vehicles):
             raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
-        self.scenario, self.vehicle, self.count, self.allowance = scenario, vehicle, count, allowance
+        self.scenario, self.vehicle, self.harm_count, self.allowance = scenario, vehicle, harm_count, allowance
         self.uncertainty = uncertainty
         self.log: list[Intervention] | None = [] if logging else None
         self.found: list[Intervention] = []  # in the last decision
@@ -142,11 +142,12 @@ class StepShield:
             )
         others = fixed_commands(self._others, possible, "shield", vehicle=vehicle)
         best = optimise_coupled(
-            worlds, vehicle, count=self.count, horizon_s=scenario.horizon_s, others_mps2=others[::members]
+            worlds, vehicle, harm_count=self.harm_count, horizon_s=scenario.horizon_s, others_mps2=others[::members]
         ).deceleration_mps2
         with renumbered(np.repeat(np.arange(worlds.n), members)):
             problem = profile_problem(
-                possible, [vehicle], count=self.count, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s,
+                possible, [vehicle], harm_count=self.harm_count, horizon_s=scenario.horizon_s,
+                time_step_s=scenario.time_step_s,
                 others_mps2=others,
             )  # fmt: skip
         running = begin_running(problem, members)

@@ -56,16 +56,16 @@ def equal_time(
     *,
     scenario: Scenario,
     against: str,
-    count: HarmCount = "first",
+    harm_count: HarmCount = "first",
     repeats: int = 3,
     on_progress: OnProgress | None = None,
 ) -> list[TimedRow]:
     """Time every agent on the list, ``repeats`` times in turn; quickest first.
 
-    ``against`` is the agent that the others' harm under ``count`` is compared with. ``on_progress`` is told how often
-    each agent has driven the whole list. Harms are the same in every repetition, times are not. Raises ``InvalidInput``
-    for less than one repetition, ``UnknownName`` for an agent to compare with that is not among them, and what
-    ``evaluate`` raises.
+    ``against`` is the agent that the others' harm under ``harm_count`` is compared with. ``on_progress`` is told how
+    often each agent has driven the whole list. Harms are the same in every repetition, times are not. Raises
+    ``InvalidInput`` for less than one repetition, ``UnknownName`` for an agent to compare with that is not among them,
+    and what ``evaluate`` raises.
     """
     check_whole_number("equal time: repeats", repeats, 1)
     if against not in agents:
@@ -83,7 +83,7 @@ def equal_time(
             outcomes[name] = result.outcome(name)
             if on_progress is not None:
                 on_progress(Progress(name, repetition + 1, repeats))
-    reference = outcomes[against].ledger.world_harm(count)
+    reference = outcomes[against].ledger.world_harm(harm_count)
     rows = [
         TimedRow(
             name,
@@ -93,7 +93,7 @@ def equal_time(
             max(spent[name]),
             mean(outcome.first_impact_harm),
             mean(outcome.total_harm),
-            paired_difference(outcome.ledger.world_harm(count), reference),
+            paired_difference(outcome.ledger.world_harm(harm_count), reference),
         )
         for name, outcome in outcomes.items()
     ]

@@ -74,9 +74,9 @@ def test_gentlest_front__collides_in_the_worlds_of_e_v2x_bm():
 
 
 @pytest.mark.parametrize("count", ["first", "total"])
-def test_e_v2x_bm__predicts_what_it_realises(count):
+def test_e_v2x_bm__predicts_what_it_realises(harm_count):
     worlds = random_worlds(100)
-    agent = make_agent("e_v2x_bm", harm_count=count)
+    agent = make_agent("e_v2x_bm", harm_count=harm_count)
     agent.begin(worlds, 1, np.arange(100))
     assert isinstance(agent, PredictingAgent)
     command = -worlds.vehicles.braking_capacity_mps2
@@ -84,7 +84,7 @@ def test_e_v2x_bm__predicts_what_it_realises(count):
     for time in np.arange(0.1, 8.05, 0.1):
         command[:, 1] = agent.act(worlds, 1)
         worlds, impacts = advance(worlds, command, until_s=time)
-        harm = impacts.first_impact_harm if count == "first" else impacts.total_harm
+        harm = impacts.first_impact_harm if harm_count == "first" else impacts.total_harm
         realised += harm.sum(axis=1)
     assert np.abs(realised - agent.predicted_harm).max() < 1e-6
 

@@ -7,7 +7,7 @@ from ethbrake_marl.agents import make_agent, optimise_coupled
 from ethbrake_marl.agents.planner import Planner
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
 
@@ -22,15 +22,15 @@ def worlds(scenario: Scenario) -> Worlds:
     return scenario.sample(10, seed=3).worlds
 
 
-@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
 def test_planner__does_no_more_harm_than_its_first_plan_and_improves_on_constants(
-    scenario: Scenario, worlds: Worlds, count: HarmCount
+    scenario: Scenario, worlds: Worlds, harm_count: HarmCount
 ) -> None:
-    agent = make_agent("planner:150", harm_count=count)
-    harm = drive(worlds, agent, scenario, 1).ledger.world_harm(count)
+    agent = make_agent("planner:150", harm_count=harm_count)
+    harm = drive(worlds, agent, scenario, 1).ledger.world_harm(harm_count)
     assert isinstance(agent, Planner)
     assert (harm <= agent.predicted_harm + 1e-4).all()
-    assert harm.mean() < 0.7 * optimise_coupled(worlds, 1, count=count).harm.mean()
+    assert harm.mean() < 0.7 * optimise_coupled(worlds, 1, harm_count=harm_count).harm.mean()
 
 
 def test_planner__is_deterministic_and_a_world_does_not_depend_on_its_batch(scenario: Scenario, worlds: Worlds) -> None:

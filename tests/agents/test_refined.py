@@ -16,15 +16,15 @@ SCENARIO = load_scenario("paper-random")
 WORLDS = SCENARIO.sample(120, 3).worlds
 
 
-def harm(agent, count="first", worlds=WORLDS):
-    return drive(worlds, agent, SCENARIO, 1).ledger.world_harm(count)
+def harm(agent, harm_count="first", worlds=WORLDS):
+    return drive(worlds, agent, SCENARIO, 1).ledger.world_harm(harm_count)
 
 
 @pytest.mark.parametrize("count", ["first", "total"])
-def test_rehearsed__is_never_worse_and_as_predicted(count):
-    plain = harm(make_agent("constant:5"), count)
-    agent = Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=8, count=count)
-    realised = harm(agent, count)
+def test_rehearsed__is_never_worse_and_as_predicted(harm_count):
+    plain = harm(make_agent("constant:5"), harm_count)
+    agent = Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=8, harm_count=harm_count)
+    realised = harm(agent, harm_count)
     assert (realised <= plain).all() and (realised < plain - 1.0).any()
     assert realised.tolist() == agent.predicted_harm.tolist()
 

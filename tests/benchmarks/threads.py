@@ -14,13 +14,13 @@ import time
 from ethbrake_marl.physics import advance
 from ethbrake_marl.studies.speed import first_decisions
 
-COUNTS = (1000, 3000, 10_000, 30_000, 100_000)
+HARM_COUNTS = (1000, 3000, 10_000, 30_000, 100_000)
 REPETITIONS, WORLD_STEPS = 15, 200_000
 
 
 def main() -> None:
     """Print one line for each number of worlds."""
-    for n in COUNTS:
+    for n in HARM_COUNTS:
         worlds = first_decisions(n)
         command = -worlds.vehicles.braking_capacity_mps2
         calls = max(3, WORLD_STEPS // n)

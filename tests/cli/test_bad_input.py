@@ -123,7 +123,7 @@ def test_long_command__a_defect_of_the_scenario_is_found_before_any_work(ethbrak
         (["--episodes", "100000000000000"], ["100000000000000", "at most 10,000,000"]),
         (["--episodes", "many"], ["--episodes"]),
         (["--seed", "-1"], ["-1"]),
-        (["--count", "both"], ["--count", "both", "first", "total"]),
+        (["--harm-count", "both"], ["--harm-count", "both", "first", "total"]),
         (["--vehicle", "vehicle_4"], ["vehicle_4", "vehicle_3"]),
         (["--initial-states", "nowhere.csv"], ["nowhere.csv"]),
         (["--agents", "ppo@" + 5000 * "a"], ["cannot be read", "File name too long"]),

@@ -80,7 +80,7 @@ def test_evaluate__same_seed_same_figures_other_seed_others(ethbrake):
 
 
 def test_evaluate_count__total_never_has_more_total_harm(ethbrake):
-    arguments = ("evaluate", "--episodes", "200", "--agents", "e_v2x_bm", "--json", "--count")
+    arguments = ("evaluate", "--episodes", "200", "--agents", "e_v2x_bm", "--json", "--harm-count")
     (first,), (total,) = (json.loads(ethbrake(*arguments, count).out) for count in ("first", "total"))
     assert total["total_harm"] < first["total_harm"]
     assert total["first_impact_harm"] > first["first_impact_harm"]

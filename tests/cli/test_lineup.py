@@ -44,7 +44,7 @@ def test_lineup__agents_of_a_run_and_of_its_bundle_are_the_same(finished_run):
 def test_lineup__the_hybrids_bound_and_count_are_as_asked(finished_run, shield, bound):
     (agent,) = make_lineup([f"ppo@{finished_run}+{shield}"], SCENARIO, harm_count="total").values()
     assert isinstance(agent, HybridAgent)
-    assert (agent.bound, agent.count) == (bound, "total")
+    assert (agent.bound, agent.harm_count) == (bound, "total")
 
 
 def test_lineup__shields_are_put_around_who_has_none_in_the_old_way(finished_run):

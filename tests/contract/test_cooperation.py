@@ -11,7 +11,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from ethbrake_marl import ethbrake_v0
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.envs.setup import make_engine
-from ethbrake_marl.harm import COUNTS, empty_ledger
+from ethbrake_marl.harm import HARM_COUNTS, empty_ledger
 from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
 from tests.contract.faces import FACES, actions, initial_state
@@ -119,8 +119,8 @@ def test_level_4__has_the_lines_of_level_3_and_full_braking_never_meets_its_obst
         _, impacts = advance(at_alert, -at_alert.vehicles.braking_capacity_mps2, until_s=8.0)
         ledgers[key] = empty_ledger(at_alert).add(impacts)
     assert not ledgers["4"].obstacle_count.any() and ledgers["3"].collided.sum() > 1_000
-    for count in COUNTS:
-        assert ledgers["4"].vehicle_harm(count).tobytes() == ledgers["3"].vehicle_harm(count).tobytes()
+    for harm_count in HARM_COUNTS:
+        assert ledgers["4"].vehicle_harm(harm_count).tobytes() == ledgers["3"].vehicle_harm(harm_count).tobytes()
     v, a = worlds["4"].speeds_mps[:, 0], worlds["4"].vehicles.braking_capacity_mps2[:, 0]
     assert (v * v / (2.0 * a) < worlds["4"].obstacle_gap_m).all()
 

@@ -6,7 +6,7 @@ import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.envs.setup import make_engine
-from ethbrake_marl.harm import COUNTS
+from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.physics import advance, concatenate
 from ethbrake_marl.scenario import load_scenario
 
@@ -26,10 +26,10 @@ def test_engine__steps_as_advance_does_and_its_ledger_counts_the_obstacle():
         ledger, rewards = ledger.add(impacts), rewards + step.reward[:, 0]
     assert engine.worlds.obstacle_gap_m.tobytes() == worlds.obstacle_gap_m.tobytes()
     assert engine.worlds.obstacle_hit.tobytes() == worlds.obstacle_hit.tobytes()
-    for count in COUNTS:
-        assert engine.ledger.obstacle_harm(count).tobytes() == ledger.obstacle_harm(count).tobytes()
-        shares = engine.ledger.vehicle_harm(count)
-        np.testing.assert_allclose(shares.sum(axis=1), engine.ledger.world_harm(count), rtol=1e-12)
+    for harm_count in HARM_COUNTS:
+        assert engine.ledger.obstacle_harm(harm_count).tobytes() == ledger.obstacle_harm(harm_count).tobytes()
+        shares = engine.ledger.vehicle_harm(harm_count)
+        np.testing.assert_allclose(shares.sum(axis=1), engine.ledger.world_harm(harm_count), rtol=1e-12)
     assert (engine.ledger.obstacle_count > 0).sum() > 20 and (engine.ledger.obstacle_count == 0).any()
     np.testing.assert_allclose(rewards, -engine.ledger.world_harm("total"), rtol=1e-12)
     untouched = (engine.ledger.count.sum(axis=1) == 0) & (engine.ledger.obstacle_count > 0)

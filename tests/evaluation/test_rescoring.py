@@ -19,7 +19,7 @@ from ethbrake_marl.scenario import Scenario
 def test_rescored__one_impact_by_hand(pair: Scenario) -> None:
     # Harm 9, of which the vehicles bear 4.95 and 4.05 (see conftest).
     result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
-    rows = {row.objective: row for row in rescored(result, [*STANDARD, "weighted:1,3"]) if row.count == "total"}
+    rows = {row.objective: row for row in rescored(result, [*STANDARD, "weighted:1,3"]) if row.harm_count == "total"}
     borne, root = (4.95, 4.05), math.sqrt(0.5)
     expected = {
         "total": (9.0, 9.0),

@@ -12,7 +12,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, rich_table, summarise
 from ethbrake_marl.evaluation.conditions import parameter_line, parameters
 from ethbrake_marl.evaluation.paper import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST
-from ethbrake_marl.harm import COUNTS
+from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.limits import limits
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
 
@@ -116,7 +116,7 @@ def test_rich_table__fits_80_columns_and_shows_both_counts(evaluation: Evaluatio
 
 
 def test_rich_table__in_120_columns_has_every_column(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "best_known", lambda worlds, task: dict.fromkeys(COUNTS, np.zeros(worlds.n)))
+    monkeypatch.setattr(limits, "best_known", lambda worlds, task: dict.fromkeys(HARM_COUNTS, np.zeros(worlds.n)))
     afresh = replace(evaluation)  # its limits are not found yet
     text = printed(afresh, width=120)
     row = summarise(afresh)[2]

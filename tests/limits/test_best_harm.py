@@ -11,7 +11,7 @@ from ethbrake_marl.agents.best_profile import BestHarm
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.evaluation.paper import TESTS
-from ethbrake_marl.harm import COUNTS
+from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.limits.best_harm import LEFT_OUT, best_harm, realised_harm, search_list, world_identity
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table, save_table
 from ethbrake_marl.limits.shipped import TABLES, best_known, shipped_profiles, shipped_tables
@@ -73,10 +73,10 @@ def test_profiles__say_which_command_is_in_force() -> None:
 def test_best_harm__is_never_worse_than_the_best_constant_deceleration(
     scenario: Scenario, worlds: Worlds, table: BestHarmTable
 ) -> None:
-    for count in COUNTS:
-        constant = optimise_coupled(worlds, 1, count=count).harm
-        assert (table.best[count].harm <= constant + 1e-7).all()
-        assert table.best[count].harm.mean() < 0.7 * constant.mean()
+    for harm_count in HARM_COUNTS:
+        constant = optimise_coupled(worlds, 1, harm_count=harm_count).harm
+        assert (table.best[harm_count].harm <= constant + 1e-7).all()
+        assert table.best[harm_count].harm.mean() < 0.7 * constant.mean()
 
 
 def test_best_harm__does_not_depend_on_batch_order_or_threads(
@@ -84,9 +84,11 @@ def test_best_harm__does_not_depend_on_batch_order_or_threads(
 ) -> None:
     rows = np.array([7, 2, 10])
     part = best_harm(scenario, worlds.take(rows), budget=BUDGET, threads=2)
-    for count in COUNTS:
-        assert np.array_equal(part.best[count].harm, table.best[count].harm[rows])
-        assert np.array_equal(part.best[count].profiles.commands_mps2, table.best[count].profiles.commands_mps2[rows])
+    for harm_count in HARM_COUNTS:
+        assert np.array_equal(part.best[harm_count].harm, table.best[harm_count].harm[rows])
+        assert np.array_equal(
+            part.best[harm_count].profiles.commands_mps2, table.best[harm_count].profiles.commands_mps2[rows]
+        )
 
 
 def test_best_harm__another_seed_searches_elsewhere(scenario: Scenario, worlds: Worlds, table: BestHarmTable) -> None:
@@ -98,8 +100,8 @@ def test_best_harm__starts_from_what_is_known_and_never_gets_worse(
     scenario: Scenario, worlds: Worlds, table: BestHarmTable
 ) -> None:
     again = best_harm(scenario, worlds, budget=100, threads=1, seed=2, known=table)
-    for count in COUNTS:
-        assert (again.best[count].harm <= table.best[count].harm + 1e-6).all()
+    for harm_count in HARM_COUNTS:
+        assert (again.best[harm_count].harm <= table.best[harm_count].harm + 1e-6).all()
     assert again.header["after"]["budget"] == BUDGET
 
 
@@ -125,8 +127,8 @@ def test_best_harm__joint_optimum_of_two_cars_by_hand() -> None:
     worlds = scenario.sample(1, seed=1).worlds
     for vehicles, harm in (((1,), 200.0), ((0,), 40.0), ((0, 1), 40.0)):
         found = best_harm(scenario, worlds, vehicles=vehicles, budget=1000, threads=1)
-        for count in COUNTS:
-            assert found.best[count].harm == pytest.approx([harm], abs=1e-2), (vehicles, count)
+        for harm_count in HARM_COUNTS:
+            assert found.best[harm_count].harm == pytest.approx([harm], abs=1e-2), (vehicles, harm_count)
 
 
 def test_stored_profile__driven_in_the_engine_does_the_stored_harm_bit_for_bit(
@@ -134,12 +136,14 @@ def test_stored_profile__driven_in_the_engine_does_the_stored_harm_bit_for_bit(
 ) -> None:
     save_table(tmp_path / "t.npz", table)
     kept = load_table(tmp_path / "t.npz")
-    for count in COUNTS:
-        agent = BestHarm(lambda problem, c: kept.profiles(problem.identity, c, problem.last_step), count=count)
+    for harm_count in HARM_COUNTS:
+        agent = BestHarm(
+            lambda problem, c: kept.profiles(problem.identity, c, problem.last_step), harm_count=harm_count
+        )
         shuffled = np.random.default_rng(0).permutation(worlds.n)
         episodes = drive(worlds.take(shuffled), agent, scenario, 1)
-        assert np.array_equal(episodes.ledger.world_harm(count), table.best[count].harm[shuffled])
-        assert np.array_equal(agent.predicted_harm, table.best[count].harm[shuffled])
+        assert np.array_equal(episodes.ledger.world_harm(harm_count), table.best[harm_count].harm[shuffled])
+        assert np.array_equal(agent.predicted_harm, table.best[harm_count].harm[shuffled])
         assert not agent.searched.any()
 
 
@@ -263,14 +267,14 @@ def test_shipped_tables__hold_the_shipped_lists_and_their_profiles_do_the_stored
         scenario = load_scenario(name)
         for first in (0, n - 5):
             worlds = scenario.sample(5, seed=7, first=first).worlds
-            for count in COUNTS:
-                known = best_known(worlds, Task(scenario, scenario.learners))[count]
+            for harm_count in HARM_COUNTS:
+                known = best_known(worlds, Task(scenario, scenario.learners))[harm_count]
                 assert np.isfinite(known).all()
-                problem = profile_problem(worlds, [1], count=count)
-                profiles, found = shipped_profiles(problem, count)
-                harm = follow_profiles(problem, profiles)[count == "total"]
+                problem = profile_problem(worlds, [1], harm_count=harm_count)
+                profiles, found = shipped_profiles(problem, harm_count)
+                harm = follow_profiles(problem, profiles)[harm_count == "total"]
                 assert np.array_equal(harm[found], known[found])
-                assert (known <= optimise_coupled(worlds, 1, count=count).harm + 1e-7).all()
+                assert (known <= optimise_coupled(worlds, 1, harm_count=harm_count).harm + 1e-7).all()
     assert max(path.stat().st_size for path in TABLES.glob("*.npz")) < 700_000
 
 

@@ -34,11 +34,11 @@ def test_best_harm_command__prints_figures_and_writes_the_table(
 
 def test_best_harm_command__one_count_from_an_earlier_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, better = tmp_path / "t.npz", tmp_path / "u.npz"
-    assert run_command([*SMALL, "--count", "first", "--output", str(file)]) == 0
+    assert run_command([*SMALL, "--harm-count", "first", "--output", str(file)]) == 0
     assert "best_known_first_impact_harm" in capsys.readouterr().out
-    assert run_command([*SMALL, "--count", "first", "--start", str(file), "--output", str(better)]) == 0
+    assert run_command([*SMALL, "--harm-count", "first", "--start", str(file), "--output", str(better)]) == 0
     assert list(load_table(better).best) == ["first"]
-    assert "--count first" in load_table(better).header["command"]
+    assert "--harm-count first" in load_table(better).header["command"]
     assert "--start t.npz" in load_table(better).header["command"]
     assert (load_table(better).best["first"].harm <= load_table(file).best["first"].harm + 1e-6).all()
 
@@ -63,7 +63,7 @@ def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path, capsys: 
 
 def test_best_harm_command__lets_the_whole_ladder_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "t.npz"
-    small = ["best-harm", "--episodes", "3", "--budget", "60", "--threads", "1", "--count", "total"]
+    small = ["best-harm", "--episodes", "3", "--budget", "60", "--threads", "1", "--harm-count", "total"]
     assert run_command([*small, "--agents", "ladder", "--output", str(file)]) == 0
     assert list(load_table(file).header["lowered_by"]) == list(LADDER)
 
@@ -81,7 +81,7 @@ def test_best_harm_command__lets_the_whole_ladder_drive(tmp_path: Path, capsys: 
         (["--start", str(TABLES / "paper-random.npz"), "--vehicles", "vehicle_3"], "holds none of these 4 worlds"),
         (["--vehicles", ""], "unknown vehicle ''"),
         (["--vehicles", "vehicle_2,vehicle_2"], "listed twice"),
-        (["--count", "some"], "some"),
+        (["--harm-count", "some"], "some"),
         (["--scenario", "cooperation-0-sensors"], "has no learner; say who is controlled"),
         (["--agents", "planner,planner"], "given twice"),
         (["--agents", "plannr"], "unknown agent 'plannr'"),

@@ -118,7 +118,7 @@ def test_early__impacts_before_the_latency_are_certain():
     assert avoidability(worlds).reason_name[0] == "early"
     assert bound.early[0] == pytest.approx(4)
     assert bound.front_pair[0] == 0  # hit: a further impact of this pair does not count first
-    assert lower_bound(worlds, count="total").early[0] == pytest.approx(4)
+    assert lower_bound(worlds, harm_count="total").early[0] == pytest.approx(4)
 
 
 def test_paper_lists__are_bounded_near_the_best_known_harm():
@@ -128,7 +128,7 @@ def test_paper_lists__are_bounded_near_the_best_known_harm():
     assert 0.62 < bound.impact_proven.mean() < 0.635
     assert not np.any(bound.impact_proven & verdict.avoidable)
     assert np.all(bound.impact_proven[verdict.reason == 2])
-    assert np.array_equal(bound.harm, lower_bound(worlds, count="total").harm)
+    assert np.array_equal(bound.harm, lower_bound(worlds, harm_count="total").harm)
 
 
 @pytest.mark.parametrize(
@@ -136,11 +136,11 @@ def test_paper_lists__are_bounded_near_the_best_known_harm():
     [("paper-random", 10_000), ("paper-delay-low", 2000), ("paper-delay-middle", 2000), ("paper-delay-high", 2000)],
 )
 @pytest.mark.parametrize("count", ["first", "total"])
-def test_best_known_harm__is_never_below_the_bound_and_near_it(name, n, count):
+def test_best_known_harm__is_never_below_the_bound_and_near_it(name, n, harm_count):
     scenario = load_scenario(name)
     worlds = scenario.sample(n, seed=7).worlds
-    known, verdict = best_known(worlds, Task(scenario, scenario.learners))[count], avoidability(worlds)
-    bound = lower_bound(worlds, count=count, horizon_s=scenario.horizon_s)
+    known, verdict = best_known(worlds, Task(scenario, scenario.learners))[harm_count], avoidability(worlds)
+    bound = lower_bound(worlds, harm_count=harm_count, horizon_s=scenario.horizon_s)
     assert np.all(bound.harm <= known)
     assert bound.harm.mean() > 0.85 * known.mean()
     assert np.all(known[verdict.avoidable] == 0)
@@ -152,15 +152,15 @@ def test_best_known_harm__is_never_below_the_bound_and_near_it(name, n, count):
 
 @pytest.mark.parametrize("name", ["paper-random", "paper-random-early", "paper-delay-high"])
 @pytest.mark.parametrize("count", ["first", "total"])
-def test_best_constant_deceleration__is_never_below_the_bound(name, count):
+def test_best_constant_deceleration__is_never_below_the_bound(name, harm_count):
     worlds = load_scenario(name).sample(400, seed=8).worlds
-    best = optimise_coupled(worlds, 1, count=count)
-    bound = lower_bound(worlds, count=count)
+    best = optimise_coupled(worlds, 1, harm_count=harm_count)
+    bound = lower_bound(worlds, harm_count=harm_count)
     assert np.all(bound.harm <= best.harm)
     assert bound.harm.mean() > 0.15 * best.harm.mean()
 
 
-def searched_harm(worlds, count, rounds, seed):
+def searched_harm(worlds, harm_count, rounds, seed):
     """Least harm of random profiles and of changes to the best of them."""
     rng = np.random.default_rng(seed)
     switch, command = random_profiles(worlds, 1, rng)
@@ -168,7 +168,7 @@ def searched_harm(worlds, count, rounds, seed):
     for k in range(rounds):
         fresh = k < rounds // 4
         tried = random_profiles(worlds, 1, rng) if fresh else moved_profiles(worlds, 1, switch, command, rng)
-        harm = play_profile(worlds, 1, *tried)[1].world_harm(count)
+        harm = play_profile(worlds, 1, *tried)[1].world_harm(harm_count)
         better = harm < best
         best[better] = harm[better]
         switch[better], command[better] = tried[0][better], tried[1][better]
@@ -185,25 +185,25 @@ def searched_worlds(n, seed):
     return concatenate([*paper, wide_worlds(3 * n, 3, seed, strong=True), wide_worlds(n, 3, seed + 1), standing])
 
 
-def check_no_profile_below(n, count, rounds, seed):
+def check_no_profile_below(n, harm_count, rounds, seed):
     worlds = searched_worlds(n, seed)
     worlds = worlds.take(~avoidability(worlds).avoidable)
-    bound = lower_bound(worlds, count=count, horizon_s=200.0)
-    best = searched_harm(worlds, count, rounds, seed)
+    bound = lower_bound(worlds, harm_count=harm_count, horizon_s=200.0)
+    best = searched_harm(worlds, harm_count, rounds, seed)
     assert np.all(bound.harm <= best)
     # The comparison has teeth: in many worlds the search comes close to the bound.
     assert np.mean(bound.harm > 0.9 * best) > 0.2
 
 
 @pytest.mark.parametrize("count", ["first", "total"])
-def test_searched_profiles__are_never_below_the_bound(count):
-    check_no_profile_below(150, count, rounds=120, seed=41)
+def test_searched_profiles__are_never_below_the_bound(harm_count):
+    check_no_profile_below(150, harm_count, rounds=120, seed=41)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("count", ["first", "total"])
-def test_many_searched_profiles__are_never_below_the_bound(count):
-    check_no_profile_below(1000, count, rounds=2000, seed=42)
+def test_many_searched_profiles__are_never_below_the_bound(harm_count):
+    check_no_profile_below(1000, harm_count, rounds=2000, seed=42)
 
 
 def random_states(n, seed):
@@ -326,7 +326,7 @@ def test_a_standing_vehicle__may_wait_before_it_drives():
 
 def test_combined__is_claimed_only_where_contact_is_unavoidable_and_not_early():
     worlds = wide_worlds(5000, 3, seed=46, strong=True)
-    reason, bound = avoidability(worlds).reason, lower_bound(worlds, count="total", horizon_s=200.0)
+    reason, bound = avoidability(worlds).reason, lower_bound(worlds, harm_count="total", horizon_s=200.0)
     assert np.all(bound.combined[reason < 2] == 0)
     assert np.mean(bound.combined[reason >= 2] > 0) > 0.5
     assert np.all(bound.harm[reason == 0] == 0)
@@ -358,7 +358,7 @@ def test_weak_brakes__leave_the_bounds_of_the_pairs():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda w: lower_bound(w, count="worst"), "count 'worst'"),
+        (lambda w: lower_bound(w, harm_count="worst"), "count 'worst'"),
         (lambda w: lower_bound(w, horizon_s=0.2), "horizon_s 0.2: must be finite and at least 0.5"),
         (lambda w: lower_bound(w, horizon_s=float("nan")), "horizon_s nan"),
         (lambda w: lower_bound(w, horizon_s=float("inf")), "horizon_s inf"),

@@ -39,8 +39,8 @@ def paper_random(n, latency=(0.0, 0.5, 0.8), seed=7) -> tuple[Worlds, np.ndarray
     return worlds, -worlds.vehicles.braking_capacity_mps2
 
 
-def world_harm(impacts, count="total") -> np.ndarray:
-    return (impacts.total_harm if count == "total" else impacts.first_impact_harm).sum(axis=1)
+def world_harm(impacts, harm_count="total") -> np.ndarray:
+    return (impacts.total_harm if harm_count == "total" else impacts.first_impact_harm).sum(axis=1)
 
 
 def test_step__without_impact_is_the_papers_matrix():

@@ -10,7 +10,7 @@ from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.paper import TESTS
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.policies import shipped
 from ethbrake_marl.policies.policy import Policy, save_policy
 from ethbrake_marl.policies.shipped import card, load_named_policy, shipped_name, shipped_policies
@@ -84,16 +84,16 @@ def test_shipped_policies__each_that_ships_is_small_and_has_a_card() -> None:
         assert card(name).startswith("# ")
 
 
-@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
 @pytest.mark.parametrize("test", list(TESTS))
 def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_shield(
-    test: str, count: HarmCount
+    test: str, harm_count: HarmCount
 ) -> None:
     scenario = load_scenario(test)
-    name = shipped_name("ppo", test, count)
+    name = shipped_name("ppo", test, harm_count)
     assert load_named_policy(f"shipped/{name}").manifest.scenario["name"] == test
-    lineup = make_lineup(["ppo@shipped", "ppo@shipped+episode"], scenario, harm_count=count)
+    lineup = make_lineup(["ppo@shipped", "ppo@shipped+episode"], scenario, harm_count=harm_count)
     result = evaluate(scenario.sample(20, 7), lineup, scenario=scenario, seed=7)
-    alone, shielded = (result.outcome(spec).ledger.world_harm(count) for spec in lineup)
+    alone, shielded = (result.outcome(spec).ledger.world_harm(harm_count) for spec in lineup)
     assert shielded.mean() <= alone.mean()
     assert (shielded <= result.outcome("ppo@shipped+episode").predicted_harm + 1e-9).all()

@@ -89,13 +89,13 @@ def most_harmful(rng, shield, candidates=8):
 ADVERSARIES = {f.__name__: f for f in (random_actions, extremes, full_drive, slow_drift, worst_case, trained)}
 
 
-def attack(scenario: Scenario, worlds, adversary, *, count="first", allowance=0.0, seed=0) -> Attack:
+def attack(scenario: Scenario, worlds, adversary, *, harm_count="first", allowance=0.0, seed=0) -> Attack:
     """Let an adversary propose in every step; harm is read from the engine, not from the shield."""
     rng = np.random.default_rng(seed)
     learner = scenario.learners[0]
     scripts = {i: make_agent(spec) for i, spec in scenario.scripts.items()}
     engine = Engine(scenario, worlds.n, learners=(learner,), scripts=scripts, worlds=worlds)
-    attached = AttachedShield(engine, None, ShieldOptions(count=count, allowance=allowance))
+    attached = AttachedShield(engine, None, ShieldOptions(harm_count=harm_count, allowance=allowance))
     engine.reset(worlds=worlds)
     accepted, decisions, k = np.zeros(worlds.n, np.int64), 0, 0
     while not engine.ended.all():
@@ -107,4 +107,4 @@ def attack(scenario: Scenario, worlds, adversary, *, count="first", allowance=0.
         k += 1
     assert not attached.shield.distrusted.any()
     shield = attached.shield
-    return Attack(engine.ledger.world_harm(count), shield.first_bound, shield.bound, accepted, decisions)
+    return Attack(engine.ledger.world_harm(harm_count), shield.first_bound, shield.bound, accepted, decisions)

@@ -61,11 +61,11 @@ def bound_chunks(worlds: int) -> Iterator[tuple[str, dict[str, Any]]]:
             first += CHUNK
 
 
-def attack_chunk(seed: int, *, N: int, count: Any, who: str, first: int, worlds: int) -> dict[str, Any]:
+def attack_chunk(seed: int, *, N: int, harm_count: Any, who: str, first: int, worlds: int) -> dict[str, Any]:
     """One adversary in some worlds."""
     scenario = line(N)
     found = attack(
-        scenario, scenario.sample(worlds, seed, first=first).worlds, ADVERSARIES[who], count=count, seed=seed
+        scenario, scenario.sample(worlds, seed, first=first).worlds, ADVERSARIES[who], harm_count=harm_count, seed=seed
     )
     return _outcome(found.realised, found.bound, found.decisions) | {"accepted": int(found.accepted.sum())}
 
@@ -142,7 +142,7 @@ def search_gate(restarts: int, seed: int) -> bool:
     """The search against the shield, and against each leak."""
     good = True
     for count in ("first", "total"):
-        whole = search(restarts, seed, count=count)
+        whole = search(restarts, seed, harm_count=count)
         good = good and whole.above == 0
         print(
             f"  the shield as it is, {count}: {whole.restarts:,} restarts, {whole.above} above the bound, largest"

@@ -37,12 +37,14 @@ class Found(NamedTuple):
     loose: float  # share of the restarts that would end above the bound if their proposals were applied unshielded
 
 
-def search(restarts: int, seed: int, leak: Leak | None = None, *, until_found: bool = False, count="first") -> Found:
+def search(
+    restarts: int, seed: int, leak: Leak | None = None, *, until_found: bool = False, harm_count="first"
+) -> Found:
     """Attack the shield, or one with a leak, from many random starts."""
     above, first, excess, loose, done = 0, None, -np.inf, 0, 0
     while done < restarts and not (until_found and first is not None):
         n = min(BATCH, restarts - done)
-        over, free = _batch(n, seed, done, leak, count)
+        over, free = _batch(n, seed, done, leak, harm_count)
         broken = np.flatnonzero(over > TOLERANCE)
         if first is None and broken.size:
             first = done + int(broken[0]) + 1
@@ -51,12 +53,12 @@ def search(restarts: int, seed: int, leak: Leak | None = None, *, until_found: b
     return Found(done, above, first, excess, loose / done)
 
 
-def _batch(n: int, seed: int, done: int, leak: Leak | None, count) -> tuple[np.ndarray, np.ndarray]:
+def _batch(n: int, seed: int, done: int, leak: Leak | None, harm_count) -> tuple[np.ndarray, np.ndarray]:
     """Harm above the bound at the alert, [n]: behind the shield, and with the same proposals applied as they are."""
     rng = np.random.default_rng([seed, done])
     scenario = line(3 if (done // BATCH) % 2 == 0 else 5)
     worlds = scenario.sample(n, seed, first=done).worlds
-    shield, engine = StepShield(scenario, scenario.learners[0], count=count), _engine(scenario, worlds)
+    shield, engine = StepShield(scenario, scenario.learners[0], harm_count=harm_count), _engine(scenario, worlds)
     shield.begin(worlds, np.arange(n))
     bound, way = shield.first_bound.copy(), rng.integers(WAYS, size=n)
     held, proposals, decision = rng.uniform(-1.0, 1.0, n), [], None
@@ -73,7 +75,7 @@ def _batch(n: int, seed: int, done: int, leak: Leak | None, count) -> tuple[np.n
         free.step(proposed[:, np.newaxis])
     while not free.ended.all():
         free.step(proposals[-1][:, np.newaxis])
-    return engine.ledger.world_harm(count) - bound, free.ledger.world_harm(count) - bound
+    return engine.ledger.world_harm(harm_count) - bound, free.ledger.world_harm(harm_count) - bound
 
 
 def _engine(scenario: Scenario, worlds) -> Engine:

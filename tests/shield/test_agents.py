@@ -18,8 +18,8 @@ SCENARIO = load_scenario("paper-random")
 WORLDS = SCENARIO.sample(300, 3).worlds
 
 
-def harm(agent, count="first"):
-    return drive(WORLDS, agent, SCENARIO, 1).ledger.world_harm(count)
+def harm(agent, harm_count="first"):
+    return drive(WORLDS, agent, SCENARIO, 1).ledger.world_harm(harm_count)
 
 
 class LateBrake:
@@ -35,10 +35,10 @@ class LateBrake:
 
 
 @pytest.mark.parametrize("count", ["first", "total"])
-def test_coupled__is_never_worse_than_either_part(count):
-    hybrid = HybridAgent(LateBrake(), SCENARIO, count=count)
-    realised = harm(hybrid, count)
-    alone, baseline = harm(LateBrake(), count), harm(make_agent("e_v2x_bm", harm_count=count), count)
+def test_coupled__is_never_worse_than_either_part(harm_count):
+    hybrid = HybridAgent(LateBrake(), SCENARIO, harm_count=harm_count)
+    realised = harm(hybrid, harm_count)
+    alone, baseline = harm(LateBrake(), harm_count), harm(make_agent("e_v2x_bm", harm_count=harm_count), harm_count)
     assert (realised <= baseline).all() and (realised <= alone).all()
     assert realised.tolist() == hybrid.predicted_harm.tolist()
     assert hybrid.chosen_policy.tolist() == (alone <= baseline).tolist()
@@ -119,9 +119,9 @@ def test_begin__the_prediction_does_not_disturb_the_policy():
 
 
 @pytest.mark.parametrize(("bound", "count"), [("pairwise", "frist"), ("coupled", "both"), ("couple", "first")])
-def test_hybrid__refuses_an_unknown_bound_or_count(bound, count):
+def test_hybrid__refuses_an_unknown_bound_or_count(bound, harm_count):
     with pytest.raises(InvalidInput, match="must be"):
-        HybridAgent(make_agent("full_brake"), SCENARIO, bound=bound, count=count)
+        HybridAgent(make_agent("full_brake"), SCENARIO, bound=bound, harm_count=harm_count)
 
 
 def test_wrapper__refuses_two_learners_and_leaves_the_environment_usable():

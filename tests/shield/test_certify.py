@@ -69,7 +69,7 @@ def test_by_hand__a_pair_counts_once_for_the_first_impact_and_each_time_for_the_
     plan[0, :5] = -1.0
     harm = {}
     for count in ("first", "total"):
-        running, backup = start(worlds, 1, plan, count=count, others_mps2=np.array([[-8.0, 0.0]]))
+        running, backup = start(worlds, 1, plan, harm_count=count, others_mps2=np.array([[-8.0, 0.0]]))
         harm[count] = backup.harm[0]
         for _ in range(3):
             decision = certify(running, plan[:, int(running.steps[0])], backup, backup.harm)
@@ -153,14 +153,14 @@ def test_bad_input__is_refused():
 
 
 @pytest.mark.parametrize(("N", "count"), [(3, "first"), (3, "total"), (5, "total")])
-def test_engine__realises_the_certified_harm_to_the_bit_whatever_is_proposed(N, count):
+def test_engine__realises_the_certified_harm_to_the_bit_whatever_is_proposed(N, harm_count):
     scenario = line(N)
     worlds, learner = scenario.sample(5, N).worlds, scenario.learners[0]
     scripts = {i: make_agent(spec) for i, spec in scenario.scripts.items()}
     engine = Engine(scenario, worlds.n, learners=(learner,), scripts=scripts, worlds=worlds)
     others = engine.wanted_mps2.copy()
     plan = np.full((worlds.n, STEPS), -0.6)
-    running, backup = start(worlds, learner, plan, others_mps2=others, count=count)
+    running, backup = start(worlds, learner, plan, others_mps2=others, harm_count=harm_count)
     backup = backup._replace(constants=np.array(CONSTANTS[::5]))
     first, rng = backup.harm, np.random.default_rng(N)
     bounds = [first]
@@ -172,5 +172,5 @@ def test_engine__realises_the_certified_harm_to_the_bit_whatever_is_proposed(N, 
         assert running.states[:, :N].tolist() == engine.worlds.speeds_mps.tolist()
         assert running.ended.tolist() == engine.ended.tolist()
     assert (np.diff(bounds, axis=0) <= 0.0).all()
-    assert engine.ledger.world_harm(count).tolist() == backup.harm.tolist()
+    assert engine.ledger.world_harm(harm_count).tolist() == backup.harm.tolist()
     assert (backup.harm <= first).all() and (first > 0.0).any()

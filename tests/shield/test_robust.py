@@ -114,7 +114,7 @@ def test_bound__at_the_alert_is_that_of_the_best_constant_in_the_worst_corner():
 
 @pytest.mark.parametrize("who", ["random", "extremes"])
 @pytest.mark.parametrize(("N", "count"), [(3, "first"), (3, "total"), (5, "first"), (5, "total")])
-def test_every_member__realises_at_most_the_bound_to_the_bit(N, count, who):
+def test_every_member__realises_at_most_the_bound_to_the_bit(N, harm_count, who):
     scenario = line(N)
     worlds, vehicle = scenario.sample(6, 21).worlds, scenario.learners[0]
     uncertainty = parse_uncertainty(ALL[N])
@@ -123,9 +123,14 @@ def test_every_member__realises_at_most_the_bound_to_the_bit(N, count, who):
     for m in range(0, M, 5):
         truth = members.take(np.arange(worlds.n) * M + m)
         shielded = StepShieldAgent(
-            Adversary(who, m), scenario, count=count, uncertainty=uncertainty, believed=worlds, later_rollouts=m == 0
+            Adversary(who, m),
+            scenario,
+            harm_count=harm_count,
+            uncertainty=uncertainty,
+            believed=worlds,
+            later_rollouts=m == 0,
         )
-        harm = drive(truth, shielded, scenario, vehicle).ledger.world_harm(count)
+        harm = drive(truth, shielded, scenario, vehicle).ledger.world_harm(harm_count)
         assert (harm <= shielded.predicted_harm).all()
         assert (harm <= shielded.shield.bound).all() and (shielded.shield.bound <= shielded.predicted_harm).all()
         assert not shielded.shield.distrusted.any()
@@ -147,13 +152,13 @@ def test_every_member__is_bounded_by_the_same_actions():
 
 
 @pytest.mark.parametrize("count", ["first", "total"])
-def test_no_width__is_step_mode_to_the_bit(count):
+def test_no_width__is_step_mode_to_the_bit(harm_count):
     scenario = line(3)
     worlds = scenario.sample(30, 3).worlds
     harms, bounds = [], []
     for settings in ({}, {"uncertainty": "latency_s=0,mass_t=0%"}):
-        shielded = StepShieldAgent(Adversary("random"), scenario, count=count, **settings)
-        harms.append(drive(worlds, shielded, scenario, 1).ledger.world_harm(count).tolist())
+        shielded = StepShieldAgent(Adversary("random"), scenario, harm_count=harm_count, **settings)
+        harms.append(drive(worlds, shielded, scenario, 1).ledger.world_harm(harm_count).tolist())
         bounds.append(shielded.shield.bound.tolist())
     assert harms[0] == harms[1] and bounds[0] == bounds[1]
 

@@ -37,9 +37,9 @@ class Wavering:
 
 @pytest.mark.parametrize("name", ADVERSARIES)
 @pytest.mark.parametrize(("N", "count"), [(3, "first"), (5, "total")])
-def test_falsification__no_adversary_gets_above_the_bound(name, N, count):
+def test_falsification__no_adversary_gets_above_the_bound(name, N, harm_count):
     scenario = line(N)
-    found = attack(scenario, scenario.sample(40, 11).worlds, ADVERSARIES[name], count=count)
+    found = attack(scenario, scenario.sample(40, 11).worlds, ADVERSARIES[name], harm_count=harm_count)
     assert (found.realised <= found.bound).all()
     assert found.realised.tolist() == found.last_bound.tolist()
 
@@ -59,9 +59,12 @@ def test_first_bound__is_what_the_coupled_optimum_realises():
 
 
 @pytest.mark.parametrize("count", ["first", "total"])
-def test_agent__is_never_worse_than_the_episode_mode_nor_than_its_prediction(count):
-    step, hybrid = StepShieldAgent(Wavering(), SCENARIO, count=count), HybridAgent(Wavering(), SCENARIO, count=count)
-    harm = {a.name: drive(WORLDS, a, SCENARIO, 1).ledger.world_harm(count) for a in (step, hybrid)}
+def test_agent__is_never_worse_than_the_episode_mode_nor_than_its_prediction(harm_count):
+    step, hybrid = (
+        StepShieldAgent(Wavering(), SCENARIO, harm_count=harm_count),
+        HybridAgent(Wavering(), SCENARIO, harm_count=harm_count),
+    )
+    harm = {a.name: drive(WORLDS, a, SCENARIO, 1).ledger.world_harm(harm_count) for a in (step, hybrid)}
     assert (harm[step.name] <= step.predicted_harm).all()
     assert (harm[step.name] <= harm[hybrid.name] + 1e-9).all()
     assert harm[step.name].mean() < harm[hybrid.name].mean() - 0.2

@@ -33,7 +33,9 @@ class Slow:
 def test_equal_time__tells_the_harm_of_an_evaluation_and_the_time_it_took():
     sample = PAPER.sample(20, 8)
     agents = {"slow": Slow(), **make_lineup(["full_brake", "e_v2x_bm"], PAPER)}
-    rows = {row.agent: row for row in equal_time(sample, agents, scenario=PAPER, against="full_brake", count="total")}
+    rows = {
+        row.agent: row for row in equal_time(sample, agents, scenario=PAPER, against="full_brake", harm_count="total")
+    }
     result = evaluate(sample, agents, scenario=PAPER)
     full = result.outcome("full_brake").total_harm
     for name, row in rows.items():

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.protocol import Agent, fixed_commands, place, recall
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.engine.stream import Script, is_state_free
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
 
 Mode = Literal["coupled", "pairwise"]
@@ -23,24 +23,24 @@ Mode = Literal["coupled", "pairwise"]
 class EV2XBM:
     """The constant deceleration of least harm.
 
-    ``coupled`` minimises the harm realised in the engine's physics until ``horizon_s`` under the given ``count``, the
+    ``coupled`` minimises the harm realised in the engine's physics until ``horizon_s`` under ``harm_count``, the
     ``others`` following their scripts, and all vehicles that are not in there (learners) braking fully. ``pairwise``
     is the paper's closed form: everybody else brakes fully, and no velocities are exchanged. ``predicted_harm`` [n] is
     what each of them expects (m2/s2). Raises ``InvalidInput`` for an unknown mode or count, and, when an episode
     begins, in ``coupled`` mode for another vehicle's script whose command is not fixed at the alert.
     """
 
-    def __init__(self, mode: Mode = "coupled", *, count: HarmCount = "first", horizon_s: float = 8.0) -> None:
+    def __init__(self, mode: Mode = "coupled", *, harm_count: HarmCount = "first", horizon_s: float = 8.0) -> None:
         if mode not in ("coupled", "pairwise"):
             raise InvalidInput(f"e_v2x_bm mode {mode!r}: must be 'coupled' or 'pairwise'")
-        check_count(count)
+        check_harm_count(harm_count)
         self.name = "e_v2x_bm" if mode == "coupled" else "e_v2x_bm:pairwise"
         self.knows = Source.MODEL if mode == "coupled" else Source.STATE
         self.predicted_harm: Floats = np.empty(0)
         self.deceleration_mps2: Floats = np.empty(0)  # a* [n]
         self.others: Mapping[int, Script] = {}
         self._mode = mode
-        self._count = count
+        self._harm_count = harm_count
         self._horizon_s = horizon_s
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
@@ -51,7 +51,7 @@ class EV2XBM:
         else:
             others = self._others_mps2(worlds, vehicle)
             coupled = optimise_coupled(
-                worlds, vehicle, count=self._count, horizon_s=self._horizon_s, others_mps2=others
+                worlds, vehicle, harm_count=self._harm_count, horizon_s=self._horizon_s, others_mps2=others
             )
             best, harm = coupled.deceleration_mps2, coupled.harm
         self.deceleration_mps2 = place(self.deceleration_mps2, rows, best)
@@ -83,7 +83,7 @@ def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
     """``e_v2x_bm``, the same as ``e_v2x_bm:coupled``, or ``e_v2x_bm:pairwise``."""
     match argument:
         case None | "coupled":
-            return EV2XBM("coupled", count=settings.harm_count, horizon_s=settings.horizon_s)
+            return EV2XBM("coupled", harm_count=settings.harm_count, horizon_s=settings.horizon_s)
         case "pairwise":
-            return EV2XBM("pairwise", count=settings.harm_count, horizon_s=settings.horizon_s)
+            return EV2XBM("pairwise", harm_count=settings.harm_count, horizon_s=settings.horizon_s)
     raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise'")

@@ -14,7 +14,7 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_breakpoints
 from ethbrake_marl.errors import renumbered
-from ethbrake_marl.harm import HarmCount, check_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance
 
 GRID = 161  # first look: evenly spaced decelerations from 0 to the capacity
@@ -64,7 +64,7 @@ def optimise_coupled(
     worlds: Worlds,
     vehicle: int,
     *,
-    count: HarmCount = "first",
+    harm_count: HarmCount = "first",
     horizon_s: float = 8.0,
     others_mps2: Floats | None = None,
 ) -> CoupledOptimum:
@@ -77,11 +77,11 @@ def optimise_coupled(
     minima, on the safe side where the harm jumps. Equal harms are decided by the other count, then by the middle one of
     the equal decelerations. A world's result does not depend on the batch it is in.
 
-    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``count`` or others beyond their capacities, ``PhysicsError``
-    naming the worlds in which some candidate could not be simulated.
+    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``harm_count`` or others beyond their capacities,
+    ``PhysicsError`` naming the worlds in which some candidate could not be simulated.
     """
-    check_count(count)
-    search = _Search(worlds, vehicle, count, horizon_s, others_mps2)
+    check_harm_count(harm_count)
+    search = _Search(worlds, vehicle, harm_count, horizon_s, others_mps2)
     best = optimise_pairwise(search.paired, vehicle).deceleration_mps2
     rows = np.arange(worlds.n)
     first, total, _ = search.simulate(rows, best)
@@ -90,19 +90,19 @@ def optimise_coupled(
     for start in range(0, hit.size, step):
         part = hit[start : start + step]
         best[part], first[part], total[part] = search.minimise(part)
-    return CoupledOptimum(best, first if count == "first" else total, first, total)
+    return CoupledOptimum(best, first if harm_count == "first" else total, first, total)
 
 
 class _Search:
     """Simulates constant decelerations of one vehicle in given worlds."""
 
     def __init__(
-        self, worlds: Worlds, vehicle: int, count: HarmCount, horizon_s: float, others_mps2: Floats | None
+        self, worlds: Worlds, vehicle: int, harm_count: HarmCount, horizon_s: float, others_mps2: Floats | None
     ) -> None:
         capacity = worlds.vehicles.braking_capacity_mps2
         self._worlds = worlds
         self._vehicle = vehicle
-        self._count = count
+        self._harm_count = harm_count
         self._horizon_s = horizon_s
         self._command = -capacity if others_mps2 is None else np.array(others_mps2, dtype=np.float64)
         self.paired = _braking_as_told(worlds, vehicle, self._command)
@@ -126,7 +126,7 @@ class _Search:
         """Samples at every deceleration [m, k] in worlds ``rows`` [m]."""
         found = self.simulate(np.repeat(rows, deceleration.shape[1]), deceleration.ravel())
         first, total, course = (part.reshape(deceleration.shape) for part in found)
-        harms = (first, total) if self._count == "first" else (total, first)
+        harms = (first, total) if self._harm_count == "first" else (total, first)
         return Samples(deceleration, *harms, course)
 
     def minimise(self, rows: Ints) -> tuple[Floats, Floats, Floats]:

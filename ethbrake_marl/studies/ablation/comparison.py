@@ -17,7 +17,7 @@ from ethbrake_marl.evaluation.seed_statistics import (
     paired_over_seeds,
     share_over_seeds,
 )
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.studies.ablation.run import Harms, Measured
 
@@ -55,25 +55,25 @@ def _level(one: Measured, searched: int) -> Json:
         "seeds": len(one.reached.collided),
         "worlds": one.reached.collided.shape[1],
         "collision_rate": mean_over_seeds(one.reached.collided.astype(np.float64)).to_json(),
-        **{count: _under_count(one, count, searched) for count in COUNTS},
+        **{harm_count: _under_count(one, harm_count, searched) for harm_count in HARM_COUNTS},
     }
 
 
-def _under_count(one: Measured, count: HarmCount, searched: int) -> Json:
+def _under_count(one: Measured, harm_count: HarmCount, searched: int) -> Json:
     """Harm (m2/s2) under one count and what it is if all brake fully, in all worlds and in the ``searched`` ones.
 
     There also the joint optimum, and the share of its reduction that is realised.
     """
-    reached, braking = one.reached.world[count], one.full_brake.world[count]
+    reached, braking = one.reached.world[harm_count], one.full_brake.world[harm_count]
     each = reached.mean(axis=1)
     return {
         "full_brake": mean_over_seeds(braking).to_json(),
         "harm": mean_over_seeds(reached).to_json(),
         "each_seed": each.tolist(),
         "interquartile_mean": interquartile_mean([each], resamples=2000).to_json(),
-        "vehicles": [mean_over_seeds(column).to_json() for column in _columns(one.reached, count)],
+        "vehicles": [mean_over_seeds(column).to_json() for column in _columns(one.reached, harm_count)],
         "searched": _searched(
-            reached[:, :searched], braking[:, :searched], None if one.best is None else one.best[count]
+            reached[:, :searched], braking[:, :searched], None if one.best is None else one.best[harm_count]
         ),
     }
 
@@ -94,11 +94,13 @@ def _searched(reached: Floats, braking: Floats, best: Floats | None) -> Json:
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     """From one level to another on the same worlds: positive is more harm."""
     found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
-    for count in COUNTS:
-        pairs = zip(_columns(after.reached, count), _columns(before.reached, count), strict=True)
-        worse = _worse_off(before.reached, after.reached, count)
-        found[count] = {
-            "difference": paired_over_seeds(after.reached.world[count], before.reached.world[count]).to_json(),
+    for harm_count in HARM_COUNTS:
+        pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
+        worse = _worse_off(before.reached, after.reached, harm_count)
+        found[harm_count] = {
+            "difference": paired_over_seeds(
+                after.reached.world[harm_count], before.reached.world[harm_count]
+            ).to_json(),
             "vehicles": [paired_over_seeds(new, old).to_json() for new, old in pairs],
             "worse_off": mean_over_seeds(worse.any(axis=2).astype(np.float64)).to_json(),
             "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
@@ -106,13 +108,13 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     return found
 
 
-def _worse_off(before: Harms, after: Harms, count: HarmCount) -> Bools:
+def _worse_off(before: Harms, after: Harms, harm_count: HarmCount) -> Bools:
     """Which vehicles bear more than before, [seeds, worlds, N]: seed k against seed k, or against the only one."""
-    old, new = before.vehicle[count], after.vehicle[count]
+    old, new = before.vehicle[harm_count], after.vehicle[harm_count]
     worse: Bools = new > old + TOLERANCE
     return worse
 
 
-def _columns(harms: Harms, count: HarmCount) -> list[Floats]:
+def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:
     """[seeds, worlds] of each vehicle."""
-    return [harms.vehicle[count][:, :, i] for i in range(harms.vehicle[count].shape[2])]
+    return [harms.vehicle[harm_count][:, :, i] for i in range(harms.vehicle[harm_count].shape[2])]

@@ -17,7 +17,7 @@ import numpy as np
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm import (
     CHUNK,
     chunk_file,
@@ -59,7 +59,7 @@ def parts_left(plan: Plan, level: Level, part: Sample) -> tuple[int, list[Path]]
     """Worlds of a question that ``search_list`` will search, not finding them kept; and what it finds damaged."""
     left, damaged = 0, []
     identity = world_identity(part.worlds, Task(level.scenario, level.scenario.learners))
-    question = {"counts": list(COUNTS), "budget": plan.budget, "search_seed": 0}
+    question = {"counts": list(HARM_COUNTS), "budget": plan.budget, "search_seed": 0}
     for first in range(0, part.worlds.n, CHUNK):
         file, wanted = chunk_file(plan.optimum_folder(level), first), identity[first : first + CHUNK]
         try:
@@ -93,13 +93,13 @@ def _told(tell: OnProgress, name: str, done: int, total: int) -> None:
 
 def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmCount, Floats]:
     """The least harm [n] of each count in all ``answers`` (its own is among them) that these learners can give too."""
-    best = {count: np.full(own.worlds.n, np.inf) for count in COUNTS}
+    best = {harm_count: np.full(own.worlds.n, np.inf) for harm_count in HARM_COUNTS}
     for other in answers:
         rows = np.flatnonzero(_can_imitate(own, other))
         if rows.size:
             for harms in _harms(own, other, rows):
-                for count in COUNTS:
-                    best[count][rows] = np.minimum(best[count][rows], harms[count])
+                for harm_count in HARM_COUNTS:
+                    best[harm_count][rows] = np.minimum(best[harm_count][rows], harms[harm_count])
     return best
 
 
@@ -127,8 +127,8 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
     worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
     for best in other.searched.best.values():
         kept = best._replace(harm=best.harm[rows], profiles=best.profiles.take(rows))
-        yield dict(zip(COUNTS, realised_harm(worlds, task, kept), strict=True))
+        yield dict(zip(HARM_COUNTS, realised_harm(worlds, task, kept), strict=True))
     for team in other.teams:
         driven = evaluate(worlds, {team.name: team}, scenario=scenario, aftermath=False).complete()
         ledger = driven.outcome(team.name).ledger
-        yield {count: ledger.world_harm(count) for count in COUNTS}
+        yield {harm_count: ledger.world_harm(harm_count) for harm_count in HARM_COUNTS}

@@ -41,7 +41,7 @@ class LineQuestion:
     vehicles: tuple[int, ...]  # lengths of the lines
     episodes: int
     list_seed: int
-    count: HarmCount
+    harm_count: HarmCount
     search_episodes: int  # worlds in which the joint optimum is searched; 0: none
     budget: int
 
@@ -153,7 +153,7 @@ def drive_longer(question: LineQuestion, agents: Sequence[Agent], tell: OnProgre
 def _of_length(
     question: LineQuestion, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: OnProgress | None
 ) -> LineResult:
-    count = question.count
+    count = question.harm_count
     braking = _driven([make_single_agent("full_brake")], scenario, sample, tell)
     reached = _driven(agents, scenario, sample, tell)
     worst, own = braking.world[count], reached.world[count]
@@ -187,8 +187,8 @@ def _searched(
     if question.search_episodes == 0:
         return None
     part = sample.worlds.take(np.arange(question.search_episodes))
-    table = best_harm(scenario, part, counts=[question.count], budget=question.budget)
+    table = best_harm(scenario, part, counts=[question.harm_count], budget=question.budget)
     if tell is not None:
         tell(Progress(f"{scenario.vehicles} vehicles, joint optimum", part.n, part.n))
-    best: Floats = np.minimum(table.best[question.count].harm, reached[:, : part.n].min(axis=0))
+    best: Floats = np.minimum(table.best[question.harm_count].harm, reached[:, : part.n].min(axis=0))
     return best[np.newaxis]

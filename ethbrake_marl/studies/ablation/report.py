@@ -13,7 +13,7 @@ from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.ablation import change_figure, harm_curve, who_pays
 from ethbrake_marl.figures.style import png_bytes
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.studies.ablation.comparison import compare
 from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, LineResult
 from ethbrake_marl.studies.ablation.plan import Plan
@@ -29,15 +29,18 @@ Json = dict[str, Any]
 
 def markdown(found: Json, conditions: str) -> str:
     """All tables, with their conditions below."""
-    blocks = ["## Levels", *[_levels(found["levels"], count) for count in COUNTS]]
+    blocks = ["## Levels", *[_levels(found["levels"], harm_count) for harm_count in HARM_COUNTS]]
     worlds = found["levels"][0]["first"]["searched"]["worlds"]
     blocks += [f"## How near the joint optimum, in the first {worlds:,} worlds"]
-    blocks += [_optima(found["levels"], count) for count in COUNTS]
+    blocks += [_optima(found["levels"], harm_count) for harm_count in HARM_COUNTS]
     for title, key in (("What each step is worth", "steps"), ("Price of lost messages", "channels")):
         if found[key]:
             blocks += [f"## {title}", _changes(found[key])]
     if found["steps"] or found["channels"]:
-        blocks += ["## Who pays", *[_who_pays(found["steps"] + found["channels"], count) for count in COUNTS]]
+        blocks += [
+            "## Who pays",
+            *[_who_pays(found["steps"] + found["channels"], harm_count) for harm_count in HARM_COUNTS],
+        ]
     return "\n\n".join([*blocks, conditions]) + "\n"
 
 
@@ -49,20 +52,20 @@ def levels_csv(measured: Sequence[Measured], searched: int) -> str:
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     vehicles = measured[0].reached.vehicle["first"].shape[2]
-    harms = [f"{_column(count)}_{i + 1}" for count in COUNTS for i in range(vehicles)]
-    sums = [f"{name}{_column(count)}" for count in COUNTS for name in _SUMS]
+    harms = [f"{_column(harm_count)}_{i + 1}" for harm_count in HARM_COUNTS for i in range(vehicles)]
+    sums = [f"{name}{_column(harm_count)}" for harm_count in HARM_COUNTS for name in _SUMS]
     writer.writerow(["level", "algorithm", "seed", "worlds", "collision_rate", *sums, *harms])
     for one in measured:
         for seed in range(len(one.reached.collided)):
             row: list[object] = [one.level.name, one.algorithm or "", seed if one.algorithm else ""]
             row += [one.reached.collided.shape[1], float(one.reached.collided[seed].mean())]
-            for count in COUNTS:
-                best = "" if one.best is None else float(one.best[count].mean())
-                reached, braking = one.reached.world[count][seed], one.full_brake.world[count]
+            for harm_count in HARM_COUNTS:
+                best = "" if one.best is None else float(one.best[harm_count].mean())
+                reached, braking = one.reached.world[harm_count][seed], one.full_brake.world[harm_count]
                 row += [float(reached.mean()), float(braking.mean())]
                 row += [float(reached[:searched].mean()), float(braking[:, :searched].mean()), best]
-            for count in COUNTS:
-                row += [float(harm) for harm in one.reached.vehicle[count][seed].mean(axis=0)]
+            for harm_count in HARM_COUNTS:
+                row += [float(harm) for harm in one.reached.vehicle[harm_count][seed].mean(axis=0)]
             writer.writerow(row)
     return text.getvalue()
 
@@ -86,7 +89,7 @@ def lines_markdown(found: Sequence[LineResult], question: LineQuestion, runs: in
         rows.append(row + ([_of(one.best_known), _of(one.share, 100.0, 1, " %")] if question.search_episodes else []))
     name = question.scenario.name
     conditions = (
-        f"{_HARM[question.count].capitalize()} (m²/s², means per world) of the line of {name} made longer:"
+        f"{_HARM[question.harm_count].capitalize()} (m²/s², means per world) of the line of {name} made longer:"
         f" {runs} {'policies' if runs > 1 else 'policy'}, {question.episodes:,} worlds of seed {question.list_seed} for"
         f" each length; {interval_words(runs)}."
     )
@@ -101,22 +104,22 @@ def _of(estimate: Estimate | None, scale: float = 1.0, digits: int = 2, unit: st
     return _cell(None if estimate is None else estimate.to_json(), scale, digits, unit)
 
 
-def _levels(levels: Sequence[Json], count: HarmCount) -> str:
-    head = ["Level", _ALGORITHM, "Collisions", "All brake fully", f"Reached, {_HARM[count]}"]
+def _levels(levels: Sequence[Json], harm_count: HarmCount) -> str:
+    head = ["Level", _ALGORITHM, "Collisions", "All brake fully", f"Reached, {_HARM[harm_count]}"]
     rows = []
     for level in levels:
-        own = level[count]
+        own = level[harm_count]
         row = [f"`{level['level']}`", level["algorithm"] or NONE, _cell(level["collision_rate"], 100.0, 1, " %")]
         rows.append([*row, _value(own["full_brake"]), _cell(own["harm"])])
     return _table(head, rows, left=2)
 
 
-def _optima(levels: Sequence[Json], count: HarmCount) -> str:
-    head = ["Level", _ALGORITHM, "All brake fully", f"Reached, {_HARM[count]}"]
+def _optima(levels: Sequence[Json], harm_count: HarmCount) -> str:
+    head = ["Level", _ALGORITHM, "All brake fully", f"Reached, {_HARM[harm_count]}"]
     head += ["Joint optimum", "Share of its reduction"]
     rows = []
     for level in levels:
-        own = level[count]["searched"]
+        own = level[harm_count]["searched"]
         if own["best_known"] is not None:
             row = [f"`{level['level']}`", level["algorithm"], _value(own["full_brake"]), _cell(own["harm"])]
             rows.append([*row, _value(own["best_known"]), _cell(own["realised_share"], 100.0, 1, " %")])
@@ -125,24 +128,27 @@ def _optima(levels: Sequence[Json], count: HarmCount) -> str:
 
 def _changes(changes: Sequence[Json]) -> str:
     head = ["From", "To", _ALGORITHM]
-    for count in COUNTS:
-        head += [f"Change of {_HARM[count]}", f"Somebody worse off, {_HARM[count]}"]
+    for harm_count in HARM_COUNTS:
+        head += [f"Change of {_HARM[harm_count]}", f"Somebody worse off, {_HARM[harm_count]}"]
     rows = []
     for change in changes:
         row = [f"`{change['from']}`", f"`{change['to']}`", change["algorithm"]]
-        for count in COUNTS:
-            row += [_cell(change[count]["difference"], sign=True), _cell(change[count]["worse_off"], 100.0, 1, " %")]
+        for harm_count in HARM_COUNTS:
+            row += [
+                _cell(change[harm_count]["difference"], sign=True),
+                _cell(change[harm_count]["worse_off"], 100.0, 1, " %"),
+            ]
         rows.append(row)
     return _table(head, rows, left=3)
 
 
-def _who_pays(changes: Sequence[Json], count: HarmCount) -> str:
-    vehicles = len(changes[0][count]["vehicles"])
-    head = [f"Change of {_HARM[count]}", _ALGORITHM, *(f"Vehicle {i + 1}" for i in range(vehicles))]
+def _who_pays(changes: Sequence[Json], harm_count: HarmCount) -> str:
+    vehicles = len(changes[0][harm_count]["vehicles"])
+    head = [f"Change of {_HARM[harm_count]}", _ALGORITHM, *(f"Vehicle {i + 1}" for i in range(vehicles))]
     head += [f"Vehicle {i + 1} worse off" for i in range(vehicles)]
     rows = []
     for change in changes:
-        own = change[count]
+        own = change[harm_count]
         row = [f"`{change['from']}` to `{change['to']}`", change["algorithm"]]
         row += [_cell(estimate, sign=True) for estimate in own["vehicles"]]
         rows.append(row + [f"{100.0 * share:.1f} %" for share in own["worse_off_vehicles"]])
@@ -176,8 +182,8 @@ def _value(estimate: Json | None) -> str:
     return NONE if estimate is None else f"{estimate['value']:.2f}"
 
 
-def _column(count: HarmCount) -> str:
-    return "first_impact_harm" if count == "first" else "total_harm"
+def _column(harm_count: HarmCount) -> str:
+    return "first_impact_harm" if harm_count == "first" else "total_harm"
 
 
 SUMMARY, TABLE, PAGE = "ablation.json", "ablation.csv", "ablation.md"

@@ -16,7 +16,7 @@ import numpy as np
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.rollout import Outcome, evaluate
-from ethbrake_marl.harm import COUNTS, HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.learning.run_folder import RunDirectory
 from ethbrake_marl.learning.team_file import load_team
 from ethbrake_marl.learning.train import resume, train
@@ -142,7 +142,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
             found.append(Measured(level, None, scripts, braking, None))
             continue
         known = best_known(answers[level.name], list(answers.values()))
-        best = {count: harm[np.newaxis] for count, harm in known.items()}
+        best = {harm_count: harm[np.newaxis] for harm_count, harm in known.items()}
         for algorithm in plan.algorithms:
             reached = _driven(level.scenario, sample, teams[level.name, algorithm], say)
             found.append(Measured(level, algorithm, reached, braking, best))
@@ -167,7 +167,7 @@ def _driven(scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: OnP
 def harms_of(outcomes: Sequence[Outcome]) -> Harms:
     """The outcomes of several seeds on the same worlds, stacked."""
     return Harms(
-        {count: np.stack([o.ledger.world_harm(count) for o in outcomes]) for count in COUNTS},
-        {count: np.stack([o.ledger.vehicle_harm(count) for o in outcomes]) for count in COUNTS},
+        {harm_count: np.stack([o.ledger.world_harm(harm_count) for o in outcomes]) for harm_count in HARM_COUNTS},
+        {harm_count: np.stack([o.ledger.vehicle_harm(harm_count) for o in outcomes]) for harm_count in HARM_COUNTS},
         np.stack([o.collided for o in outcomes]),
     )

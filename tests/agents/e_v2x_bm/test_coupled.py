@@ -49,8 +49,8 @@ def least_on_grid(worlds: Worlds, vehicle: int, points: int) -> tuple[Floats, Fl
 def test_coupled__is_not_worse_than_a_grid_of_401(vehicles, vehicle, n):
     worlds = random_worlds(n, seed=21, vehicles=vehicles)
     first, total = least_on_grid(worlds, vehicle, 401)
-    assert np.all(optimise_coupled(worlds, vehicle, count="first").harm <= first + 1e-9)
-    assert np.all(optimise_coupled(worlds, vehicle, count="total").harm <= total + 1e-9)
+    assert np.all(optimise_coupled(worlds, vehicle, harm_count="first").harm <= first + 1e-9)
+    assert np.all(optimise_coupled(worlds, vehicle, harm_count="total").harm <= total + 1e-9)
 
 
 @pytest.mark.parametrize("n", [120, pytest.param(10_000, marks=pytest.mark.long)])
@@ -59,20 +59,20 @@ def test_coupled__is_not_worse_than_a_grid_of_2001_on_the_papers_list(n):
     others = -worlds.vehicles.braking_capacity_mps2
     grid = np.full((n, 1), -7.0) * np.linspace(0.0, 1.0, 2001)
     for count, harms in zip(("first", "total"), forecast(worlds, others, 1, grid, 8.0), strict=True):
-        excess = optimise_coupled(worlds, 1, count=count).harm - harms.min(axis=1)
+        excess = optimise_coupled(worlds, 1, harm_count=count).harm - harms.min(axis=1)
         print(f"{count}: largest excess {excess.max():.1e}, mean {excess.mean():.5f} m2/s2")
         assert excess.max() <= 1e-6
         assert np.mean(excess) < 0.0  # narrowing finds more than the grid
 
 
 @pytest.mark.parametrize("count", ["first", "total"])
-def test_coupled__states_the_harm_that_its_deceleration_realises(count):
+def test_coupled__states_the_harm_that_its_deceleration_realises(harm_count):
     worlds = random_worlds(200, seed=23)
-    best = optimise_coupled(worlds, 1, count=count)
+    best = optimise_coupled(worlds, 1, harm_count=harm_count)
     impacts = realised(worlds, 1, best.deceleration_mps2)
     assert np.array_equal(best.first_impact_harm, impacts.first_impact_harm.sum(axis=1))
     assert np.array_equal(best.total_harm, impacts.total_harm.sum(axis=1))
-    assert np.array_equal(best.harm, best.first_impact_harm if count == "first" else best.total_harm)
+    assert np.array_equal(best.harm, best.first_impact_harm if harm_count == "first" else best.total_harm)
     assert 0.3 < np.mean(best.harm > 0) < 0.9
 
 
@@ -140,7 +140,7 @@ def test_coupled__no_world_is_fine():
 
 def test_coupled__refuses_an_unknown_count():
     with pytest.raises(InvalidInput, match="'first' or 'total'"):
-        optimise_coupled(random_worlds(1, seed=1), 1, count="both")
+        optimise_coupled(random_worlds(1, seed=1), 1, harm_count="both")
 
 
 def samples(at, harm, other=None) -> Samples:
@@ -205,16 +205,16 @@ def test_coupled__looks_into_more_than_the_most_promising_cell():
         mass_t=rng.uniform(1, 20, (250, 5)),
         restitution=rng.uniform(0, 1, 250),
     )
-    assert optimise_coupled(worlds.take([191]), 2, count="total").harm[0] < 1048.2
+    assert optimise_coupled(worlds.take([191]), 2, harm_count="total").harm[0] < 1048.2
 
 
 @pytest.mark.parametrize(
     ("world", "count", "least"), [(609, "first", 12.2943), (3545, "first", 18.3988), (3290, "total", 55.3322)]
 )
-def test_coupled__finds_what_falls_toward_a_jump_between_two_samples(world, count, least):
+def test_coupled__finds_what_falls_toward_a_jump_between_two_samples(world, harm_count, least):
     # Just before one more impact the harm is least: a sawtooth that an even look from outside does not show.
     one = load_scenario("paper-random").sample(1, seed=7, first=world).worlds
-    assert optimise_coupled(one, 1, count=count).harm[0] < least
+    assert optimise_coupled(one, 1, harm_count=harm_count).harm[0] < least
 
 
 def test_coupled__is_steady_around_its_optimum():

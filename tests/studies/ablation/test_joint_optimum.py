@@ -50,12 +50,12 @@ def test_best_known__more_learners_are_never_worse_world_by_world(answers):
     far = load_scenario("cooperation-4-all").replace(obstacle_gap_m=200)
     every = [*list(answers.values())[:3], answer(Level(far), 1)]
     paper, pair, everybody = (best_known(each, every) for each in every[1:])
-    for count, harm in pair.items():
-        assert (harm <= paper[count] + 1e-9).all() and (everybody[count] <= harm + 1e-9).all()
-        assert harm.mean() < every[2].searched.best[count].harm.mean() - 1.0
+    for harm_count, harm in pair.items():
+        assert (harm <= paper[harm_count] + 1e-9).all() and (everybody[harm_count] <= harm + 1e-9).all()
+        assert harm.mean() < every[2].searched.best[harm_count].harm.mean() - 1.0
     with_obstacle = best_known(answers["cooperation-4-all"], list(answers.values()))
-    for count, best in answers["cooperation-4-all"].searched.best.items():
-        assert with_obstacle[count].mean() < best.harm.mean() - 1.0
+    for harm_count, best in answers["cooperation-4-all"].searched.best.items():
+        assert with_obstacle[harm_count].mean() < best.harm.mean() - 1.0
 
 
 def test_best_known__an_obstacle_that_is_reached_counts():
