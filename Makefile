@@ -26,7 +26,7 @@ help:
 	@echo "make check            lint and test"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
-	@echo "make test-shield      try to break the step shield: speed, interference, search, faces, bound (three quarters of an hour of one core)"
+	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
 	@echo "make test-hostile     6,000 files and command lines of strangers: each refused in one line, or in order"
 	@echo "make shield-bugs      plant 19 bugs in copies of the shield; each must turn a test red"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"

@@ -1,7 +1,7 @@
 """Episodes of ``n`` worlds at once: reset, step, roles, latency gates, episode ends.
 
-Every face of the environment, every evaluation and every search is a thin layer on this. An episode starts at t = 0,
-when Vehicle 1 brakes; ``reset`` moves exactly to the first moment at which a learner's latency has elapsed.
+Every interface of the environment, every evaluation and every search is a thin layer on this. An episode starts at
+t = 0, when Vehicle 1 brakes; ``reset`` moves exactly to the first moment at which a learner's latency has elapsed.
 """
 
 from __future__ import annotations

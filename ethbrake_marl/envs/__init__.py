@@ -1,1 +1,1 @@
-"""The four faces of the environment, thin over ``engine``: PettingZoo, Gymnasium, its vector API, Stable-Baselines3."""
+"""The four interfaces, thin over ``engine``: PettingZoo, Gymnasium, its vector API, Stable-Baselines3."""

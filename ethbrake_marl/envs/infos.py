@@ -1,8 +1,8 @@
-"""What the infos of every face say, computed once for all vehicles of all worlds.
+"""Infos of every interface, computed once for all vehicles of all worlds.
 
-After a reset: ``time_s``, ``applied_command_mps2`` (in force now; 0 until the latency has elapsed), the vehicle's share
-of the harm so far under both counts, the same for the whole world, and whether anything has collided. After a step
-also ``wanted_command_mps2``, ``applied_action`` (the vehicle's command as an action, whoever chose it), and the reward
+After a reset: ``time_s``, ``command_in_force_mps2`` (in force now; 0 until the latency has elapsed), the vehicle's
+share of the harm so far under both counts, the same for the whole world, and whether anything has collided. After a step
+also ``chosen_command_mps2``, ``chosen_action`` (the vehicle's command as an action, whoever chose it), and the reward
 terms before their weights. Where the scenario has a ``v2x`` channel, always also ``known_from_s`` [N]: since when this
 vehicle has the news of each other one (infinite: never; its own: 0).
 """
@@ -25,14 +25,14 @@ from ethbrake_marl.scenario.v2x import news_of
 
 AT_ANY_TIME = (
     "time_s",
-    "applied_command_mps2",
+    "command_in_force_mps2",
     "first_impact_harm",
     "total_harm",
     "world_first_impact_harm",
     "world_total_harm",
     "collided",
 )
-AFTER_A_STEP = (*AT_ANY_TIME, "wanted_command_mps2", "applied_action")
+AFTER_A_STEP = (*AT_ANY_TIME, "chosen_command_mps2", "chosen_action")
 _FLOAT32 = np.dtype(np.float32)
 
 
@@ -90,7 +90,7 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 
 def plain_infos(told: Report, vehicles: Ints | None = None) -> list[dict[str, Any]]:
-    """Infos of these vehicles (None: of all), world by world, as plain numbers; ``applied_action`` is an array [1]."""
+    """Infos of these vehicles (None: of all), world by world, as plain numbers; ``chosen_action`` is an array [1]."""
     infos = _without_news(told, vehicles)
     if told.known_from_s is not None:
         news = told.known_from_s if vehicles is None else told.known_from_s.take(vehicles, axis=1)
@@ -107,19 +107,19 @@ def _without_news(told: Report, vehicles: Ints | None) -> list[dict[str, Any]]:
     for k, world in enumerate(worlds):
         terms = told.step.shared_in(k)
         for time, applied, first, total, world_first, world_total, collided, wanted, action in world:
-            applied_action = np.empty(1, _FLOAT32)
-            applied_action[0] = action
+            chosen_action = np.empty(1, _FLOAT32)
+            chosen_action[0] = action
             infos.append(
                 {
                     "time_s": time,
-                    "applied_command_mps2": applied,
+                    "command_in_force_mps2": applied,
                     "first_impact_harm": first,
                     "total_harm": total,
                     "world_first_impact_harm": world_first,
                     "world_total_harm": world_total,
                     "collided": collided == 1.0,
-                    "wanted_command_mps2": wanted,
-                    "applied_action": applied_action,
+                    "chosen_command_mps2": wanted,
+                    "chosen_action": chosen_action,
                     "reward_terms": terms.copy(),
                 }
             )
@@ -134,7 +134,7 @@ def _at_any_time(values: list[Any]) -> dict[str, Any]:
     time, applied, first, total, world_first, world_total, collided, *_ = values
     return {
         "time_s": time,
-        "applied_command_mps2": applied,
+        "command_in_force_mps2": applied,
         "first_impact_harm": first,
         "total_harm": total,
         "world_first_impact_harm": world_first,
@@ -157,7 +157,7 @@ def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools | None) -
     info = _masked(always, rows)
     if stepped is None:
         return info
-    columns["applied_action"] = columns["applied_action"].astype(np.float32)[:, np.newaxis]
+    columns["chosen_action"] = columns["chosen_action"].astype(np.float32)[:, np.newaxis]
     info |= _masked({name: columns[name] for name in AFTER_A_STEP[len(AT_ANY_TIME) :]}, stepped)
     terms = {} if told.step is None else told.step.shared | _column(told.step.further, vehicle)
     info["reward_terms"] = _masked(terms, stepped)

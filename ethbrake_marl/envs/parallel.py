@@ -1,4 +1,4 @@
-"""PettingZoo's face: every vehicle of one world is an agent, to the collective end."""
+"""PettingZoo's interface: every vehicle of one world is an agent, to the collective end."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
 
     Learners need an action [1] in [-1, 1] in each step: -1 full braking capacity, 0 coasts, +1 full driving capacity.
     Scripted vehicles observe, are rewarded and get infos too; what is passed for them is ignored, and
-    ``infos[agent]["applied_action"]`` shows what their script did. All agents end together: terminated when all are
+    ``infos[agent]["chosen_action"]`` shows what their script did. All agents end together: terminated when all are
     at rest and no command would move one, truncated at the horizon. ``state()`` is the full state for centralised
     critics. Observations, rewards, infos and ``reset``: as for ``EthBrakeEnv``; any number of ``learners``.
     """

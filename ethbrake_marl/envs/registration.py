@@ -1,4 +1,4 @@
-"""Ids under which Gymnasium and PettingZoo know this environment. Naming a face does not import it."""
+"""Ids under which Gymnasium and PettingZoo know this environment. Naming an interface does not import it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's face: a native ``VecEnv`` whose rows are learners. Importing this file imports torch."""
+"""Stable-Baselines3's interface: a native ``VecEnv`` whose rows are learners. Importing this file imports torch."""
 
 from __future__ import annotations
 

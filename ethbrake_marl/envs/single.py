@@ -1,4 +1,4 @@
-"""Gymnasium's face: one learner, one world."""
+"""Gymnasium's interface: one learner, one world."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gymnasium's vector face: one learner, many worlds, advanced together."""
+"""Gymnasium's vector interface: one learner, many worlds, advanced together."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ class AttachedHybrid(Attached):
         return {
             "mode": "episode",
             "proposed_action": proposed,
-            "applied_action": applied,
+            "chosen_action": applied,
             "intervened": abs(applied - proposed) > ROUNDING,
             "chosen_policy": bool(self.hybrid.chosen_policy[k]),
             "policy_harm": float(self.hybrid.policy_harm[k]),

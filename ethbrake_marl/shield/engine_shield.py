@@ -1,8 +1,8 @@
-"""Shields attached to a running engine: what every wrapped face shares.
+"""Shields attached to a running engine: what every wrapped interface shares.
 
-There is one way from a proposal to a step, whatever the face and whatever stands between it and the engine:
+There is one way from a proposal to a step, whatever the interface and whatever stands between it and the engine:
 
-1. *Certify.* The face asks what may be applied. That changes nothing.
+1. *Certify.* The interface asks what may be applied. That changes nothing.
 2. *Step.* The engine makes the step on a copy of its worlds and shows it to the shield. What is not the certified step,
    in its command, its place in the episode, or the state and harm that it leads to, is refused: ``UncertifiedStep``.
 3. *Commit.* The engine puts the new worlds and the shield's new memory in place together (``engine.Watcher``).
@@ -205,7 +205,7 @@ class AttachedShield(Attached):
         return {
             "mode": "step" if after.uncertainty is None else "robust",
             "proposed_action": proposed,
-            "applied_action": float(decision.applied[k]),
+            "chosen_action": float(decision.applied[k]),
             "intervened": bool(decision.intervened[k]),
             "reason": REASONS[decision.reason[k]],
             "bound_harm": float(decision.bound[k]),

@@ -43,10 +43,10 @@ def proposing_agent(policy: Agent | LearnedPolicy | None, where: str) -> Agent:
     )
 
 
-def engine_of(env: object, face: type, where: str, maker: str) -> Engine:
-    """The engine of one of this package's environments, whatever wraps it; ``InvalidInput`` for another face."""
+def engine_of(env: object, interface: type, where: str, maker: str) -> Engine:
+    """The engine of one of this package's environments, whatever wraps it; ``InvalidInput`` for another interface."""
     engine = getattr(getattr(env, "unwrapped", env), "engine", None)
-    if not (isinstance(env, face) and isinstance(engine, Engine)):
+    if not (isinstance(env, interface) and isinstance(engine, Engine)):
         raise InvalidInput(f"{where}: {env} is not one of this package's environments ({maker})")
     return engine
 

@@ -45,7 +45,7 @@ def test_e_v2x_bm__full_braking_of_the_others_is_the_papers_case():
     assert told.deceleration_mps2.tolist() == alone.deceleration_mps2.tolist()
 
 
-def test_e_v2x_bm__knows_who_drives_in_the_engines_of_all_faces():
+def test_e_v2x_bm__knows_who_drives_in_the_engines_of_all_interfaces():
     scenario = PAPER.replace(
         roles={"vehicle_1": "full_brake", "vehicle_2": "e_v2x_bm", "vehicle_3": "constant:3"}, early_impacts="keep"
     )

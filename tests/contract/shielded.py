@@ -1,4 +1,4 @@
-"""The shielded faces behind the same small interface as the bare ones."""
+"""The shielded interfaces behind the same small interface as the bare ones."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from tests.contract.faces import Parallel, Sb3, Single, Vector
+from tests.contract.interfaces import Parallel, Sb3, Single, Vector
 
 
 class ShieldedParallel(Parallel):

@@ -1,4 +1,4 @@
-"""What every face promises, stricter than the libraries' own checkers."""
+"""What every interface promises, stricter than the libraries' own checkers."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import pytest
 from ethbrake_marl.envs.setup import UnknownResetOption
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario
-from tests.contract.faces import (
+from tests.contract.interfaces import (
     BATCHED,
-    FACES,
     FIVE,
+    INTERFACES,
     PAPER,
     SCENARIOS,
-    Face,
+    Interface,
     Turn,
     actions,
     all_digests,
@@ -29,7 +29,7 @@ from tests.contract.faces import (
     rows_of,
 )
 
-each_face = pytest.mark.parametrize("name", FACES)
+each_interface = pytest.mark.parametrize("name", INTERFACES)
 each_batch = pytest.mark.parametrize("name", BATCHED)
 each_scenario = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
 
@@ -46,76 +46,76 @@ TWO = Scenario(
 )
 
 
-def make(name: str, scenario: Scenario = PAPER, **settings: Any) -> Face:
-    return FACES[name](scenario, rows_of(name), **settings)
+def make(name: str, scenario: Scenario = PAPER, **settings: Any) -> Interface:
+    return INTERFACES[name](scenario, rows_of(name), **settings)
 
 
-def play(face: Face, seed: int | None, steps: int = 160) -> Iterator[Turn]:
-    face.reset(seed)
-    for action in actions(3, steps, face.n):
-        yield face.step(action)
+def play(interface: Interface, seed: int | None, steps: int = 160) -> Iterator[Turn]:
+    interface.reset(seed)
+    for action in actions(3, steps, interface.n):
+        yield interface.step(action)
 
 
-@each_face
+@each_interface
 @each_scenario
 def test_seed__repeats_whole_episodes_bit_for_bit(name: str, scenario: Scenario) -> None:
     assert digest(name, scenario, 11) == digest(name, scenario, 11)
     assert sum(turn.ended.sum() for turn in play(make(name, scenario), 11)) >= 2 * rows_of(name) - 1
 
 
-@each_face
+@each_interface
 def test_seed__starts_its_stream_again_whatever_happened_before(name: str) -> None:
-    face = make(name)
-    first = [turn.bits() for turn in play(face, 4)]
-    list(play(face, 99, steps=7))
-    assert [turn.bits() for turn in play(face, 4)] == first
+    interface = make(name)
+    first = [turn.bits() for turn in play(interface, 4)]
+    list(play(interface, 99, steps=7))
+    assert [turn.bits() for turn in play(interface, 4)] == first
 
 
-@each_face
+@each_interface
 def test_seed__different_seeds_differ(name: str) -> None:
-    face = make(name)
-    assert not np.array_equal(face.reset(1), face.reset(2))
+    interface = make(name)
+    assert not np.array_equal(interface.reset(1), interface.reset(2))
 
 
-@each_face
+@each_interface
 def test_seed__without_one_the_stream_goes_on(name: str) -> None:
-    face = make(name)
-    first, second = face.reset(1), face.reset()
+    interface = make(name)
+    first, second = interface.reset(1), interface.reset()
     assert not np.array_equal(first, second)
-    face.reset(1)
-    assert np.array_equal(face.reset(), second)
+    interface.reset(1)
+    assert np.array_equal(interface.reset(), second)
 
 
-@each_face
+@each_interface
 def test_seed__an_environment_that_was_never_seeded_uses_fresh_entropy(name: str) -> None:
     assert not np.array_equal(make(name).reset(), make(name).reset())
 
 
-@each_face
+@each_interface
 @pytest.mark.parametrize("seed", [-1, 1.5, True, "1"])
 def test_seed__anything_but_a_whole_number_from_0_is_refused(name: str, seed: Any) -> None:
     with pytest.raises(InvalidInput, match=r"reset: seed = .*must be None or a whole number, at least 0"):
         make(name).reset(seed)
 
 
-@each_face
+@each_interface
 @each_scenario
 def test_observation__lies_in_its_finite_float32_space_at_every_step(name: str, scenario: Scenario) -> None:
-    face = make(name, scenario)
-    assert np.isfinite(face.space.low).all() and np.isfinite(face.space.high).all()
-    assert face.space.dtype == np.float32
-    seen = [face.reset(5)]
-    for turn in play(face, 5):
+    interface = make(name, scenario)
+    assert np.isfinite(interface.space.low).all() and np.isfinite(interface.space.high).all()
+    assert interface.space.dtype == np.float32
+    seen = [interface.reset(5)]
+    for turn in play(interface, 5):
         seen += [turn.observation, *(final[np.newaxis] for final in turn.final.values())]
         assert np.isfinite(turn.reward).all()
         assert len(turn.final) == turn.ended.sum()
     for batch in seen:
         assert batch.dtype == np.float32
         assert np.isfinite(batch).all()
-        assert all(row in face.space for row in batch)
+        assert all(row in interface.space for row in batch)
 
 
-@each_face
+@each_interface
 def test_arrays__what_was_returned_never_changes_and_may_be_overwritten(name: str) -> None:
     untouched, abused = make(name), make(name)
     kept: list[tuple[np.ndarray, np.ndarray]] = []
@@ -130,75 +130,75 @@ def test_arrays__what_was_returned_never_changes_and_may_be_overwritten(name: st
     assert all(np.array_equal(array, copy_) for array, copy_ in kept)
 
 
-@each_face
+@each_interface
 def test_actions__are_left_alone(name: str) -> None:
-    face = make(name)
-    face.reset(5)
-    for action in actions(3, 20, face.n):
+    interface = make(name)
+    interface.reset(5)
+    for action in actions(3, 20, interface.n):
         before = action.copy()
-        face.step(action)
+        interface.step(action)
         assert np.array_equal(action, before)
 
 
 @each_batch
 @each_scenario
 def test_batch__its_worlds_differ_from_each_other_in_every_episode(name: str, scenario: Scenario) -> None:
-    face = make(name, scenario)
-    starts = [row.tobytes() for row in face.reset(5)]
-    for turn in play(face, 5):
+    interface = make(name, scenario)
+    starts = [row.tobytes() for row in interface.reset(5)]
+    for turn in play(interface, 5):
         starts += [turn.observation[row].tobytes() for row in turn.final]
-    assert len(starts) >= 2 * face.n
+    assert len(starts) >= 2 * interface.n
     assert len(set(starts)) == len(starts)
 
 
-@each_face
+@each_interface
 def test_truncated__marks_the_horizon_and_nothing_else(name: str) -> None:
     # From 0.5 s to the horizon at 0.95 s: four steps of 0.1 s and one of 0.05 s.
-    face = make(name, PAPER.replace(horizon_s=0.95))
-    turns = list(play(face, 5, steps=15))
+    interface = make(name, PAPER.replace(horizon_s=0.95))
+    turns = list(play(interface, 5, steps=15))
     assert [bool(turn.truncated.all()) for turn in turns] == [False, False, False, False, True] * 3
     assert not any(turn.terminated.any() for turn in turns)
 
 
-@each_face
+@each_interface
 def test_terminated__marks_the_moment_when_all_rest(name: str) -> None:
-    face = make(name, TWO)
-    face.reset(0)
-    turns = [face.step(np.full((face.n, 1), -1.0, np.float32)) for _ in range(20)]
+    interface = make(name, TWO)
+    interface.reset(0)
+    turns = [interface.step(np.full((interface.n, 1), -1.0, np.float32)) for _ in range(20)]
     assert [bool(turn.terminated.all()) for turn in turns] == ([False] * 9 + [True]) * 2
     assert not any(turn.truncated.any() for turn in turns)
 
 
-@each_face
+@each_interface
 def test_terminated__at_the_horizon_itself_is_not_truncated(name: str) -> None:
-    face = make(name, TWO.replace(horizon_s=1.5))
-    face.reset(0)
-    turns = [face.step(np.full((face.n, 1), -1.0, np.float32)) for _ in range(10)]
+    interface = make(name, TWO.replace(horizon_s=1.5))
+    interface.reset(0)
+    turns = [interface.step(np.full((interface.n, 1), -1.0, np.float32)) for _ in range(10)]
     assert turns[-1].terminated.all() and not turns[-1].truncated.any()
 
 
-@each_face
+@each_interface
 def test_terminated__not_while_a_command_would_move_a_vehicle_at_rest(name: str) -> None:
     # Driving from 1.45 s on: the vehicle rests for an instant only, and the horizon ends the episode.
-    face = make(name, TWO.replace(horizon_s=2.0))
-    face.reset(0)
+    interface = make(name, TWO.replace(horizon_s=2.0))
+    interface.reset(0)
     for _ in range(9):
-        face.step(np.full((face.n, 1), -1.0, np.float32))
-    turns = [face.step(np.full((face.n, 1), 1.0, np.float32)) for _ in range(6)]
+        interface.step(np.full((interface.n, 1), -1.0, np.float32))
+    turns = [interface.step(np.full((interface.n, 1), 1.0, np.float32)) for _ in range(6)]
     assert not any(turn.terminated.any() for turn in turns)
     assert turns[-1].truncated.all()
 
 
-@each_face
+@each_interface
 @each_scenario
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
 def test_clone__in_mid_episode_goes_on_alike_and_apart(name: str, scenario: Scenario, clone: Any) -> None:
-    face = make(name, scenario)
-    list(play(face, 5, steps=10))
-    twin = copy.copy(face)
-    twin.env = clone(face.env)
-    twin_turns = [twin.step(action).bits() for action in actions(8, 90, face.n)]
-    assert [face.step(action).bits() for action in actions(8, 90, face.n)] == twin_turns
+    interface = make(name, scenario)
+    list(play(interface, 5, steps=10))
+    twin = copy.copy(interface)
+    twin.env = clone(interface.env)
+    twin_turns = [twin.step(action).bits() for action in actions(8, 90, interface.n)]
+    assert [interface.step(action).bits() for action in actions(8, 90, interface.n)] == twin_turns
 
 
 def test_spawn__another_process_sees_the_same_bits() -> None:
@@ -210,8 +210,8 @@ def test_spawn__another_process_sees_the_same_bits() -> None:
 
 @each_scenario
 @pytest.mark.parametrize("reward", ["harm", "total-harm", "paper"])
-def test_faces__agree_on_every_episode(scenario: Scenario, reward: str) -> None:
-    runs = {name: list(play(FACES[name](scenario, 1, reward=reward), 7)) for name in FACES}
+def test_interfaces__agree_on_every_episode(scenario: Scenario, reward: str) -> None:
+    runs = {name: list(play(INTERFACES[name](scenario, 1, reward=reward), 7)) for name in INTERFACES}
     assert sum(turn.ended.sum() for turn in runs["single"]) >= 2
     assert any(turn.reward[0] != 0.0 for turn in runs["single"])
     expected = [turn.bits() for turn in runs["single"]]
@@ -219,17 +219,17 @@ def test_faces__agree_on_every_episode(scenario: Scenario, reward: str) -> None:
         assert [turn.bits() for turn in turns] == expected, name
 
 
-@each_face
+@each_interface
 @each_scenario
 def test_batch__of_one_is_row_k_of_a_batch(name: str, scenario: Scenario) -> None:
     n, seed = 5, 7
     worlds = scenario.sample(n, seed, channel="training").worlds
-    batch = FACES["vector"](scenario, n)
+    batch = INTERFACES["vector"](scenario, n)
     start = batch.reset(seed)
     columns = actions(3, 70, n)
     turns = [batch.step(action) for action in columns]
     for k in range(n):
-        alone = FACES[name](scenario, 1)
+        alone = INTERFACES[name](scenario, 1)
         assert np.array_equal(alone.reset(options={"initial_state": initial_state(worlds, k)})[0], start[k])
         for turn, action in zip(turns, columns, strict=True):
             mine = alone.step(action[k : k + 1])
@@ -244,7 +244,7 @@ def test_batch__of_one_is_row_k_of_a_batch(name: str, scenario: Scenario) -> Non
             pytest.fail("the episode did not end")
 
 
-@each_face
+@each_interface
 @pytest.mark.parametrize(
     ("value", "message"),
     [
@@ -255,83 +255,85 @@ def test_batch__of_one_is_row_k_of_a_batch(name: str, scenario: Scenario) -> Non
     ],
 )
 def test_action__one_that_cannot_be_used_is_refused_and_changes_nothing(name: str, value: Any, message: str) -> None:
-    face, untouched = make(name), make(name)
-    list(play(face, 5, steps=10)), list(play(untouched, 5, steps=10))
-    bad = np.zeros((face.n, 1), object)
+    interface, untouched = make(name), make(name)
+    list(play(interface, 5, steps=10)), list(play(untouched, 5, steps=10))
+    bad = np.zeros((interface.n, 1), object)
     bad[-1] = value
     with pytest.raises(InvalidInput, match=message):
-        face.step(bad)
-    for action in actions(8, 5, face.n):
-        assert face.step(action).bits() == untouched.step(action).bits()
+        interface.step(bad)
+    for action in actions(8, 5, interface.n):
+        assert interface.step(action).bits() == untouched.step(action).bits()
 
 
-@each_face
+@each_interface
 def test_action__of_another_shape_is_refused(name: str) -> None:
-    face = make(name)
-    face.reset(5)
+    interface = make(name)
+    interface.reset(5)
     with pytest.raises(InvalidInput, match="shape"):
-        face.step(np.zeros((face.n, 2), np.float32))
+        interface.step(np.zeros((interface.n, 2), np.float32))
 
 
-@each_face
+@each_interface
 def test_step__before_the_first_reset_is_refused(name: str) -> None:
-    face = make(name)
+    interface = make(name)
     with pytest.raises(InvalidInput, match="step: no episode is running; call reset first"):
-        face.step(np.zeros((face.n, 1), np.float32))
+        interface.step(np.zeros((interface.n, 1), np.float32))
 
 
-@each_face
+@each_interface
 def test_options__an_unknown_one_warns_and_is_ignored(name: str) -> None:
-    face = make(name)
-    expected = face.reset(5)
+    interface = make(name)
+    expected = interface.reset(5)
     with pytest.warns(UnknownResetOption, match="reset: unknown option colour, ignored; known: initial_state") as seen:
-        given = face.reset(5, {"colour": "red"})
+        given = interface.reset(5, {"colour": "red"})
     assert len(seen) == 1
     assert np.array_equal(given, expected)
 
 
-@each_face
+@each_interface
 @pytest.mark.parametrize("state", [{"gaps_m": [7, -1]}, {"gap_m": 7}, {"speeds_mps": [1, 2]}, [7, 7], None])
 def test_options__a_bad_initial_state_is_refused_and_changes_nothing(name: str, state: Any) -> None:
-    face, untouched = make(name), make(name)
-    list(play(face, 5, steps=10)), list(play(untouched, 5, steps=10))
+    interface, untouched = make(name), make(name)
+    list(play(interface, 5, steps=10)), list(play(untouched, 5, steps=10))
     with pytest.raises(InvalidInput, match="initial_state"):
-        face.reset(None if name == "sb3" else 3, {"initial_state": state})  # SB3 keeps a seed until a reset succeeds
-    assert np.array_equal(face.reset(), untouched.reset())
+        interface.reset(
+            None if name == "sb3" else 3, {"initial_state": state}
+        )  # SB3 keeps a seed until a reset succeeds
+    assert np.array_equal(interface.reset(), untouched.reset())
 
 
-@each_face
+@each_interface
 def test_options__an_initial_state_serves_one_episode_in_every_world(name: str) -> None:
-    face = make(name)
+    interface = make(name)
     state = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
-    start = face.reset(5, {"initial_state": state})
+    start = interface.reset(5, {"initial_state": state})
     assert (start == start[0]).all()
-    assert np.array_equal(start, face.reset(6, {"initial_state": state}))
+    assert np.array_equal(start, interface.reset(6, {"initial_state": state}))
     own_speed = 18.0 / 20.0
     assert start[0, 0] == np.float32(own_speed)
-    assert not np.array_equal(face.reset(), start)
+    assert not np.array_equal(interface.reset(), start)
 
 
 @pytest.mark.parametrize("name", ["single", "vector"])
-def test_learners__these_faces_need_exactly_one(name: str) -> None:
+def test_learners__these_interfaces_need_exactly_one(name: str) -> None:
     with pytest.raises(InvalidInput, match=r"2 learners \(vehicle_2, vehicle_3\)"):
         make(name, learners=["vehicle_2", "vehicle_3"])
     with pytest.raises(InvalidInput, match=r"0 learners \(none\)"):
         make(name, FIVE, learners=[])
 
 
-@each_face
+@each_interface
 @pytest.mark.parametrize("learner", ["vehicle_1", "vehicle_3", "vehicle_5"])
 def test_learners__any_vehicle_may_be_the_one(name: str, learner: str) -> None:
     five = FIVE.replace(obstacle_gap_m=30) if learner == "vehicle_1" else FIVE
-    face, same = make(name, five, learners=[learner]), make(name, five, learners=[int(learner[-1]) - 1])
-    turns = list(play(face, 5, steps=30))
+    interface, same = make(name, five, learners=[learner]), make(name, five, learners=[int(learner[-1]) - 1])
+    turns = list(play(interface, 5, steps=30))
     assert [turn.bits() for turn in turns] == [turn.bits() for turn in play(same, 5, steps=30)]
     other = make(name, five, learners=["vehicle_4"])
     assert [turn.bits() for turn in turns] != [turn.bits() for turn in play(other, 5, steps=30)]
 
 
-@each_face
+@each_interface
 def test_learners__vehicle_1_needs_an_obstacle_ahead(name: str) -> None:
     with pytest.raises(InvalidInput, match=r"roles\.vehicle_1 = learner: has nothing to lose .* obstacle_gap_m: 42"):
         make(name, FIVE, learners=["vehicle_1"])

@@ -14,7 +14,7 @@ from ethbrake_marl.envs.setup import make_engine
 from ethbrake_marl.harm import HARM_COUNTS, empty_ledger
 from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
-from tests.contract.faces import FACES, actions, initial_state
+from tests.contract.interfaces import INTERFACES, actions, initial_state
 
 LEVELS = [entry.name for entry in list_scenarios() if entry.path.parent.name == "cooperation"]
 ONE_LEARNS = [name for name in LEVELS if len(load_scenario(name).learners) == 1]
@@ -71,25 +71,25 @@ def test_pettingzoo__holds(scenario: Any) -> None:
 @pytest.mark.parametrize(
     "scenario", [*ONE_LEARNS, line(2).with_learners(["vehicle_1"]), line(2).with_learners(["vehicle_2"])], ids=named
 )
-def test_faces__agree_on_every_episode(scenario: Any) -> None:
+def test_interfaces__agree_on_every_episode(scenario: Any) -> None:
     loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     bits = {}
-    for name, face in FACES.items():
-        running = face(loaded, 1)
+    for name, interface in INTERFACES.items():
+        running = interface(loaded, 1)
         bits[name] = [running.reset(7).tobytes(), *(running.step(a).bits() for a in actions(3, 160, 1))]
     assert all(run == bits["single"] for run in bits.values())
 
 
-@pytest.mark.parametrize("name", FACES)
+@pytest.mark.parametrize("name", INTERFACES)
 def test_batch__of_one_is_row_k_of_a_batch_where_the_channel_is_fixed(name: str) -> None:
     fixed = {"preset": "nominal", "link_latency_s": 0.6, "hears": "front", "sensing_s": [0.9, 0.9]}
     scenario = load_scenario("paper-random").replace(v2x=fixed, objective="own", early_impacts="keep")
     worlds = scenario.sample(4, 7, channel="training").worlds
-    batch = FACES["vector"](scenario, 4)
+    batch = INTERFACES["vector"](scenario, 4)
     start, columns = batch.reset(7), actions(3, 40, 4)
     turns = [batch.step(action) for action in columns]
     for k in range(4):
-        alone = FACES[name](scenario, 1)
+        alone = INTERFACES[name](scenario, 1)
         assert np.array_equal(alone.reset(options={"initial_state": initial_state(worlds, k)})[0], start[k])
         for turn, action in zip(turns, columns, strict=True):
             mine = alone.step(action[k : k + 1])

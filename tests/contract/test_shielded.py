@@ -1,4 +1,4 @@
-"""Behind the shield every face keeps the promises of the bare one, and the libraries' own checkers pass."""
+"""Behind the shield every interface keeps the promises of the bare one, and the libraries' own checkers pass."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from ethbrake_marl.envs.setup import UnknownResetOption
 from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
-from tests.contract import faces
+from tests.contract import interfaces
 from tests.contract import test_contract as bare
-from tests.contract.faces import PAPER, actions
+from tests.contract.interfaces import PAPER, actions
 from tests.contract.shielded import SHIELDED, STEP
 
 MODES: dict[str, dict[str, Any]] = {"step": {"mode": "step"}, "episode": {"policy": make_agent("full_brake")}}
@@ -49,11 +49,11 @@ pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHo
 
 
 @pytest.fixture(autouse=True)
-def _shielded_faces(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, face in SHIELDED.items():
-        monkeypatch.setitem(faces.FACES, name, face)  # type: ignore[arg-type]
+def _shielded_interfaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, interface in SHIELDED.items():
+        monkeypatch.setitem(interfaces.INTERFACES, name, interface)  # type: ignore[arg-type]
     batched = ("shielded vector", "shielded sb3")
-    monkeypatch.setattr(faces, "BATCHED", (*faces.BATCHED, *batched))
+    monkeypatch.setattr(interfaces, "BATCHED", (*interfaces.BATCHED, *batched))
 
 
 @pytest.fixture
@@ -93,11 +93,11 @@ def test_action__that_cannot_be_used_is_refused_and_changes_nothing(name: str, v
     bare.test_action__one_that_cannot_be_used_is_refused_and_changes_nothing(name, value, message)
 
 
-def test_faces__agree_behind_the_shield_and_differ_from_the_bare_ones() -> None:
-    runs = {name: [turn.bits() for turn in bare.play(face(PAPER, 1), 7)] for name, face in STEP.items()}
+def test_interfaces__agree_behind_the_shield_and_differ_from_the_bare_ones() -> None:
+    runs = {name: [turn.bits() for turn in bare.play(interface(PAPER, 1), 7)] for name, interface in STEP.items()}
     expected = runs["shielded single"]
     assert all(run == expected for run in runs.values())
-    assert [turn.bits() for turn in bare.play(faces.FACES["single"](PAPER, 1), 7)] != expected
+    assert [turn.bits() for turn in bare.play(interfaces.INTERFACES["single"](PAPER, 1), 7)] != expected
 
 
 @pytest.mark.parametrize("mode", MODES)

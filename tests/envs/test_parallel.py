@@ -8,7 +8,7 @@ from pettingzoo.utils.conversions import aec_to_parallel
 
 from ethbrake_marl.envs.parallel import EthBrakeParallelEnv, env, parallel_env, raw_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from tests.contract.faces import FIVE, PAPER, actions
+from tests.contract.interfaces import FIVE, PAPER, actions
 from tests.envs.lines import CRASH, REST
 
 near = pytest.approx
@@ -80,23 +80,23 @@ def test_scripted_vehicle__applies_its_script_whatever_is_passed() -> None:
 def test_infos__show_the_action_that_was_applied() -> None:
     environment = started(FIVE)
     infos = environment.step({"vehicle_1": act(1.0), "vehicle_4": act(-0.3)})[4]
-    applied = {agent: info["applied_action"] for agent, info in infos.items()}
+    applied = {agent: info["chosen_action"] for agent, info in infos.items()}
     assert applied["vehicle_1"] == act(-1.0)
     assert applied["vehicle_2"] == act(-3.0 / 7.0)  # constant:3 of 7 m/s2
     assert applied["vehicle_4"] == act(-0.3)
     assert all(action in environment.action_space(agent) for agent, action in applied.items())
-    assert infos["vehicle_2"]["wanted_command_mps2"] == -3.0
+    assert infos["vehicle_2"]["chosen_command_mps2"] == -3.0
     capacity = environment.engine.worlds.vehicles.braking_capacity_mps2[0, 3]
-    assert infos["vehicle_4"]["wanted_command_mps2"] == near(-0.3 * capacity)
+    assert infos["vehicle_4"]["chosen_command_mps2"] == near(-0.3 * capacity)
 
 
 def test_infos__a_command_is_in_force_once_its_latency_has_elapsed() -> None:
     environment = started(PAPER)  # Vehicle 3 wants to brake from t = 0; its latency is 0.8 s
     in_force = [environment.step({"vehicle_2": act(0.5)})[4] for _ in range(4)]
     assert [info["vehicle_3"]["time_s"] for info in in_force] == near([0.6, 0.7, 0.8, 0.9])
-    assert [info["vehicle_3"]["wanted_command_mps2"] for info in in_force] == [-6.0] * 4
-    assert [info["vehicle_3"]["applied_command_mps2"] for info in in_force][::3] == [0.0, -6.0]
-    assert [info["vehicle_2"]["applied_command_mps2"] for info in in_force] == [3.5] * 4
+    assert [info["vehicle_3"]["chosen_command_mps2"] for info in in_force] == [-6.0] * 4
+    assert [info["vehicle_3"]["command_in_force_mps2"] for info in in_force][::3] == [0.0, -6.0]
+    assert [info["vehicle_2"]["command_in_force_mps2"] for info in in_force] == [3.5] * 4
 
 
 def test_infos_and_rewards__split_a_crash_by_mass() -> None:
@@ -163,7 +163,7 @@ def test_learners__none_at_all_plays_the_scripts_from_the_alert() -> None:
     environment = started(CRASH, learners=[])
     assert environment.engine.worlds.time_s == [0.0]
     infos = environment.step({})[4]
-    assert infos["vehicle_2"]["applied_action"] == act(-1.0)  # who learned and no longer does brakes fully
+    assert infos["vehicle_2"]["chosen_action"] == act(-1.0)  # who learned and no longer does brakes fully
 
 
 def test_spaces__are_one_object_for_each_agent() -> None:

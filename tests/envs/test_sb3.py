@@ -12,7 +12,7 @@ from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.envs.single import EthBrakeEnv
 from ethbrake_marl.envs.state import full_state
 from ethbrake_marl.errors import InvalidInput
-from tests.contract.faces import FIVE, PAPER, actions, initial_state
+from tests.contract.interfaces import FIVE, PAPER, actions, initial_state
 from tests.envs.lines import CRASH, REST
 
 near = pytest.approx

@@ -9,7 +9,7 @@ from ethbrake_marl.envs.single import EthBrakeEnv
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.rewards import RewardParams
-from tests.contract.faces import FIVE
+from tests.contract.interfaces import FIVE
 from tests.envs.lines import CRASH, REST
 
 near = pytest.approx
@@ -26,7 +26,7 @@ def test_episode__of_a_crash_by_hand() -> None:
     assert [step[3] for step in steps] == [False] * 7 + [True]
     last = steps[-1][4]
     assert (last["first_impact_harm"], last["world_first_impact_harm"]) == (near(9.0), near(36.0))
-    assert last["applied_command_mps2"] == 0.0
+    assert last["command_in_force_mps2"] == 0.0
     with pytest.raises(InvalidInput, match="step: no episode is running; call reset first"):
         env.step(COAST)
 
@@ -37,7 +37,7 @@ def test_step__returns_plain_types() -> None:
     _, reward, terminated, truncated, info = env.step(BRAKE)
     assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
     assert {type(value) for value in info.values()} == {float, bool, np.ndarray, dict}
-    assert info["wanted_command_mps2"] == -8.0
+    assert info["chosen_command_mps2"] == -8.0
 
 
 def test_infos__hold_the_same_keys_in_every_step() -> None:
@@ -45,7 +45,7 @@ def test_infos__hold_the_same_keys_in_every_step() -> None:
     _, at_reset = env.reset(seed=0)
     infos = [env.step(BRAKE)[4] for _ in range(10)]
     assert {frozenset(info) for info in infos} == {
-        frozenset(at_reset) | {"applied_action", "wanted_command_mps2", "reward_terms"}
+        frozenset(at_reset) | {"chosen_action", "chosen_command_mps2", "reward_terms"}
     }
 
 

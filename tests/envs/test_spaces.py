@@ -8,7 +8,7 @@ from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.observations import Feature, ObservationSpec
 from ethbrake_marl.physics import make_worlds
 from ethbrake_marl.scenario import Scenario
-from tests.contract.faces import FIVE, PAPER
+from tests.contract.interfaces import FIVE, PAPER
 
 
 def test_feature_box__has_the_features_bounds() -> None:

@@ -13,7 +13,7 @@ from ethbrake_marl.envs.single import EthBrakeEnv
 from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario
-from tests.contract.faces import FIVE, PAPER, actions, initial_state
+from tests.contract.interfaces import FIVE, PAPER, actions, initial_state
 
 near = pytest.approx
 
@@ -46,8 +46,8 @@ def test_autoreset__same_step_literally() -> None:
         ended = terminated | truncated
         rows.append((k, terminated.tolist(), truncated.tolist(), np.round(infos["time_s"], 9).tolist()))
         assert ("final_obs" in infos) == ended.any()
-        assert np.array_equal(infos["_applied_action"], ~ended)
-        assert (infos["applied_action"][ended] == 0.0).all()
+        assert np.array_equal(infos["_chosen_action"], ~ended)
+        assert (infos["chosen_action"][ended] == 0.0).all()
         if ended.any():
             assert np.array_equal(infos["_final_obs"], ended)
             assert [final is not None for final in infos["final_obs"]] == ended.tolist()
@@ -98,7 +98,7 @@ def test_autoreset__next_step_ignores_the_action_of_the_reset_and_rewards_nothin
         assert np.array_equal(reward, expected[1])
         assert reward == near(np.full(2, -12.0 if k in (1, 5, 9) else 0.0))
         assert truncated.all() == (k in (3, 7, 11))
-        assert np.array_equal(infos["_applied_action"], [k not in (4, 8, 12)] * 2)
+        assert np.array_equal(infos["_chosen_action"], [k not in (4, 8, 12)] * 2)
 
 
 def test_autoreset__both_modes_play_the_same_first_episodes() -> None:
@@ -143,13 +143,13 @@ def test_infos__are_gymnasiums_columns_and_masks() -> None:
     names = {name for name in infos if not name.startswith("_")}
     assert {f"_{name}" for name in names} == set(infos) - names
     for name in names - {"reward_terms"}:
-        assert infos[name].shape == ((3, 1) if name == "applied_action" else (3,))
+        assert infos[name].shape == ((3, 1) if name == "chosen_action" else (3,))
         assert infos[f"_{name}"].tolist() == [True] * 3
     assert infos["reward_terms"]["harm"].shape == (3,)
     arrays = [value for value in infos.values() if isinstance(value, np.ndarray)]
     assert not any(np.shares_memory(a, b) for a, b in combinations(arrays, 2))
-    assert np.array_equal(infos["applied_action"], action)
-    assert infos["wanted_command_mps2"] == near(action[:, 0] * np.where(action[:, 0] < 0, capacity, 3.0))
+    assert np.array_equal(infos["chosen_action"], action)
+    assert infos["chosen_command_mps2"] == near(action[:, 0] * np.where(action[:, 0] < 0, capacity, 3.0))
 
 
 def test_infos__are_those_of_an_environment_alone() -> None:

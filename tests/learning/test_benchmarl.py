@@ -33,7 +33,7 @@ def test_line_env__keeps_torchrls_contract_and_shows_the_native_worlds() -> None
     seen = env.reset()
     rows = native.reset()
     own = env.engine.observation.size
-    env.engine.reset(seed=5)  # reset goes on with the stream; the native face has just begun it
+    env.engine.reset(seed=5)  # reset goes on with the stream; the native interface has just begun it
     assert seen["learners", "observation"].shape == (4, 2, own)
     first = env._seen()
     np.testing.assert_array_equal(first["learners"]["observation"].reshape(8, own).numpy(), rows[:, :own])

@@ -260,7 +260,7 @@ def test_scheme__of_a_recipe_and_who_drives_what() -> None:
     assert who_drives_what(drivers("independent", PAIR)) == told
 
 
-def test_train__takes_names_as_the_faces_do(tmp_path: Path) -> None:
+def test_train__takes_names_as_the_interfaces_do(tmp_path: Path) -> None:
     recipe = tmp_path / "tiny.yaml"
     recipe.write_text(json.dumps(TINY.model_dump(mode="json", exclude_unset=True)))
     train(recipe, "cooperation-3-pair", tmp_path / "named", steps=1)

@@ -1,8 +1,8 @@
-"""Refused calls, exceptions, interrupts and wrappers in between, on every face: what was realised against the bound.
+"""Refused calls, exceptions, interrupts and wrappers, on every interface: what was realised against the bound.
 
-``disturbed(face, episodes, seed)`` plays episodes in which calls are refused, raise, or are interrupted at random
-lines; ``wrapped(face, wrapper, calls, seed)`` steps with a wrapper between the shield and the engine. Harm is read by a
-watcher of its own from the engine's ledger, of every episode that ended.
+``disturbed(interface, episodes, seed)`` plays episodes in which calls are refused, raise, or are interrupted at random
+lines; ``wrapped(interface, wrapper, calls, seed)`` steps with a wrapper between the shield and the engine. Harm is read by
+a watcher of its own from the engine's ledger, of every episode that ended.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def interrupt_at(line: int) -> Iterator[None]:
 
 
 def disturbed(name: str, episodes: int, seed: int) -> Tally:
-    """Play so many episodes through a face; before every second step something is refused, raises or is interrupted."""
+    """Play so many episodes through an interface; before every second step something fails or is interrupted."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MovingAtHorizon)
         play = PLAYS[name](seed)

@@ -15,7 +15,9 @@ from tests.programme.planting import Patch, misfits, red_with
 
 BY_HAND = "test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner"
 QUICK = ("tests/shield/test_certify.py", "tests/shield/test_step_shield.py", f"tests/shield/test_robust.py::{BY_HAND}")
-WHOLE = tuple(f"tests/shield/test_{name}.py" for name in ("engine_shield", "step", "rollouts", "faces", "interference"))
+WHOLE = tuple(
+    f"tests/shield/test_{name}.py" for name in ("engine_shield", "step", "rollouts", "interfaces", "interference")
+)
 KERNEL, CERTIFY, GUARD, ROLLOUTS, ATTACHED, COMPARISON = (
     f"ethbrake_marl/shield/{name}.py"
     for name in ("certify_kernel", "certify", "step_shield", "rollouts", "engine_shield", "comparison")

@@ -1,4 +1,4 @@
-"""Every face behind the shield, with something in between: to be stepped, disturbed and looked into."""
+"""Every interface behind the shield, with something in between: to be stepped, disturbed and looked into."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, S
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.shield.lines import line
 
-ROWS = 5  # worlds of the batched faces
+ROWS = 5  # worlds of the batched interfaces
 SCENARIO = line(3)
 
 
@@ -58,7 +58,7 @@ class Failing:
 
 
 class Play:
-    """One face behind the shield: ``step`` makes a step with fresh proposals, ``bad`` are calls that must raise."""
+    """One interface, shielded: ``step`` makes a step with fresh proposals, ``bad`` are calls that must raise."""
 
     def __init__(self, seed: int) -> None:
         self.rng, self.policy = np.random.default_rng(seed), Failing()

@@ -3,12 +3,12 @@
 Five gates, one line each, exit status 1 if one fails:
 
 bound   random worlds against every adversary of ``tests.shield.lines``, both counts, N = 3 and 5, e from 0 to 0.3
-faces   worlds through every wrapped face (``tests.shield.face_attack``)
-interference  refused calls, exceptions and interrupts at random lines on every face, and wrappers in between
+interfaces   worlds through every wrapped interface (``tests.shield.interface_attack``)
+interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
 search  restarts of a search against the shield, and against twelve leaks of it (``tests.shield.search``)
 speed   decisions per second in a batch, and the latency of one decision
 
-No realised harm may be above the bound at the alert (tolerance 1e-9). Bound and faces run in chunks; each finished
+No realised harm may be above the bound at the alert (tolerance 1e-9). Bound and interfaces run in chunks; each finished
 chunk is a file in ``--results``, so what was stopped goes on, and several processes (``--part 1/2``, ``--part 2/2``)
 share the work. ``--results`` of other code, or of another seed, are refused.
 """
@@ -35,7 +35,7 @@ from ethbrake_marl.shield import StepShieldAgent
 from ethbrake_marl.shield.certify import certify
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
-from tests.shield.face_attack import FACES
+from tests.shield.interface_attack import INTERFACES
 from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
 from tests.shield.lines import ADVERSARIES, attack, line
 from tests.shield.sabotage import LEAKS
@@ -70,16 +70,16 @@ def attack_chunk(seed: int, *, N: int, harm_count: Any, who: str, first: int, wo
     return _outcome(found.realised, found.bound, found.decisions) | {"accepted": int(found.accepted.sum())}
 
 
-def face_chunks(worlds: int) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Likewise for the faces."""
-    for who in FACES:
+def interface_chunks(worlds: int) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Likewise for the interfaces."""
+    for who in INTERFACES:
         for k, first in enumerate(range(0, worlds, CHUNK)):
-            yield f"face-{who}-{k:03d}", {"who": who, "first": first, "worlds": min(CHUNK, worlds - first)}
+            yield f"interface-{who}-{k:03d}", {"who": who, "first": first, "worlds": min(CHUNK, worlds - first)}
 
 
-def face_chunk(seed: int, *, who: str, first: int, worlds: int) -> dict[str, Any]:
-    """One face."""
-    realised, bound, decisions = FACES[who](worlds, seed * 1_000_000 + first)
+def interface_chunk(seed: int, *, who: str, first: int, worlds: int) -> dict[str, Any]:
+    """One interface."""
+    realised, bound, decisions = INTERFACES[who](worlds, seed * 1_000_000 + first)
     return _outcome(np.array(realised), np.array(bound), decisions)
 
 
@@ -252,13 +252,13 @@ def main() -> int:
     """All gates."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--worlds", type=int, default=1_000_000, help="of the gate 'bound', all cells together")
-    parser.add_argument("--face-worlds", type=int, default=10_000, help="through each face")
-    parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each face")
+    parser.add_argument("--interface-worlds", type=int, default=10_000, help="through each interface")
+    parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each interface")
     parser.add_argument("--restarts", type=int, default=1_000, help="of the search")
     parser.add_argument("--decisions", type=int, default=5_000, help="timed one by one")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
-        "--only", default="speed,interference,search,faces,bound", help="gates, with commas between them"
+        "--only", default="speed,interference,search,interfaces,bound", help="gates, with commas between them"
     )
     parser.add_argument("--results", type=Path, default=ROOT / "runs" / "test-shield", help="folder of finished chunks")
     parser.add_argument("--part", default="1/1", help="this process's share of the chunks, for instance 1/2")
@@ -268,7 +268,7 @@ def main() -> int:
         "speed": lambda: speed(given.decisions),
         "search": lambda: search_gate(given.restarts, given.seed),
         "interference": lambda: interference_gate(given.interfered, given.seed),
-        "faces": lambda: run_chunks(list(face_chunks(given.face_worlds)), face_chunk, given, code),
+        "interfaces": lambda: run_chunks(list(interface_chunks(given.interface_worlds)), interface_chunk, given, code),
         "bound": lambda: run_chunks(list(bound_chunks(given.worlds)), attack_chunk, given, code),
     }
     verdicts = {}

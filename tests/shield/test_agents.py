@@ -75,8 +75,8 @@ def test_wrapper__applies_the_certified_strategy_whatever_is_proposed():
         while shielded.agents:
             _, _, _, _, infos = shielded.step({"vehicle_2": np.array([1.0])})
             shield = infos["vehicle_2"]["shield"]
-            assert shield["proposed_action"] == 1.0 and shield["applied_action"] <= 0.0
-            assert infos["vehicle_2"]["applied_action"] == pytest.approx(shield["applied_action"], abs=1e-12)
+            assert shield["proposed_action"] == 1.0 and shield["chosen_action"] <= 0.0
+            assert infos["vehicle_2"]["chosen_action"] == pytest.approx(shield["chosen_action"], abs=1e-12)
         realised = shielded.unwrapped.engine.ledger.world_harm("first")[0]
         assert realised == pytest.approx(min(shield["policy_harm"], shield["bound_harm"]), abs=1e-9)
 

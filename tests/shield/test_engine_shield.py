@@ -111,11 +111,11 @@ def test_step__what_is_not_certified_is_refused_and_the_worlds_stay_as_they_are(
 
 
 @pytest.mark.parametrize("what", [name for name in CHEATS if name != "a step"])
-@pytest.mark.parametrize("face", ["single", "vector", "sb3"])
-def test_last_step__is_compared_too_whatever_starts_the_next_episode(face, what):
-    if face == "single":
+@pytest.mark.parametrize("interface", ["single", "vector", "sb3"])
+def test_last_step__is_compared_too_whatever_starts_the_next_episode(interface, what):
+    if interface == "single":
         env, actions = shielded(), DRIVE
-    elif face == "vector":
+    elif interface == "vector":
         env, actions = ShieldedVectorEnv(EthBrakeVectorEnv(3, PAPER)), np.ones((3, 1))
         env.reset(seed=0)
     else:

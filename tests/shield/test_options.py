@@ -30,15 +30,15 @@ MODES = {
 }
 
 
-def step(face, env):
+def step(interface, env):
     """One step with full driving everywhere: (rewards, what the shield tells of each world)."""
-    if face is HybridShield:
+    if interface is HybridShield:
         _, rewards, *_, infos = env.step({"vehicle_2": np.array([1.0])})
         return np.array([rewards["vehicle_2"]]), [infos["vehicle_2"]["shield"]]
-    if face is ShieldedEnv:
+    if interface is ShieldedEnv:
         _, reward, *_, info = env.step(np.array([1.0], np.float32))
         return np.array([reward]), [info["shield"]]
-    if face is ShieldedVectorEnv:
+    if interface is ShieldedVectorEnv:
         _, rewards, *_, infos = env.step(np.ones((2, 1)))
         return rewards, [{key: value[k] for key, value in infos["shield"].items()} for k in range(2)]
     _, rewards, _, infos = env.step(np.ones((2, 1), np.float32))
@@ -46,14 +46,14 @@ def step(face, env):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("face", INTERFACES)
-def test_interfaces__have_every_mode_and_the_penalty(face, mode):
+@pytest.mark.parametrize("interface", INTERFACES)
+def test_interfaces__have_every_mode_and_the_penalty(interface, mode):
     paid = []
     for penalty in (0.0, 7.0):
-        env = face(INTERFACES[face](), make_agent("full_brake"), intervention_penalty=penalty, **MODES[mode])
-        env.seed(3) if face is ShieldedVecEnv else None
-        env.reset() if face is ShieldedVecEnv else env.reset(seed=3)
-        first = [step(face, env) for _ in range(3)]
+        env = interface(INTERFACES[interface](), make_agent("full_brake"), intervention_penalty=penalty, **MODES[mode])
+        env.seed(3) if interface is ShieldedVecEnv else None
+        env.reset() if interface is ShieldedVecEnv else env.reset(seed=3)
+        first = [step(interface, env) for _ in range(3)]
         told = [world for _, worlds in first for world in worlds]
         assert {each["mode"] for each in told} == {mode.partition(":")[0]}
         paid.append(np.array([rewards for rewards, _ in first]))
@@ -62,7 +62,7 @@ def test_interfaces__have_every_mode_and_the_penalty(face, mode):
     assert paid[0] - paid[1] == pytest.approx(7.0 * intervened, abs=1e-5)
 
 
-@pytest.mark.parametrize("face", INTERFACES)
+@pytest.mark.parametrize("interface", INTERFACES)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -75,10 +75,10 @@ def test_interfaces__have_every_mode_and_the_penalty(face, mode):
         ({"allowence": 1.0}, "option 'allowence'; did you mean 'allowance'"),
     ],
 )
-def test_interfaces__refuse_what_does_not_fit_in_the_same_words(face, options, message):
+def test_interfaces__refuse_what_does_not_fit_in_the_same_words(interface, options, message):
     with pytest.raises(InvalidInput, match=message) as error:
-        face(INTERFACES[face](), make_agent("coast"), **options)
-    assert face.__name__ in str(error.value)
+        interface(INTERFACES[interface](), make_agent("coast"), **options)
+    assert interface.__name__ in str(error.value)
 
 
 def test_options__choose_the_mode_by_the_uncertainty():

@@ -195,7 +195,7 @@ def test_begin__of_some_rows_leaves_the_members_of_others_alone():
     assert shield.running.states[rows].tolist() == before[rows].tolist()
 
 
-def test_faces__take_the_mode_and_tell_how_many_members():
+def test_interfaces__take_the_mode_and_tell_how_many_members():
     env = HybridShield(parallel_env(), mode="robust", uncertainty="gaps_m=0.5")
     env.reset(seed=3)
     first = env.attached.shield.first_bound[0]
@@ -220,6 +220,6 @@ def test_refused__mode_and_uncertainty_that_do_not_fit(settings, message):
         HybridShield(parallel_env(), **settings)
 
 
-def test_refused__by_the_gymnasium_face_too():
+def test_refused__by_the_gymnasium_interface_too():
     with pytest.raises(InvalidInput, match="must be an Uncertainty or text"):
         ShieldedEnv(gymnasium.make("EthBrake-v0"), uncertainty=1)

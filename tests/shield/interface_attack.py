@@ -1,4 +1,4 @@
-"""The same attack through every face of the shield: what was realised against the bound at the alert."""
+"""The same attack through every interface of the shield: what was realised against the bound at the alert."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, S
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.shield.lines import line
 
-ROWS = 250  # worlds that batched faces advance together
+ROWS = 250  # worlds that batched interfaces advance together
 Harms = tuple[list[float], list[float], int]  # realised, bound at the alert, decisions
 
 
@@ -128,7 +128,7 @@ def _with(told: Harms, engine: Any, bound: float, steps: int) -> Harms:
 
 
 def _batched(shield: Any, step: Any, worlds: int, seed: int) -> Harms:
-    """A face that renews its rows by itself: until so many episodes have ended."""
+    """An interface that renews its rows by itself: until so many episodes have ended."""
     realised: list[float] = []
     bounds: list[float] = []
     proposals, decisions = Proposals(seed, ROWS), 0
@@ -141,4 +141,4 @@ def _batched(shield: Any, step: Any, worlds: int, seed: int) -> Harms:
     return realised, bounds, decisions
 
 
-FACES = {f.__name__: f for f in (parallel, aec, single, vector, sb3, evaluation)}
+INTERFACES = {f.__name__: f for f in (parallel, aec, single, vector, sb3, evaluation)}

@@ -1,4 +1,4 @@
-"""The step shield on every face: the libraries' own checkers, and the bound."""
+"""The step shield on every interface: the libraries' own checkers, and the bound."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, s
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 
 KEYS = {
-    "mode", "proposed_action", "applied_action", "intervened", "reason", "bound_harm", "margin", "trusted", "settles",
+    "mode", "proposed_action", "chosen_action", "intervened", "reason", "bound_harm", "margin", "trusted", "settles",
 }  # fmt: skip
 
 
@@ -151,7 +151,7 @@ def test_parallel__actions_that_are_no_mapping_are_refused(actions):
 
 
 @pytest.mark.parametrize(
-    ("face", "make", "shape"),
+    ("interface", "make", "shape"),
     [
         (HybridShield, parallel_env, None),
         (ShieldedEnv, lambda: gymnasium.make("EthBrake-v0"), (1,)),
@@ -159,14 +159,14 @@ def test_parallel__actions_that_are_no_mapping_are_refused(actions):
         (ShieldedVecEnv, lambda: make_sb3_vec_env("paper-random", 2), (2, 1)),
     ],
 )
-def test_faces__a_complex_action_is_refused(face, make, shape):
-    env = face(make(), mode="step") if face is HybridShield else face(make())
+def test_interfaces__a_complex_action_is_refused(interface, make, shape):
+    env = interface(make(), mode="step") if interface is HybridShield else interface(make())
     env.reset()
     with pytest.raises(InvalidInput, match="is not a number"):
         env.step({"vehicle_2": np.array([1j])} if shape is None else np.full(shape, 1j))
 
 
-def others(face):
+def others(interface):
     """Environments that a wrapper does not shield."""
     makers = {
         HybridShield: parallel_env,
@@ -174,20 +174,20 @@ def others(face):
         ShieldedVectorEnv: lambda: gymnasium.make_vec("EthBrake-v0", num_envs=2),
         ShieldedVecEnv: lambda: make_sb3_vec_env("paper-random", 2),
     }
-    return [gymnasium.make("CartPole-v1"), None, *(make() for each, make in makers.items() if each is not face)]
+    return [gymnasium.make("CartPole-v1"), None, *(make() for each, make in makers.items() if each is not interface)]
 
 
-@pytest.mark.parametrize("face", [HybridShield, ShieldedEnv, ShieldedVectorEnv, ShieldedVecEnv])
-def test_faces__an_environment_of_another_kind_is_refused_by_name(face):
-    settings = {"mode": "step"} if face is HybridShield else {}
-    for env in others(face):
-        with pytest.raises(InvalidInput, match=f"^{face.__name__}: .* is not one of this package's environments"):
-            face(env, **settings)
+@pytest.mark.parametrize("interface", [HybridShield, ShieldedEnv, ShieldedVectorEnv, ShieldedVecEnv])
+def test_interfaces__an_environment_of_another_kind_is_refused_by_name(interface):
+    settings = {"mode": "step"} if interface is HybridShield else {}
+    for env in others(interface):
+        with pytest.raises(InvalidInput, match=f"^{interface.__name__}: .* is not one of this package's environments"):
+            interface(env, **settings)
 
 
 @pytest.mark.parametrize("policy", [lambda observation: observation, dict, 5, "ppo@shipped", Speechless])
 @pytest.mark.parametrize("mode", ["episode", "step", None])
-def test_faces__a_policy_that_is_none_is_refused_at_once(policy, mode):
+def test_interfaces__a_policy_that_is_none_is_refused_at_once(policy, mode):
     with pytest.raises(InvalidInput, match="must be an agent or a policy"):
         if mode is None:
             ShieldedEnv(gymnasium.make("EthBrake-v0"), policy)

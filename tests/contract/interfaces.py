@@ -1,4 +1,4 @@
-"""The four faces behind one small interface, so that one suite judges them all, and the scenarios it judges them on."""
+"""The four interfaces behind one small protocol, so that one suite judges them all, and the scenarios for it."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ class Turn:
 
     def bits(self) -> bytes:
         parts = [np.asarray(a).tobytes() for a in (self.observation, self.terminated, self.truncated)]
-        parts.append(np.asarray(self.reward, np.float32).tobytes())  # the coarsest of the four faces
+        parts.append(np.asarray(self.reward, np.float32).tobytes())  # the coarsest of the four interfaces
         parts += [str(row).encode() + array.tobytes() for row, array in sorted(self.final.items())]
         return b"".join(parts) + repr(sorted(self.harm.items())).encode()
 
 
-class Face(Protocol):
-    """A face with one learner in each of n worlds; ended episodes are followed by the next of the stream."""
+class Interface(Protocol):
+    """An interface with one learner in each of n worlds; ended episodes are followed by the next of the stream."""
 
     env: Any
     n: int
@@ -114,11 +114,13 @@ class Single:
         return one_row(self, *self.env.step(action[0]))
 
 
-def one_row(face: Face, observation: Array, reward: float, terminated: bool, truncated: bool, info: Any) -> Turn:
+def one_row(
+    interface: Interface, observation: Array, reward: float, terminated: bool, truncated: bool, info: Any
+) -> Turn:
     turn = Turn(observation[np.newaxis], np.array([reward]), np.array([terminated]), np.array([truncated]))
     if turn.ended[0]:
         turn.final, turn.harm = {0: observation}, {0: harms(info)}
-        turn.observation = face.reset()
+        turn.observation = interface.reset()
     return turn
 
 
@@ -160,7 +162,7 @@ class Sb3:
         return turn
 
 
-FACES: dict[str, type[Parallel] | type[Single] | type[Vector] | type[Sb3]] = {
+INTERFACES: dict[str, type[Parallel] | type[Single] | type[Vector] | type[Sb3]] = {
     "parallel": Parallel,
     "single": Single,
     "vector": Vector,
@@ -170,7 +172,7 @@ BATCHED = ("vector", "sb3")
 
 
 def rows_of(name: str) -> int:
-    """Worlds that the suite runs a face with."""
+    """Worlds that the suite runs an interface with."""
     return 6 if name in BATCHED else 1
 
 
@@ -182,16 +184,20 @@ def actions(seed: int, steps: int, n: int) -> Array:
 
 def digest(name: str, scenario: Scenario, seed: int, steps: int = 160, n: int | None = None) -> str:
     """Hash of everything that a fresh environment returns in ``steps`` steps: several whole episodes."""
-    face = FACES[name](scenario, rows_of(name) if n is None else n)
-    hash_ = hashlib.sha256(face.reset(seed).tobytes())
-    for action in actions(3, steps, face.n):
-        hash_.update(face.step(action).bits())
+    interface = INTERFACES[name](scenario, rows_of(name) if n is None else n)
+    hash_ = hashlib.sha256(interface.reset(seed).tobytes())
+    for action in actions(3, steps, interface.n):
+        hash_.update(interface.step(action).bits())
     return hash_.hexdigest()
 
 
 def all_digests() -> dict[str, str]:
-    """One digest for each face and scenario, for another process to compare."""
-    return {f"{face} {name}": digest(face, scenario, 11) for face in FACES for name, scenario in SCENARIOS.items()}
+    """One digest for each interface and scenario, for another process to compare."""
+    return {
+        f"{interface} {name}": digest(interface, scenario, 11)
+        for interface in INTERFACES
+        for name, scenario in SCENARIOS.items()
+    }
 
 
 def initial_state(worlds: Worlds, row: int) -> dict[str, Any]:
