@@ -1,8 +1,8 @@
 """Refused calls, exceptions, interrupts and wrappers, on every interface: what was realised against the bound.
 
 ``disturbed(interface, episodes, seed)`` plays episodes in which calls are refused, raise, or are interrupted at random
-lines; ``wrapped(interface, wrapper, calls, seed)`` steps with a wrapper between the shield and the engine. Harm is read by
-a watcher of its own from the engine's ledger, of every episode that ended.
+lines; ``wrapped(interface, wrapper, calls, seed)`` steps with a wrapper between the shield and the engine. Harm is read
+by a watcher of its own from the engine's ledger, of every episode that ended.
 """
 
 from __future__ import annotations
