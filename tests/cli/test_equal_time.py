@@ -8,7 +8,7 @@ def test_equal_time__compares_a_search_with_a_policy(ethbrake):
     answer = ethbrake("equal-time", *map(str, arguments), "--json")
     assert answer.status == 0, answer.err
     found = json.loads(answer.out)
-    assert (found["scenario"], found["seed"], found["episodes"], found["count"]) == ("paper-random", 8, 4, "first")
+    assert (found["scenario"], found["seed"], found["episodes"], found["harm_count"]) == ("paper-random", 8, 4, "first")
     assert {row["agent"]: row["knows"] for row in found["agents"]} == {
         "ppo@shipped": "messages",
         "best_harm:50": "true model",

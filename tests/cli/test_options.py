@@ -1,0 +1,25 @@
+"""Options of the version before: they do what they did, with a warning that names the new one."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from ethbrake_marl.cli.options import rename_old_options
+from ethbrake_marl.errors import OldSpelling
+
+
+@pytest.mark.parametrize("old", [["--count", "total"], ["--count=total"]])
+def test_old_options__do_the_same(ethbrake, old):
+    line = ("evaluate", "--agents", "e_v2x_bm", "--episodes", "20", "--json")
+    new = ethbrake(*line, "--harm-count", "total")
+    with pytest.warns(OldSpelling, match="--count is written --harm-count now"):
+        answer = ethbrake(*line, *old)
+    assert answer.status == 0
+    assert json.loads(answer.out)["agents"] == json.loads(new.out)["agents"]
+
+
+def test_rename_old_options__leaves_everything_else():
+    line = ["evaluate", "--agents", "constant:-5", "--counts", "3", "--harm-count=first", "count"]
+    assert rename_old_options(line) == line
