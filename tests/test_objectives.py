@@ -71,7 +71,7 @@ def played(reward, scenario=PAPER, n=60):
     return total, engine
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
 @pytest.mark.parametrize("objective", EACH)
 def test_rewards__add_up_to_minus_the_objective_of_the_ledger(objective, harm_count):
     total, engine = played({"objective": objective, "harm_count": harm_count})

@@ -3,8 +3,8 @@
 After a reset: ``time_s``, ``command_in_force_mps2`` (in force now; 0 until the latency has elapsed), the vehicle's
 share of the harm so far under both counts, the same for the whole world, and whether anything has collided. After a
 step also ``chosen_command_mps2``, ``chosen_action`` (the vehicle's command as an action, whoever chose it), and the
-reward terms before their weights. Where the scenario has a ``v2x`` channel, always also ``known_from_s`` [N]: since when this
-vehicle has the news of each other one (infinite: never; its own: 0).
+reward terms before their weights. Where the scenario has a ``v2x`` channel, always also ``known_from_s`` [N]: since
+when this vehicle has the news of each other one (infinite: never; its own: 0).
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ def test_gentlest_front__collides_in_the_worlds_of_e_v2x_bm():
     assert np.array_equal(collided[0], collided[1]) and np.array_equal(collided[1], collided[2])
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_e_v2x_bm__predicts_what_it_realises(harm_count):
     worlds = random_worlds(100)
     agent = make_agent("e_v2x_bm", harm_count=harm_count)
@@ -101,8 +101,7 @@ def test_e_v2x_bm__pairwise_predicts_the_closed_form():
 def test_e_v2x_bm__uses_the_count_and_the_horizon_it_was_given():
     worlds = random_worlds(40)
     for settings in ({"harm_count": "first"}, {"harm_count": "total"}, {"horizon_s": 1.5}):
-        given = {key.removeprefix("harm_"): value for key, value in settings.items()}
-        assert np.array_equal(asked("e_v2x_bm", worlds, **settings), -optimise_coupled(worlds, 1, **given)[0])
+        assert np.array_equal(asked("e_v2x_bm", worlds, **settings), -optimise_coupled(worlds, 1, **settings)[0])
     assert not np.array_equal(asked("e_v2x_bm", worlds), asked("e_v2x_bm", worlds, harm_count="total"))
     assert not np.array_equal(asked("e_v2x_bm", worlds), asked("e_v2x_bm", worlds, horizon_s=1.5))
 

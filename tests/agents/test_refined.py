@@ -20,7 +20,7 @@ def harm(agent, harm_count="first", worlds=WORLDS):
     return drive(worlds, agent, SCENARIO, 1).ledger.world_harm(harm_count)
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_rehearsed__is_never_worse_and_as_predicted(harm_count):
     plain = harm(make_agent("constant:5"), harm_count)
     agent = Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=8, harm_count=harm_count)

@@ -178,7 +178,7 @@ def test_evaluate__several_learners_and_objectives(ethbrake, tmp_path):
     words += ["--objective", "own", "--objective", "weighted:1,4,1"]
     rows = json.loads(ethbrake(*words, "--per-world", worlds, "--json").out)
     assert rows[0]["parameters"]["controlled_vehicles"] == ["vehicle_2", "vehicle_3"]
-    told = [(one["objective"], one["count"]) for one in rows[1]["objectives"]]
+    told = [(one["objective"], one["harm_count"]) for one in rows[1]["objectives"]]
     assert told == [("own", "first"), ("weighted:1,4,1", "first"), ("own", "total"), ("weighted:1,4,1", "total")]
     own = rows[0]["objectives"][2]
     assert sum(own[f"vehicle_{i}"] for i in (1, 2, 3)) == pytest.approx(rows[0]["total_harm"])

@@ -33,7 +33,7 @@ def test_rescored__one_impact_by_hand(pair: Scenario) -> None:
     for name, row in rows.items():
         assert [estimate.value for estimate in row.each] == pytest.approx(expected[name]), name
     found = rows["own"].to_json()
-    assert (found["objective"], found["count"], found["vehicle_1_interval"]) == (
+    assert (found["objective"], found["harm_count"], found["vehicle_1_interval"]) == (
         "own",
         "total",
         pytest.approx([4.95] * 2),

@@ -24,18 +24,18 @@ def test_rate__five_of_ten_is_the_textbook_wilson_interval() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 10, 10_000])
-def test_rate__none_and_all_reach_the_end_of_the_range_and_no_further(harm_count: int) -> None:
-    reach = Z_SQUARED / (harm_count + Z_SQUARED)
-    assert rate(0, harm_count).interval == pytest.approx((0.0, reach), abs=1e-8)
-    assert rate(harm_count, harm_count).interval == pytest.approx((1.0 - reach, 1.0), abs=1e-8)
-    assert rate(0, harm_count).interval[0] == 0.0
-    assert rate(harm_count, harm_count).interval[1] == 1.0
+def test_rate__none_and_all_reach_the_end_of_the_range_and_no_further(count: int) -> None:
+    reach = Z_SQUARED / (count + Z_SQUARED)
+    assert rate(0, count).interval == pytest.approx((0.0, reach), abs=1e-8)
+    assert rate(count, count).interval == pytest.approx((1.0 - reach, 1.0), abs=1e-8)
+    assert rate(0, count).interval[0] == 0.0
+    assert rate(count, count).interval[1] == 1.0
 
 
 @pytest.mark.parametrize(("successes", "count"), [(-1, 10), (11, 10), (0, 0)])
-def test_rate__refuses_impossible_counts(successes: int, harm_count: int) -> None:
+def test_rate__refuses_impossible_counts(successes: int, count: int) -> None:
     with pytest.raises(InvalidInput, match="successes"):
-        rate(successes, harm_count)
+        rate(successes, count)
 
 
 def test_mean__one_to_five() -> None:

@@ -135,7 +135,7 @@ def test_paper_lists__are_bounded_near_the_best_known_harm():
     ("name", "n"),
     [("paper-random", 10_000), ("paper-delay-low", 2000), ("paper-delay-middle", 2000), ("paper-delay-high", 2000)],
 )
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_best_known_harm__is_never_below_the_bound_and_near_it(name, n, harm_count):
     scenario = load_scenario(name)
     worlds = scenario.sample(n, seed=7).worlds
@@ -151,7 +151,7 @@ def test_best_known_harm__is_never_below_the_bound_and_near_it(name, n, harm_cou
 
 
 @pytest.mark.parametrize("name", ["paper-random", "paper-random-early", "paper-delay-high"])
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_best_constant_deceleration__is_never_below_the_bound(name, harm_count):
     worlds = load_scenario(name).sample(400, seed=8).worlds
     best = optimise_coupled(worlds, 1, harm_count=harm_count)
@@ -195,13 +195,13 @@ def check_no_profile_below(n, harm_count, rounds, seed):
     assert np.mean(bound.harm > 0.9 * best) > 0.2
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_searched_profiles__are_never_below_the_bound(harm_count):
     check_no_profile_below(150, harm_count, rounds=120, seed=41)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_many_searched_profiles__are_never_below_the_bound(harm_count):
     check_no_profile_below(1000, harm_count, rounds=2000, seed=42)
 

@@ -26,7 +26,7 @@ GRID = 1 << 14  # every state on the way is a multiple of 1 / GRID: squares and 
 FAR = Fraction(1 << 20)
 CAPACITY_MPS2 = 16.0
 GOLDEN = Path(__file__).parents[1] / "golden" / "manufactured_worlds.json"
-HARM_COUNTS = {2: 300, 3: 200, 4: 150, 5: 100}
+COUNTS = {2: 300, 3: 200, 4: 150, 5: 100}
 MASSES = (  # touching neighbours weigh a power of two together, so that common speeds are dyadic
     (1, 1, 2, 4, 8), (2, 2, 4, 8, 16), (1, 3, 1, 3, 1), (3, 1, 3, 1, 3), (3, 5, 3, 5, 3), (7, 1, 7, 1, 7),
     (1, 7, 1, 7, 1), (1, 1, 1, 1, 1), (8, 4, 2, 1, 1), (2, 6, 2, 6, 2), (1, 15, 1, 15, 1), (6, 2, 6, 2, 6),
@@ -44,22 +44,20 @@ class Case:
     outcome: Outcome
 
 
-def manufactured(seed: int, N: int, harm_count: int) -> list[Case]:
-    """``harm_count`` worlds of ``N`` vehicles, each with contacts at chosen times."""
-    return collect(attempt, seed, N, harm_count)
+def manufactured(seed: int, N: int, count: int) -> list[Case]:
+    """``count`` worlds of ``N`` vehicles, each with contacts at chosen times."""
+    return collect(attempt, seed, N, count)
 
 
-def pressed(seed: int, N: int, harm_count: int) -> list[Case]:
-    """``harm_count`` worlds of ``N`` vehicles that touch at the start: resting contact, holding brakes, release."""
-    return collect(press, seed, N, harm_count)
+def pressed(seed: int, N: int, count: int) -> list[Case]:
+    """``count`` worlds of ``N`` vehicles that touch at the start: resting contact, holding brakes, release."""
+    return collect(press, seed, N, count)
 
 
-def collect(
-    build: Callable[[np.random.Generator, int], Iterator[Case]], seed: int, N: int, harm_count: int
-) -> list[Case]:
+def collect(build: Callable[[np.random.Generator, int], Iterator[Case]], seed: int, N: int, count: int) -> list[Case]:
     rng = np.random.default_rng([seed, N])
     cases: list[Case] = []
-    while len(cases) < harm_count:
+    while len(cases) < count:
         cases += build(rng, N)
     return cases
 
@@ -190,8 +188,8 @@ def stored() -> list[Case]:
 def write_golden() -> None:
     """Manufacture the worlds of the golden file."""
     rows = []
-    for N, harm_count in HARM_COUNTS.items():
-        for case in manufactured(20, N, harm_count)[:harm_count]:
+    for N, count in COUNTS.items():
+        for case in manufactured(20, N, count)[:count]:
             line = case.line
             numbers = (line.gaps, line.speeds, line.command, line.latency, line.mass, line.limit)
             rows.append(json.dumps([*map(floats, numbers), float(line.restitution), float(case.until)]))

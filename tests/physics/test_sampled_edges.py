@@ -47,10 +47,10 @@ def test_latency__within_a_millionth_of_a_step_after_a_sample_is_over_at_it(late
 
 
 @pytest.mark.parametrize(("closing", "count"), [(1e-5, 0), (math.nextafter(1e-5, 1.0), 1)])
-def test_touch__ends_where_an_impact_begins(closing, harm_count):
+def test_touch__ends_where_an_impact_begins(closing, count):
     after, impacts = advance_sampled(line([0.0], [0.0, closing]), 0.0, until_s=1.0, step_s=1.0)
-    assert impacts.count.tolist() == [[harm_count]] and after.pair_hit.tolist() == [[bool(harm_count)]]
-    assert impacts.total_harm.tolist() == [[closing * closing * harm_count]]
+    assert impacts.count.tolist() == [[count]] and after.pair_hit.tolist() == [[bool(count)]]
+    assert impacts.total_harm.tolist() == [[closing * closing * count]]
     assert after.speeds_mps[0, 0] == after.speeds_mps[0, 1] == pytest.approx(closing / 2.0)
 
 

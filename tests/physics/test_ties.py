@@ -272,9 +272,9 @@ def test_bounces__below_the_plastic_speed_there_is_none_but_harm(closing, e, apa
 
 
 @pytest.mark.parametrize(("closing", "count"), [(1e-5, 0), (math.nextafter(1e-5, 1.0), 1), (0.5e-5, 0)])
-def test_touch__up_to_its_speed_is_no_impact_but_ends_in_contact(closing, harm_count):
+def test_touch__up_to_its_speed_is_no_impact_but_ends_in_contact(closing, count):
     worlds, parts = run(line([0.0], [0.0, closing], e=0.5), [0.0, 0.0], 0.0)
-    assert parts[0].count.tolist() == [[harm_count]] and worlds.pair_hit.tolist() == [[bool(harm_count)]]
+    assert parts[0].count.tolist() == [[count]] and worlds.pair_hit.tolist() == [[bool(count)]]
     assert worlds.speeds_mps[0, 0] == worlds.speeds_mps[0, 1] == pytest.approx(closing / 2.0)
 
 

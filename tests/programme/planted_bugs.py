@@ -160,8 +160,8 @@ BUGS: dict[str, Bug] = {
     "better off called worse off": Bug(COMPARISON, "new > old + TOLERANCE", "old > new + TOLERANCE", OF_ABLATION),
     "difference of two levels the wrong way round": Bug(
         COMPARISON,
-        "paired_over_seeds(after.reached.world[count], before.reached.world[count])",
-        "paired_over_seeds(before.reached.world[count], after.reached.world[count])",
+        "after.reached.world[harm_count], before.reached.world[harm_count]",
+        "before.reached.world[harm_count], after.reached.world[harm_count]",
         OF_ABLATION,
     ),
     "beside the joint optimum stand all worlds": Bug(
@@ -184,7 +184,7 @@ BUGS: dict[str, Bug] = {
     ),
     "regret of total harm against the best first-impact harm": Bug(
         REGRET,
-        'return self.first_impact_harm if count == "first" else self.total_harm',
+        'return self.first_impact_harm if harm_count == "first" else self.total_harm',
         "return self.first_impact_harm",
         OF_TABLES,
     ),
@@ -199,7 +199,7 @@ BUGS: dict[str, Bug] = {
     ),
     # ------------------------------------------------------------ learning
     "the best policy judged by the other count": Bug(
-        COURSE, "        name = HARM_METRIC[self.count]\n", '        name = HARM_METRIC["first"]\n', OF_LEARNING
+        COURSE, "        name = HARM_METRIC[self.harm_count]\n", '        name = HARM_METRIC["first"]\n', OF_LEARNING
     ),
     "no alarm where the harm rises with the return": Bug(
         COURSE, "lowest >= first[harm]", "lowest == first[harm]", OF_LEARNING

@@ -56,7 +56,7 @@ def bound_chunks(worlds: int) -> Iterator[tuple[str, dict[str, Any]]]:
     for N, count, name in cells:
         chunks = max(1, round(SLOW_CHUNKS.get(name, CHUNKS[N]) * worlds / 1_000_000))
         for k in range(chunks):
-            given = {"N": N, "count": count, "who": name, "first": first, "worlds": min(CHUNK, worlds)}
+            given = {"N": N, "harm_count": count, "who": name, "first": first, "worlds": min(CHUNK, worlds)}
             yield f"bound-{N}-{count}-{name}-{k:03d}", given
             first += CHUNK
 
@@ -119,7 +119,7 @@ def _there(given: argparse.Namespace, name: str) -> bool:
 def _tell(rows: list[dict[str, Any]], wanted: int) -> bool:
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
-        groups[" ".join(str(row[key]) for key in ("N", "count", "who") if key in row)].append(row)
+        groups[" ".join(str(row[key]) for key in ("N", "harm_count", "who") if key in row)].append(row)
     for name, members in groups.items():
         total = {key: sum(m[key] for m in members) for key in ("worlds", "decisions", "above", "cpu_s")}
         print(

@@ -34,7 +34,7 @@ class LateBrake:
         return np.where(worlds.time_s < 0.9, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_coupled__is_never_worse_than_either_part(harm_count):
     hybrid = HybridAgent(LateBrake(), SCENARIO, harm_count=harm_count)
     realised = harm(hybrid, harm_count)
@@ -118,7 +118,7 @@ def test_begin__the_prediction_does_not_disturb_the_policy():
     assert policy.begun == WORLDS.n
 
 
-@pytest.mark.parametrize(("bound", "count"), [("pairwise", "frist"), ("coupled", "both"), ("couple", "first")])
+@pytest.mark.parametrize(("bound", "harm_count"), [("pairwise", "frist"), ("coupled", "both"), ("couple", "first")])
 def test_hybrid__refuses_an_unknown_bound_or_count(bound, harm_count):
     with pytest.raises(InvalidInput, match="must be"):
         HybridAgent(make_agent("full_brake"), SCENARIO, bound=bound, harm_count=harm_count)

@@ -152,7 +152,7 @@ def test_bad_input__is_refused():
         plan_harm(running, np.zeros((1, 3)))
 
 
-@pytest.mark.parametrize(("N", "count"), [(3, "first"), (3, "total"), (5, "total")])
+@pytest.mark.parametrize(("N", "harm_count"), [(3, "first"), (3, "total"), (5, "total")])
 def test_engine__realises_the_certified_harm_to_the_bit_whatever_is_proposed(N, harm_count):
     scenario = line(N)
     worlds, learner = scenario.sample(5, N).worlds, scenario.learners[0]

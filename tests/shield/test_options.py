@@ -26,7 +26,7 @@ MODES = {
     "episode": {"mode": "episode"},
     "episode:pairwise": {"mode": "episode", "bound": "pairwise"},
     "step": {"mode": "step", "allowance": 1.0, "logging": True},
-    "robust": {"mode": "robust", "uncertainty": "gaps_m=0.2", "count": "total"},
+    "robust": {"mode": "robust", "uncertainty": "gaps_m=0.2", "harm_count": "total"},
 }
 
 

@@ -113,7 +113,7 @@ def test_bound__at_the_alert_is_that_of_the_best_constant_in_the_worst_corner():
 
 
 @pytest.mark.parametrize("who", ["random", "extremes"])
-@pytest.mark.parametrize(("N", "count"), [(3, "first"), (3, "total"), (5, "first"), (5, "total")])
+@pytest.mark.parametrize(("N", "harm_count"), [(3, "first"), (3, "total"), (5, "first"), (5, "total")])
 def test_every_member__realises_at_most_the_bound_to_the_bit(N, harm_count, who):
     scenario = line(N)
     worlds, vehicle = scenario.sample(6, 21).worlds, scenario.learners[0]
@@ -151,7 +151,7 @@ def test_every_member__is_bounded_by_the_same_actions():
     assert (shield.bound <= first).all() and (first > 0.0).any()
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_no_width__is_step_mode_to_the_bit(harm_count):
     scenario = line(3)
     worlds = scenario.sample(30, 3).worlds

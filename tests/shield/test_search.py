@@ -54,7 +54,7 @@ def test_programme__its_million_worlds_are_all_different() -> None:
     chunks = [arguments for _, arguments in programme.bound_chunks(1_000_000)]
     assert sum(chunk["worlds"] for chunk in chunks) == 1_000_000
     assert len({chunk["first"] for chunk in chunks}) == len(chunks)
-    assert {(chunk["N"], chunk["count"]) for chunk in chunks} == {
+    assert {(chunk["N"], chunk["harm_count"]) for chunk in chunks} == {
         (3, "first"),
         (3, "total"),
         (5, "first"),

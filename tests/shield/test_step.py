@@ -36,7 +36,7 @@ class Wavering:
 
 
 @pytest.mark.parametrize("name", ADVERSARIES)
-@pytest.mark.parametrize(("N", "count"), [(3, "first"), (5, "total")])
+@pytest.mark.parametrize(("N", "harm_count"), [(3, "first"), (5, "total")])
 def test_falsification__no_adversary_gets_above_the_bound(name, N, harm_count):
     scenario = line(N)
     found = attack(scenario, scenario.sample(40, 11).worlds, ADVERSARIES[name], harm_count=harm_count)
@@ -58,7 +58,7 @@ def test_first_bound__is_what_the_coupled_optimum_realises():
     assert shield.first_bound == pytest.approx(optimum.harm, abs=1e-6)
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_agent__is_never_worse_than_the_episode_mode_nor_than_its_prediction(harm_count):
     step, hybrid = (
         StepShieldAgent(Wavering(), SCENARIO, harm_count=harm_count),

@@ -65,7 +65,7 @@ def test_coupled__is_not_worse_than_a_grid_of_2001_on_the_papers_list(n):
         assert np.mean(excess) < 0.0  # narrowing finds more than the grid
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_coupled__states_the_harm_that_its_deceleration_realises(harm_count):
     worlds = random_worlds(200, seed=23)
     best = optimise_coupled(worlds, 1, harm_count=harm_count)
@@ -209,7 +209,7 @@ def test_coupled__looks_into_more_than_the_most_promising_cell():
 
 
 @pytest.mark.parametrize(
-    ("world", "count", "least"), [(609, "first", 12.2943), (3545, "first", 18.3988), (3290, "total", 55.3322)]
+    ("world", "harm_count", "least"), [(609, "first", 12.2943), (3545, "first", 18.3988), (3290, "total", 55.3322)]
 )
 def test_coupled__finds_what_falls_toward_a_jump_between_two_samples(world, harm_count, least):
     # Just before one more impact the harm is least: a sawtooth that an even look from outside does not show.

@@ -130,7 +130,9 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     ),
     "obstacle that gives way a little": (Patch(OBSTACLE, "UNMOVABLE_T = math.inf", "UNMOVABLE_T = 1e9"),),
     "harm of an impact with the obstacle shared as with a vehicle": (
-        Patch(HARM, "harm[:, 0] += self.obstacle_harm(count)", "harm[:, 0] += 0.5 * self.obstacle_harm(count)"),
+        Patch(
+            HARM, "harm[:, 0] += self.obstacle_harm(harm_count)", "harm[:, 0] += 0.5 * self.obstacle_harm(harm_count)"
+        ),
     ),
     "later impacts with the obstacle counted as first ones": (
         Patch(
