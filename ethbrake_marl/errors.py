@@ -37,6 +37,11 @@ def one_line(text: str) -> str:
     return f"{line[:_KEPT_BEGINNING]} ... ({len(text):,} characters) ... {line[-_KEPT_END:]}"
 
 
+def count_of(n: int, thing: str) -> str:
+    """A number and what it counts, as a message has it: ``1 world``, ``10,000 worlds``."""
+    return f"{n:,} {thing}{'' if n == 1 else 's'}"
+
+
 class EthBrakeError(Exception):
     """Base of every error that this package raises on purpose; its text is one line, whatever it tells of."""
 
@@ -75,7 +80,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
     def __str__(self) -> str:
         named = [f"world {row}: {reason}" for row, reason in list(self.worlds.items())[:_NAMED]]
         more = len(self.worlds) - len(named)
-        return one_line("; ".join([*named, f"and {more:,} more worlds"] if more else named))
+        return one_line("; ".join([*named, f"and {count_of(more, 'more world')}"] if more else named))
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> PhysicsError:
         """The same of the batch from which the worlds of this one were taken: world k was its world ``rows[k]``."""

@@ -10,7 +10,9 @@ from ethbrake_marl.errors import (
     AlreadyExists,
     CorruptBundle,
     InvalidInput,
+    PhysicsError,
     UnknownName,
+    count_of,
     one_line,
     plain_text,
 )
@@ -48,3 +50,8 @@ def test_terminal__every_way_to_it_is_clean(capsys: pytest.CaptureFixture[str]) 
     captured = capsys.readouterr()
     assert captured.err == "runs/\\x1b[2J\\nx\n"
     assert captured.out == "# \\u202egnp\n\n[/] ppo@\\x1b[31m :smile:\n6\N{NO-BREAK SPACE}m/s²\n"
+
+
+def test_count_of__one_is_no_plural():
+    assert [count_of(n, "world") for n in (0, 1, 2, 10_000)] == ["0 worlds", "1 world", "2 worlds", "10,000 worlds"]
+    assert str(PhysicsError(dict.fromkeys(range(6), "broke"))).endswith("; and 1 more world")

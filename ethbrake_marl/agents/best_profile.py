@@ -10,7 +10,7 @@ from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.protocol import fixed_commands, place
 from ethbrake_marl.engine.stream import Script
-from ethbrake_marl.errors import InvalidInput, renumbered
+from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.search.kernel import MOST_PHASES
@@ -69,7 +69,9 @@ class BestHarm:
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The command of the phase in force, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
         if worlds.n > len(self._start_s) or np.isnan(self._start_s[: worlds.n]).any():
-            raise InvalidInput(f"agent {self.name!r}: act on {worlds.n} worlds, but begin was not called for each")
+            raise InvalidInput(
+                f"agent {self.name!r}: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
+            )
         passed = (worlds.time_s - self._start_s[: worlds.n]) / TIME_STEP_S
         step = np.maximum(np.floor(passed + 1e-6), 0.0).astype(np.int64)
         return self._profiles.take(slice(worlds.n)).at(step)[:, 0]
@@ -83,9 +85,9 @@ class BestHarm:
         """The given profiles with those of ``unknown`` worlds replaced by searched ones."""
         part, theirs = worlds.take(unknown), others[unknown]
         problem = self._problem(part, vehicle, theirs)
-        horizon_s, count = self._horizon_s, self._harm_count
+        horizon_s, harm_count = self._horizon_s, self._harm_count
         with renumbered(unknown):
-            coupled = optimise_coupled(part, vehicle, harm_count=count, horizon_s=horizon_s, others_mps2=theirs)
+            coupled = optimise_coupled(part, vehicle, harm_count=harm_count, horizon_s=horizon_s, others_mps2=theirs)
             given = constant_profiles(problem, -coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
             found = search_profiles(problem, given, budget=self._budget).profiles
         whole, found = pad_profiles([profiles, found], MOST_PHASES)

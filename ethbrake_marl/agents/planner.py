@@ -13,7 +13,7 @@ from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.protocol import Agent, fixed_commands, place
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.engine.stream import Script
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.search.kernel import MOST_PHASES
@@ -84,7 +84,9 @@ class Planner:
         """The first command of the new plans, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
         n = worlds.n
         if n > self._latency_s.size or np.isnan(self._latency_s[:n]).any():
-            raise InvalidInput(f"agent {self.name!r}: act on {n} worlds, but begin was not called for each of them")
+            raise InvalidInput(
+                f"agent {self.name!r}: act on {count_of(n, 'world')}, but begin was not called for each of them"
+            )
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
         due = (worlds.time_s > self._planned_s[:n]) & (worlds.time_s < self._horizon_s) & moving
         rows = np.flatnonzero(due)

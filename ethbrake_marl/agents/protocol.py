@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from ethbrake_marl.engine.stream import Script, is_state_free
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics import Floats, Ints, Worlds
 
 
@@ -69,7 +69,7 @@ def recall(stored: Floats, n: int, name: str) -> Floats:
     """The values of a batch of ``n`` (own memory). Raises ``InvalidInput`` if an episode in it never began."""
     values = stored[:n].copy()
     if len(values) < n or not np.all(np.isfinite(values)):
-        raise InvalidInput(f"agent {name!r}: act on {n} worlds, but begin was not called for each of them")
+        raise InvalidInput(f"agent {name!r}: act on {count_of(n, 'world')}, but begin was not called for each of them")
     return values
 
 

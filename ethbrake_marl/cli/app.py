@@ -70,6 +70,7 @@ from ethbrake_marl.scenario import (
 )
 
 BAD_INPUT = 2
+_NO_VARIABLE = ""  # no completion is offered, so no variable may ask for it
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
 GENERALISE = "Example: ethbrake generalise --runs runs/cooperation-4-all-cooperation-seed0 --vehicles 3,5,10"
 
@@ -120,7 +121,8 @@ def run_command(arguments: Sequence[str]) -> int:
     Other errors, which are defects, pass through.
     """
     try:
-        status = app(rename_old_options(arguments), prog_name="ethbrake", standalone_mode=False)
+        arguments = rename_old_options(arguments)
+        status = app(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=_NO_VARIABLE)
         sys.stdout.flush()
     except TyperException as error:
         context = getattr(error, "ctx", None)

@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, VehicleOption
-from ethbrake_marl.cli.picture import PictureOption, picture_app, picture_target
+from ethbrake_marl.cli.picture import PictureOption, counted_without, picture_app, picture_target, tell_left_out
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation import (
     Rescored,
     SummaryRow,
@@ -162,8 +163,9 @@ def shield_command(
         write_json([row.to_json() for row in rows])
     else:
         result_console().print(modes_table(rows))
+    tell_left_out(rows[0].left_out, episodes)
     moving = {f"{row.agent} ({row.mode})": row.horizon_ends for row in rows if row.mode != NONE}
-    if note := horizon_note(moving, episodes, chosen.horizon_s):
+    if note := horizon_note(moving, episodes - len(rows[0].left_out), chosen.horizon_s):
         say(note)
 
 
@@ -186,10 +188,12 @@ def picture_shield_modes(
     chosen = load_driven(scenario, vehicle)
     rows = measured_modes(agents, chosen, episodes, harm_count)
     caption = (
-        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}, {harm_count} harm; mean and 95 %"
-        " interval of the difference, paired by world."
+        f"{chosen.name}, {count_of(episodes, 'world')} of the list of seed {LIST_SEED}, {harm_count} harm; mean and 95"
+        " % interval of the difference, paired by world."
     )
+    caption += counted_without(rows[0].left_out)
     write_output(target, png_bytes(shield_modes_figure(rows, caption=caption)), force=force)
+    tell_left_out(rows[0].left_out, episodes)
     say(f"picture: {target}")
 
 

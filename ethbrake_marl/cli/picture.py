@@ -9,13 +9,15 @@ import typer
 
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.criticality import CELLS, criticality_map
 from ethbrake_marl.evaluation.deceleration import deceleration_curve
 from ethbrake_marl.evaluation.inputs import LIST_SEED, load_driven, make_agents, make_proposers
 from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.evaluation.text import left_out_line
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import LeftOutRows
 from ethbrake_marl.scenario import Task
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
@@ -110,22 +112,24 @@ def picture_shield(
     target = picture_target(output, force=force)
     from ethbrake_marl.figures.shield import operating_figure
     from ethbrake_marl.figures.style import png_bytes
-    from ethbrake_marl.shield.review import ALLOWANCES, operating_curve
+    from ethbrake_marl.shield.review import ALLOWANCES, operating_curves
 
     chosen = load_driven(scenario, vehicle)
     worlds = chosen.sample(episodes, LIST_SEED).worlds
-    curves = []
+    lineup = make_proposers(agents.split(","), chosen, harm_count=harm_count)
     with interruptible("nothing was written"), progress_bars() as bars:
-        for name, agent in make_proposers(agents.split(","), chosen, harm_count=harm_count).items():
-            curves.append(
-                (name, operating_curve(worlds, agent, chosen, chosen.learners[0], ALLOWANCES, harm_count=harm_count))
-            )
-            bars.show(name, episodes, episodes)
+        curves = operating_curves(
+            worlds, lineup, chosen, chosen.learners[0], ALLOWANCES, harm_count=harm_count,
+            on_progress=lambda name: bars.show(name, episodes, episodes),
+        )  # fmt: skip
     caption = (
-        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; step shield, {harm_count} harm. Beside the"
-        " points: what certificates may reach above the bound (m²/s²)."
+        f"{chosen.name}, {count_of(episodes, 'world')} of the list of seed {LIST_SEED}; step shield, {harm_count} harm."
+        " Beside the points: what certificates may reach above the bound (m²/s²)."
     )
-    write_output(target, png_bytes(operating_figure(curves, caption=caption)), force=force)
+    left_out = next(iter(curves.values()))[0].left_out
+    figure = operating_figure(list(curves.items()), caption=caption + counted_without(left_out))
+    write_output(target, png_bytes(figure), force=force)
+    tell_left_out(left_out, episodes)
     say(f"picture: {target}")
 
 
@@ -165,15 +169,28 @@ def picture_robustness(
             on_progress=lambda what, done: bars.show(what, done, episodes),
         )  # fmt: skip
     caption = (
-        f"{chosen.name}, {episodes} worlds of the list of seed {LIST_SEED}; {agent} proposes; {harm_count} harm."
-        f" Intervals of width 1: {intervals}."
+        f"{chosen.name}, {count_of(episodes, 'world')} of the list of seed {LIST_SEED}; {agent} proposes;"
+        f" {harm_count} harm. Intervals of width 1: {intervals}."
     )
+    caption += counted_without(points[0].left_out)
     write_output(target, png_bytes(robustness_figure(points, caption=caption)), force=force)
     if as_json:
         write_json([point._asdict() for point in points])
     else:
         result_console().print(robustness_table(points))
+    tell_left_out(points[0].left_out, episodes)
     say(f"picture: {target}")
+
+
+def counted_without(left_out: LeftOutRows) -> str:
+    """What a caption says of worlds that count in no figure; nothing where there are none."""
+    return f" Left out: {len(left_out):,}, which the physics could not advance." if left_out else ""
+
+
+def tell_left_out(left_out: LeftOutRows, whole: int) -> None:
+    """Name the worlds that count in no figure, of ``whole``, in a line on stderr; none where every world counts."""
+    if left_out:
+        say(left_out_line([f"world {world} of seed {LIST_SEED} ({reason})" for world, reason in left_out], whole))
 
 
 def picture_target(output: Path, *, force: bool) -> Path:

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from ethbrake_marl.engine.step import CLOCK_WIDTH, LAST_STEP, START
-from ethbrake_marl.errors import FailedWorld, InvalidInput, PhysicsError
+from ethbrake_marl.errors import FailedWorld, InvalidInput, PhysicsError, count_of
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
 from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.rows import Packed, harm_at, has_obstacle, pack, state_width
@@ -173,7 +173,9 @@ class Stream:
 def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
     """Refuse worlds, with ``InvalidInput``, that are not ``n`` lines of ``vehicles`` at the alert: t = 0, no impact."""
     if (worlds.n, worlds.N) != (n, vehicles):
-        raise InvalidInput(f"reset: {worlds.n} worlds of {worlds.N} vehicles given; {n} of {vehicles} needed")
+        raise InvalidInput(
+            f"reset: {count_of(worlds.n, 'world')} of {worlds.N} vehicles given; {n} of {vehicles} needed"
+        )
     at_alert = (worlds.time_s == 0.0) & ~worlds.pair_hit.any(axis=1) & ~worlds.obstacle_hit
     if not at_alert.all():
         k = int(np.argmin(at_alert))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.rollout import Evaluation
 from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.physics import Floats, Worlds
@@ -71,7 +72,7 @@ def parameters(evaluation: Evaluation) -> dict[str, Any]:
 def parameter_line(found: Mapping[str, Any]) -> str:
     """The ``parameters`` in one line, for captions: scenario, number of worlds, seed, then ``quantity_line``."""
     seed = "" if found["seed"] is None else f", seed {found['seed']}"
-    return f"{found['scenario']}: {found['count']:,} worlds{seed}; {quantity_line(found)}"
+    return f"{found['scenario']}: {count_of(found['count'], 'world')}{seed}; {quantity_line(found)}"
 
 
 def quantity_line(found: Mapping[str, Any]) -> str:

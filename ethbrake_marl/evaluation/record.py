@@ -15,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import episode_engine
-from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of
 from ethbrake_marl.evaluation.aftermath import with_post_ahead
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.harm import Ledger
@@ -55,7 +55,7 @@ def record_episode(
     """
     if world.n != 1:
         raise InvalidInput(
-            f"record_episode: {world.n} worlds given; exactly 1 is needed, for instance worlds.take([0])"
+            f"record_episode: {count_of(world.n, 'world')} given; exactly 1 is needed, for instance worlds.take([0])"
         )
     if not (sample_s > 0.0 and math.isfinite(sample_s)):
         raise InvalidInput(f"record_episode: sample_s = {sample_s}; must be finite and above 0")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,9 @@ from rich.table import Table
 
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.errors import renumbered
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
-from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.physics import Floats, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Task
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
 from ethbrake_marl.shield.review import VERDICTS, review
@@ -37,6 +38,7 @@ class ModeRow:
     replaced: float | None = None  # share of the decisions; of step mode alone, as all that follows
     verdicts: tuple[float, ...] | None = None  # shares of the replaced decisions, in the order of VERDICTS
     above_bound: int | None = None  # worlds whose realised harm is above the bound told at the alert
+    left_out: LeftOutRows = ()  # worlds that could not be advanced: in no row, whichever agent and mode met them
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
@@ -49,7 +51,8 @@ class ModeRow:
             "decisions_replaced": self.replaced,
         }
         shares = (None,) * len(VERDICTS) if self.verdicts is None else self.verdicts
-        return {**told, **dict(zip(VERDICTS, shares, strict=True)), "above_bound": self.above_bound}
+        told |= {**dict(zip(VERDICTS, shares, strict=True)), "above_bound": self.above_bound}
+        return {**told, "left_out": [{"world": world, "reason": reason} for world, reason in self.left_out]}
 
 
 def compare_modes(
@@ -62,14 +65,24 @@ def compare_modes(
     """Let every agent drive the vehicle alone, in episode mode and in step mode, through every world; see ``ModeRow``.
 
     Each replaced decision of step mode is simulated again without the shield (``shield.review.review``). The given
-    agents are left as they are. Raises ``InvalidInput`` where a shield refuses the scenario.
+    agents are left as they are. A world that cannot be advanced with one of them is left out for all, and named in
+    ``left_out``. Raises ``InvalidInput`` where a shield refuses the scenario, ``PhysicsError`` where no world is left.
     """
+    rows, _, left_out = measured_without_failed(
+        lambda at: _compared(agents, worlds.take(at), task, on_progress), worlds.n
+    )
+    return [replace(row, left_out=left_out) for row in rows]
+
+
+def _compared(agents: Mapping[str, Agent], worlds: Worlds, task: Task, on_progress: Progress | None) -> list[ModeRow]:
+    """The rows of worlds that can all be advanced; ``PhysicsError`` names those that cannot."""
     rows = []
     for name, agent in agents.items():
         parts = []
         for first in range(0, worlds.n, CHUNK):
-            part = worlds.take(np.arange(first, min(first + CHUNK, worlds.n)))
-            parts.append(_measured(part, agent, task))
+            chunk = np.arange(first, min(first + CHUNK, worlds.n))
+            with renumbered(chunk):
+                parts.append(_measured(worlds.take(chunk), agent, task))
             if on_progress is not None:
                 on_progress(name, min(first + CHUNK, worlds.n))
         rows += _rows(name, parts)

@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ethbrake_marl.agents.knowledge import Source, knowledge_text
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS, PAPER_ROWS, PaperRow
 from ethbrake_marl.evaluation.regret import Between, Distance
@@ -210,11 +211,16 @@ def left_out_lines(rows: Sequence[SummaryRow]) -> list[str]:
     if not left_out:
         return []
     whole = rows[0].episodes + len(left_out)
-    named = [str(left) for left in left_out[:_NAMED]] + (["and so on"] if len(left_out) > _NAMED else [])
-    return [
-        f"LEFT OUT for every agent: {len(left_out):,} of {whole:,} worlds, which the physics could not advance"
+    return [left_out_line([str(left) for left in left_out], whole)]
+
+
+def left_out_line(worlds: Sequence[str], whole: int) -> str:
+    """That these of ``whole`` worlds, each named with its reason, count in no figure."""
+    named = [*worlds[:_NAMED], *(["and so on"] if len(worlds) > _NAMED else [])]
+    return (
+        f"LEFT OUT for every agent: {len(worlds):,} of {whole:,} worlds, which the physics could not advance"
         f" (please report them): {'; '.join(named)}."
-    ]
+    )
 
 
 def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
@@ -244,7 +250,7 @@ def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
         )
     below = {row.agent: row.distance.below_best_known for row in rows if row.distance.below_best_known}
     if below:
-        counts = ", ".join(f"{agent} in {count:,} worlds" for agent, count in below.items())
+        counts = ", ".join(f"{agent} in {count_of(count, 'world')}" for agent, count in below.items())
         text += f" Below what was known: {counts}."
     return [text]
 

@@ -11,6 +11,7 @@ from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.figures.style import COLOURS, GREY, add_caption, new_figure, series_style, style_axes
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 
@@ -43,7 +44,7 @@ def harm_curve(found: Json, caption: str) -> Figure:
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=4, frameon=False, fontsize=8.5)
     worlds = found["levels"][0]["first"]["searched"]["worlds"]
-    add_caption(figure, f"{caption} All of this figure: the first {worlds:,} worlds.")
+    add_caption(figure, f"{caption} All of this figure: the first {count_of(worlds, 'world')}.")
     return figure
 
 

@@ -1,7 +1,7 @@
 """Exact physics of a line of vehicles: compiled and pure. No YAML, no random numbers, no torch."""
 
 from ethbrake_marl.physics.advance import ImpactRows, Impacts, advance
-from ethbrake_marl.physics.failed import leaving_out_failed
+from ethbrake_marl.physics.failed import LeftOutRows, leaving_out_failed, measured_without_failed
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.sampled import advance_sampled
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, assign, concatenate, make_worlds
@@ -12,6 +12,7 @@ __all__ = [
     "ImpactRows",
     "Impacts",
     "Ints",
+    "LeftOutRows",
     "Vehicles",
     "Worlds",
     "advance",
@@ -21,4 +22,5 @@ __all__ = [
     "forecast",
     "leaving_out_failed",
     "make_worlds",
+    "measured_without_failed",
 ]

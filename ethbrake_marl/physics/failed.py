@@ -14,6 +14,7 @@ from ethbrake_marl.physics.worlds import Floats, Ints
 Result = TypeVar("Result")
 
 
+LeftOutRows = tuple[tuple[int, str], ...]  # row of the batch that was given, why its world counts nowhere
 _REASONS = {PENETRATED: "a contact was missed", STUCK: f"more than {MOST_EVENTS} events"}
 
 
@@ -25,6 +26,17 @@ def failure(status: Ints, from_s: Floats, until_s: Floats) -> PhysicsError:
             for k in np.flatnonzero(status != DONE).tolist()
         }
     )
+
+
+def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[Result, Ints, LeftOutRows]:
+    """What ``measure`` finds in those of ``n`` worlds in which it does not fail, their rows, and which were left out.
+
+    As ``leaving_out_failed``, but raises ``PhysicsError`` where no world is left.
+    """
+    found, rows, failed = leaving_out_failed(measure, np.arange(n))
+    if found is None:
+        raise PhysicsError(failed)
+    return found, rows, tuple(sorted(failed.items()))
 
 
 def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Result | None, Ints, dict[int, str]]:

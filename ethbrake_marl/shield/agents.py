@@ -21,7 +21,7 @@ from ethbrake_marl.agents.protocol import Agent, check_agent, place, recall
 from ethbrake_marl.agents.refined import Rehearsed
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, introduce, scripted
-from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.rows import TIME, Packed
@@ -185,7 +185,9 @@ class StepShieldAgent(AgentAround):
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Find the bound of these rows; ``worlds`` holds those rows only, at the alert."""
         if self._believed is not None and not (rows < self._believed.n).all():
-            raise InvalidInput(f"step: believed holds {self._believed.n} worlds, but row {rows.max()} begins")
+            raise InvalidInput(
+                f"step: believed holds {count_of(self._believed.n, 'world')}, but row {rows.max()} begins"
+            )
         if self.shield is None or self.shield.vehicle != vehicle:
             self.shield, self._asked = self._make(vehicle), None
         if self._asked is not None and len(rows) < len(self._wanted):
@@ -206,7 +208,9 @@ class StepShieldAgent(AgentAround):
         """
         shield = self.shield
         if shield is None or shield.running is None or len(self._wanted) < worlds.n:
-            raise InvalidInput(f"agent {self.name!r}: act on {worlds.n} worlds, but begin was not called for each")
+            raise InvalidInput(
+                f"agent {self.name!r}: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
+            )
         if len(self._wanted) > worlds.n:  # a smaller batch has begun
             shield.keep(worlds.n)
             self.predicted_harm, self._wanted, self._first_s = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,9 +13,9 @@ from ethbrake_marl.actions import action_to_command
 from ethbrake_marl.agents.around import AgentAround
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics import Bools, Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.agents import StepShieldAgent, first_decision_s
 from ethbrake_marl.shield.rollouts import proposed_action
@@ -52,7 +52,7 @@ def review(driver: StepShieldAgent, worlds: Worlds, vehicle: int) -> Review:
     if shield is None or shield.log is None or shield.running is None:
         raise InvalidInput("review: nothing was logged; make the agent with logging=True, and drive it")
     if worlds.n != shield.running.n:
-        raise InvalidInput(f"review: {worlds.n} worlds, but {shield.running.n} were driven last")
+        raise InvalidInput(f"review: {count_of(worlds.n, 'world')}, but {shield.running.n} were driven last")
     log = [entry for entry in shield.log if entry.world < worlds.n and entry.episode == shield.episode[entry.world]]
     world = np.array([entry.world for entry in log], np.int64)
     step = np.array([entry.step for entry in log], np.int64)
@@ -71,7 +71,8 @@ def _harm_released(driver: StepShieldAgent, worlds: Worlds, vehicle: int, world:
     """Harm in some worlds [m] when what was applied is applied again up to decision ``step`` [m], then the policy."""
     assert driver.shield is not None
     again = _Released(copy.deepcopy(driver.policy), driver.shield.backup.plan[world], step, driver.scenario.time_step_s)
-    return drive(worlds.take(world), again, driver.scenario, vehicle).ledger.world_harm(driver.shield.harm_count)
+    with renumbered(world):
+        return drive(worlds.take(world), again, driver.scenario, vehicle).ledger.world_harm(driver.shield.harm_count)
 
 
 class OperatingPoint(NamedTuple):
@@ -81,18 +82,40 @@ class OperatingPoint(NamedTuple):
     intervention_rate: float  # share of decisions
     intervened_worlds: float  # share of worlds with at least one
     harm: float  # mean over worlds (m2/s2)
+    left_out: LeftOutRows = ()  # worlds that could not be advanced: in no point, whichever allowance met them
 
 
-def operating_curve(
+def operating_curves(
     worlds: Worlds,
-    policy: Agent,
+    policies: Mapping[str, Agent],
     scenario: Scenario,
     vehicle: int,
     allowances: Sequence[float],
     *,
     harm_count: HarmCount = "first",
+    on_progress: Callable[[str], None] | None = None,
+) -> dict[str, list[OperatingPoint]]:
+    """Interventions against residual harm for each policy: one point per allowance, from none to very large.
+
+    A world that cannot be advanced in one of the cases is left out of all, and named in ``left_out``; ``on_progress``
+    is told each policy that is done. Raises ``PhysicsError`` where no world is left.
+    """
+
+    def measured(at: Ints) -> dict[str, list[OperatingPoint]]:
+        curves = {}
+        for name, policy in policies.items():
+            curves[name] = _operating_points(worlds.take(at), policy, scenario, vehicle, allowances, harm_count)
+            if on_progress is not None:
+                on_progress(name)
+        return curves
+
+    curves, _, left_out = measured_without_failed(measured, worlds.n)
+    return {name: [point._replace(left_out=left_out) for point in points] for name, points in curves.items()}
+
+
+def _operating_points(
+    worlds: Worlds, policy: Agent, scenario: Scenario, vehicle: int, allowances: Sequence[float], harm_count: HarmCount
 ) -> list[OperatingPoint]:
-    """Interventions against residual harm: one point per allowance, from none (the bound itself) to very large."""
     points = []
     for allowance in allowances:
         driver = StepShieldAgent(copy.deepcopy(policy), scenario, harm_count=harm_count, allowance=allowance)

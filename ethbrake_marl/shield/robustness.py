@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.physics import Worlds
+from ethbrake_marl.physics import Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.agents import StepShieldAgent
 from ethbrake_marl.shield.uncertainty import Uncertainty
@@ -35,6 +36,7 @@ class RobustnessPoint(NamedTuple):
     above: float  # share of worlds that realise more than the bound stated at the alert
     excess: float  # mean of how much more, 0 where it is not (m2/s2)
     distrusted: float  # share of worlds in which the shield noticed
+    left_out: LeftOutRows = ()  # worlds that could not be advanced: in no point, whichever shield and truth met them
 
 
 def robustness(
@@ -52,8 +54,9 @@ def robustness(
     """Both shields around ``policy`` in every kind of truth at each width; ``worlds`` is what the shields are told.
 
     The engine runs the truth, and the policy sees it; the shields begin with what they are told and see what happens.
-    The numbers that place a truth in its box are those of ``seed``, the same for all widths. Raises ``InvalidInput``
-    for no width or a negative one, and what ``StepShieldAgent`` raises.
+    The numbers that place a truth in its box are those of ``seed``, the same for all widths. A world that cannot be
+    advanced in one of the cases is left out of all, and named in ``left_out``. Raises ``InvalidInput`` for no width or
+    a negative one, ``PhysicsError`` where no world is left, and what ``StepShieldAgent`` raises.
     """
     if not widths or not all(0.0 <= width < np.inf for width in widths):
         raise InvalidInput(f"robustness: widths {tuple(widths)}: at least one is needed, each at least 0")
@@ -61,33 +64,44 @@ def robustness(
         uncertainty.scaled(max(widths)).draw(worlds, np.random.default_rng(seed))
     except InvalidInput as error:
         raise InvalidInput(f"{error}; widths of up to {max(widths):g} times those given are measured") from None
-    points, known = [], {}
-    for width in widths:
-        intervals = uncertainty.scaled(width)
-        for truth in TRUTHS:
-            driven = worlds
-            if truth != "as told":
-                driven = intervals.draw(worlds, np.random.default_rng(seed), corners=truth == "corner")
-            for mode in MODES:
-                alike = width == 0.0 or (mode, truth) == ("step", "as told")  # what is told is all that matters
-                key = (0.0, "as told", "step") if alike else (width, truth, mode)
-                if key not in known:
-                    shielded = StepShieldAgent(
-                        copy.deepcopy(policy), scenario, harm_count=harm_count, believed=worlds,
-                        uncertainty=intervals if mode == "robust" else None,
-                    )  # fmt: skip
-                    known[key] = _means(driven, shielded, vehicle, harm_count)
-                points.append(RobustnessPoint(mode, truth, float(width), *known[key]))
-                if on_progress is not None:
-                    on_progress(f"{mode}, {truth}, width {width:g}", worlds.n)
-    return points
+
+    def measured(at: Ints) -> list[RobustnessPoint]:
+        points, known, told = [], dict[tuple[float, str, str], RobustnessPoint](), worlds.take(at)
+        for width, truth, mode in itertools.product(map(float, widths), TRUTHS, MODES):
+            alike = width == 0.0 or (mode, truth) == ("step", "as told")  # what is told is all that matters
+            key = (0.0, "as told", "step") if alike else (width, truth, mode)
+            if key not in known:
+                intervals = uncertainty.scaled(width)
+                shielded = StepShieldAgent(
+                    copy.deepcopy(policy), scenario, harm_count=harm_count, believed=told,
+                    uncertainty=intervals if mode == "robust" else None,
+                )  # fmt: skip
+                driven = worlds
+                if key[1] != "as told":  # drawn for all worlds: a truth does not depend on which of them are left out
+                    driven = intervals.draw(worlds, np.random.default_rng(seed), corners=truth == "corner")
+                known[key] = _point(driven.take(at), shielded, vehicle, harm_count)
+            points.append(known[key]._replace(mode=mode, truth=truth, width=width))
+            if on_progress is not None:
+                on_progress(f"{mode}, {truth}, width {width:g}", worlds.n)
+        return points
+
+    found, _, left_out = measured_without_failed(measured, worlds.n)
+    return [point._replace(left_out=left_out) for point in found]
 
 
-def _means(worlds: Worlds, shielded: StepShieldAgent, vehicle: int, harm_count: HarmCount) -> tuple[float, ...]:
-    """What a shield makes of the worlds that it is driven through: the last columns of its point."""
+def _point(worlds: Worlds, shielded: StepShieldAgent, vehicle: int, harm_count: HarmCount) -> RobustnessPoint:
+    """What a shield makes of the worlds that it is driven through; which case that is, the caller says."""
     harm = drive(worlds, shielded, shielded.scenario, vehicle).ledger.world_harm(harm_count)
     bound, shield = shielded.predicted_harm, shielded.shield
     assert shield is not None
     above = np.maximum(harm - bound, 0.0)
-    means = (harm.mean(), bound.mean(), (above > 0.0).mean(), above.mean(), shield.distrusted.mean())
-    return tuple(map(float, means))
+    return RobustnessPoint(
+        mode="",
+        truth="",
+        width=0.0,
+        harm=float(harm.mean()),
+        bound=float(bound.mean()),
+        above=float((above > 0.0).mean()),
+        excess=float(above.mean()),
+        distrusted=float(shield.distrusted.mean()),
+    )

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
 from ethbrake_marl.figures.learning_curves import SeedCurve, at_common_steps, seed_curves
@@ -149,7 +149,7 @@ def _estimate(harms: Any) -> dict[str, Any]:
 def _conditions(plan: Sequence[Trainings]) -> str:
     """The fixed list of each recipe, in words."""
     lists = sorted({(t.recipe.evaluation.worlds, t.recipe.evaluation.seed) for t in plan})
-    return "Fixed list: " + "; ".join(f"{worlds:,} worlds of seed {seed}" for worlds, seed in lists) + "."
+    return "Fixed list: " + "; ".join(f"{count_of(worlds, 'world')} of seed {seed}" for worlds, seed in lists) + "."
 
 
 def _csv(curves: Mapping[str, Mapping[str, SeedCurve]]) -> str:

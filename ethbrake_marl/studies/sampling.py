@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ethbrake_marl.agents.registry import make_single_agent
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.figures.sampling import draw_errors
 from ethbrake_marl.figures.style import Figure, png_bytes
@@ -160,8 +161,8 @@ def sampling_report(figure_path: str | Path, *, scenario: str = "paper-random", 
     worlds = chosen.sample(n, seed).worlds
     studies = [convergence(worlds, agent, until_s=chosen.horizon_s) for agent in CONTROLS]
     caption = (
-        f"{scenario}: {n:,} worlds, seed {seed}; Vehicles 1 and 3 brake fully. Error: sampled minus exact harm. At"
-        " 0.2 s the latency of Vehicle 3 falls between two samples, so it brakes 0.1 s late."
+        f"{scenario}: {count_of(n, 'world')}, seed {seed}; Vehicles 1 and 3 brake fully. Error: sampled minus"
+        " exact harm. At 0.2 s the latency of Vehicle 3 falls between two samples, so it brakes 0.1 s late."
     )
     write_output(figure_path, png_bytes(convergence_figure(studies, caption)), force=True)
     return "\n\n".join(convergence_table(study) for study in studies)

@@ -22,6 +22,14 @@ def files(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def test_command_line__a_variable_of_shell_completion_changes_nothing(ethbrake, monkeypatch):
+    monkeypatch.setenv("_ETHBRAKE_COMPLETE", "bash_source")
+    answer = ethbrake("scenario", "list")
+    assert (answer.status, answer.err) == (0, "")
+    assert "paper-random" in answer.out
+    refused(ethbrake("scenario", "show", "nowhere"), "nowhere")
+
+
 SCENARIO_DEFECTS = [
     ("\ngaps_m: ", "\ngap_m: ", ["gap_m", "gaps_m"]),
     ("\nmass_t: [4.5, 5.5, 5.9]\n", "\n", ["mass_t", "missing"]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -11,8 +12,9 @@ from ethbrake_marl.agents.registry import Entry, make_agent
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import InvalidInput, OldSpelling
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.catalogue import shipped_folder
+from tests.failing_worlds import plant
 
 
 def test_shield__prints_its_rows_as_json_and_as_a_table(ethbrake):
@@ -25,6 +27,31 @@ def test_shield__prints_its_rows_as_json_and_as_a_table(ethbrake):
     assert rows[2]["above_bound"] == 0 and rows[0]["needed"] is None
     table = ethbrake(*arguments).out
     assert "full_brake" in table and "needed" in table and f"{rows[2]['harm']:.2f}" in table
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("shield", "--agents", "full_brake"),
+        ("picture", "shield-modes", "--agents", "coast", "--output", "x.png"),
+        ("picture", "shield", "--agents", "coast,full_brake", "--output", "x.png"),
+        ("picture", "robustness", "--output", "x.png"),
+    ],
+    ids=lambda command: " ".join(command[:2]),
+)
+def test_commands_of_the_shield__name_the_worlds_that_they_leave_out(ethbrake, monkeypatch, tmp_path, command):
+    monkeypatch.chdir(tmp_path)
+    sample = Scenario.sample
+
+    def planted(self, n, seed, **options):
+        drawn = sample(self, n, seed, **options)
+        return replace(drawn, worlds=plant(drawn.worlds, [2] if n == 4 else []))
+
+    monkeypatch.setattr(Scenario, "sample", planted)
+    answer = ethbrake(*command, "--episodes", "4")
+    assert answer.status == 0
+    assert "LEFT OUT for every agent: 1 of 4 worlds" in answer.err
+    assert "world 2 of seed 7 (a contact was missed" in answer.err
 
 
 def test_shield__an_unknown_agent_is_refused(ethbrake):

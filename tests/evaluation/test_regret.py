@@ -125,7 +125,7 @@ def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Ev
     table = markdown_table(summarise(four))
     assert "≥ 0.75" in table
     assert "Found beforehand in 75.0 % of the worlds" in table
-    assert "Below what was known: a in 1 worlds." in table
+    assert "Below what was known: a in 1 world." in table
 
 
 def test_distance__without_full_braking_nothing_is_realised(four: Evaluation, evaluation: Evaluation) -> None:

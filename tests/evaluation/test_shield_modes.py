@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.evaluation.shield_modes import ModeRow, compare_modes, modes_table
 from ethbrake_marl.evaluation.statistics import paired_difference
 from ethbrake_marl.figures.shield import shield_modes_figure
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
+from tests.failing_worlds import plant, without
 
 PAPER = load_scenario("paper-random")
 WORLDS = PAPER.sample(60, 3).worlds
@@ -61,3 +64,18 @@ def test_table_and_figure__show_every_row(rows: list[ModeRow]) -> None:
     assert np.allclose(sorted(drawn), sorted(expected))
     with pytest.raises(InvalidInput, match="at least one agent"):
         shield_modes_figure([])
+
+
+def test_worlds_that_cannot_be_advanced__are_out_for_all_modes_and_named(
+    rows: list[ModeRow], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ethbrake_marl.evaluation.shield_modes.CHUNK", 25)
+    task, agents = Task(PAPER, (1,)), {"full_brake": make_agent("full_brake"), "coast": make_agent("coast")}
+    found = compare_modes(agents, plant(WORLDS, [2, 40]), task)
+    assert [[world for world, _ in row.left_out] for row in found] == [[2, 40]] * 8
+    assert "contact was missed" in found[0].left_out[0][1]
+    expected = compare_modes(agents, WORLDS.take(without(60, [2, 40])), task)
+    assert [replace(row, left_out=()) for row in found] == expected
+    assert found[0].to_json()["left_out"][1]["world"] == 40 and rows[0].to_json()["left_out"] == []
+    with pytest.raises(PhysicsError):
+        compare_modes(agents, plant(WORLDS, list(range(60))), task)

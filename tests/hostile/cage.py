@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import collections
-import dataclasses
-import errno
 import hashlib
-import inspect
 import json
 import os
 import resource
@@ -15,14 +11,15 @@ import signal
 import stat
 import sys
 import traceback
-import typing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import EthBrakeError
-from tests.hostile.case import INSIDE, OUTSIDE, PRECIOUS, Case, write
+from tests.hostile.case import INSIDE, OUTSIDE, PRECIOUS, Case, placed, write
+from tests.hostile.confined import can_confine, confine
+from tests.hostile.surroundings import names_of, strays
+from tests.hostile.watch import keep_inside, tell, watch
 
 CPU_LIMIT_S = 10  # of a case
 WALL_LIMIT_S = 90.0  # on a machine that does other things too
@@ -30,34 +27,6 @@ MEMORY_LIMIT_BYTES = 2 << 30  # beyond what the libraries take
 LINE_LIMIT = 2_000  # characters
 REFUSED = 2
 BROKEN = 99  # exit status of a traceback
-
-_EXECUTING = (
-    "os.system",
-    "os.exec",
-    "os.posix_spawn",
-    "os.spawn",
-    "os.fork",
-    "os.forkpty",
-    "pty.spawn",
-    "subprocess.Popen",
-    "pickle.find_class",
-    "marshal.load",
-    "marshal.loads",
-    "ctypes.dlopen",
-    "code.__new__",
-    "function.__new__",
-    "socket.connect",
-    "socket.bind",
-    "webbrowser.open",
-    "builtins.input",
-)
-_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-_CHANGING = {  # which of its arguments an event changes
-    "os.mkdir": (0,), "os.remove": (0,), "os.rmdir": (0,), "os.truncate": (0,), "os.chmod": (0,), "os.chown": (0,),
-    "os.link": (1,), "os.symlink": (1,), "os.rename": (0, 1), "os.utime": (0,), "shutil.rmtree": (0,),
-}  # fmt: skip
-_BY_FOLDER = {"os.mkdir": 2, "os.remove": 1, "os.rmdir": 1}
-_READ_ANNOTATIONS = {inspect.__file__, typing.__file__, dataclasses.__file__, collections.__file__}
 
 
 @dataclass(frozen=True)
@@ -76,14 +45,27 @@ class Verdict:
         return self.status == REFUSED
 
 
-def judge(case: Case, folder: Path) -> Verdict:
-    """Build the case in the new ``folder``, run it, and compare what happened with the rules."""
-    inside = folder / INSIDE
+def judge(case: Case, folder: Path, names: set[str]) -> Verdict:
+    """Build the case in the new ``folder``, run it, and compare what happened with the rules.
+
+    A case that names a place outside the folder above is not run. ``names`` gains the names that a case uses.
+    """
+    inside, own = folder / INSIDE, folder.parent
+    case, beside = placed(case, inside), frozenset(os.listdir(own))
     write(folder / OUTSIDE / PRECIOUS, "years of work")
     write(folder / OUTSIDE / "step_000000000001" / "kept.txt", "years of work")
     inside.mkdir(parents=True)
     case.build(inside)
-    before = _content(folder)
+    names.update(names_of(case, inside))
+    outside = tuple(f"names a place outside: {place:.200}" for place in strays(case, inside, own))
+    verdict = Verdict(BROKEN, 0.0, 0, "not run", outside) if outside else _run(case, folder)
+    shutil.rmtree(folder, ignore_errors=True)
+    left = sorted(frozenset(os.listdir(own)) - beside)
+    return replace(verdict, faults=(*verdict.faults, *(f"left beside its folder: {name}" for name in left)))
+
+
+def _run(case: Case, folder: Path) -> Verdict:
+    inside, before = folder / INSIDE, _content(folder)
     streams = [folder.with_suffix(suffix) for suffix in (".out", ".err", ".seen")]
     child = _fork(case, inside, streams)
     beside = None if case.meanwhile is None else _fork_meanwhile(case, inside)
@@ -96,7 +78,6 @@ def judge(case: Case, folder: Path) -> Verdict:
     faults = [*_faults_of_end(case, status, out, err), *_faults_of_deeds(case, status, changed, seen)]
     for path in streams:
         path.unlink()
-    _remove(folder)
     lines = (out + err).splitlines() or [""]
     return Verdict(status, cpu_s, max(map(len, lines)), err.strip()[-LINE_LIMIT:], tuple(faults))
 
@@ -118,8 +99,10 @@ def _fork(case: Case, inside: Path, streams: list[Path]) -> int:
         os.environ.update(case.environment)
         _limit()
         own = os.path.realpath(inside) + os.sep
-        sys.addaudithook(lambda event, arguments: _watch(event, arguments, seen))
-        sys.addaudithook(lambda event, arguments: _keep_inside(event, arguments, own, seen))
+        if can_confine():
+            confine(inside)
+        sys.addaudithook(lambda event, arguments: watch(event, arguments, seen))
+        sys.addaudithook(lambda event, arguments: keep_inside(event, arguments, own, seen))
         if case.reader is not None:
             _read(case, seen)
         status = run_command(list(case.command))
@@ -149,62 +132,14 @@ def _read(case: Case, seen: int) -> None:
     except EthBrakeError as error:
         text = str(error)
         if not text.isprintable() or len(text) > LINE_LIMIT:
-            _tell(seen, f"message of {type(error).__name__}: {text!r:.200}")
+            tell(seen, f"message of {type(error).__name__}: {text!r:.200}")
     except MemoryError:
-        _tell(seen, "memory: through Python")
+        tell(seen, "memory: through Python")
     except Exception as error:
-        _tell(seen, f"python: {type(error).__name__}: {error!r:.200}")
+        tell(seen, f"python: {type(error).__name__}: {error!r:.200}")
     else:
         if case.certain:
-            _tell(seen, "python: no error")
-
-
-def _watch(event: str, arguments: tuple[object, ...], seen: int) -> None:
-    """Called by the interpreter for everything that touches the world."""
-    if event.startswith("marshal.") and sys._getframe(2).f_code.co_filename.startswith("<frozen importlib"):
-        return
-    if event in _EXECUTING or (event == "exec" and not _of_a_module(arguments[0])):
-        _tell(seen, f"executed: {event} {arguments!r:.60} by {_callers()}")
-
-
-def _keep_inside(event: str, arguments: tuple[Any, ...], own: str, seen: int) -> None:
-    """Refuse, and tell, whatever would change something outside the case's own folder, whoever runs the attack."""
-    if event == "open":
-        writes = isinstance(arguments[2], int) and arguments[2] & _WRITING
-        places = [os.path.realpath(os.fsdecode(arguments[0]))] if writes and not isinstance(arguments[0], int) else []
-    else:
-        given = [arguments[k] for k in _CHANGING.get(event, ()) if not isinstance(arguments[k], int)]
-        inside_a_folder = event in _BY_FOLDER and arguments[_BY_FOLDER[event]] != -1  # where its name is relative to
-        places = [] if inside_a_folder else [_entry(os.fsdecode(path)) for path in given]
-    for place in places:
-        if place != os.devnull and not f"{place}{os.sep}".startswith(own):
-            if not f"{place}/".startswith(("/dev/", "/proc/")):  # asked for, and impossible for everybody
-                _tell(seen, f"would have changed what is outside: {event} {place}"[:300])
-            raise PermissionError(errno.EPERM, "outside the case's folder", place)
-
-
-def _entry(path: str) -> str:
-    """A path whose last part is not followed."""
-    return os.path.join(os.path.realpath(os.path.dirname(path) or "."), os.path.basename(path))
-
-
-def _callers() -> str:
-    frame = sys._getframe(3)
-    names = []
-    while frame is not None and len(names) < 7:
-        names.append(f"{os.path.basename(frame.f_code.co_filename)}:{frame.f_lineno}")
-        frame = frame.f_back
-    return " < ".join(names)
-
-
-def _of_a_module(code: object) -> bool:
-    """Whether a code object is of a file that is imported late, or an annotation in such a file."""
-    caller = sys._getframe(3).f_code.co_filename
-    return os.path.isfile(getattr(code, "co_filename", "")) or caller in _READ_ANNOTATIONS
-
-
-def _tell(seen: int, what: str) -> None:
-    os.write(seen, (json.dumps(what) + "\n").encode())
+            tell(seen, "python: no error")
 
 
 def _fork_meanwhile(case: Case, inside: Path) -> int:
@@ -213,6 +148,8 @@ def _fork_meanwhile(case: Case, inside: Path) -> int:
         return child
     try:
         assert case.meanwhile is not None
+        if can_confine():
+            confine(inside)
         while True:
             case.meanwhile(inside)
     finally:
@@ -244,8 +181,12 @@ def _faults_of_end(case: Case, status: int, out: str, err: str) -> list[str]:
         faults.append("was unpacked before it was refused")
     if "Traceback" in err + out:
         faults.append("traceback")
+    kept = "\t" if status else "\t\N{NO-BREAK SPACE}"  # the latter stands between the numbers and units of a result
+    coloured = status == 0 and not case.environment.keys().isdisjoint(
+        ("FORCE_COLOR", "TTY_COMPATIBLE")
+    )  # as it was asked to be
     for line in (out + err).split("\n"):
-        if not line.replace("\t", " ").isprintable():
+        if not line.translate({ord(character): " " for character in kept}).isprintable() and not coloured:
             faults.append(f"a line commands the terminal: {line!r:.200}")
         if status == REFUSED and len(line) > LINE_LIMIT:
             faults.append(f"a line of {len(line)} characters")
@@ -279,7 +220,3 @@ def _content(folder: Path) -> dict[str, str]:
 
 def _changed(before: dict[str, str], after: dict[str, str]) -> list[str]:
     return [name for name in sorted(before.keys() | after.keys()) if before.get(name) != after.get(name)]
-
-
-def _remove(folder: Path) -> None:
-    shutil.rmtree(folder, ignore_errors=True)

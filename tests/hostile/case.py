@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 Build = Callable[[Path], object]
@@ -12,6 +12,7 @@ Build = Callable[[Path], object]
 INSIDE = "inside"  # of a case's folder: where the command runs
 OUTSIDE = "outside"  # beside it: what no case may touch
 PRECIOUS = "precious.txt"
+HERE = "/@here"  # in a command or a variable: the absolute path of the folder where the command runs
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,12 @@ NASTY = (
     "a\tb",
     "\u061c",
 )
+
+
+def placed(case: Case, inside: Path) -> Case:
+    """The case with the folder where its command runs in the place of ``HERE``."""
+    variables = {name: value.replace(HERE, f"{inside}") for name, value in case.environment.items()}
+    return replace(case, command=tuple(word.replace(HERE, f"{inside}") for word in case.command), environment=variables)
 
 
 def write(path: Path, content: bytes | str) -> None:

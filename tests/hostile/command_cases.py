@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.hostile.case import NASTY, OUTSIDE, PRECIOUS, Build, Case, write
+from tests.hostile.case import HERE, NASTY, OUTSIDE, PRECIOUS, Build, Case, write
 from tests.hostile.yaml_parts import SPECS
 
 FEW = ("--episodes", "3")
@@ -30,7 +31,7 @@ NUMBERS = (
 WORDS = (
     "",
     "x" * 9000,
-    "/",
+    f"{HERE}/",
     "..",
     "a/../../b",
     "a\0b",
@@ -55,15 +56,15 @@ VARIABLES = (
     {"NO_COLOR": ""},
     {"FORCE_COLOR": "1"},
     {"TTY_COMPATIBLE": "1"},
-    {"TMPDIR": "/proc/nowhere"},
-    {"TMPDIR": "/dev/null"},
-    {"HOME": "/proc/nowhere"},
-    {"NUMBA_CACHE_DIR": "/dev/null/x"},
+    {"TMPDIR": f"{HERE}/file/x"},
+    {"TMPDIR": f"{HERE}/file"},
+    {"HOME": f"{HERE}/file/x"},
+    {"NUMBA_CACHE_DIR": f"{HERE}/file/x"},
     {"MPLBACKEND": "nonsense"},
     {"NUMBA_NUM_THREADS": "x"},
     {"OMP_NUM_THREADS": "-1"},
-    {"MPLCONFIGDIR": "/dev/null"},
-    {"PWD": "/proc/nowhere"},
+    {"MPLCONFIGDIR": f"{HERE}/file"},
+    {"PWD": f"{HERE}/nowhere"},
     {"TZ": "\x1b"},
     {"_ETHBRAKE_COMPLETE": "bash_source"},
     {"_TYPER_STANDARD_TRACEBACK": "1"},
@@ -76,9 +77,10 @@ def _taken(folder: Path) -> None:
     (folder / "link").symlink_to(f"../../{OUTSIDE}/{PRECIOUS}")
     (folder / "dangling").symlink_to("nowhere")
     (folder / "loop").symlink_to("loop")
+    os.mkfifo(folder / "pipe")
 
 
-# Places where nothing can be written, not even by the superuser: no case may write outside its own folder.
+# Places below the case's own folder where nothing can be written, not even by the superuser.
 TARGETS = (
     "file",
     "file/x",
@@ -86,9 +88,9 @@ TARGETS = (
     "link",
     "dangling",
     "loop",
-    "/dev/null",
-    "/dev/null/x",
-    "/proc/x",
+    "pipe",
+    "pipe/x",
+    f"{HERE}/loop/x",
     "x" * 300,
     "\0b",
 )
@@ -166,7 +168,7 @@ def _variables() -> Iterator[Case]:
             "command",
             "environment",
             ("evaluate", "--agents", "coast,full_brake", *FEW),
-            lambda folder: None,
+            lambda folder: write(folder / "file", "precious"),
             certain=False,
             environment=variables,
         )
@@ -174,7 +176,7 @@ def _variables() -> Iterator[Case]:
             "command",
             "environment, error",
             ("evaluate", "--agents", "ppo@\x1b[2J"),
-            lambda folder: None,
+            lambda folder: write(folder / "file", "precious"),
             environment=variables,
         )
 

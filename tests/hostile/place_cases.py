@@ -17,7 +17,7 @@ from ethbrake_marl.policies.policy import load_policy
 from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.scenario import load_scenario, read_initial_states
 from tests.hostile.archives import good_bytes
-from tests.hostile.case import NASTY, Build, Case, write
+from tests.hostile.case import HERE, INSIDE, NASTY, OUTSIDE, Build, Case, write
 from tests.hostile.csv_cases import TABLE
 from tests.hostile.table_cases import COMMAND
 from tests.hostile.yaml_parts import RECIPE, SCENARIO
@@ -91,6 +91,10 @@ def _link(to: str) -> Callable[[Path], None]:
     return lambda path: path.symlink_to(to)
 
 
+def _link_out(path: Path) -> None:
+    path.symlink_to(next(above for above in path.parents if above.name == INSIDE).parent / OUTSIDE)
+
+
 def _loop(path: Path) -> None:
     path.symlink_to(path.name + "2")
     (path.parent / (path.name + "2")).symlink_to(path.name)
@@ -113,7 +117,7 @@ PLACES: dict[str, Callable[[Path], object]] = {
     "a link to /proc/self/mem": _link("/proc/self/mem"),
     "a link to /proc/kmsg": _link("/proc/kmsg"),
     "a link to /proc/self/fd/0": _link("/proc/self/fd/0"),
-    "a link to /etc": _link("/etc"),
+    "a link to a folder elsewhere": _link_out,
     "ten gigabytes of nothing": _giant,
     "an empty file": lambda path: path.touch(),
     "/dev/null": _link("/dev/null"),
@@ -157,7 +161,7 @@ def _turning(path: Path, right: bytes) -> Build:
 
 CHANGING = {"vanishes and comes back": _vanishing, "grows": _growing, "turns into a pipe": _turning}
 
-LONG = ("a" * 300, "a/" * 3000, "a" * 5000, "../" * 500 + "x", "/" * 5000 + "x", "é" * 200)
+LONG = ("a" * 300, "a/" * 3000, "a" * 5000, f"../{INSIDE}/" * 300 + "x", HERE + "/" * 5000 + "x", "é" * 200)
 
 
 def places(rng: random.Random) -> Iterator[Case]:
@@ -209,5 +213,5 @@ def _case(
     category: str, target: Target, build: Build, name: str, *, certain: bool = True, meanwhile: Build | None = None
 ) -> Case:
     command = target.command(name)
-    reader = None if name.startswith("--") or not name else lambda: target.reader(name)
+    reader = None if name.startswith("--") or not name else lambda: target.reader(name.replace(HERE, f"{Path.cwd()}"))
     return Case("place", category, command, build, certain=certain, reader=reader, meanwhile=meanwhile)

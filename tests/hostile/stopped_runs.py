@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
 import hashlib
 import json
+import shutil
 import signal
 import tempfile
 from pathlib import Path
@@ -36,6 +38,7 @@ SAC = {
 def stopped(algorithm: str) -> Path:
     """A training that was interrupted, with its checkpoints; it goes on for a few updates."""
     folder = Path(tempfile.mkdtemp(prefix="hostile-runs-")) / RUN
+    atexit.register(shutil.rmtree, folder.parent, ignore_errors=True)
     seen = []
 
     def measure(policy: object) -> dict[str, float]:

@@ -68,7 +68,7 @@ CERTAIN: dict[str, Callable[[random.Random], bytes]] = {
         {
             **good(),
             r.choice(
-                ("more", "first", "x" * 3000, "../../evil", "/etc/x", r.choice(NASTY), "first_harm.npy", "")
+                ("more", "first", "x" * 3000, "../../evil", "/proc/x", r.choice(NASTY), "first_harm.npy", "")
             ): np.zeros(3),
         }
     ),
@@ -216,7 +216,7 @@ CERTAIN: dict[str, Callable[[random.Random], bytes]] = {
         r.choice(
             (
                 "../pwned.npy",
-                "/tmp/pwned.npy",
+                "/proc/pwned.npy",
                 "a/../../pwned.npy",
                 "C:\\x.npy",
                 "identity.npy/",

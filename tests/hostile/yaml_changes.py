@@ -180,7 +180,7 @@ SCENARIO_ONLY: dict[str, tuple[bool, Change]] = {
                     "{uniform: [5, 9], choice: [1]}",
                     "{uniform: {low: 1}}",
                     "{choice: [[1]]}",
-                    "{normal: {mean: 7, sd: 1e-320, low: 5, high: 9}}",
+                    "{normal: {mean: 7, sd: -1e-320, low: 5, high: 9}}",
                     "{normal: {mean: 1e308, sd: 1, low: 5, high: 9}}",
                     "{choice: [7], weights: [1e999]}",
                 )

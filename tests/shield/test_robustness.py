@@ -11,6 +11,7 @@ from ethbrake_marl.figures.shield import robustness_figure, robustness_table
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield.robustness import MODES, TRUTHS, robustness
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from tests.failing_worlds import plant, without
 
 SCENARIO = load_scenario("paper-random")
 WORLDS = SCENARIO.sample(25, 3).worlds
@@ -82,3 +83,11 @@ def test_refused__nothing_to_draw_and_widths_that_are_none():
     for widths in ((), (-1.0,), (float("nan"),)):
         with pytest.raises(InvalidInput, match="widths"):
             robustness(WORLDS, make_agent("full_brake"), SCENARIO, 1, INTERVALS, widths=widths)
+
+
+def test_worlds_that_cannot_be_advanced__are_in_no_point_and_named():
+    found = robustness(plant(WORLDS, [3]), make_agent("full_brake"), SCENARIO, 1, INTERVALS, widths=(0.0, 1.0))
+    assert {point.left_out for point in found} == {((3, found[0].left_out[0][1]),)}
+    rest = WORLDS.take(without(25, [3]))
+    (expected, *_) = robustness(rest, make_agent("full_brake"), SCENARIO, 1, INTERVALS, widths=(0.0,))
+    assert found[0][:-1] == expected[:-1] and expected.left_out == ()

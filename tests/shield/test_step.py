@@ -13,7 +13,8 @@ from ethbrake_marl.figures.shield import operating_figure
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent, StepShield, StepShieldAgent, parse_uncertainty
 from ethbrake_marl.shield.certify import REASONS
-from ethbrake_marl.shield.review import operating_curve, review
+from ethbrake_marl.shield.review import operating_curves, review
+from tests.failing_worlds import plant, without
 from tests.shield.lines import ADVERSARIES, attack, line
 
 pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
@@ -221,7 +222,11 @@ def test_agent__what_is_no_number_is_replaced_and_told(capacity):
 
 def test_operating_curve__fewer_interventions_cost_harm():
     worlds = WORLDS.take(np.arange(60))
-    points = operating_curve(worlds, make_agent("coast"), SCENARIO, 1, [0.0, 20.0, 1e6])
+    done = []
+    points = operating_curves(
+        worlds, {"coast": make_agent("coast")}, SCENARIO, 1, [0.0, 20.0, 1e6], on_progress=done.append
+    )["coast"]
+    assert done == ["coast"]
     rates, harms = [p.intervention_rate for p in points], [p.harm for p in points]
     assert rates == sorted(rates, reverse=True) and rates[-1] == 0.0
     assert harms == sorted(harms) and harms[0] < harms[-1]
@@ -230,6 +235,16 @@ def test_operating_curve__fewer_interventions_cost_harm():
     assert line_drawn.get_xdata().tolist() == rates
     with pytest.raises(InvalidInput, match="at least one point"):
         operating_figure([])
+
+
+def test_operating_curve__leaves_worlds_out_that_cannot_be_advanced_and_names_them():
+    agents = {"coast": make_agent("coast"), "brake": make_agent("full_brake")}
+    found = operating_curves(plant(WORLDS.take(np.arange(9)), [2, 6]), agents, SCENARIO, 1, [0.0, 20.0])
+    rest = operating_curves(WORLDS.take(without(9, [2, 6])), agents, SCENARIO, 1, [0.0, 20.0])
+    for name in agents:
+        assert [[world for world, _ in point.left_out] for point in found[name]] == [[2, 6]] * 2
+        assert [point[:-1] for point in found[name]] == [point[:-1] for point in rest[name]]
+        assert rest[name][0].left_out == ()
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.ablation import change_figure, harm_curve, who_pays
@@ -31,7 +32,7 @@ def markdown(found: Json, conditions: str) -> str:
     """All tables, with their conditions below."""
     blocks = ["## Levels", *[_levels(found["levels"], harm_count) for harm_count in HARM_COUNTS]]
     worlds = found["levels"][0]["first"]["searched"]["worlds"]
-    blocks += [f"## How near the joint optimum, in the first {worlds:,} worlds"]
+    blocks += [f"## How near the joint optimum, in the first {count_of(worlds, 'world')}"]
     blocks += [_optima(found["levels"], harm_count) for harm_count in HARM_COUNTS]
     for title, key in (("What each step is worth", "steps"), ("Price of lost messages", "channels")):
         if found[key]:
@@ -90,12 +91,13 @@ def lines_markdown(found: Sequence[LineResult], question: LineQuestion, runs: in
     name = question.scenario.name
     conditions = (
         f"{_HARM[question.harm_count].capitalize()} (m²/s², means per world) of the line of {name} made longer:"
-        f" {runs} {'policies' if runs > 1 else 'policy'}, {question.episodes:,} worlds of seed {question.list_seed} for"
-        f" each length; {interval_words(runs)}."
+        f" {runs} {'policies' if runs > 1 else 'policy'}, {count_of(question.episodes, 'world')} of seed"
+        f" {question.list_seed} for each length; {interval_words(runs)}."
     )
     if question.search_episodes:
         conditions += (
-            f" Best known and share: the first {question.search_episodes} worlds, {question.budget:,} candidates each."
+            f" Best known and share: the first {count_of(question.search_episodes, 'world')},"
+            f" {question.budget:,} candidates each."
         )
     return f"{_table(head, rows, left=1)}\n\n{conditions}\n"
 
@@ -220,8 +222,8 @@ def _conditions(plan: Plan, machine: str) -> str:
     )
     return (
         f"{recipes}; {plan.seeds} {'seeds' if plan.seeds > 1 else 'seed'}, {plan.steps_per_learner:,} decisions of each"
-        f" learner. Harms are means per world in m²/s² on the same {plan.episodes:,} worlds of seed {plan.list_seed} at"
-        f" every level; {interval_words(plan.seeds)}. Joint optimum: the least harm known that the level's learners can"
-        f" do, and everything beside it, in the first {plan.search_episodes:,} of these worlds, {plan.budget:,}"
-        f" candidates per world and count. {machine}."
+        f" learner. Harms are means per world in m²/s² on the same {count_of(plan.episodes, 'world')} of seed"
+        f" {plan.list_seed} at every level; {interval_words(plan.seeds)}. Joint optimum: the least harm known that"
+        f" the level's learners can do, and everything beside it, in the first {plan.search_episodes:,} of these"
+        f" worlds, {plan.budget:,} candidates per world and count. {machine}."
     )
