@@ -12,21 +12,31 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Vehicles
 from ethbrake_marl.physics.compiled import compiled
 
+LARGEST = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # one float32 step beyond 1 is rounding, and means 1
+
 
 def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Floats:
-    """The action as float64, refused with ``InvalidInput`` unless it has ``shape`` and lies in [-1, 1]."""
+    """The action as float64 of ``shape``, refused with ``InvalidInput`` unless it fits there and lies in [-1, 1].
+
+    Axes of length 1 may be missing or added: a single action may come as a number, as [1] or as [1, 1]. One float32
+    step beyond -1 or 1, which a network's last rounding can give, is -1 or 1.
+    """
     try:
         if np.iscomplexobj(action):
             raise TypeError
         given = np.asarray(action, dtype=np.float64)
     except (TypeError, ValueError):
         raise InvalidInput(f"action of {names}: {action!r} is not a number; one in [-1, 1] is needed") from None
-    if given.shape != shape:
+    if given.shape != shape and _longer_axes(given.shape) != _longer_axes(shape):
         raise InvalidInput(f"action of {names}: shape {given.shape}; {shape} is needed")
-    good = (given >= -1.0) & (given <= 1.0)
+    good = (given >= -LARGEST) & (given <= LARGEST)
     if not good.all():
         raise InvalidInput(f"action of {names}: {float(given[~good].flat[0])!r}; must be in [-1, 1]")
-    return given
+    return given.reshape(shape).clip(-1.0, 1.0)
+
+
+def _longer_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(length for length in shape if length != 1)
 
 
 def action_to_command(action: Floats, vehicles: Vehicles, vehicle: int) -> Floats:

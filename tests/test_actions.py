@@ -8,7 +8,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import make_worlds
 
 
-@pytest.mark.parametrize("value", [-1.0000001, 1.0000000000000002, 2.0, np.nan, np.inf])
+@pytest.mark.parametrize("value", [-1.0000003, 1.0000001193, 2.0, np.nan, np.inf])
 def test_action__beyond_the_bounds_is_told_in_digits_that_show_it(value):
     with pytest.raises(InvalidInput) as caught:
         checked_action([0.5, value], (2,), "vehicle_2")
@@ -17,6 +17,25 @@ def test_action__beyond_the_bounds_is_told_in_digits_that_show_it(value):
 
 def test_action__at_the_bounds_is_taken():
     assert checked_action([-1, 1], (2,), "vehicle_2").tolist() == [-1.0, 1.0]
+
+
+@pytest.mark.parametrize("beyond", [np.nextafter(np.float32(1), np.float32(2)), 1.0000000000000002])
+def test_action__one_float32_step_beyond_the_bounds_is_at_them(beyond):
+    assert checked_action([-beyond, beyond, 0.5], (3,), "vehicle_2").tolist() == [-1.0, 1.0, 0.5]
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
+def test_action__a_single_one_may_have_any_axes_of_length_1(shape):
+    for needed in [(1,), (1, 1)]:
+        assert checked_action(np.full(shape, 0.25), needed, "vehicle_2").tolist() == np.full(needed, 0.25).tolist()
+
+
+@pytest.mark.parametrize(
+    ("shape", "needed"), [((2,), (1,)), ((0,), (1,)), ((2, 3), (3, 2)), ((6,), (3, 2)), ((), (2,))]
+)
+def test_action__of_another_shape_is_refused(shape, needed):
+    with pytest.raises(InvalidInput, match=r"action of vehicle_2: shape \("):
+        checked_action(np.zeros(shape), needed, "vehicle_2")
 
 
 def test_action__is_linear_on_each_side_of_coasting_and_back():

@@ -300,12 +300,9 @@ class Engine:
                 self._wanted[:, vehicle] = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
         before = self._objective_harm() if self._objectives else None
         reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
-        world, status = step_worlds(
-            self._state, self._params, self._clock, columns, self._learner_index, self._settings, NO_ROWS,
-            self._wanted, reward, outcome,
-        )  # fmt: skip
-        if status == BAD_ACTION:
-            self._refuse(world, columns)
+        status = self._step_worlds(columns, reward, outcome)
+        if status == BAD_ACTION:  # nothing was moved
+            status = self._step_worlds(self._in_range(columns), reward, outcome)
         step = Step(reward, outcome, self.reward, {})
         if status != DONE:
             times = self._state[:, 0]
@@ -331,10 +328,17 @@ class Engine:
             columns[:, c] = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
         return columns
 
-    def _refuse(self, world: int, actions: Floats) -> None:
-        for c, vehicle in enumerate(self.learners):
-            checked_action(actions[:, c], (self.n,), f"vehicle_{vehicle + 1}")
-        raise AssertionError(f"world {world}: an action was refused, and then not")
+    def _step_worlds(self, columns: Floats, reward: Floats, outcome: Floats) -> int:
+        _, status = step_worlds(
+            self._state, self._params, self._clock, columns, self._learner_index, self._settings, NO_ROWS,
+            self._wanted, reward, outcome,
+        )  # fmt: skip
+        return status
+
+    def _in_range(self, columns: Floats) -> Floats:
+        """The actions [n, L] without the last rounding of a float32; ``InvalidInput`` for one out of range."""
+        each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
+        return np.stack(each, axis=1)
 
     def _objective_harm(self) -> Floats:
         """What the objective of each vehicle makes of the harm so far, [n, N]."""

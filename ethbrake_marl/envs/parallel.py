@@ -1,18 +1,19 @@
-"""PettingZoo's interface: every vehicle of one world is an agent, to the collective end."""
+"""PettingZoo's interface: the vehicles of one world are agents, to the collective end."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.infos import Report, plain_infos, report
 from ethbrake_marl.envs.setup import (
+    AnyScenario,
     action_box,
     check_render_mode,
     feature_box,
@@ -22,12 +23,13 @@ from ethbrake_marl.envs.setup import (
     restart,
 )
 from ethbrake_marl.envs.state import full_state, state_features
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.observations import Observations, ObservationSpec
+from ethbrake_marl.physics import Ints
 from ethbrake_marl.rewards import Reward
-from ethbrake_marl.scenario import Scenario
 
 Infos = dict[str, dict[str, Any]]
+WhoIsAgent = Literal["all", "learners"]
 
 
 class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
@@ -35,7 +37,9 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
 
     Learners need an action [1] in [-1, 1] in each step: -1 full braking capacity, 0 coasts, +1 full driving capacity.
     Scripted vehicles observe, are rewarded and get infos too; what is passed for them is ignored, and
-    ``infos[agent]["chosen_action"]`` shows what their script did. All agents end together: terminated when all are
+    ``infos[agent]["chosen_action"]`` shows what their script did. With ``agents="learners"`` only learners are agents:
+    for trainers that learn from every agent. ``max_cycles`` truncates an episode after so many steps, if it is not
+    over before. All agents end together: terminated when all are
     at rest and no command would move one, truncated at the horizon. ``state()`` is the full state for centralised
     critics. Observations, rewards, infos and ``reset``: as for ``EthBrakeEnv``; any number of ``learners``.
     """
@@ -44,19 +48,24 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
 
     def __init__(
         self,
-        scenario: str | Path | Scenario = "paper-random",
+        scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str | int] | None = None,
         reward: Reward = "harm",
         observation: ObservationSpec | None = None,
+        agents: WhoIsAgent = "all",
+        max_cycles: int | None = None,
     ) -> None:
         check_render_mode(render_mode)
-        self.render_mode = render_mode
+        if max_cycles is not None:
+            check_whole_number("max_cycles", max_cycles, 1)
+        self.render_mode, self.max_cycles = render_mode, max_cycles
         self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
-        self.possible_agents = list(self.engine.scenario.vehicle_names)
+        names = self.engine.scenario.vehicle_names
+        self._learners = [names[i] for i in self.engine.learners]
+        self._vehicles = _agent_vehicles(self.engine, agents)
+        self.possible_agents = [names[i] for i in self._vehicles.tolist()]
         self.agents: list[str] = []
-        self._learners = [self.possible_agents[i] for i in self.engine.learners]
-        self._vehicles = np.arange(len(self.possible_agents))
         features = self.engine.observation.features
         self.observation_spaces = {agent: feature_box(features) for agent in self.possible_agents}
         self.action_spaces = {agent: action_box() for agent in self.possible_agents}
@@ -90,8 +99,10 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         self._check_agents(actions)
         step = self.engine.step(learner_columns(self._learners, actions))
         agents = self.possible_agents
-        (rewards,) = step.reward.tolist()
+        (rewards,) = step.reward.take(self._vehicles, axis=1).tolist()
         terminated, truncated = step.ending(0)
+        if self.max_cycles is not None and not terminated:
+            truncated = truncated or int(self.engine.steps[0]) >= self.max_cycles
         infos = self._infos(report(self.engine, step))
         if terminated or truncated:
             self.agents = []
@@ -122,7 +133,20 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         return {agent: every[0, i] for i, agent in enumerate(self.possible_agents)}
 
     def _infos(self, told: Report) -> Infos:
-        return dict(zip(self.possible_agents, plain_infos(told), strict=True))
+        return dict(zip(self.possible_agents, plain_infos(told, self._vehicles), strict=True))
+
+
+def _agent_vehicles(engine: Engine, agents: WhoIsAgent) -> Ints:
+    """Indices of the vehicles that are agents."""
+    if agents not in get_args(WhoIsAgent):
+        raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
+    if agents == "all":
+        return np.arange(engine.scenario.vehicles)
+    if not engine.learners:
+        raise InvalidInput(
+            f"agents = 'learners': nobody learns in {engine.scenario.name!r}; name learners, or take 'all'"
+        )
+    return np.array(engine.learners)
 
 
 parallel_env = EthBrakeParallelEnv

@@ -11,9 +11,11 @@ PETTINGZOO_ID = "ethbrake/ethbrake-v0"
 
 def register_environments() -> None:
     """Register every id that is not registered yet; calling it again changes nothing."""
-    if GYMNASIUM_ID not in gymnasium.registry:
+    for id_ in (GYMNASIUM_ID, f"ethbrake/{GYMNASIUM_ID}"):
+        if id_ in gymnasium.registry:
+            continue
         gymnasium.register(
-            GYMNASIUM_ID,
+            id_,
             entry_point="ethbrake_marl.envs.single:EthBrakeEnv",
             vector_entry_point="ethbrake_marl.envs.vector:EthBrakeVectorEnv",
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -18,6 +17,7 @@ from ethbrake_marl.engine.step import Step
 from ethbrake_marl.envs.infos import Report, plain_infos, report
 from ethbrake_marl.envs.setup import (
     INITIAL_STATE,
+    AnyScenario,
     action_box,
     check_seed,
     feature_box,
@@ -32,14 +32,14 @@ from ethbrake_marl.observations import Feature, Observations, ObservationSpec
 from ethbrake_marl.physics import Bools, Ints, Worlds, concatenate
 from ethbrake_marl.physics.rows import Packed, unpack
 from ethbrake_marl.rewards import Reward
-from ethbrake_marl.scenario import Scenario, initial_state_worlds
+from ethbrake_marl.scenario import initial_state_worlds
 
 Rewards = NDArray[np.float32]
 Appended = Literal["number", "state"]
 
 
 def make_sb3_vec_env(
-    scenario: str | Path | Scenario,
+    scenario: AnyScenario,
     n_envs: int,
     seed: int | None = 0,
     learners: Sequence[str | int] | None = None,
@@ -127,7 +127,7 @@ class EthBrakeVecEnv(VecEnv):
             raise InvalidInput("step: no episode is running; call reset first")
         actions, self._actions = self._actions, None
         engine, learners = self.engine, self._learners
-        if actions.shape != (self.num_envs, 1):
+        if actions.size != self.num_envs:
             raise InvalidInput(
                 f"step: actions of shape {actions.shape}; one for each row, ({self.num_envs}, 1), is needed"
             )

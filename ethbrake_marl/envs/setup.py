@@ -19,6 +19,8 @@ from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
 
+AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping: what a file would say
+
 
 def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
     """Float32 box [F] with the features' bounds, which are finite."""
@@ -32,7 +34,7 @@ def action_box() -> Box[np.float32]:
 
 
 def make_engine(
-    scenario: str | Path | Scenario,
+    scenario: AnyScenario,
     n: int,
     *,
     learners: Sequence[str | int] | None = None,
@@ -40,13 +42,16 @@ def make_engine(
     observation: ObservationSpec | None = None,
     seed: int = 0,
 ) -> Engine:
-    """Build ``n`` running worlds of a scenario (a shipped name, a path to a YAML file, or a ``Scenario``).
+    """Build ``n`` running worlds of a scenario: a shipped name, a path to a YAML file, its content, or a ``Scenario``.
 
     ``learners`` (names such as ``vehicle_2``, or indices from 0) replace the scenario's own; a vehicle that learned
     and is not listed brakes fully. Scripts come from the scenario's roles.
     """
     check_whole_number("number of worlds", n, 1)
-    loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    if isinstance(scenario, Mapping):
+        loaded = Scenario(**scenario)
+    else:
+        loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     if observation is not None and not isinstance(observation, ObservationSpec):
         raise InvalidInput(
             f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1)"

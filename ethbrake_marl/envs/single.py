@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.envs.infos import plain_infos, report
 from ethbrake_marl.envs.setup import (
+    AnyScenario,
     action_box,
     check_render_mode,
     check_seed,
@@ -24,7 +24,6 @@ from ethbrake_marl.envs.setup import (
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations, ObservationSpec
 from ethbrake_marl.rewards import Reward
-from ethbrake_marl.scenario import Scenario
 
 
 class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
@@ -42,7 +41,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
     def __init__(
         self,
-        scenario: str | Path | Scenario = "paper-random",
+        scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str | int] | None = None,
         reward: Reward = "harm",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.engine.step import Step
 from ethbrake_marl.envs.infos import batch_info, report
 from ethbrake_marl.envs.setup import (
+    AnyScenario,
     action_box,
     check_render_mode,
     check_seed,
@@ -26,7 +26,6 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations, ObservationSpec
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.rewards import Reward
-from ethbrake_marl.scenario import Scenario
 
 _MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 
@@ -44,7 +43,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     def __init__(
         self,
         num_envs: int = 1,
-        scenario: str | Path | Scenario = "paper-random",
+        scenario: AnyScenario = "paper-random",
         render_mode: str | None = None,
         learners: Sequence[str | int] | None = None,
         reward: Reward = "harm",
