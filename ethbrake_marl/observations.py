@@ -29,6 +29,7 @@ from ethbrake_marl.physics.rows import (
     TIME,
     command_at,
     gap_at,
+    has_news,
     pack,
     params_at,
     speed_at,
@@ -197,15 +198,15 @@ def _observe_rows(  # noqa: C901
     speed, command, gap_column = speed_at(N), command_at(N), gap_at(N)
     hit = gap_column + N - 1
     braking, driving, latency, mass = params_at(0, N), params_at(1, N), params_at(2, N), params_at(3, N)
-    news, obstacle = params_at(5, N), state_width(N)
-    by_link, some_obstacle = params.shape[1] > news, state.shape[1] > obstacle
-    own_part, to_next = (news, N + 1) if by_link else (latency, 1)  # of vehicle j's latency: own_part + j * to_next
+    news, obstacle = params_at(6, N), state_width(N)
+    by_link, some_obstacle = has_news(params, N), state.shape[1] > obstacle
+    own_part = params_at(5, N) if by_link else latency  # of vehicle j's latency: own_part + j
     value = np.zeros(out.shape[2])
     for k in range(out.shape[0]):
         time = state[k, TIME]
         for o in range(observers.shape[0]):
             i = observers[o]
-            own_speed, own_latency = state[k, speed + i], max(params[k, own_part + i * to_next] - time, 0.0)
+            own_speed, own_latency = state[k, speed + i], max(params[k, own_part + i] - time, 0.0)
             own_stop = stopping_distance(own_speed, own_latency, params[k, braking + i])
             value[0] = own_speed
             value[1] = state[k, command + i]
@@ -227,7 +228,7 @@ def _observe_rows(  # noqa: C901
                     gap += state[k, gap_column + p]
                 in_front = j < i
                 other_speed = state[k, speed + j]
-                other_latency = max(params[k, own_part + j * to_next] - time, 0.0)
+                other_latency = max(params[k, own_part + j] - time, 0.0)
                 other_stop = stopping_distance(other_speed, other_latency, params[k, braking + j])
                 room = gap + other_stop if in_front else other_stop - gap
                 value[c] = 1.0

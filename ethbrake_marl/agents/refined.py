@@ -11,7 +11,7 @@ from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.protocol import Agent, check_agent, place, recall
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, introduce, scripted
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import check_whole_number
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
@@ -51,8 +51,7 @@ class Rehearsed(AgentAround):
     ) -> None:
         check_agent(policy, "rehearsed")
         for name, number in (("rehearsals", rehearsals), ("rounds", rounds)):
-            if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= 10_000:
-                raise InvalidInput(f"rehearsed: {name} = {number!r}: must be a whole number in 1..10000")
+            check_whole_number(f"rehearsed: {name}", number, 1, 10_000)
         check_harm_count(harm_count)
         super().__init__(policy, f"{policy.name}+refined")
         self.scenario = scenario

@@ -36,14 +36,17 @@ from ethbrake_marl.physics.rows import (
     Packed,
     command_at,
     gap_at,
+    has_news,
     has_obstacle,
     ledger_columns,
     obstacle_ledger_columns,
+    own_latency_and_news,
     pack,
     params_at,
     previous_at,
     speed_at,
     unpack,
+    with_news_columns,
     with_obstacle_columns,
 )
 from ethbrake_marl.physics.segment import DONE
@@ -57,7 +60,6 @@ from ethbrake_marl.rewards import (
     weighted_sum,
 )
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.v2x import known_from, told_by_link
 
 Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 
@@ -96,6 +98,7 @@ class Engine:
     _wanted: Floats  # [n, N] m/s2
     _potential: Floats  # [n, N]
     _obstacle: bool  # the rows have columns of an obstacle
+    _by_link: bool  # ... of news by link
 
     def __init__(
         self,
@@ -172,8 +175,8 @@ class Engine:
 
     @property
     def known_from_s(self) -> Floats:
-        """When vehicle i has (had, or will have) the news of vehicle j, [n, N, N]; see ``v2x.known_from``."""
-        return known_from(self.worlds.vehicles)
+        """From when on vehicle i acts on news of vehicle j, [n, N, N]: ``known_from_s`` of the worlds' vehicles."""
+        return own_latency_and_news(self._params, self.scenario.vehicles)[1]
 
     @property
     def ended(self) -> Bools:
@@ -210,7 +213,6 @@ class Engine:
         """
         if worlds is not None:
             check_alert(worlds, self.n, self.scenario.vehicles)
-            worlds = told_by_link(worlds) if self.scenario.v2x.by_link else worlds
         stream = copy.copy(self._stream)
         if seed is not None:
             stream.restart(seed)
@@ -219,7 +221,8 @@ class Engine:
         new = copy.copy(self)
         new._stream, new.roster = stream, Roster(self.n, stream.seed, first)
         new._obstacle = self.scenario.has_obstacle or has_obstacle(start.packed.state, self.scenario.vehicles)
-        new._state, new._params = new._kept(start.packed.state).copy(), start.packed.params.copy()
+        new._by_link = self.scenario.v2x.by_link or has_news(start.packed.params, self.scenario.vehicles)
+        new._state, new._params = (array.copy() for array in new._kept(start.packed))
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
         new._potential = np.zeros(start.wanted.shape)
         new._begin(np.arange(self.n), start)
@@ -248,16 +251,17 @@ class Engine:
         position = self._stream.position
         start = self._stream.take(len(rows))
         self.roster.renew(rows, position)
-        state, params = start.packed
-        if params.shape[1] < self._params.shape[1]:  # worlds that were given have news by link, those of the stream not
-            params = pack(told_by_link(unpack(start.packed))).params
-        self._state[rows], self._params[rows] = self._kept(state), params
+        self._state[rows], self._params[rows] = self._kept(start.packed)
         self._clock[rows], self._wanted[rows] = start.clock, start.wanted
         self._begin(rows, start)
 
-    def _kept(self, state: Floats) -> Floats:
-        """Rows as wide as they are kept: with an obstacle's columns if the stream or the given worlds have one."""
-        return with_obstacle_columns(state, self.scenario.vehicles) if self._obstacle else state
+    def _kept(self, packed: Packed) -> Packed:
+        """Rows as wide as they are kept: with columns of an obstacle, and of news by link, if the first had such."""
+        (state, params), N = packed, self.scenario.vehicles
+        return Packed(
+            with_obstacle_columns(state, N) if self._obstacle else state,
+            with_news_columns(params, N) if self._by_link else params,
+        )
 
     def observe(self, vehicle: int) -> Observations:
         """Current observation of one vehicle, [n, F]."""
@@ -402,10 +406,10 @@ class Engine:
         early = {i: script for i, script in self._remembering.items() if i not in self.deciders}
         if not early:
             return
-        self._state[rows] = self._kept(pack(alert).state)
+        self._state[rows] = self._kept(pack(alert)).state
         worlds = self.worlds
         for vehicle, script in early.items():
             wanted = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
             self._wanted[rows, vehicle] = wanted[rows]
         with renumbered(rows):
-            self._state[rows] = self._kept(moved(alert, self._wanted[rows], start_s).state)
+            self._state[rows] = self._kept(moved(alert, self._wanted[rows], start_s)).state

@@ -3,8 +3,8 @@
 After a reset: ``time_s``, ``command_in_force_mps2`` (in force now; 0 until the latency has elapsed), the vehicle's
 share of the harm so far under both counts, the same for the whole world, and whether anything has collided. After a
 step also ``chosen_command_mps2``, ``chosen_action`` (the vehicle's command as an action, whoever chose it), and the
-reward terms before their weights. Where the scenario has a ``v2x`` channel, always also ``known_from_s`` [N]: since
-when this vehicle has the news of each other one (infinite: never; its own: 0).
+reward terms before their weights. Where the scenario has a ``v2x`` channel, always also ``known_from_s`` [N]: from
+when on this vehicle acts on news of each one (infinite: never; of itself: its latency).
 """
 
 from __future__ import annotations
@@ -20,8 +20,15 @@ from ethbrake_marl.engine.step import Step
 from ethbrake_marl.harm import front_share
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.rows import TIME, command_at, harm_at, params_at, state_width
-from ethbrake_marl.scenario.v2x import news_of
+from ethbrake_marl.physics.rows import (
+    TIME,
+    command_at,
+    harm_at,
+    has_news,
+    own_latency_and_news,
+    params_at,
+    state_width,
+)
 
 AT_ANY_TIME = (
     "time_s",
@@ -51,8 +58,8 @@ def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -
         state, params, wanted = (array.take(rows, axis=0) for array in (state, params, wanted))
     values = np.empty((*wanted.shape, len(AFTER_A_STEP)))
     _report_rows(state, params, wanted, values)
-    news = params[:, params_at(5, wanted.shape[1]) :]
-    return Report(values, step, news_of(news) if news.shape[1] else None)
+    N = wanted.shape[1]
+    return Report(values, step, own_latency_and_news(params, N)[1] if has_news(params, N) else None)
 
 
 @compiled

@@ -19,6 +19,7 @@ from ethbrake_marl.observations import (
     observe,
 )
 from ethbrake_marl.physics import Worlds
+from ethbrake_marl.physics.worlds import known_at_once
 from ethbrake_marl.scenario import Scenario
 
 _OWN_ONLY = ObservationSpec(front=0, rear=0)
@@ -46,7 +47,8 @@ def state_features(scenario: Scenario) -> tuple[Feature, ...]:
 
 def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
     """State of every world, [n, S] float32 in its own memory; S = 7 N + 2 P + 1, and 2 more with an obstacle ahead."""
-    whole_latency = replace(worlds.vehicles, known_from_s=np.empty((worlds.n, 0)))  # with what a channel has drawn
+    latency = worlds.vehicles.latency_s  # whole, with what a channel has drawn
+    whole_latency = replace(worlds.vehicles, own_latency_s=latency, known_from_s=known_at_once(latency))
     vehicles = [observe(replace(worlds, vehicles=whole_latency), i, _OWN_ONLY) for i in range(worlds.N)]
     pair_values = {"gap": worlds.gaps_m, "hit": worlds.pair_hit.astype(np.float64)}
     columns = [pair_values[f.name][:, p] for p in range(worlds.N - 1) for f in _PAIR_FEATURES]

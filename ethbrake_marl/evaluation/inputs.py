@@ -15,7 +15,7 @@ from ethbrake_marl.agents.registry import current_spelling, make_agent, make_sin
 from ethbrake_marl.agents.rollout import introduce, scripted
 from ethbrake_marl.agents.spelling import AgentSpec, parse_spec
 from ethbrake_marl.agents.team import Driver, Team, team_of
-from ethbrake_marl.errors import InvalidInput, OldSpelling, unknown_name
+from ethbrake_marl.errors import InvalidInput, OldSpelling, check_one_learner, unknown_name
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
@@ -67,12 +67,8 @@ def load_driven(name_or_path: str, vehicle: str | None) -> Scenario:
     scenario = load_runnable(name_or_path)
     if vehicle is not None:
         return scenario.with_learners([vehicle])
-    if len(scenario.learners) != 1:
-        learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "none"
-        raise InvalidInput(
-            f"scenario {scenario.name!r} has {len(scenario.learners)} learners ({learners}); say which vehicle is"
-            " driven, for instance --vehicle vehicle_2"
-        )
+    learners = [scenario.vehicle_names[i] for i in scenario.learners]
+    check_one_learner(scenario.name, learners, "say which vehicle is driven, for instance --vehicle vehicle_2")
     return scenario
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ethbrake_marl.engine.snapshot import Arrays
+from ethbrake_marl.engine.snapshot import Arrays, with_own_latency
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.files.arrays import ArrayHeader, ArrayRow, check_arrays
 from ethbrake_marl.learning.algorithms.protocol import Algorithm
@@ -23,9 +23,10 @@ from ethbrake_marl.learning.model_state import REPLAY, Model
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.team import Trained, drivers_of
 
-_SCRIPT = "environment.engine.script."
-_MAY_BE_INFINITE = ("environment.engine.state", "environment.engine.params")  # no obstacle; news that never comes
-_STREAM = "environment.engine.stream"
+_ENGINE = "environment.engine."
+_SCRIPT = f"{_ENGINE}script."
+_MAY_BE_INFINITE = (f"{_ENGINE}state", f"{_ENGINE}params")  # no obstacle; news that never comes
+_STREAM = f"{_ENGINE}stream"
 _DRAWN_LIMIT = 1 << 53  # worlds
 
 
@@ -51,9 +52,10 @@ def check_fits(folder: Path, state: TrainingState, model: Model, algorithm: Algo
         ) from None
 
 
-def _check_arrays(arrays: Arrays, model: Model, algorithm: Algorithm) -> None:
+def _check_arrays(kept: Arrays, model: Model, algorithm: Algorithm) -> None:
     environment: Any = model.env
     environment.reset()
+    arrays = dict(with_own_latency(kept, environment.engine.scenario.vehicles, _ENGINE))
     rows = [_row(f"policy.{name}", tensor.numpy()) for name, tensor in model.policy.state_dict().items()]
     rows += [_row(name, tensor.numpy()) for name, tensor in algorithm.learned_beside(model).items()]
     for name, optimizer in algorithm.optimizers(model).items():

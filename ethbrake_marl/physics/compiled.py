@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-import numpy as np
 from numba.core import config as numba_config
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import check_whole_number
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -86,8 +85,7 @@ def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Resu
     The first part is done by the caller's own thread, so 1 thread means no others. If parts fail, the error of the
     first of them is raised after all have ended. Raises ``InvalidInput`` unless ``threads`` is a whole number >= 1.
     """
-    if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or not threads >= 1:
-        raise InvalidInput(f"threads = {threads!r}: must be a whole number, at least 1")
+    check_whole_number("threads", threads, 1)
     parts = min(int(threads), n)
     if parts <= 1:
         return [work(slice(0, n))]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import GAP, MASS
 from ethbrake_marl.physics.segment import HIT
-from ethbrake_marl.physics.worlds import Bools, Floats, Vehicles, Worlds
+from ethbrake_marl.physics.worlds import Bools, Floats, Vehicles, Worlds, vehicles_at_once
 
 UNMOVABLE_T = math.inf
 FAR_AWAY_M = 1e300  # stands for no obstacle where others of a batch have one: nothing comes near, no bit changes
@@ -31,14 +31,13 @@ def obstacle_ahead(worlds: Worlds) -> Bools:
 def with_obstacle(worlds: Worlds) -> Worlds:
     """These worlds, all with an obstacle ahead, with that obstacle as vehicle 0 and every other vehicle one later."""
     vehicles = worlds.vehicles
-    written_out = Vehicles(
+    written_out = vehicles_at_once(  # inside the physics nobody observes
         ahead(0.0, vehicles.braking_capacity_mps2),
         ahead(0.0, vehicles.driving_capacity_mps2),
         ahead(0.0, vehicles.latency_s),
         ahead(UNMOVABLE_T, vehicles.mass_t),
         ahead(0.0, vehicles.speed_limit_mps),
         vehicles.restitution,
-        np.empty((worlds.n, 0)),
     )
     return Worlds(
         written_out,

@@ -8,8 +8,9 @@ Columns, for N vehicles and P = N - 1 pairs; the ``_at`` functions give the firs
 state   time, speeds N, commands in force N, commands in force before N, gaps P, hit flags P; and since the
         episode began: first-impact harm P, total harm P, impacts P; and, where worlds have an obstacle ahead: gap to it
         (infinite: none), hit flag, and since the episode began: first-impact harm, total harm, impacts
-params  restitution, braking N, driving N, latency N, mass N, speed limit N; and, where it is told, when vehicle i has
-        the news of vehicle j, and the own parts of latencies, N * N columns (``Vehicles.known_from_s``)
+params  restitution, braking N, driving N, latency N, mass N, speed limit N; and, where news comes link by link: own
+        latency N, and from when on vehicle i acts on news of vehicle j, N * N columns (without them latencies are all
+        own, and everything is known from them on)
 """
 
 from __future__ import annotations
@@ -22,7 +23,15 @@ from ethbrake_marl.physics.advance import no_obstacle_harm
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.physics.segment import ROW_WIDTH
-from ethbrake_marl.physics.worlds import Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.physics.worlds import (
+    Floats,
+    Ints,
+    Vehicles,
+    Worlds,
+    is_known_at_once,
+    known_at_once,
+    vehicles_at_once,
+)
 
 TIME = 0
 RESTITUTION = 0
@@ -67,7 +76,10 @@ def state_width(vehicles: int) -> int:
 
 @compiled
 def params_at(group: int, vehicles: int) -> int:
-    """First column of a group of parameters: 0 braking, 1 driving, 2 latency, 3 mass, 4 speed limit, 5 news."""
+    """First column of a group of parameters: 0 braking, 1 driving, 2 latency, 3 mass, 4 speed limit.
+
+    Where news comes link by link: 5 own latency, 6 news.
+    """
     return 1 + group * vehicles
 
 
@@ -81,11 +93,11 @@ class Packed(NamedTuple):
     """Worlds by rows."""
 
     state: Floats  # [n, S]
-    params: Floats  # [n, 1 + 5 N] or [n, 1 + 5 N + N * N]
+    params: Floats  # [n, 1 + 5 N] or [n, 1 + 6 N + N * N]
 
 
 def pack(worlds: Worlds) -> Packed:
-    """Worlds by rows, with no harm so far; with columns of the obstacle if any world has one."""
+    """Worlds by rows, with no harm so far; with columns of the obstacle, and of news by link, if any world has such."""
     n, N = worlds.speeds_mps.shape
     state = np.zeros((n, state_width(N)))
     state[:, TIME] = worlds.time_s
@@ -102,7 +114,7 @@ def pack(worlds: Worlds) -> Packed:
             v.latency_s,
             v.mass_t,
             v.speed_limit_mps,
-            v.known_from_s,
+            *(() if is_known_at_once(v) else (v.own_latency_s, v.known_from_s.reshape(n, N * N))),
         ],
         axis=1,
     )
@@ -124,15 +136,37 @@ def with_obstacle_columns(state: Floats, vehicles: int) -> Floats:
     return np.concatenate([state, np.full((len(state), 1), np.inf), np.zeros((len(state), OBSTACLE_WIDTH - 1))], axis=1)
 
 
+@compiled
+def has_news(params: Floats, vehicles: int) -> bool:
+    """Whether these rows have columns of news by link."""
+    return bool(params.shape[1] > params_at(5, vehicles))
+
+
+def with_news_columns(params: Floats, vehicles: int) -> Floats:
+    """The rows with columns of news by link; where there were none, all news comes at the own latency."""
+    if has_news(params, vehicles):
+        return params
+    latency = params[:, params_at(2, vehicles) : params_at(3, vehicles)]
+    return np.concatenate([params, latency, latency.repeat(vehicles, axis=1)], axis=1)
+
+
+def own_latency_and_news(params: Floats, vehicles: int) -> tuple[Floats, Floats]:
+    """``own_latency_s`` [n, N] and ``known_from_s`` [n, N, N] of these rows' ``Vehicles``, in their own memory."""
+    if not has_news(params, vehicles):
+        latency = params[:, params_at(2, vehicles) : params_at(3, vehicles)].copy()
+        return latency, known_at_once(latency)
+    own, news = params_at(5, vehicles), params_at(6, vehicles)
+    return params[:, own:news].copy(), params[:, news:].copy().reshape(-1, vehicles, vehicles)
+
+
 def unpack(packed: Packed) -> Worlds:
     """The worlds of these rows, in their own memory."""
     state, params = packed
     N = vehicles_in(state)
-    braking, driving, latency, mass, limit = (params[:, params_at(g, N) : params_at(g + 1, N)].copy() for g in range(5))
-    gaps, news = gap_at(N), params[:, params_at(5, N) :].copy()
+    gaps = gap_at(N)
     obstacle = with_obstacle_columns(state, N)[:, state_width(N) :]
     return Worlds(
-        Vehicles(braking, driving, latency, mass, limit, params[:, RESTITUTION].copy(), news),
+        _vehicles(params, N),
         state[:, gaps : gaps + N - 1].copy(),
         state[:, speed_at(N) : command_at(N)].copy(),
         state[:, TIME].copy(),
@@ -141,6 +175,16 @@ def unpack(packed: Packed) -> Worlds:
         obstacle[:, 0].copy(),
         obstacle[:, 1] == 1.0,
     )
+
+
+def _vehicles(params: Floats, vehicles: int) -> Vehicles:
+    columns = (params[:, params_at(g, vehicles) : params_at(g + 1, vehicles)].copy() for g in range(5))
+    braking, driving, latency, mass, limit = columns
+    restitution = params[:, RESTITUTION].copy()
+    if not has_news(params, vehicles):
+        return vehicles_at_once(braking, driving, latency, mass, limit, restitution)
+    own, news = own_latency_and_news(params, vehicles)
+    return Vehicles(braking, driving, latency, mass, limit, restitution, own, news)
 
 
 def ledger_columns(state: Floats, vehicles: int) -> tuple[Floats, Floats, Ints]:

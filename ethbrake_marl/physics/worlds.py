@@ -15,7 +15,7 @@ Only gaps and speeds are stored: absolute positions would lose digits as the lin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -35,18 +35,23 @@ class Vehicles:
 
     braking_capacity_mps2: Floats  # [n, N] largest deceleration, > 0
     driving_capacity_mps2: Floats  # [n, N] largest forward acceleration, >= 0
-    latency_s: Floats  # [n, N] commands are ignored before this time, >= 0
+    latency_s: Floats  # [n, N] commands are ignored before this time, >= 0; a channel (``v2x``) may add to the own part
     mass_t: Floats  # [n, N] > 0
     speed_limit_mps: Floats  # [n, N] driving stops here, > 0
     restitution: Floats  # [n] in [0, 1]
-    # [n, 0], or [n, N * N] (``v2x``), in column i * N + j: when vehicle i has the news of vehicle j; where i is j: the
-    # own part of its latency
+    own_latency_s: Floats  # [n, N] the vehicle's own part of its latency, which is what others are told of it
+    # [n, N, N] from when on vehicle i acts on news of vehicle j; infinite: never. Never before latency_s of vehicle i,
+    # and of itself (i is j) exactly from then on. Without a channel both of these share the memory of ``latency_s``
     known_from_s: Floats
 
     def take(self, rows: ArrayLike) -> Vehicles:
         """Select worlds by index or mask (always a copy)."""
         index = np.asarray(rows)
-        return Vehicles(*(np.ascontiguousarray(getattr(self, f.name)[index]) for f in fields(self)))
+        return _combined(lambda column: np.ascontiguousarray(column[index]), self)
+
+
+_OF_VEHICLES = tuple(f.name for f in fields(Vehicles))
+_WITHOUT_NEWS = _OF_VEHICLES[:-2]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,17 +86,63 @@ class Worlds:
         )
 
 
+def vehicles_at_once(
+    braking_mps2: Floats,
+    driving_mps2: Floats,
+    latency_s: Floats,
+    mass_t: Floats,
+    limit_mps: Floats,
+    restitution: Floats,
+) -> Vehicles:
+    """Vehicles without a channel: latencies are all own, and all news is known from them on."""
+    known = known_at_once(latency_s)
+    return Vehicles(braking_mps2, driving_mps2, latency_s, mass_t, limit_mps, restitution, latency_s, known)
+
+
+def known_at_once(latency_s: Floats) -> Floats:
+    """``Vehicles.known_from_s`` [n, N, N] without a channel: all news, from the own latency [n, N] on.
+
+    A view of ``latency_s`` that takes no memory (its last axis has stride 0) and cannot be written.
+    """
+    latency = np.ascontiguousarray(latency_s, np.float64)
+    (n, N), size = latency.shape, latency.itemsize
+    view: Floats = np.ndarray((n, N, N), np.float64, latency, strides=(N * size, size, 0))
+    view.flags.writeable = False
+    return view
+
+
+def is_known_at_once(vehicles: Vehicles) -> bool:
+    """Whether nothing comes link by link, whatever memory says so: no channel, or one that changes nothing."""
+    if _is_view(vehicles):
+        return True
+    own, latency = vehicles.own_latency_s, vehicles.latency_s
+    return bool((own == latency).all() and (vehicles.known_from_s == latency[:, :, np.newaxis]).all())
+
+
+def _is_view(vehicles: Vehicles) -> bool:
+    """Whether own latency and news are the latency's memory, as ``vehicles_at_once`` makes them."""
+    latency, news = vehicles.latency_s, vehicles.known_from_s
+    return vehicles.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
+
+
 def concatenate(parts: Sequence[Worlds]) -> Worlds:
     """Join worlds with the same number of vehicles into one batch."""
-    vehicles = Vehicles(*(np.concatenate([getattr(w.vehicles, f.name) for w in parts]) for f in fields(Vehicles)))
+    vehicles = _combined(lambda *columns: np.concatenate(columns), *(w.vehicles for w in parts))
     return Worlds(vehicles, *(np.concatenate([getattr(w, f.name) for w in parts]) for f in fields(Worlds)[1:]))
+
+
+def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
+    """``change`` of each column of these vehicles, which picks or joins rows; without a channel it stays one memory."""
+    at_once = all(_is_view(part) for part in parts)
+    columns = [
+        change(*(getattr(part, name) for part in parts)) for name in (_WITHOUT_NEWS if at_once else _OF_VEHICLES)
+    ]
+    return vehicles_at_once(*columns) if at_once else Vehicles(*columns)
 
 
 def assign(worlds: Worlds, rows: Ints, fresh: Worlds) -> Worlds:
     """The batch with ``rows`` replaced by the worlds of ``fresh`` (len(rows) of them); nothing is changed in place."""
-    vehicles = Vehicles(
-        *(_assigned(getattr(worlds.vehicles, f.name), rows, getattr(fresh.vehicles, f.name)) for f in fields(Vehicles))
-    )
+    vehicles = _combined(lambda whole, part: _assigned(whole, rows, part), worlds.vehicles, fresh.vehicles)
     state = (_assigned(getattr(worlds, f.name), rows, getattr(fresh, f.name)) for f in fields(Worlds)[1:])
     return Worlds(vehicles, *state)
 
@@ -127,14 +178,13 @@ def make_worlds(
     n = speeds.shape[0] if gaps.ndim < 2 else max(speeds.shape[0], gaps.shape[0])
     N = speeds.shape[1]
     restitution_ = _full("restitution", restitution, (n,), 0.0, 1.0)
-    vehicles = Vehicles(
+    vehicles = vehicles_at_once(
         _full("braking_capacity_mps2", braking_capacity_mps2, (n, N), 0.0, np.inf, open_low=True),
         _full("driving_capacity_mps2", driving_capacity_mps2, (n, N), 0.0, np.inf),
         _full("latency_s", latency_s, (n, N), 0.0, np.inf),
         _full("mass_t", mass_t, (n, N), 0.0, np.inf, open_low=True),
         _full("speed_limit_mps", speed_limit_mps, (n, N), 0.0, np.inf, open_low=True),
         restitution_,
-        np.empty((n, 0)),
     )
     speeds = _full("speeds_mps", speeds, (n, N), 0.0, np.inf)
     if not np.all(speeds <= vehicles.speed_limit_mps):

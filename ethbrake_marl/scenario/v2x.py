@@ -18,7 +18,6 @@ it happens. The rule of the paper, preset ``paper``: everything, from the own la
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -28,7 +27,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles
 
 PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
 PER_LINK = 4  # uniform numbers of one link: wait, burst, loss, hop; one Philox counter
@@ -198,7 +197,10 @@ def link_delays(channel: Channel, u: Floats) -> Floats:
 
 
 def with_news(v2x: V2X, vehicles: Vehicles, u: Floats) -> Vehicles:
-    """These vehicles with the latencies and the news of the channel drawn by ``u`` [n, N * N * PER_LINK] in [0, 1)."""
+    """These vehicles with the latencies and the news of the channel drawn by ``u`` [n, N * N * PER_LINK] in [0, 1).
+
+    Their latencies, so far all own, stay as ``own_latency_s``.
+    """
     n, N = vehicles.latency_s.shape
     channel, links = v2x.channel, u.reshape(n, N, N, PER_LINK)
     low, high = channel.sensing_s
@@ -217,29 +219,8 @@ def with_news(v2x: V2X, vehicles: Vehicles, u: Floats) -> Vehicles:
             told = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
             latency[:, i] = np.maximum(latency[:, i], told)
     known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
-    return replace(vehicles, latency_s=latency, known_from_s=_by_link(known, vehicles.latency_s))
-
-
-def _by_link(known: Floats, own_latency_s: Floats) -> Floats:
-    """The columns of ``Vehicles.known_from_s`` [n, N * N]: the news [n, N, N], on the diagonal the own parts [n, N]."""
-    n, N = own_latency_s.shape
-    columns = known.reshape(n, N * N).copy()
-    columns[:, :: N + 1] = own_latency_s
-    return columns
-
-
-def known_from(vehicles: Vehicles) -> Floats:
-    """When vehicle i has the news of vehicle j (s since the alert), [n, N, N]; infinite: never; of itself: 0."""
-    columns = vehicles.known_from_s
-    return news_of(columns if columns.shape[1] else vehicles.latency_s.repeat(vehicles.latency_s.shape[1], axis=1))
-
-
-def news_of(columns: Floats) -> Floats:
-    """The columns of ``Vehicles.known_from_s`` [n, N * N] as [n, N, N], in their own memory; of itself: 0."""
-    N = math.isqrt(columns.shape[1])
-    known = columns.copy()
-    known[:, :: N + 1] = 0.0
-    return known.reshape(-1, N, N)
+    known[:, np.arange(N), np.arange(N)] = latency  # no vehicle waits for a message from itself
+    return replace(vehicles, latency_s=latency, known_from_s=known)
 
 
 def hidden_from(vehicles: Vehicles, vehicle: int) -> Bools:
@@ -248,22 +229,11 @@ def hidden_from(vehicles: Vehicles, vehicle: int) -> Bools:
     Either news of another vehicle has not arrived by then, or another one reacts later than the own part of its
     latency, which is all that a message tells. Never without a channel.
     """
-    n, N = vehicles.latency_s.shape
-    if not vehicles.known_from_s.shape[1]:
-        return np.zeros(n, np.bool_)
-    own_part = vehicles.known_from_s[:, :: N + 1]
-    hidden = (known_from(vehicles)[:, vehicle] > vehicles.latency_s[:, [vehicle]]) | (vehicles.latency_s > own_part)
+    late = vehicles.latency_s > vehicles.own_latency_s
+    hidden = (vehicles.known_from_s[:, vehicle] > vehicles.latency_s[:, [vehicle]]) | late
     hidden[:, vehicle] = False
     some: Bools = np.any(hidden, axis=1)
     return some
-
-
-def told_by_link(worlds: Worlds) -> Worlds:
-    """The same worlds with their news written out link by link."""
-    if worlds.vehicles.known_from_s.shape[1]:
-        return worlds
-    columns = _by_link(known_from(worlds.vehicles), worlds.vehicles.latency_s)
-    return replace(worlds, vehicles=replace(worlds.vehicles, known_from_s=columns))
 
 
 def fixed_news(v2x: V2X, vehicles: Vehicles, where: str) -> Vehicles:

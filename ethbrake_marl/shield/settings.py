@@ -9,7 +9,7 @@ import numpy as np
 from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, check_one_learner
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.scenario import Scenario
 
@@ -53,11 +53,10 @@ def engine_of(env: object, interface: type, where: str, maker: str) -> Engine:
 
 def only_shielded(engine: Engine, where: str) -> int:
     """Index of the one learner, which is shielded; ``InvalidInput`` when there is none or more than one."""
-    if len(engine.learners) != 1:
-        learners = ", ".join(engine.scenario.vehicle_names[i] for i in engine.learners) or "none"
-        raise InvalidInput(
-            f"{where}: the environment has {len(engine.learners)} learners ({learners}), a shield needs exactly"
-            " one learner: what is certified is known only if every other vehicle follows a script; pass"
-            " learners=['vehicle_2'] to the environment"
-        )
+    check_one_learner(
+        engine.scenario.name,
+        [engine.scenario.vehicle_names[i] for i in engine.learners],
+        f"{where} needs exactly one learner: what is certified is known only if every other vehicle follows a script;"
+        " pass learners=['vehicle_2'] to the environment",
+    )
     return engine.learners[0]

@@ -17,6 +17,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.physics import Floats, Worlds, concatenate
+from ethbrake_marl.physics.worlds import is_known_at_once, known_at_once
 from ethbrake_marl.scenario.quantities import DECLARED
 from ethbrake_marl.shield.settings import is_amount
 
@@ -208,12 +209,19 @@ def _side(worlds: Worlds, interval: Interval, place: int) -> Side:
 
 
 def _placed(worlds: Worlds, sides: list[Side], share: Callable[[int], Floats | int]) -> Worlds:
-    """The worlds with each uncertain number at ``share(k)`` of its interval: 0 its least value, 1 its largest."""
+    """The worlds with each uncertain number at ``share(k)`` of its interval: 0 its least value, 1 its largest.
+
+    Without a channel an uncertain latency is also what others are told, and when the news is known. With one, only the
+    reaction is uncertain.
+    """
     changed: dict[str, Any] = {}
     for k, side in enumerate(sides):
         values = changed.setdefault(side.quantity, _values(worlds, side.quantity).copy())
         at = np.broadcast_to(np.asarray(share(k), np.float64), side.low.shape)
         inside = side.low + at * (side.high - side.low)
         values[:, side.place] = np.where(at == 0.0, side.low, np.where(at == 1.0, side.high, inside))
-    vehicles = replace(worlds.vehicles, **{name: v for name, v in changed.items() if name in OF_VEHICLES})
-    return replace(worlds, vehicles=vehicles, **{name: v for name, v in changed.items() if name not in OF_VEHICLES})
+    if "latency_s" in changed and is_known_at_once(worlds.vehicles):
+        latency = changed["latency_s"]
+        changed |= {"own_latency_s": latency, "known_from_s": known_at_once(latency)}
+    vehicles = replace(worlds.vehicles, **{name: v for name, v in changed.items() if hasattr(worlds.vehicles, name)})
+    return replace(worlds, vehicles=vehicles, **{name: v for name, v in changed.items() if hasattr(worlds, name)})

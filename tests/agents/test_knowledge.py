@@ -19,7 +19,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.scenario.v2x import hidden_from, known_from
+from ethbrake_marl.scenario.v2x import hidden_from
 
 PAPER = load_scenario("paper-random")
 BLOCKED = load_scenario("cooperation-2-blocked")
@@ -116,7 +116,8 @@ def altered(worlds: Worlds, observer: int, rng: np.random.Generator) -> Worlds:
     """The same worlds with everything changed that has not reached ``observer`` by now, the future included."""
     vehicles, now = worlds.vehicles, worlds.time_s[:, np.newaxis]
     n, N = worlds.speeds_mps.shape
-    unknown = known_from(vehicles)[:, observer] > now
+    unknown = vehicles.known_from_s[:, observer] > now
+    unknown[:, observer] = False  # of itself it knows
     beside = np.zeros((n, N - 1), np.bool_)
     for pair in range(N - 1):
         far = pair if pair < observer else pair + 1
@@ -128,10 +129,8 @@ def altered(worlds: Worlds, observer: int, rng: np.random.Generator) -> Worlds:
     later = np.where(vehicles.latency_s > now, vehicles.latency_s + rng.uniform(0.01, 1.0, (n, N)), vehicles.latency_s)
     latency = np.where(unknown, rng.uniform(0.0, 2.0, (n, N)), vehicles.latency_s)
     latency[:, observer] = later[:, observer]
-    news = vehicles.known_from_s.copy()
-    news = np.where(news > now, news + rng.uniform(0.01, 1.0, news.shape), news)
-    own_parts = vehicles.known_from_s[:, :: N + 1]
-    news[:, :: N + 1] = np.where(unknown, rng.uniform(0.0, 2.0, (n, N)), own_parts)
+    news = vehicles.known_from_s
+    news = np.where(news > now[:, :, np.newaxis], news + rng.uniform(0.01, 1.0, news.shape), news)
     changed = replace(
         vehicles,
         braking_capacity_mps2=other(vehicles.braking_capacity_mps2, 3.0, 9.0, unknown),
@@ -139,6 +138,7 @@ def altered(worlds: Worlds, observer: int, rng: np.random.Generator) -> Worlds:
         mass_t=other(vehicles.mass_t, 1.0, 40.0, unknown),
         speed_limit_mps=other(vehicles.speed_limit_mps, 30.0, 60.0, unknown),
         latency_s=latency,
+        own_latency_s=other(vehicles.own_latency_s, 0.0, 2.0, unknown),
         known_from_s=news,
     )
     return replace(

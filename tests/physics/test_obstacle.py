@@ -228,5 +228,5 @@ def test_with_obstacle__writes_it_out_in_front():
     v = worlds.vehicles
     assert v.mass_t.tolist() == [[np.inf, 1.0, 1.0]] and v.speed_limit_mps.tolist() == [[0.0, 40.0, 40.0]]
     assert v.braking_capacity_mps2.tolist() == v.driving_capacity_mps2.tolist() == [[0.0, 6.0, 6.0]]
-    assert v.latency_s.tolist() == [[0.0] * 3] and v.known_from_s.shape == (1, 0)
+    assert v.latency_s.tolist() == [[0.0] * 3] and v.known_from_s.shape == (1, 3, 3)
     assert worlds.obstacle_gap_m.tolist() == [np.inf] and worlds.obstacle_hit.tolist() == [False]

@@ -9,7 +9,7 @@ import pytest
 
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.physics import rows as packed
-from ethbrake_marl.physics.rows import Packed, ledger_columns, pack, unpack
+from ethbrake_marl.physics.rows import Packed, has_news, ledger_columns, pack, unpack, with_news_columns
 from ethbrake_marl.physics.segment import ROW_WIDTH
 
 
@@ -33,9 +33,11 @@ def worlds(n, vehicles):
 def test_unpack__gives_back_every_bit_in_its_own_memory(n, vehicles, told):
     given = worlds(n, vehicles)
     if told:  # when each vehicle has the news of each other one
-        news = np.arange(float(n * vehicles**2)).reshape(n, -1)
-        given = replace(given, vehicles=replace(given.vehicles, known_from_s=news))
+        news = np.arange(float(n * vehicles**2)).reshape(n, vehicles, vehicles)
+        told_of = {"own_latency_s": 0.5 * given.vehicles.latency_s, "known_from_s": news}
+        given = replace(given, vehicles=replace(given.vehicles, **told_of))
     rows = pack(given)
+    assert has_news(rows.params, vehicles) == told
     back = unpack(rows)
     rows.state[:], rows.params[:] = -1.0, -1.0
     for part, again in ((given, back), (given.vehicles, back.vehicles)):
@@ -43,6 +45,19 @@ def test_unpack__gives_back_every_bit_in_its_own_memory(n, vehicles, told):
             value = getattr(part, name)
             if name != "vehicles":
                 np.testing.assert_array_equal(getattr(again, name), value, strict=True)
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_with_news_columns__says_the_same_as_without(told):
+    given = worlds(7, 3)
+    if told:
+        given = replace(given, vehicles=replace(given.vehicles, own_latency_s=0.5 * given.vehicles.latency_s))
+    state, params = pack(given)
+    wide = with_news_columns(params, 3)
+    assert (params.shape, wide.shape) == ((7, 28 if told else 16), (7, 28))
+    again = unpack(Packed(state, wide)).vehicles
+    for name in again.__slots__:
+        np.testing.assert_array_equal(getattr(again, name), getattr(given.vehicles, name), strict=True)
 
 
 def test_ledger_columns__are_in_their_own_memory():
@@ -57,7 +72,7 @@ def test_columns__follow_each_other_without_a_hole():
     # 3 vehicles, 2 pairs: time | speeds 3 | commands 3 | before 3 | gaps 2 | hit 2 | first 2 | total 2 | count 2
     at = [packed.speed_at(3), packed.command_at(3), packed.previous_at(3), packed.gap_at(3), packed.harm_at(3)]
     assert at == [1, 4, 7, 10, 14] and packed.state_width(3) == 20
-    assert [packed.params_at(group, 3) for group in range(6)] == [1, 4, 7, 10, 13, 16]
+    assert [packed.params_at(group, 3) for group in range(7)] == [1, 4, 7, 10, 13, 16, 19]
     assert packed.pack(worlds(1, 3)).state.shape == (1, 20) and packed.NO_ROWS.shape == (0, ROW_WIDTH)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Worlds, assign, concatenate, make_worlds
+from ethbrake_marl.physics.worlds import is_known_at_once
 
 PARAMETERS = {
     "braking_capacity_mps2": 7.0,
@@ -41,7 +42,10 @@ def numbered(n: int, first: int = 0) -> Worlds:
         latency_s=wide + 0.125, mass_t=wide + 1.5, speed_limit_mps=wide + 99.0, restitution=number / 1000.0,
     )  # fmt: skip
     hit = np.stack([number % 2 == 0, number % 3 == 0], axis=1)
-    worlds = replace(worlds, vehicles=replace(worlds.vehicles, known_from_s=wide + np.arange(9.0)))
+    news = (wide + np.arange(9.0)).reshape(n, 3, 3)
+    worlds = replace(
+        worlds, vehicles=replace(worlds.vehicles, own_latency_s=wide + 0.0625 * np.arange(3.0), known_from_s=news)
+    )
     return replace(
         worlds,
         time_s=number + 0.75,
@@ -68,9 +72,31 @@ def test_make_worlds__broadcasts_every_parameter_to_its_shape():
     of_worlds = {"time_s", "restitution", "obstacle_gap_m", "obstacle_hit"}
     assert all(shapes[name] == (4,) for name in of_worlds)
     assert wide == set(shapes) - {"gaps_m", "pair_hit", "known_from_s"} - of_worlds
-    assert shapes["known_from_s"] == (4, 0)
+    assert shapes["known_from_s"] == (4, 3, 3)
     assert worlds.vehicles.mass_t[3].tolist() == [1.0, 2.0, 3.0]
-    assert all(column.flags.c_contiguous and column.flags.owndata for column in columns(worlds).values())
+    own = [column for name, column in columns(worlds).items() if name != "known_from_s"]
+    assert all(column.flags.c_contiguous and column.flags.owndata for column in own)
+    assert worlds.vehicles.own_latency_s.tolist() == [[0.25] * 3] * 4
+
+
+def test_known_at_once__takes_no_memory_and_cannot_be_written():
+    worlds = build(speeds=np.full((4, 3), 10.0), gaps=5.0, latency_s=[0.0, 0.25, 0.5])
+    two = np.array([2, 0])
+    some_rows = (worlds.take(two), worlds.take(np.empty(0, np.int64)))
+    for some in (worlds, *some_rows, concatenate([worlds, worlds]), assign(worlds, two, some_rows[0])):
+        news = some.vehicles.known_from_s
+        assert news.tolist() == [[[0.0] * 3, [0.25] * 3, [0.5] * 3]] * some.n
+        assert is_known_at_once(some.vehicles) and (news.strides[2], news.flags.writeable) == (0, False)
+
+
+def test_is_known_at_once__goes_by_the_numbers():
+    vehicles = build(latency_s=[0.0, 0.25, 0.5]).vehicles
+    assert is_known_at_once(replace(vehicles, known_from_s=vehicles.known_from_s.copy()))
+    assert not is_known_at_once(replace(vehicles, latency_s=vehicles.latency_s + 0.125))
+    assert not is_known_at_once(replace(vehicles, own_latency_s=vehicles.latency_s - 0.125))
+    late = vehicles.known_from_s.copy()
+    late[0, 2, 1] = np.inf
+    assert not is_known_at_once(replace(vehicles, known_from_s=late))
 
 
 def test_make_worlds__many_gaps_make_many_worlds_of_one_set_of_speeds():

@@ -16,6 +16,7 @@ from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import observation_for, observe
 from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.physics.rows import Packed, pack, unpack, with_news_columns
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
 from ethbrake_marl.scenario.v2x import (
     CHANNELS,
@@ -24,9 +25,7 @@ from ethbrake_marl.scenario.v2x import (
     V2X,
     Channel,
     burst_periods,
-    known_from,
     link_delays,
-    told_by_link,
     with_news,
 )
 from ethbrake_marl.search.motion import CLOCK_WIDTH
@@ -92,10 +91,11 @@ def test_with_news__sight_goes_hop_by_hop():
     u = np.full((1, 9 * PER_LINK), 0.5)
     told = with_news(V2X.model_validate("sensors-only"), vehicles([0.0, 0.1, 2.5]), u)
     assert told.latency_s.tolist() == [[0.0, pytest.approx(0.95), 2.5]]  # 0.95 + 0.95 < 2.5, its own part
-    known = known_from(told)[0]
+    known = told.known_from_s[0]
     assert known[0].tolist() == [0.0, pytest.approx(0.95), np.inf]
-    assert known[1].tolist() == [pytest.approx(0.95), 0.0, pytest.approx(0.95)]
-    assert known[2].tolist() == [np.inf, 2.5, 0.0]
+    assert known[1].tolist() == [pytest.approx(0.95)] * 3
+    assert known[2].tolist() == [np.inf, 2.5, 2.5]
+    assert told.own_latency_s.tolist() == [[0.0, 0.1, 2.5]]
 
 
 def test_with_news__news_of_the_emergency_comes_by_radio_or_by_sight():
@@ -103,19 +103,19 @@ def test_with_news__news_of_the_emergency_comes_by_radio_or_by_sight():
     u = np.full((1, 9 * PER_LINK), 0.5)
     told = with_news(v2x, vehicles([0.0, 0.1, 0.6]), u)
     assert told.latency_s.tolist() == [[0.0, 0.4, 0.6]]
-    assert known_from(told)[0].tolist() == [[0.0, 0.4, 0.4], [0.4, 0.0, 0.4], [0.6, 0.6, 0.0]]
+    assert told.known_from_s[0].tolist() == [[0.0, 0.4, 0.4], [0.4, 0.4, 0.4], [0.6, 0.6, 0.6]]
     links = u.reshape(9, PER_LINK).copy()
     links[2 * 3 + 0, 2] = 0.0  # the link from vehicle_1 to vehicle_3 is lost
     lossy = V2X.model_validate({"preset": "nominal", "link_latency_s": 0.4, "lost": 0.1})
     told = with_news(lossy, vehicles([0.0, 0.1, 0.6]), links.reshape(1, -1))
     assert told.latency_s.tolist() == [[0.0, 0.4, pytest.approx(0.4 + 0.95)]]
-    assert known_from(told)[0, 2].tolist() == [np.inf, pytest.approx(1.35), 0.0]
+    assert told.known_from_s[0, 2].tolist() == [np.inf, pytest.approx(1.35), pytest.approx(1.35)]
 
 
 def test_with_news__front_news_only_at_the_papers_times():
     told = with_news(V2X.model_validate({"hears": "front"}), vehicles([0.0, 0.5, 0.8]), np.zeros((1, 36)))
     assert told.latency_s.tolist() == [[0.0, 0.5, 0.8]]
-    assert known_from(told)[0].tolist() == [[0.0, np.inf, np.inf], [0.5, 0.0, np.inf], [0.8, 0.8, 0.0]]
+    assert told.known_from_s[0].tolist() == [[0.0, np.inf, np.inf], [0.5, 0.5, np.inf], [0.8, 0.8, 0.8]]
 
 
 def slow_news(channel: Channel, own_s: list[float], links: np.ndarray) -> tuple[list[float], np.ndarray]:
@@ -139,7 +139,7 @@ def slow_news(channel: Channel, own_s: list[float], links: np.ndarray) -> tuple[
     for i in range(1, N) if channel.timing != "latency" else ():
         latency[i] = max(latency[i], min(heard[i, 0], latency[i - 1] + seen[i, i - 1]))
     known = np.maximum(np.array(latency)[:, np.newaxis], np.minimum(heard, seen))
-    known[np.arange(N), np.arange(N)] = 0.0
+    known[np.arange(N), np.arange(N)] = latency
     return latency, known
 
 
@@ -159,7 +159,7 @@ def test_with_news__is_what_a_loop_over_the_links_gives(given):
     for k in range(40):
         latency, known = slow_news(v2x.channel, own[k].tolist(), u[k].reshape(4, 4, PER_LINK))
         assert told.latency_s[k] == pytest.approx(latency, rel=1e-12)
-        assert known_from(told)[k] == pytest.approx(known, rel=1e-12)
+        assert told.known_from_s[k] == pytest.approx(known, rel=1e-12)
 
 
 def test_channels__are_those_of_the_page():
@@ -199,8 +199,9 @@ def test_v2x__says_whether_it_differs_from_the_paper_and_whether_chance_decides(
 
 def test_paper__is_the_rule_of_the_own_latency():
     plain, named = PAPER.sample(50, 7).worlds, PAPER.replace(v2x="paper").sample(50, 7).worlds
-    assert named.vehicles.known_from_s.shape == (50, 0)
-    assert known_from(plain.vehicles)[0].tolist() == [[0.0, 0.0, 0.0], [0.5, 0.0, 0.5], [0.8, 0.8, 0.0]]
+    for vehicles in (plain.vehicles, named.vehicles):
+        assert vehicles.own_latency_s.tolist() == vehicles.latency_s.tolist() == [[0.0, 0.5, 0.8]] * 50
+        assert vehicles.known_from_s.tolist() == [[[0.0] * 3, [0.5] * 3, [0.8] * 3]] * 50
     assert named.gaps_m.tobytes() == plain.gaps_m.tobytes()
 
 
@@ -214,6 +215,9 @@ def test_sample__a_world_alone_has_the_same_news_and_the_line_of_the_paper(name)
     assert many.gaps_m.tobytes() == same.gaps_m.tobytes() and many.speeds_mps.tobytes() == same.speeds_mps.tobytes()
     other = scenario.sample(30, 7, channel="training").worlds
     assert (many.vehicles.known_from_s[:, 1] != other.vehicles.known_from_s[:, 1]).all()
+    for k in range(3):  # of itself a vehicle knows from its latency on, whatever the channel does
+        assert many.vehicles.known_from_s[:, k, k].tobytes() == many.vehicles.latency_s[:, k].tobytes()
+    assert (many.vehicles.own_latency_s == 0.0).all()
 
 
 def exchanged(of, values, rng):
@@ -230,13 +234,13 @@ def shuffled(worlds, vehicle):
 
     So also all that the channel has in store: news to come, and latencies of those who have not reacted.
     """
-    unknown = known_from(worlds.vehicles)[:, vehicle] > worlds.time_s[:, np.newaxis]
+    unknown = unknown_to(vehicle, worlds)
     lines = np.random.default_rng(1).permutation(worlds.n)
     changed = {}
     for name in ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps"):
         column = getattr(worlds.vehicles, name)
         changed[name] = np.where(unknown, column[lines] * 1.5, column)
-    changed["latency_s"], changed["known_from_s"] = other_future(worlds, unknown)
+    changed |= other_future(worlds, unknown)
     gaps = np.where(unknown[:, [0, 2]], worlds.gaps_m[lines] + 3.0, worlds.gaps_m)
     return replace(
         worlds,
@@ -250,14 +254,22 @@ def shuffled(worlds, vehicle):
     )
 
 
+def unknown_to(vehicle, worlds):
+    """Which vehicles this one has no news of by now, [n, N]; of itself it knows."""
+    unknown = worlds.vehicles.known_from_s[:, vehicle] > worlds.time_s[:, np.newaxis]
+    unknown[:, vehicle] = False
+    return unknown
+
+
 def other_future(worlds, unknown):
     """Latencies and news by link with all that is still to come exchanged, and the own parts of the ``unknown``."""
-    rng, now, N = np.random.default_rng(2), worlds.time_s[:, np.newaxis], worlds.N
-    latency, news = worlds.vehicles.latency_s, worlds.vehicles.known_from_s
-    own_parts = np.arange(0, N * N, N + 1)
-    to_come = news > now
-    to_come[:, own_parts] = unknown
-    return exchanged(latency > now, latency, rng), exchanged(to_come, news, rng)
+    rng, now, v = np.random.default_rng(2), worlds.time_s[:, np.newaxis], worlds.vehicles
+    to_come = v.known_from_s > now[:, :, np.newaxis]
+    return {
+        "latency_s": exchanged(v.latency_s > now, v.latency_s, rng),
+        "own_latency_s": exchanged(unknown, v.own_latency_s, rng),
+        "known_from_s": exchanged(to_come, v.known_from_s, rng),
+    }
 
 
 def test_observe__tells_own_parts_of_latencies_and_nothing_that_the_channel_has_drawn():
@@ -265,8 +277,8 @@ def test_observe__tells_own_parts_of_latencies_and_nothing_that_the_channel_has_
     scenario = PAPER.replace(v2x="congested", latency_s=[0, 0.1, 0.5], early_impacts="keep")
     worlds = scenario.sample(1, 7).worlds
     worlds.vehicles.latency_s[0] = [0.0, 0.4, 0.9]
-    worlds.vehicles.known_from_s[0] = [0.0, 0.8, 0.8, 0.4, 0.1, 0.4, 0.9, 0.9, 0.5]
-    assert known_from(worlds.vehicles)[0].tolist() == [[0.0, 0.8, 0.8], [0.4, 0.0, 0.4], [0.9, 0.9, 0.0]]
+    worlds.vehicles.known_from_s[0] = [[0.0, 0.8, 0.8], [0.4, 0.4, 0.4], [0.9, 0.9, 0.9]]
+    assert worlds.vehicles.own_latency_s.tolist() == [[0.0, 0.1, 0.5]]
     spec = observation_for(scenario)
     at = [f.name for f in spec.features].index("rear_1.latency_left")
     for time, own_left, rear_left in ((0.0, 0.1, 0.0), (0.4, 0.0, 0.1), (0.6, 0.0, 0.0), (0.95, 0.0, 0.0)):
@@ -283,7 +295,8 @@ def test_full_state__has_the_latency_that_the_channel_has_drawn():
 
 def test_observe__writing_the_papers_news_out_by_link_changes_no_bit():
     plain = PAPER.sample(50, 7).worlds
-    told = told_by_link(plain)
+    rows = pack(plain)
+    told = unpack(Packed(rows.state, with_news_columns(rows.params, 3)))
     for time in (0.0, 0.3, 0.6, 1.0):
         for i in range(3):
             now = (replace(w, time_s=np.full(50, time)) for w in (plain, told))
@@ -302,11 +315,10 @@ def test_observe__what_is_not_known_changes_no_bit(name, obstacle, latency):
     for time in (0.0, 0.5, 0.8, 1.0, 1.5):
         worlds, _ = advance(start, -3.0, until_s=time)
         other = shuffled(worlds, 1)
-        unknown = known_from(worlds.vehicles)[:, 1][:, [0, 2]] > time
+        unknown = worlds.vehicles.known_from_s[:, 1][:, [0, 2]] > time
         assert observe(worlds, 1, spec).tobytes() == observe(other, 1, spec).tobytes()
         for i in range(3):
-            latency, news = other_future(worlds, known_from(worlds.vehicles)[:, i] > time)
-            later = replace(worlds, vehicles=replace(worlds.vehicles, latency_s=latency, known_from_s=news))
+            later = replace(worlds, vehicles=replace(worlds.vehicles, **other_future(worlds, unknown_to(i, worlds))))
             assert observe(worlds, i, spec).tobytes() == observe(later, i, spec).tobytes()
         flags = observe(worlds, 1, spec)[:, [7, 17]]
         assert (flags == ~unknown).all()
@@ -325,7 +337,7 @@ def engine(scenario, n=20, **settings):
 def test_engine__tells_what_is_known_when_and_starts_when_a_learner_may_act():
     running = engine(channel_of("blocked"), seed=3)
     vehicles = running.worlds.vehicles
-    assert running.known_from_s.tolist() == known_from(vehicles).tolist()
+    assert running.known_from_s.tolist() == vehicles.known_from_s.tolist()
     assert running.worlds.time_s.tolist() == vehicles.latency_s[:, 1].tolist()
     assert np.ptp(running.worlds.time_s) > 0.2
     before = running.known_from_s.copy()
@@ -338,13 +350,13 @@ def test_engine__takes_worlds_with_and_without_news_by_link():
     plain = PAPER.sample(20, 7).worlds
     running = engine(channel_of("nominal"))
     running.reset(worlds=plain)
-    assert running.known_from_s.tolist() == known_from(plain.vehicles).tolist()
+    assert running.known_from_s.tolist() == plain.vehicles.known_from_s.tolist()
     running.renew(np.array([0]))
     running.step(np.zeros((20, 1)))
     of_paper = engine(PAPER)
     of_paper.reset(worlds=channel_of("nominal").sample(20, 7).worlds)
     of_paper.renew(np.array([0]))
-    assert of_paper.known_from_s[0].tolist() == known_from(plain.vehicles)[0].tolist()
+    assert of_paper.known_from_s[0].tolist() == plain.vehicles.known_from_s[0].tolist()
 
 
 def test_engine__snapshot_keeps_the_news():
@@ -352,6 +364,20 @@ def test_engine__snapshot_keeps_the_news():
     restore_engine(other, engine_snapshot(running))
     assert other.known_from_s.tobytes() == running.known_from_s.tobytes()
     assert other.observe(1).tobytes() == running.observe(1).tobytes()
+
+
+def test_engine__goes_on_from_an_earlier_snapshot_with_own_latencies_on_the_diagonal_of_the_news():
+    scenario = channel_of("blocked").replace(latency_s=[0.0, 0.2, 0.4])
+    running, other = engine(scenario, seed=3), engine(scenario, seed=4)
+    kept = engine_snapshot(running)
+    news = kept["params"][:, 19:].copy()
+    news[:, ::4] = kept["params"][:, 16:19]
+    kept["params"] = np.concatenate([kept["params"][:, :16], news], axis=1)  # as it was kept until November 2026
+    restore_engine(other, kept)
+    assert other.packed.params.tobytes() == running.packed.params.tobytes()
+    assert other.observe(1).tobytes() == running.observe(1).tobytes()
+    with pytest.raises(InvalidInput, match=r"params is \(20, 20\); \(20, 28\) is needed"):
+        restore_engine(other, {**kept, "params": kept["params"][:, :20]})
 
 
 def test_infos__tell_the_news_only_where_there_is_a_channel():
@@ -424,5 +450,7 @@ def test_v2x__declared_is_the_same_scenario(name):
 def test_identities__do_not_depend_on_the_news():
     worlds = PAPER.sample(5, 7).worlds
     clock, command = np.zeros((5, CLOCK_WIDTH)), -worlds.vehicles.braking_capacity_mps2
-    plain, told = (identities(w, command, clock, np.array([1])) for w in (worlds, told_by_link(worlds)))
+    late = replace(worlds.vehicles, known_from_s=worlds.vehicles.known_from_s + 1.0)
+    by_link = replace(worlds, vehicles=late)
+    plain, told = (identities(w, command, clock, np.array([1])) for w in (worlds, by_link))
     assert plain.tolist() == told.tolist() and len(set(plain.tolist())) == 5

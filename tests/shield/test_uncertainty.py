@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics import make_worlds
+from ethbrake_marl.physics.worlds import is_known_at_once
 from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Interval, Uncertainty, checked_uncertainty, parse_uncertainty
 
 
@@ -141,3 +144,17 @@ def test_python_form__is_checked_too():
     with pytest.raises(InvalidInput, match="must be an Uncertainty or text"):
         checked_uncertainty(0.1)
     assert checked_uncertainty(None) is None
+
+
+def test_draw__without_a_channel_own_part_and_news_go_with_the_latency():
+    drawn = parse_uncertainty("latency_s=0.1").draw(line(), np.random.default_rng(3)).vehicles
+    assert (drawn.latency_s != line().vehicles.latency_s).all() and is_known_at_once(drawn)
+
+
+def test_draw__over_a_channel_only_the_reaction_is_uncertain():
+    vehicles = line().vehicles
+    news = vehicles.known_from_s + 0.5
+    worlds = replace(line(), vehicles=replace(vehicles, known_from_s=news))
+    drawn = parse_uncertainty("latency_s=0.1").draw(worlds, np.random.default_rng(3)).vehicles
+    assert drawn.known_from_s.tolist() == news.tolist()
+    assert drawn.own_latency_s.tolist() == vehicles.own_latency_s.tolist()
