@@ -13,8 +13,8 @@ from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.episode import START, decision_at
 from ethbrake_marl.search.kernel import MOST_PHASES
-from ethbrake_marl.search.motion import START
 from ethbrake_marl.search.problem import TIME_STEP_S, ProfileProblem, profile_problem
 from ethbrake_marl.search.profiles import Profiles, constant_profiles, follow_profiles, pad_profiles, search_profiles
 
@@ -72,8 +72,7 @@ class BestHarm:
             raise InvalidInput(
                 f"agent {self.name!r}: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
             )
-        passed = (worlds.time_s - self._start_s[: worlds.n]) / TIME_STEP_S
-        step = np.maximum(np.floor(passed + 1e-6), 0.0).astype(np.int64)
+        step = np.maximum(decision_at(worlds.time_s, self._start_s[: worlds.n], TIME_STEP_S), 0)
         return self._profiles.take(slice(worlds.n)).at(step)[:, 0]
 
     def _problem(self, worlds: Worlds, vehicle: int, others: Floats) -> ProfileProblem:

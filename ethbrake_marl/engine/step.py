@@ -13,6 +13,7 @@ import numpy as np
 from ethbrake_marl.actions import command_of
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.episode import command_in_force, onset_s, stands, step_end_s
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
 from ethbrake_marl.physics.obstacle import FAR_AWAY_M, place_obstacle
 from ethbrake_marl.physics.rows import (
@@ -149,9 +150,9 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     braking, driving, latency, mass, limit = (
         params_at(0, N), params_at(1, N), params_at(2, N), params_at(3, N), params_at(4, N),
     )  # fmt: skip
-    P, hazard = N - 1, state_width(N)
+    P, obstacle = N - 1, state_width(N)
     worst, worst_status = -1, DONE
-    at = 1 if state.shape[1] > hazard else 0  # vehicle i stands in column at + i, behind an obstacle
+    at = 1 if state.shape[1] > obstacle else 0  # vehicle i stands in column at + i, behind an obstacle
     table = np.zeros((TABLE_ROWS, N + at))
     for k in range(n):
         if clock[k, ENDED] == 1.0:
@@ -166,17 +167,17 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         clock[k, STEP] += 1.0
         at_horizon = clock[k, STEP] >= clock[k, LAST_STEP]
         time = state[k, TIME]
-        until = settings[HORIZON] if at_horizon else clock[k, START] + clock[k, STEP] * settings[TIME_STEP]
+        until = step_end_s(clock[k, STEP], clock[k, LAST_STEP], clock[k, START], settings[TIME_STEP], settings[HORIZON])
         if at == 1:
-            place_obstacle(table, min(state[k, hazard], FAR_AWAY_M), state[k, hazard + 1])
+            place_obstacle(table, min(state[k, obstacle], FAR_AWAY_M), state[k, obstacle + 1])
         for i in range(N):
             table[SPEED, at + i] = state[k, speed + i]
             table[COMMAND, at + i] = wanted[k, i]
             table[MASS, at + i] = params[k, mass + i]
             table[LIMIT, at + i] = params[k, limit + i]
-            table[ONSET, at + i] = params[k, latency + i] - time
+            table[ONSET, at + i] = onset_s(params[k, latency + i], time)
             state[k, previous + i] = state[k, command + i]
-            state[k, command + i] = wanted[k, i] if params[k, latency + i] <= until else 0.0
+            state[k, command + i] = command_in_force(wanted[k, i], params[k, latency + i], until)
         for p in range(P):
             table[GAP, at + p] = state[k, gap + p]
             table[HIT, at + p] = state[k, gap + P + p]
@@ -197,17 +198,17 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         at_rest = True
         for i in range(N):
             state[k, speed + i] = table[SPEED, at + i]
-            at_rest = at_rest and table[SPEED, at + i] == 0.0 and wanted[k, i] <= 0.0
+            at_rest = at_rest and stands(table[SPEED, at + i], wanted[k, i])
         impacts, first_harm, total_harm = 0.0, 0.0, 0.0
-        if at == 1 and state[k, hazard] < math.inf:
-            state[k, hazard] = table[GAP, 0]
-            state[k, hazard + 1] = table[HIT, 0]
-            state[k, hazard + 2] += table[FIRST_HARM, 0]
-            state[k, hazard + 3] += table[TOTAL_HARM, 0]
-            state[k, hazard + 4] += table[COUNT, 0]
+        if at == 1 and state[k, obstacle] < math.inf:
+            state[k, obstacle] = table[GAP, 0]
+            state[k, obstacle + 1] = table[HIT, 0]
+            state[k, obstacle + 2] += table[FIRST_HARM, 0]
+            state[k, obstacle + 3] += table[TOTAL_HARM, 0]
+            state[k, obstacle + 4] += table[COUNT, 0]
             first_harm = table[FIRST_HARM, 0]
             total_harm = table[TOTAL_HARM, 0]
-            impacts = state[k, hazard + 4]
+            impacts = state[k, obstacle + 4]
         for p in range(P):
             state[k, gap + p] = table[GAP, at + p]
             state[k, gap + P + p] = table[HIT, at + p]

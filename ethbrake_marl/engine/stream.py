@@ -11,6 +11,7 @@ import numpy as np
 from ethbrake_marl.engine.step import CLOCK_WIDTH, LAST_STEP, START
 from ethbrake_marl.errors import FailedWorld, InvalidInput, PhysicsError, count_of
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
+from ethbrake_marl.physics.episode import first_decision_s, number_of_decisions
 from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.rows import Packed, harm_at, has_obstacle, pack, state_width
 from ethbrake_marl.physics.segment import DONE
@@ -156,13 +157,12 @@ class Stream:
     def prepare(self, alert: Worlds) -> Start:
         """Worlds at t = 0, made ready for their first decision. Raises ``InvalidInput`` if nobody may ever decide."""
         clock = np.zeros((alert.n, CLOCK_WIDTH))
-        if self._deciders:
-            clock[:, START] = alert.vehicles.latency_s[:, self._deciders].min(axis=1)
+        clock[:, START] = first_decision_s(alert, self._deciders)
         step, horizon = self._scenario.time_step_s, self._scenario.horizon_s
         if not (clock[:, START] < horizon).all():
             late = float(clock[:, START].max())
             raise InvalidInput(f"reset: nobody decides before the horizon ({late:g} s >= {horizon:g} s)")
-        clock[:, LAST_STEP] = np.ceil((horizon - clock[:, START]) / step - 1e-9)
+        clock[:, LAST_STEP] = number_of_decisions(clock[:, START], step, horizon)
         wanted = np.zeros(alert.speeds_mps.shape)
         for vehicle, script in self._state_free.items():
             script.begin(alert, vehicle, np.arange(alert.n))

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ethbrake_marl.physics import Floats, Worlds, advance, advance_sampled
+from ethbrake_marl.physics.episode import decision_s, first_decision_s
 from ethbrake_marl.physics.events import solo_motion
 from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.scenario import Scenario, Task
@@ -89,7 +90,7 @@ class SampledHarm:
         self._worlds = worlds
         self._command = np.zeros(worlds.speeds_mps.shape)
         self._harm = np.zeros(worlds.n)
-        self._start_s = worlds.vehicles.latency_s[:, VEHICLE_2]
+        self._start_s = first_decision_s(worlds, [VEHICLE_2])
         self._step_s, self._horizon_s = scenario.time_step_s, scenario.horizon_s
         self._samples = -1  # steps of the map so far; the time before its first sample is the first
 
@@ -112,7 +113,7 @@ class SampledHarm:
     def _move(self) -> None:
         """Go on by one step: every world to its next sample, none beyond its first one at or after the horizon."""
         self._samples += 1
-        next_s = np.minimum(self._start_s + self._samples * self._step_s, self._horizon_s)
+        next_s = np.minimum(decision_s(self._start_s, self._step_s, self._samples), self._horizon_s)
         until_s = np.maximum(next_s, self._worlds.time_s)
         self._worlds, impacts = advance_sampled(self._worlds, self._command, until_s=until_s, step_s=self._step_s)
         self._harm += impacts.total_harm.sum(axis=1)

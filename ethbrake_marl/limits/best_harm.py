@@ -21,10 +21,9 @@ from ethbrake_marl.agents.rollout import scripted
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, BestKnown, join_tables, load_table, save_table
-from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
+from ethbrake_marl.physics import Floats, Ints, UInt64s, Worlds, leaving_out_failed
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.search.kernel import MOST_PHASES
-from ethbrake_marl.search.motion import UInt64s
 from ethbrake_marl.search.problem import ProfileProblem, profile_problem
 from ethbrake_marl.search.profiles import (
     Profiles,

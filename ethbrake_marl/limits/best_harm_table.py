@@ -20,8 +20,7 @@ from ethbrake_marl.files.durable import write_file
 from ethbrake_marl.files.json import parse_strict_json
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.physics import Bools, Floats, Ints
-from ethbrake_marl.search.motion import UInt64s
+from ethbrake_marl.physics import Bools, Floats, Ints, UInt64s
 from ethbrake_marl.search.problem import ProfileProblem
 from ethbrake_marl.search.profiles import Profiles, check_profiles, pad_profiles
 

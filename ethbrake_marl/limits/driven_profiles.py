@@ -16,6 +16,7 @@ from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.best_harm import scripted_commands, world_identity
 from ethbrake_marl.limits.best_harm_table import BestHarmTable
 from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
+from ethbrake_marl.physics.episode import decision_at, first_decision_s
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.search.problem import profile_problem
 from ethbrake_marl.search.profiles import Profiles, follow_profiles
@@ -86,13 +87,13 @@ class _Recorder(AgentAround):
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """All episodes begin at once here."""
-        self._start_s = np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
+        self._start_s = first_decision_s(worlds, [vehicle])
         self.commands_mps2 = np.full((worlds.n, self.commands_mps2.shape[1]), np.nan)
         super().begin(worlds, vehicle, rows)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         command = self.policy.act(worlds, vehicle)
-        step = np.floor((worlds.time_s - self._start_s) / self._time_step_s + 1e-6).astype(np.int64)
+        step = decision_at(worlds.time_s, self._start_s, self._time_step_s)
         deciding = np.flatnonzero((step >= 0) & (step < self.commands_mps2.shape[1]))
         self.commands_mps2[deciding, step[deciding]] = command[deciding]
         return command

@@ -4,7 +4,17 @@ from ethbrake_marl.physics.advance import ImpactRows, Impacts, advance
 from ethbrake_marl.physics.failed import LeftOutRows, leaving_out_failed, measured_without_failed
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.sampled import advance_sampled
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, assign, concatenate, make_worlds
+from ethbrake_marl.physics.worlds import (
+    Bools,
+    Floats,
+    Ints,
+    UInt64s,
+    Vehicles,
+    Worlds,
+    assign,
+    concatenate,
+    make_worlds,
+)
 
 __all__ = [
     "Bools",
@@ -13,6 +23,7 @@ __all__ = [
     "Impacts",
     "Ints",
     "LeftOutRows",
+    "UInt64s",
     "Vehicles",
     "Worlds",
     "advance",

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.physics.compiled import by_parts, compiled
+from ethbrake_marl.physics.episode import command_in_force, onset_s
 from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
 from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle, without_obstacle
@@ -98,8 +99,8 @@ def advance_worlds(
             table[SPEED, i] = speeds[k, i]
             table[MASS, i] = mass[k, i]
             table[LIMIT, i] = limit[k, i]
-            table[ONSET, i] = latency[k, i] - time[k]
-            in_force[k, i] = wanted if latency[k, i] <= until[k] else 0.0
+            table[ONSET, i] = onset_s(latency[k, i], time[k])
+            in_force[k, i] = command_in_force(wanted, latency[k, i], until[k])
         for p in range(vehicles - 1):
             table[GAP, p] = gaps[k, p]
             table[HIT, p] = 1.0 if hit[k, p] else 0.0

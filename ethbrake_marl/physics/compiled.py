@@ -65,12 +65,21 @@ def compiled_apart(function: Function) -> Function:
     return _compile(function, inline=False)
 
 
-def _compile(function: Function, *, inline: bool) -> Function:
+def compiled_within(function: Function) -> Function:
+    """Compile as ``compiled`` does, and write it into its callers before they are compiled: for a level of its own.
+
+    ``forceinline`` still counts references at each level through which an array is handed on; this does not.
+    """
+    return _compile(function, inline=False, within=True)
+
+
+def _compile(function: Function, *, inline: bool, within: bool = False) -> Function:
     config: Any = numba_config  # its settings are made at run time
     before = config.CACHE_DIR
     config.CACHE_DIR = str(cache_folder())
     try:
-        compiler: Any = numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy", forceinline=inline)
+        how: dict[str, Any] = {"inline": "always"} if within else {"forceinline": inline}
+        compiler: Any = numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy", **how)
         return cast(Function, compiler(function))
     finally:
         config.CACHE_DIR = before

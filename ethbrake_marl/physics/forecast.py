@@ -9,6 +9,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError, renumbered
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.episode import onset_s
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
 from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle
 from ethbrake_marl.physics.segment import (
@@ -104,7 +105,7 @@ def forecast_worlds(
                 table[COMMAND, i] = candidates[k, c] if i == vehicle else command[k, i]
                 table[MASS, i] = mass[k, i]
                 table[LIMIT, i] = limit[k, i]
-                table[ONSET, i] = latency[k, i] - time[k]
+                table[ONSET, i] = onset_s(latency[k, i], time[k])
             for p in range(vehicles - 1):
                 table[GAP, p] = gaps[k, p]
                 table[HIT, p] = 1.0 if hit[k, p] else 0.0

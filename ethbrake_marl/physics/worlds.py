@@ -27,6 +27,7 @@ from ethbrake_marl.errors import InvalidInput
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
+UInt64s = NDArray[np.uint64]
 
 
 @dataclass(frozen=True, slots=True)

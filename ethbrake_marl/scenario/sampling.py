@@ -13,6 +13,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.physics.advance import advance
+from ethbrake_marl.physics.episode import first_decision_s
 from ethbrake_marl.physics.events import stopping_distances
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, concatenate, make_worlds
 from ethbrake_marl.scenario.distributions import support, values
@@ -150,7 +151,7 @@ def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
         if scripted is None:
             raise InvalidInput(f"scenario {scenario.name!r}: early_impacts reject: {script!r} depends on the state")
         command[:, i] = scripted
-    first_action_s = vehicles.latency_s[:, list(scenario.learners)].min(axis=1)
+    first_action_s = first_decision_s(worlds, scenario.learners)
     _, impacts = advance(worlds, command, until_s=first_action_s)
     return np.asarray(impacts.count.sum(axis=1) + impacts.obstacle_count > 0)
 

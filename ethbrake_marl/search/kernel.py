@@ -3,7 +3,7 @@
 Method: given profiles (constants among them) and random ones are tried; the best of them, all different, are improved
 by random changes of any size, each success being repeated twice as large; after each round the better half goes on.
 The last one is divided into more phases and improved further, at the end decision by decision, as the engine runs.
-Letters as in ``profile_motion``; Q given profiles, M of them and of the random ones improved.
+Letters as in ``physics.episode``; Q given profiles, M of them and of the random ones improved.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.physics import Floats, Ints, UInt64s
 from ethbrake_marl.physics.compiled import compiled, compiled_apart
-from ethbrake_marl.search.motion import LAST_STEP, STEPWISE, SearchWorld, follow, follow_whole
+from ethbrake_marl.physics.episode import LAST_STEP, STEPWISE, Episode, follow, follow_whole
 from ethbrake_marl.search.moves import (
     AMOUNT,
     CHANGE_WIDTH,
@@ -37,6 +37,14 @@ PER_PROFILE = 400  # candidates of the budget for each profile of the first roun
 SMALLEST_FIELD, LARGEST_FIELD = 4, 128  # profiles there
 SAME = 1e-6  # values (m2/s2) closer than this belong to the same profile
 ATTENTION_STEPS = 30  # phases are divided within these first steps
+
+
+class SearchWorld(NamedTuple):
+    """One world as candidates run in it."""
+
+    episode: Episode
+    bounds: Floats  # [C, 2] smallest and largest command (m/s2)
+    random: UInt64s  # [1] state of the world's random numbers
 
 
 class Population(NamedTuple):
@@ -88,7 +96,7 @@ def search_world(
     copy_profile(field.ends[0], field.commands[0], ends, commands)
     used = compact(ends[:used], commands[:used], used)
     for k in range(used, K):
-        ends[k] = int(world.clock[LAST_STEP])
+        ends[k] = int(world.episode.clock[LAST_STEP])
         for c in range(C):
             commands[k, c] = commands[used - 1, c]
     return used
@@ -128,7 +136,7 @@ def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bu
                 continue
             copy_rows(states[phase:], new_states[phase:], 1)
         spent += 1
-        new_value, reached = follow(world, new_ends, new_commands, new_states, phase, value)
+        new_value, reached = follow(world.episode, new_ends, new_commands, new_states, phase, value)
         if reached < 0 or not new_value < value:
             if active == 0:
                 return math.inf
@@ -139,7 +147,7 @@ def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bu
         change[AMOUNT] *= 2.0
         again = spent > 0 and change[KIND] != SET_COMMAND
     for k in range(active - 1, ends.shape[0]):
-        ends[k] = int(world.clock[LAST_STEP])  # the episode is over by then
+        ends[k] = int(world.episode.clock[LAST_STEP])  # the episode is over by then
     return value
 
 
@@ -149,7 +157,7 @@ def gather(
 ) -> None:
     """Fill the field with the best of the given profiles and of ``drawn`` random ones, all of different value."""
     Q, K = seed_ends.shape
-    last = int(world.clock[LAST_STEP])
+    last = int(world.episode.clock[LAST_STEP])
     ends, commands = np.zeros(K, np.int64), np.zeros(field.commands.shape[1:])
     worst = 0
     for s in range(Q + drawn):
@@ -161,7 +169,7 @@ def gather(
                 used += 1
         else:
             draw_profile(world.random, world.bounds, ends[:used], commands[:used], last)
-        value, reached = follow_whole(world, ends[:used], commands[:used], states, field.values[worst])
+        value, reached = follow_whole(world.episode, ends[:used], commands[:used], states, field.values[worst])
         if reached < 0 or not value < field.values[worst] or is_among(value, field.values):
             continue
         copy_profile(ends, commands, field.ends[worst], field.commands[worst])
@@ -222,7 +230,9 @@ def divide(world: SearchWorld, field: Population) -> None:
     if used > 0 and field.values[0] > 0.0:
         K = field.ends.shape[1]
         used = compact(field.ends[0, :used], field.commands[0, :used], used)
-        split_phases(field.ends[0], field.commands[0], used, K, min(ATTENTION_STEPS, int(world.clock[LAST_STEP])))
+        split_phases(
+            field.ends[0], field.commands[0], used, K, min(ATTENTION_STEPS, int(world.episode.clock[LAST_STEP]))
+        )
         field.phases[0] = K
 
 
@@ -234,7 +244,7 @@ def select_stepwise(
 
     Rounding may decide on which side of a jump a profile lands.
     """
-    world.clock[STEPWISE] = 1.0
+    world.episode.clock[STEPWISE] = 1.0
     Q, K = seed_ends.shape
     best_ends, best_commands = np.zeros(K, np.int64), np.zeros(field.commands.shape[1:])
     least, size = math.inf, 0
@@ -245,7 +255,7 @@ def select_stepwise(
             continue
         ends = seed_ends[s - SMALLEST_FIELD] if given else field.ends[s, :n]
         commands = seed_commands[s - SMALLEST_FIELD] if given else field.commands[s, :n]
-        value, reached = follow_whole(world, ends, commands, states, least)
+        value, reached = follow_whole(world.episode, ends, commands, states, least)
         if reached > 0 and value < least:
             least, size = value, n
             copy_profile(ends, commands, best_ends, best_commands)

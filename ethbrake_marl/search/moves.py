@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.physics import Floats, Ints, UInt64s
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.search.motion import UInt64s
 
 RESOLUTION = 1048576.0  # commands are multiples of 1 / 2^20 m/s2: short to store, exact to repeat, and off any edge
 LONGEST_DRAWN = 25.0  # steps of a phase that is drawn

@@ -11,10 +11,8 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_harm_count
-from ethbrake_marl.physics import Floats, Ints, Worlds, advance
-from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle
-from ethbrake_marl.physics.rows import TIME, command_at, gap_at, harm_at, pack, params_at, speed_at
-from ethbrake_marl.search.motion import (
+from ethbrake_marl.physics import Floats, Ints, UInt64s, Worlds, advance
+from ethbrake_marl.physics.episode import (
     CLOCK_WIDTH,
     HARM_IS_TOTAL,
     HORIZON,
@@ -23,8 +21,11 @@ from ethbrake_marl.search.motion import (
     START,
     STEPWISE,
     TIME_STEP,
-    UInt64s,
+    first_decision_s,
+    number_of_decisions,
 )
+from ethbrake_marl.physics.obstacle import ahead, obstacle_ahead, with_obstacle
+from ethbrake_marl.physics.rows import TIME, command_at, gap_at, harm_at, pack, params_at, speed_at
 
 TIME_STEP_S = 0.1  # between two decisions, where nobody says otherwise
 PER_WORLD = ("start", "clock", "bounds", "command", "latency", "mass", "limit", "identity")  # arrays of a problem
@@ -88,9 +89,9 @@ def profile_problem(
     if command.shape != worlds.speeds_mps.shape:
         raise InvalidInput(f"others_mps2: shape {command.shape}; {worlds.speeds_mps.shape} is needed")
     command[:, chosen] = 0.0
-    hazard = obstacle_ahead(worlds)
-    if hazard.any():
-        if not hazard.all():
+    obstacle = obstacle_ahead(worlds)
+    if obstacle.any():
+        if not obstacle.all():
             raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (obstacle_gap_m), not all")
         return profile_problem(
             with_obstacle(worlds),
@@ -102,12 +103,12 @@ def profile_problem(
             deciders=None if deciders is None else [i + 1 for i in deciders],
         )
     decide = _checked_vehicles(vehicles if deciders is None else deciders, worlds.N)
-    first = np.maximum(v.latency_s[:, decide].min(axis=1), worlds.time_s)
+    first = first_decision_s(worlds, decide.tolist())
     if not (first < horizon_s).all():
         raise InvalidInput(f"horizon_s {horizon_s:g}: must be after the first decision at {first.max():g} s")
     clock = np.empty((worlds.n, CLOCK_WIDTH))
     clock[:, START], clock[:, TIME_STEP], clock[:, HORIZON] = first, time_step_s, horizon_s
-    clock[:, LAST_STEP] = np.ceil((horizon_s - first) / time_step_s - 1e-9)
+    clock[:, LAST_STEP] = number_of_decisions(first, time_step_s, horizon_s)
     clock[:, RESTITUTION], clock[:, HARM_IS_TOTAL], clock[:, STEPWISE] = v.restitution, harm_count == "total", 0.0
     bounds = np.stack([-v.braking_capacity_mps2[:, chosen], v.driving_capacity_mps2[:, chosen]], axis=2)
     after, impacts = advance(worlds, command, until_s=first)
@@ -123,9 +124,9 @@ def state_columns(worlds: Worlds) -> Floats:
 
     Raises ``InvalidInput`` for worlds of which only some have an obstacle ahead.
     """
-    hazard = obstacle_ahead(worlds)
-    if hazard.any():
-        if not hazard.all():
+    obstacle = obstacle_ahead(worlds)
+    if obstacle.any():
+        if not obstacle.all():
             raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (obstacle_gap_m), not all")
         worlds = with_obstacle(worlds)
     return np.concatenate([worlds.speeds_mps, worlds.gaps_m, worlds.pair_hit], axis=1)

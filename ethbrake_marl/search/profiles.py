@@ -15,12 +15,12 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.physics import Bools, Floats, Ints, UInt64s
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.episode import EPISODE_ROWS, LATENCY, STEPWISE, Episode, follow_whole, harm_so_far
 from ethbrake_marl.physics.impact import MASS
-from ethbrake_marl.physics.segment import COMMAND, LIMIT, TABLE_ROWS
-from ethbrake_marl.search.kernel import MOST_PHASES, copy_rows, search_world
-from ethbrake_marl.search.motion import STEPWISE, SearchWorld, UInt64s, follow_whole
+from ethbrake_marl.physics.segment import COMMAND, LIMIT
+from ethbrake_marl.search.kernel import MOST_PHASES, SearchWorld, copy_rows, search_world
 from ethbrake_marl.search.problem import ProfileProblem, seeded
 
 
@@ -115,7 +115,7 @@ def search_profiles(
     random = seeded(problem.identity, seed)
 
     def work(k: int) -> int:
-        world = make_setting(
+        world = make_search_world(
             problem.clock[k], problem.bounds[k], problem.command[k], problem.latency[k], problem.mass[k],
             problem.limit[k], problem.vehicles, random[k : k + 1],
         )  # fmt: skip
@@ -173,16 +173,17 @@ def check_profiles(problem: ProfileProblem, profiles: Profiles) -> None:
 
 
 @compiled
-def make_setting(
+def make_search_world(
     clock: Floats, bounds: Floats, command: Floats, latency: Floats, mass: Floats, limit: Floats, vehicles: Ints,
     random: UInt64s,
 ) -> SearchWorld:  # fmt: skip
-    """One world's setting, with room to work in."""
+    """One world's surroundings, with room to work in."""
     N = mass.shape[0]
-    table = np.zeros((TABLE_ROWS, N))
+    table = np.zeros((EPISODE_ROWS, N))
     for i in range(N):
-        table[COMMAND, i], table[MASS, i], table[LIMIT, i] = command[i], mass[i], limit[i]
-    return SearchWorld(table, np.zeros((2, N - 1)), latency, clock.copy(), vehicles, bounds, random)
+        table[COMMAND, i], table[LATENCY, i] = command[i], latency[i]
+        table[MASS, i], table[LIMIT, i] = mass[i], limit[i]
+    return SearchWorld(Episode(table, clock.copy(), vehicles), bounds, random)
 
 
 @compiled
@@ -193,13 +194,13 @@ def follow_worlds(
     """Fill ``first`` and ``total`` [n] with the harm of one profile per world, and ``failed`` [n] where it ended."""
     no_random = np.zeros(1, np.uint64)
     for k in range(start.shape[0]):
-        world = make_setting(clock[k], bounds[k], command[k], latency[k], mass[k], limit[k], vehicles, no_random)
+        episode = make_search_world(
+            clock[k], bounds[k], command[k], latency[k], mass[k], limit[k], vehicles, no_random
+        ).episode
         states = np.zeros((ends.shape[1] + 1, start.shape[1]))
         copy_rows(start[k : k + 1], states, 1)
-        world.clock[STEPWISE] = 1.0
-        if follow_whole(world, ends[k], commands[k], states, math.inf)[1] < 0:
+        episode.clock[STEPWISE] = 1.0
+        if follow_whole(episode, ends[k], commands[k], states, math.inf)[1] < 0:
             failed[k] = True
             continue
-        for p in range(mass.shape[1] - 1):
-            first[k] += world.harm[0, p]
-            total[k] += world.harm[1, p]
+        first[k], total[k] = harm_so_far(episode.table, 0.0), harm_so_far(episode.table, 1.0)

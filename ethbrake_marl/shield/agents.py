@@ -24,6 +24,7 @@ from ethbrake_marl.agents.rollout import drive, introduce, scripted
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.episode import decision_s, first_decision_s
 from ethbrake_marl.physics.rows import TIME, Packed
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import state_columns
@@ -113,11 +114,6 @@ class FixedCommand:
         return self.command_mps2
 
 
-def first_decision_s(worlds: Worlds, vehicle: int) -> Floats:
-    """Time of a vehicle's first decision in worlds at the alert, [n] s."""
-    return np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
-
-
 class _Asked(NamedTuple):
     """What was decided when the agent was asked last, and is not known to be carried out."""
 
@@ -198,7 +194,7 @@ class StepShieldAgent(AgentAround):
         bound = self.shield.first_bound[rows] + self.shield.allowance
         self.predicted_harm = place(self.predicted_harm, rows, bound)
         self._wanted = place(self._wanted, rows, np.zeros(worlds.n))
-        self._first_s = place(self._first_s, rows, first_decision_s(worlds, vehicle))
+        self._first_s = place(self._first_s, rows, first_decision_s(worlds, [vehicle]))
         self._asked = None
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
@@ -253,7 +249,7 @@ class StepShieldAgent(AgentAround):
         """Where a decision is due now, [n]. Raises ``UncertifiedStep`` where one was due, and nobody asked."""
         assert self.shield is not None and self.shield.running is not None
         running, step_s = self.shield.running, self.scenario.time_step_s
-        due_s = self._first_s + running.steps * step_s
+        due_s = decision_s(self._first_s, step_s, running.steps)
         late = ~running.finished & (worlds.time_s > due_s + step_s / 2)
         if late.any():
             k = int(np.argmax(late))

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics import Bools, Floats, Ints
-from ethbrake_marl.search.motion import START, TIME_STEP
+from ethbrake_marl.physics.episode import START, TIME_STEP, decision_s
 from ethbrake_marl.search.problem import ProfileProblem
 from ethbrake_marl.shield.certify_kernel import NO_CERTIFICATE, NOT_A_NUMBER, certify_worlds, harm_of_plans
 
@@ -58,7 +58,7 @@ class Running(NamedTuple):
     """
 
     problem: ProfileProblem  # parameters, commands of the others, grid of decisions; one vehicle; n * M rows
-    states: Floats  # [n * M, S] of agents.profile_motion: speeds, gaps, hit flags, both harms so far
+    states: Floats  # [n * M, S] of ``physics.episode``: speeds, gaps, hit flags, both harms so far
     steps: Ints  # [n] number of the decision
     ended: Bools  # [n * M]
 
@@ -81,8 +81,7 @@ class Running(NamedTuple):
     def time_s(self) -> Floats:
         """Time of the decision in the nominal member, [n] s."""
         clock = self.problem.clock[:: self.members]
-        time: Floats = clock[:, START] + self.steps * clock[:, TIME_STEP]
-        return time
+        return decision_s(clock[:, START], clock[:, TIME_STEP], self.steps)
 
     def rows_of(self, worlds: Ints) -> Ints:
         """The rows of the members of some worlds."""

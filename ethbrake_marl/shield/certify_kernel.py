@@ -1,9 +1,8 @@
 """The compiled decisions of the step shield.
 
-Everything that is certified is advanced decision by decision with the very operations of the engine's step
-(``run_segment``, ``time_of`` and ``at_rest`` of ``search.motion``): what was certified is what will be
-executed, to the same bits. Only the search for a promising constant runs in one segment to the horizon; what it finds
-is certified step by step before it counts.
+Everything that is certified is advanced decision by decision by ``physics.episode.step_episode``, with the operations
+of the engine's step: what was certified is what will be executed, to the same bits. Only the search for a
+promising constant runs in one segment to the horizon; what it finds is certified step by step before it counts.
 
 A world has M members, worlds that must all keep the bound: one without uncertainty, then nothing here costs more.
 """
@@ -18,18 +17,21 @@ import numpy as np
 from ethbrake_marl.actions import command_of
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled, compiled_apart
-from ethbrake_marl.physics.impact import MASS
-from ethbrake_marl.physics.segment import COMMAND, DONE, LIMIT, ROW_WIDTH, TABLE_ROWS
-from ethbrake_marl.search.motion import (
+from ethbrake_marl.physics.episode import (
+    EPISODE_ROWS,
+    GOES_ON,
     HARM_IS_TOTAL,
     LAST_STEP,
+    LATENCY,
     RESTITUTION,
-    at_rest,
+    grid_of,
+    harm_so_far,
     restore,
-    run_segment,
     save,
-    time_of,
+    step_again,
 )
+from ethbrake_marl.physics.impact import MASS
+from ethbrake_marl.physics.segment import COMMAND, LIMIT
 
 # reasons of a decision, in the order of REASONS of shield.certify
 SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED = range(6)
@@ -39,9 +41,7 @@ NEARLY = 1e-9  # a constant whose harm (m2/s2) in one segment is above the limit
 class Members(NamedTuple):
     """The members of one world, and room to work in."""
 
-    table: Floats  # of physics.segment
-    harm: Floats  # [2, P] first-impact and total harm so far
-    no_rows: Floats  # no list of impacts is kept
+    table: Floats  # of physics.episode
     clock: Floats  # [M, CLOCK_WIDTH]
     bounds: Floats  # [M, 2] m/s2
     command: Floats  # [M, N] of the others
@@ -53,35 +53,13 @@ class Members(NamedTuple):
 
 
 @compiled
-def counted(harm: Floats, total: float) -> float:
-    """Harm of the world so far under the count that is guaranteed, summed front to rear as the ledger does."""
-    value, row = 0.0, 1 if total == 1.0 else 0
-    for p in range(harm.shape[1]):
-        value += harm[row, p]
-    return value
-
-
-@compiled
-def advance_decisions(
-    table: Floats, harm: Floats, latency: Floats, clock: Floats, step: int, end: int, no_rows: Floats
-) -> int:
-    """From decision ``step`` to decision ``end`` under the commands in the table.
-
-    1: the episode has ended, 0: not yet, -1: the physics failed.
-    """
-    time, until = time_of(clock, step), time_of(clock, end)
-    if run_segment(table, harm, latency, clock[RESTITUTION], time, until, no_rows) != DONE:
-        return -1
-    return 1 if end >= clock[LAST_STEP] or at_rest(table) else 0
-
-
-@compiled
 def enter(world: Members, m: int, state: Floats) -> None:
     """Member ``m`` in a saved state."""
-    table, command, mass, limit = world.table, world.command[m], world.mass[m], world.limit[m]
+    table = world.table
     for i in range(table.shape[1]):
-        table[COMMAND, i], table[MASS, i], table[LIMIT, i] = command[i], mass[i], limit[i]
-    restore(table, world.harm, state)
+        table[COMMAND, i], table[LATENCY, i] = world.command[m, i], world.latency[m, i]
+        table[MASS, i], table[LIMIT, i] = world.mass[m, i], world.limit[m, i]
+    restore(table, state)
 
 
 @compiled
@@ -92,13 +70,14 @@ def act(world: Members, m: int, action: float) -> None:
 
 @compiled_apart
 def take_step(world: Members, m: int, state: Floats, step: int, action: float, after: Floats) -> int:
-    """The step of one action from ``state``; fills ``after``. Returns as ``advance_decisions``."""
-    table, harm = world.table, world.harm
+    """The step of one action from ``state``; fills ``after``. Returns as ``step_episode``."""
     enter(world, m, state)
     act(world, m, action)
-    ended = advance_decisions(table, harm, world.latency[m], world.clock[m], step, step + 1, world.no_rows)
-    save(table, harm, after)
-    return ended
+    outcome = step_again(
+        world.table, world.clock[m, RESTITUTION], grid_of(world.clock[m]), step, step + 1, world.table[:0]
+    )
+    save(world.table, after)
+    return outcome
 
 
 @compiled
@@ -108,15 +87,14 @@ def take_steps(
     """The step of one action in every member; how many episodes go on, or -1 if the physics failed."""
     going = 0
     for m in range(ended.shape[0]):
-        status = 1
         if ended[m]:
-            after[m, :] = states[m]
-        else:
-            status = take_step(world, m, states[m], step, action, after[m])
-        if status < 0:
+            after[m, :], over[m] = states[m], True
+            continue
+        outcome = take_step(world, m, states[m], step, action, after[m])
+        if outcome < GOES_ON:
             return -1
-        over[m] = status == 1
-        going += 1 - status
+        over[m] = outcome != GOES_ON
+        going += 0 if over[m] else 1
     return going
 
 
@@ -125,8 +103,8 @@ def worst_so_far(world: Members, states: Floats) -> float:
     """Largest harm so far over the members."""
     worst = 0.0
     for m in range(states.shape[0]):
-        restore(world.table, world.harm, states[m])
-        worst = max(worst, counted(world.harm, world.clock[m, HARM_IS_TOTAL]))
+        restore(world.table, states[m])
+        worst = max(worst, harm_so_far(world.table, world.clock[m, HARM_IS_TOTAL]))
     return worst
 
 
@@ -136,16 +114,18 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
 
     Gives up with infinity as soon as it is above ``most`` (harm never falls), or where the physics fails.
     """
-    table, harm, latency, clock = world.table, world.harm, world.latency[m], world.clock[m]
-    vehicle, braking, driving, no_rows = world.vehicle, -world.bounds[m, 0], world.bounds[m, 1], world.no_rows
+    table, no_rows, total = world.table, world.table[:0], world.clock[m, HARM_IS_TOTAL]
+    restitution, grid = world.clock[m, RESTITUTION], grid_of(world.clock[m])
+    vehicle, braking, driving = world.vehicle, -world.bounds[m, 0], world.bounds[m, 1]
     enter(world, m, state)
-    status, value = 1 if ended else 0, counted(harm, clock[HARM_IS_TOTAL])
-    while status == 0:
+    goes_on, value = not ended, harm_so_far(table, total)
+    while goes_on:
         table[COMMAND, vehicle] = command_of(plan[step], braking, driving)
-        status = advance_decisions(table, harm, latency, clock, step, step + 1, no_rows)
-        value = counted(harm, clock[HARM_IS_TOTAL])
-        if status < 0 or value > most:
+        outcome = step_again(table, restitution, grid, step, step + 1, no_rows)
+        value = harm_so_far(table, total)
+        if outcome < GOES_ON or value > most:
             return math.inf
+        goes_on = outcome == GOES_ON
         step += 1
     return value
 
@@ -166,14 +146,14 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 @compiled
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, action: float) -> float:
     """Harm of the episode under a constant action from here, in one segment; infinity where the physics fails."""
-    table, harm, clock = world.table, world.harm, world.clock[m]
+    table, clock = world.table, world.clock[m]
     enter(world, m, state)
     act(world, m, action)
     if not ended:
-        last = int(clock[LAST_STEP])
-        if advance_decisions(table, harm, world.latency[m], clock, step, last, world.no_rows) < 0:
+        last, grid = int(clock[LAST_STEP]), grid_of(clock)
+        if step_again(table, clock[RESTITUTION], grid, step, last, table[:0]) < GOES_ON:
             return math.inf
-    return counted(harm, clock[HARM_IS_TOTAL])
+    return harm_so_far(table, clock[HARM_IS_TOTAL])
 
 
 @compiled_apart
@@ -264,8 +244,7 @@ def certify_worlds(
     World k's members are the rows from k * M on, M of them.
     """
     N, n = mass.shape[1], steps.shape[0]
-    table, harm, critical = np.zeros((TABLE_ROWS, N)), np.zeros((2, N - 1)), np.zeros(1, np.int64)
-    no_rows = np.empty((0, ROW_WIDTH))
+    table, critical = np.zeros((EPISODE_ROWS, N)), np.zeros(1, np.int64)
     room = np.zeros((2, plans.shape[1]))
     M = states.shape[0] // max(n, 1)
     for k in range(n):
@@ -277,8 +256,7 @@ def certify_worlds(
             over[a:b] = True
             continue
         world = Members(
-            table, harm, no_rows, clock[a:b], bounds[a:b], command[a:b], latency[a:b], mass[a:b], limit[a:b], vehicle,
-            critical,
+            table, clock[a:b], bounds[a:b], command[a:b], latency[a:b], mass[a:b], limit[a:b], vehicle, critical
         )  # fmt: skip
         good = decide_world(
             world, states[a:b], ended[a:b], steps[k], proposed[k], budget[k], certified[k], constants, plans[k], room,
@@ -297,15 +275,13 @@ def harm_of_plans(
     Where one of the ``constants`` is better, it replaces the plan (in place) first.
     """
     N, n = mass.shape[1], steps.shape[0]
-    table, harm, critical = np.zeros((TABLE_ROWS, N)), np.zeros((2, N - 1)), np.zeros(1, np.int64)
-    no_rows = np.empty((0, ROW_WIDTH))
+    table, critical = np.zeros((EPISODE_ROWS, N)), np.zeros(1, np.int64)
     trial = np.zeros(plans.shape[1])
     M = states.shape[0] // max(n, 1)
     for k in range(n):
         a, b = k * M, k * M + M
         world = Members(
-            table, harm, no_rows, clock[a:b], bounds[a:b], command[a:b], latency[a:b], mass[a:b], limit[a:b], vehicle,
-            critical,
+            table, clock[a:b], bounds[a:b], command[a:b], latency[a:b], mass[a:b], limit[a:b], vehicle, critical
         )  # fmt: skip
         value[k] = worst_of_plan(world, states[a:b], ended[a:b], steps[k], plans[k], math.inf)
         if constants.shape[0] > 0:

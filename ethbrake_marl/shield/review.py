@@ -16,8 +16,9 @@ from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, LeftOutRows, Worlds, measured_without_failed
+from ethbrake_marl.physics.episode import decision_at, first_decision_s
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.shield.agents import StepShieldAgent, first_decision_s
+from ethbrake_marl.shield.agents import StepShieldAgent
 from ethbrake_marl.shield.rollouts import proposed_action
 
 SAME_HARM = 1e-9  # harms (m2/s2) closer than this are one harm
@@ -139,11 +140,11 @@ class _Released(AgentAround):
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         super().begin(worlds, vehicle, rows)
-        self._first_s = first_decision_s(worlds, vehicle)
+        self._first_s = first_decision_s(worlds, [vehicle])
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         own = proposed_action(self.policy, worlds, vehicle)
-        step = np.rint((worlds.time_s - self._first_s) / self._time_step_s).astype(np.int64)
+        step = decision_at(worlds.time_s, self._first_s, self._time_step_s)
         held = self._actions[np.arange(len(step)), np.clip(step, 0, self._actions.shape[1] - 1)]
         action = np.where(step < self._release, held, own)
         return action_to_command(action, worlds.vehicles, vehicle)

@@ -19,8 +19,8 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive, introduce, scripted
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.physics.episode import HARM_IS_TOTAL, START, TIME_STEP, decision_at
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.motion import HARM_IS_TOTAL, START, TIME_STEP
 from ethbrake_marl.search.problem import ProfileProblem, worlds_at
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify, from_now, plan_harm
 from ethbrake_marl.shield.certify_kernel import ENDED
@@ -145,7 +145,7 @@ class _Recorder(AgentAround):
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The policy's action, rounded as it is written."""
         action = _or_braking(proposed_action(self.policy, worlds, vehicle))
-        step = np.rint((worlds.time_s - self._clock[:, START]) / self._clock[:, TIME_STEP]).astype(np.int64)
+        step = decision_at(worlds.time_s, self._clock[:, START], self._clock[:, TIME_STEP])
         rows = np.flatnonzero((step >= 0) & (step < self.actions.shape[1]))
         self.actions[rows, step[rows]] = action[rows]
         return action_to_command(action, worlds.vehicles, vehicle)

@@ -8,8 +8,7 @@ import numpy as np
 
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.segment import ROW_WIDTH, TABLE_ROWS
-from ethbrake_marl.search.motion import at_rest
+from ethbrake_marl.physics.episode import EPISODE_ROWS, at_rest
 from ethbrake_marl.shield.certify import Running
 from ethbrake_marl.shield.certify_kernel import Members, follow_plan
 
@@ -31,11 +30,9 @@ def rests_after_plans(
 ) -> None:  # fmt: skip
     """Fill ``rests`` [n]: under the plan every member of the world comes to rest before the horizon, and stays so."""
     N, n = mass.shape[1], steps.shape[0]
-    table, harm, critical = np.zeros((TABLE_ROWS, N)), np.zeros((2, N - 1)), np.zeros(1, np.int64)
+    table, critical = np.zeros((EPISODE_ROWS, N)), np.zeros(1, np.int64)
     M = states.shape[0] // max(n, 1)
-    world = Members(
-        table, harm, np.empty((0, ROW_WIDTH)), clock, bounds, command, latency, mass, limit, vehicle, critical
-    )
+    world = Members(table, clock, bounds, command, latency, mass, limit, vehicle, critical)
     for k in range(n):
         rests[k] = True
         for m in range(k * M, k * M + M):

@@ -18,6 +18,7 @@ from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.episode import number_of_decisions
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import PER_WORLD as OF_PROBLEM
 from ethbrake_marl.search.problem import profile_problem
@@ -111,7 +112,7 @@ class StepShield:
         self.episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode
         self.distrusted: Bools = np.zeros(0, np.bool_)
         self._others = scripted(scenario, but=vehicle) if others is None else others
-        self._width = int(np.ceil(scenario.horizon_s / scenario.time_step_s)) + 1
+        self._width = int(number_of_decisions(np.zeros(1), scenario.time_step_s, scenario.horizon_s)[0]) + 1
 
     @property
     def bound(self) -> Floats:

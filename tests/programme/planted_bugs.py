@@ -140,7 +140,9 @@ BUGS: dict[str, Bug] = {
         "(0.0 * impacts.first_impact_harm, 0.0 * impacts.total_harm, impacts.count)",
         ("tests/envs/test_parallel.py",),
     ),
-    "one step more where the division rounds up": Bug(STARTS, " / step - 1e-9)", " / step)", OF_ENGINE),
+    "one step more where the division rounds up": Bug(
+        "ethbrake_marl/physics/episode.py", " / time_step_s - _ROUNDING)", " / time_step_s)", OF_ENGINE
+    ),
     "rows that have ended are paid again": Bug(
         ENGINE, "        extra[self.ended & ~step.ended] = 0.0\n", "", OF_ENGINE
     ),

@@ -16,6 +16,7 @@ from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import observation_for, observe
 from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.physics.episode import CLOCK_WIDTH
 from ethbrake_marl.physics.rows import Packed, pack, unpack, with_news_columns
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
 from ethbrake_marl.scenario.v2x import (
@@ -28,7 +29,6 @@ from ethbrake_marl.scenario.v2x import (
     link_delays,
     with_news,
 )
-from ethbrake_marl.search.motion import CLOCK_WIDTH
 from ethbrake_marl.search.problem import identities
 
 PAPER = load_scenario("paper-random")

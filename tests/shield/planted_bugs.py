@@ -43,10 +43,14 @@ BUGS: dict[str, tuple[Patch, ...]] = {
         ),
     ),
     "an impact counted again where the pair was hit before": (
-        Patch(KERNEL, "    save(table, harm, after)\n", "    table[HIT, 0] = 0.0\n    save(table, harm, after)\n"),
-        Patch(KERNEL, "import COMMAND, DONE, LIMIT,", "import COMMAND, DONE, HIT, LIMIT,"),
+        Patch(
+            KERNEL, "    save(world.table, after)\n", "    world.table[HIT, 0] = 0.0\n    save(world.table, after)\n"
+        ),
+        Patch(KERNEL, "import COMMAND, LIMIT\n", "import COMMAND, HIT, LIMIT\n"),
     ),
-    "harm so far forgotten": (Patch(KERNEL, "    save(table, harm, after)\n", "    save(table, harm * 0.0, after)\n"),),
+    "harm so far forgotten": (
+        Patch(KERNEL, "    save(world.table, after)\n", "    world.table[-2:] = 0.0\n    save(world.table, after)\n"),
+    ),
     "latency ignored": (
         Patch(
             GUARD,

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ethbrake_marl.search.motion import RESTITUTION
+from ethbrake_marl.physics.episode import RESTITUTION
 from ethbrake_marl.shield import StepShield
 from ethbrake_marl.shield.certify import Decision, Running
 

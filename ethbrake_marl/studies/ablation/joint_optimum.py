@@ -28,6 +28,7 @@ from ethbrake_marl.limits.best_harm import (
 )
 from ethbrake_marl.limits.best_harm_table import BestHarmTable
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.episode import first_decision_s
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Sample, Task
 from ethbrake_marl.studies.ablation.plan import Level, Plan
@@ -114,7 +115,7 @@ def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
     if not (set(theirs.learners) <= set(mine.learners) and same_scripts):
         return np.zeros(own.worlds.n, np.bool_)
     latency_s, obstacle_m = own.worlds.vehicles.latency_s, other.worlds.obstacle_gap_m
-    later_s = latency_s[:, theirs.learners].min(axis=1) - latency_s[:, mine.learners].min(axis=1)
+    later_s = first_decision_s(own.worlds, theirs.learners) - first_decision_s(own.worlds, mine.learners)
     steps = later_s / mine.time_step_s
     same = (latency_s == other.worlds.vehicles.latency_s).all(axis=1)
     on_grid = np.abs(steps - np.rint(steps)) < 1e-9
