@@ -68,12 +68,12 @@ BUGS: dict[str, tuple[Patch, ...]] = {
         ),
     ),
     "late latency: counted from the segment's start": (
-        Patch(ADVANCE, "table[ONSET, i] = latency[k, i] - time[k]", "table[ONSET, i] = latency[k, i]"),
+        Patch(ADVANCE, "table[ONSET, i] = onset_s(latency[k, i], time[k])", "table[ONSET, i] = latency[k, i]"),
     ),
     "latency rounded up to the end of the step": (
         Patch(
             ADVANCE,
-            "table[ONSET, i] = latency[k, i] - time[k]",
+            "table[ONSET, i] = onset_s(latency[k, i], time[k])",
             "table[ONSET, i] = latency[k, i] - time[k] if latency[k, i] <= time[k] else duration",
         ),
     ),
