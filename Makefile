@@ -87,7 +87,7 @@ lint: $(STAMP)
 	@echo "== ruff format --check"
 	@$(BIN)/python -m ruff format --check .
 	@echo "== mypy --strict"
-	@$(BIN)/python -m mypy --strict ethbrake_marl
+	@$(BIN)/python -m mypy --strict ethbrake_marl tests/every_public_name.py
 
 check: lint
 	@$(MAKE) --no-print-directory test

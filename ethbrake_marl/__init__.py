@@ -2,18 +2,23 @@
 
 Importing it registers ``EthBrake-v0`` with Gymnasium and ``ethbrake/ethbrake-v0`` with PettingZoo, and nothing more: a
 public name is imported when it is first used, so torch and matplotlib are loaded only by what needs them.
+
+The imports below are the table of public names, each once. Type checkers read them as imports; at run time they are
+read from this file, and each is made on first use.
 """
 
 from __future__ import annotations
 
+import ast
+from difflib import get_close_matches
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ethbrake_marl.envs.registration import register_environments
 
 if TYPE_CHECKING:
-    from ethbrake_marl.agents.registry import make_agent as make_agent
-    from ethbrake_marl.agents.registry import register_agent as register_agent
+    # Environments
     from ethbrake_marl.engine.engine import Engine as Engine
     from ethbrake_marl.envs.parallel import EthBrakeParallelEnv as EthBrakeParallelEnv
     from ethbrake_marl.envs.parallel import env as env
@@ -23,63 +28,97 @@ if TYPE_CHECKING:
     from ethbrake_marl.envs.sb3 import make_sb3_vec_env as make_sb3_vec_env
     from ethbrake_marl.envs.single import EthBrakeEnv as EthBrakeEnv
     from ethbrake_marl.envs.vector import EthBrakeVectorEnv as EthBrakeVectorEnv
-    from ethbrake_marl.errors import EthBrakeError as EthBrakeError
-    from ethbrake_marl.evaluation import evaluate as evaluate
-    from ethbrake_marl.observations import ObservationSpec as ObservationSpec
-    from ethbrake_marl.observations import observation_for as observation_for
-    from ethbrake_marl.physics import Worlds as Worlds
-    from ethbrake_marl.physics import advance as advance
-    from ethbrake_marl.physics import make_worlds as make_worlds
-    from ethbrake_marl.policies.policy import load_policy as load_policy
-    from ethbrake_marl.rewards import RewardParams as RewardParams
+
+    # Scenarios, and the worlds drawn from them
+    from ethbrake_marl.scenario import Sample as Sample
     from ethbrake_marl.scenario import Scenario as Scenario
     from ethbrake_marl.scenario import list_scenarios as list_scenarios
     from ethbrake_marl.scenario import load_scenario as load_scenario
+    from ethbrake_marl.physics import Worlds as Worlds
+    from ethbrake_marl.physics import advance as advance
+    from ethbrake_marl.physics import make_worlds as make_worlds
+
+    # Observations and rewards
+    from ethbrake_marl.observations import ObservationSpec as ObservationSpec
+    from ethbrake_marl.observations import observation_for as observation_for
+    from ethbrake_marl.rewards import RewardParams as RewardParams
+
+    # Agents, teams and policies
+    from ethbrake_marl.agents.learned import LearnedAgent as LearnedAgent
+    from ethbrake_marl.agents.protocol import Agent as Agent
+    from ethbrake_marl.agents.registry import AgentSettings as AgentSettings
+    from ethbrake_marl.agents.registry import agent_names as agent_names
+    from ethbrake_marl.agents.registry import make_agent as make_agent
+    from ethbrake_marl.agents.team import Team as Team
+    from ethbrake_marl.policies.policy import Policy as Policy
+    from ethbrake_marl.policies.policy import load_policy as load_policy
+    from ethbrake_marl.policies.shipped import load_shipped as load_shipped
+
+    # Shields, one for each interface
     from ethbrake_marl.shield import HybridShield as HybridShield
+    from ethbrake_marl.shield import ShieldedEnv as ShieldedEnv
+    from ethbrake_marl.shield import ShieldedVectorEnv as ShieldedVectorEnv
+    from ethbrake_marl.shield import ShieldOptions as ShieldOptions
+    from ethbrake_marl.shield import shielded_aec as shielded_aec
+    from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
+
+    # Training
+    from ethbrake_marl.learning.recipe import TrainingRecipe as TrainingRecipe
+    from ethbrake_marl.learning.recipe import load_recipe as load_recipe
+    from ethbrake_marl.learning.train import TrainResult as TrainResult
+    from ethbrake_marl.learning.train import resume as resume
+    from ethbrake_marl.learning.train import train as train
+    from ethbrake_marl.progress import Progress as Progress
+
+    # Evaluation
+    from ethbrake_marl.evaluation import EpisodeRecord as EpisodeRecord
+    from ethbrake_marl.evaluation import Evaluation as Evaluation
+    from ethbrake_marl.evaluation import Outcome as Outcome
+    from ethbrake_marl.evaluation import SummaryRow as SummaryRow
+    from ethbrake_marl.evaluation import evaluate as evaluate
+    from ethbrake_marl.evaluation import record_episode as record_episode
+    from ethbrake_marl.evaluation import summarise as summarise
+
+    # Registration of your own parts
+    from ethbrake_marl.agents.registry import register_agent as register_agent
+    from ethbrake_marl.learning.registry import register_algorithm as register_algorithm
+
+    # Errors
+    from ethbrake_marl.errors import EthBrakeError as EthBrakeError
 
 __version__ = "0.1.0"
 
-_HOME = {
-    "Engine": "engine.engine",
-    "EthBrakeEnv": "envs.single",
-    "EthBrakeError": "errors",
-    "EthBrakeParallelEnv": "envs.parallel",
-    "EthBrakeVecEnv": "envs.sb3",
-    "EthBrakeVectorEnv": "envs.vector",
-    "HybridShield": "shield",
-    "ObservationSpec": "observations",
-    "RewardParams": "rewards",
-    "Scenario": "scenario",
-    "Worlds": "physics",
-    "advance": "physics",
-    "env": "envs.parallel",
-    "evaluate": "evaluation",
-    "list_scenarios": "scenario",
-    "load_policy": "policies.policy",
-    "load_scenario": "scenario",
-    "make_agent": "agents.registry",
-    "make_sb3_vec_env": "envs.sb3",
-    "make_worlds": "physics",
-    "observation_for": "observations",
-    "parallel_env": "envs.parallel",
-    "raw_env": "envs.parallel",
-    "register_agent": "agents.registry",
-}
 
-__all__ = ["__version__", *_HOME]
+def _read_homes() -> dict[str, str]:
+    """Public name -> the module that it lives in, as the imports above say."""
+    content = ast.parse(Path(__file__).read_text("utf-8")).body
+    table = next(part for part in content if isinstance(part, ast.If)).body
+    lines = [line for line in table if isinstance(line, ast.ImportFrom)]
+    return {alias.name: str(line.module) for line in lines for alias in line.names}
 
 
-def __getattr__(name: str) -> Any:
+_HOMES = _read_homes()
+
+
+def _import_public(name: str) -> Any:
     """Import a public name from the file it lives in, once."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    if name == "__all__":
+        return ["__version__", *_HOMES]
+    if name not in _HOMES:
+        close = get_close_matches(name, _HOMES, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
+    value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value
     return value
 
 
+if not TYPE_CHECKING:  # type checkers would take any name for a public one
+    __getattr__ = _import_public
+
+
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME})
+    return sorted({*globals(), *_HOMES, "__all__"})
 
 
 register_environments()

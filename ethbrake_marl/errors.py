@@ -43,7 +43,16 @@ def count_of(n: int, thing: str) -> str:
 
 
 class EthBrakeError(Exception):
-    """Base of every error that this package raises on purpose; its text is one line, whatever it tells of."""
+    """Base of every error that this package raises on purpose; its text is one line, whatever it tells of.
+
+    >>> import ethbrake_marl as eb
+    >>> try:
+    ...     eb.load_scenario("paper-randon")
+    ... except eb.EthBrakeError as error:
+    ...     print(error)
+    unknown scenario 'paper-randon'; did you mean 'paper-random'?
+
+    """
 
     def __str__(self) -> str:
         """The message as ``one_line``."""

@@ -1,4 +1,4 @@
-"""Whose harm counts: what each vehicle's objective makes of the harm of the line, from the one ledger.
+"""Objectives, whose harm counts: what each vehicle's objective makes of the harm of the line, from the one ledger.
 
 Every objective is an amount of harm (m2/s2) to be made small; ``H_i`` is what vehicle i bears, ``H`` what all do:
 

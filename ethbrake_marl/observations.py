@@ -1,4 +1,4 @@
-"""What a vehicle observes: named features with fixed analytic scalings, the same for every vehicle.
+"""Observations: named features with fixed analytic scalings, the same for every vehicle.
 
 An observation is the vehicle's own features followed by those of its nearest neighbours, front ones first. Each
 feature is ``clip(value / scale, low, high)``. What this vehicle does not know, or a neighbour that is absent, reads 0
@@ -100,10 +100,17 @@ _ROLE, _OBSTACLE = len(ROLE_FEATURES), len(OBSTACLE_FEATURES)
 
 @dataclass(frozen=True, slots=True)
 class ObservationSpec:
-    """How many neighbours an observation holds on each side, and whether its own place and an obstacle follow."""
+    """How many neighbours an observation holds on each side, and whether its own place and an obstacle follow.
 
-    front: int = 1
-    rear: int = 1
+    >>> import ethbrake_marl as eb
+    >>> spec = eb.ObservationSpec(front=2, rear=0)
+    >>> spec.size, spec.features[7].name
+    (27, 'front_1.known')
+
+    """
+
+    front: int = 1  # neighbours ahead, 0 to 64
+    rear: int = 1  # neighbours behind
     role: bool = False  # ROLE_FEATURES
     obstacle: bool = False  # OBSTACLE_FEATURES
 

@@ -37,7 +37,23 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 class RewardParams(BaseModel):
-    """Weights of the terms and their constants; a weight of 0 switches a term off."""
+    """Weights of the terms and their constants; a weight of 0 switches a term off.
+
+    Args:
+        harm, collision, risk, jerk, terminal, shaping: weights, at least 0, of the terms that this file's head lists.
+        harm_count: impacts that count, ``first`` of each pair or ``total``.
+        objective: whose harm counts, one name or one for each vehicle; None: the scenario's.
+        shaping_discount: the learner's own discount, in (0, 1].
+        k_energy: weight of an impact's squared closing speed in the collision term.
+        ttc_scale_s: time to collision at which the risk term falls, s.
+        safety_buffer_m: distance kept free in the risk term, m.
+        target_gap_m: gap below which the risk term rises, m.
+        distance_slope_per_m: how steeply it does, 1/m.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.EthBrakeEnv("paper-random", reward=eb.RewardParams(harm=0.05, terminal=1.0))
+
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 

@@ -1,4 +1,4 @@
-"""Who drives a vehicle: one protocol, the scripts and the baselines. See docs/baselines.md."""
+"""The agents that drive a vehicle: one protocol, scripts, baselines and the registry. See docs/baselines.md."""
 
 from ethbrake_marl.agents.e_v2x_bm.agent import EV2XBM
 from ethbrake_marl.agents.e_v2x_bm.coupled import CoupledOptimum, optimise_coupled

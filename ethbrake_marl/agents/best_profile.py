@@ -64,7 +64,7 @@ class BestHarm:
         self.predicted_harm = place(self.predicted_harm, rows, first if self._harm_count == "first" else total)
         self.searched = place(self.searched, rows, (~known).astype(np.float64))
         self._start_s = place(self._start_s, rows, problem.clock[:, START])
-        self._profiles = _placed(self._profiles, rows, profiles, self._start_s.size)
+        self._profiles = _place(self._profiles, rows, profiles, self._start_s.size)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The command of the phase in force, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
@@ -95,7 +95,7 @@ class BestHarm:
         return whole
 
 
-def _placed(stored: Profiles, rows: Ints, profiles: Profiles, n: int) -> Profiles:
+def _place(stored: Profiles, rows: Ints, profiles: Profiles, n: int) -> Profiles:
     """The stored profiles, now of ``n`` rows, with those of ``rows`` replaced."""
     stored, profiles = pad_profiles([stored, profiles], 1)
     grown = stored.grown(n)

@@ -1,4 +1,4 @@
-"""What an agent knows of the line while it drives: a small fixed vocabulary, stated by every agent itself.
+"""The vocabulary in which every agent states what it knows of the line while it drives.
 
 An agent says it with an attribute ``knows``: one ``Source``, its name, or several where parts of it know different
 things (a shield around a policy). A channel (``v2x``) hides things from the first two sources only.
@@ -42,7 +42,7 @@ def knowledge_of(agent: object) -> Knowledge:
     return tuple(source for source in Source if source in found)
 
 
-def combined(*agents: object, also: Source | None = None) -> Knowledge:
+def combine(*agents: object, also: Source | None = None) -> Knowledge:
     """What several agents know between them, and what a wrapper around them knows ``also``."""
     known = {source for agent in agents for source in knowledge_of(agent)} | ({also} if also else set())
     return tuple(source for source in Source if source in known)

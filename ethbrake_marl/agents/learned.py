@@ -28,7 +28,13 @@ class LearnedPolicy(Protocol):
 
 
 class LearnedAgent:
-    """Drives one vehicle by a policy's deterministic action; holds no state between steps."""
+    """Drives one vehicle by a policy's deterministic action; holds no state between steps.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.LearnedAgent(eb.load_shipped("ppo"), name="mine").name
+    'mine'
+
+    """
 
     knows = Source.MESSAGES
 

@@ -1,4 +1,4 @@
-"""A policy that rehearses: at the alert it tries deviations from itself in the engine, and drives the best it found."""
+"""The refinement of a policy: at the alert it tries deviations in the engine, and drives the best it found."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ import copy
 
 import numpy as np
 
-from ethbrake_marl.agents.around import AgentAround
 from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.protocol import Agent, check_agent, place, recall
+from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place, recall
 from ethbrake_marl.agents.registry import AgentSettings
-from ethbrake_marl.agents.rollout import drive, introduce, scripted
+from ethbrake_marl.agents.rollout import drive, script_agents, set_others
 from ethbrake_marl.errors import check_whole_number
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 
-REHEARSALS = 32  # deviations tried in each round
+TRIES = 32  # deviations tried in each round
 ROUNDS = 6  # each starts from the best of the rounds before
 SEGMENT_S = 0.4  # a deviation changes at multiples of this time
 HOLDS = (2, 3, 6)  # segments for which it stays the same, in turn
@@ -25,19 +24,32 @@ _SEGMENTS = 64  # of different deviation; the last one goes on
 _BLOCK = 4096  # worlds rolled out together: bounds memory, changes no result
 
 
-class Rehearsed(AgentAround):
+class Refined(AgentAround):
     """Drives by ``policy`` plus the deviation that did the least harm when many were rolled out at the alert.
 
-    A deviation is a sequence of accelerations added to what the policy does; the policy goes on reacting to what it
-    observes. The first one is none. In each of ``rounds`` rounds ``rehearsals`` fixed changes, the same in every world,
-    are added to the best deviation so far, and the least harm of all is kept: a random local search around the policy.
-    ``predicted_harm`` [n] is that least harm (m2/s2, under ``harm_count``), never above the policy's own, and what is
-    realised if the other vehicles follow their scripts. Equal harms: the earlier one, so a policy that cannot be
-    bettered drives as it is. A world's choice does not depend on its batch. Raises ``InvalidInput`` for what is not an
-    agent, numbers of rehearsals or rounds outside 1 to 10,000, an unknown count.
+    A deviation is a sequence of accelerations added to what the policy does, which goes on reacting to what it
+    observes. Each round adds fixed changes, the same in every world, to the best deviation so far; the first is none.
+    ``predicted_harm`` [n] (m2/s2) is the least harm found, never above the policy's own, and is realised if the other
+    vehicles follow their scripts. Equal harms: the earlier one. A world's choice does not depend on its batch. Raises
+    ``InvalidInput`` for what is not an agent, or numbers outside 1 to 10,000.
+
+    Args:
+        policy: any agent.
+        scenario: in which it tries them.
+        tries: deviations of each round.
+        rounds: each starts from the best of those before.
+        harm_count: which harm is least, ``first`` or ``total``.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> refined = eb.make_agent("constant:5+refined", scenario=scenario)
+    >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"refined": refined}, scenario=scenario).outcome("refined")
+    >>> bool((outcome.first_impact_harm == outcome.predicted_harm).all())
+    True
+
     """
 
-    adds = Source.MODEL  # in which it rehearses
+    adds = Source.MODEL  # in which it tries them
     divides_along = ("_deviation", "predicted_harm")
 
     def __init__(
@@ -45,40 +57,40 @@ class Rehearsed(AgentAround):
         policy: Agent,
         scenario: Scenario,
         *,
-        rehearsals: int = REHEARSALS,
+        tries: int = TRIES,
         rounds: int = ROUNDS,
         harm_count: HarmCount = "first",
     ) -> None:
-        check_agent(policy, "rehearsed")
-        for name, number in (("rehearsals", rehearsals), ("rounds", rounds)):
-            check_whole_number(f"rehearsed: {name}", number, 1, 10_000)
+        check_agent(policy, "refined")
+        for name, number in (("tries", tries), ("rounds", rounds)):
+            check_whole_number(f"refined: {name}", number, 1, 10_000)
         check_harm_count(harm_count)
         super().__init__(policy, f"{policy.name}+refined")
         self.scenario = scenario
-        self.rehearsals = rehearsals
+        self.tries = tries
         self.rounds = rounds
         self.harm_count: HarmCount = harm_count
         self.predicted_harm: Floats = np.empty(0)
         self._deviation: Floats = np.empty((0, _SEGMENTS))  # [n, segments] that is driven
-        self._stage = copy.deepcopy(policy)  # rehearsing must not disturb the policy's memory of running episodes
+        self._stage = copy.deepcopy(policy)  # trying must not disturb the policy's memory of running episodes
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Rehearse for these rows; ``worlds`` holds those rows only, at the alert."""
+        """Search for these rows; ``worlds`` holds those rows only, at the alert."""
         best = np.zeros((worlds.n, _SEGMENTS))
         least = self._harm(worlds, vehicle, best)
         for number in range(self.rounds):
-            change = changes(number, self.rehearsals)
+            change = changes(number, self.tries)
             open_rows = np.flatnonzero(least > 0.0)
-            step = max(1, _BLOCK // self.rehearsals)
+            step = max(1, _BLOCK // self.tries)
             for some in (open_rows[i : i + step] for i in range(0, len(open_rows), step)):
-                tried = best[some, np.newaxis] + change  # [worlds, rehearsals, segments]
+                tried = best[some, np.newaxis] + change  # [worlds, tries, segments]
                 harm = self._harm(worlds.take(np.repeat(some, len(change))), vehicle, tried.reshape(-1, _SEGMENTS))
                 harm = harm.reshape(len(some), len(change))
                 chosen = harm.argmin(axis=1)
                 better = harm[np.arange(len(some)), chosen] < least[some]
                 best[some[better]] = tried[better, chosen[better]]
                 least[some[better]] = harm[better, chosen[better]]
-        introduce(self.policy, vehicle, scripted(self.scenario, but=vehicle))
+        set_others(self.policy, vehicle, script_agents(self.scenario, except_for=vehicle))
         self.policy.begin(worlds, vehicle, rows)
         self._deviation = place(self._deviation, rows, best)
         self.predicted_harm = place(self.predicted_harm, rows, least)
@@ -86,7 +98,7 @@ class Rehearsed(AgentAround):
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """Wanted signed acceleration, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
         deviation = recall(self._deviation, worlds.n, self.name)
-        return deviated(self.policy.act(worlds, vehicle), deviation, worlds, vehicle)
+        return deviate(self.policy.act(worlds, vehicle), deviation, worlds, vehicle)
 
     def _harm(self, worlds: Worlds, vehicle: int, deviation: Floats) -> Floats:
         """Harm under one deviation per world, [n]."""
@@ -97,7 +109,7 @@ class Rehearsed(AgentAround):
 
 def refine(policy: Agent, argument: None, settings: AgentSettings) -> Agent:
     """``+refined`` around an agent."""
-    return Rehearsed(policy, settings.needed_scenario(), harm_count=settings.harm_count)
+    return Refined(policy, settings.needed_scenario(), harm_count=settings.harm_count)
 
 
 class _Deviating(AgentAround):
@@ -108,24 +120,24 @@ class _Deviating(AgentAround):
         self.deviation = deviation  # [n, segments]
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        return deviated(self.policy.act(worlds, vehicle), self.deviation, worlds, vehicle)
+        return deviate(self.policy.act(worlds, vehicle), self.deviation, worlds, vehicle)
 
 
-def changes(number: int, rehearsals: int) -> Floats:
-    """What round ``number`` adds to a deviation, as shares of the braking capacity: [rehearsals, segments].
+def changes(number: int, tries: int) -> Floats:
+    """What round ``number`` adds to a deviation, as shares of the braking capacity: [tries, segments].
 
     Change k is constant over ``HOLDS`` segments and uniform in plus or minus one of ``SIZES``, in turn; the numbers are
     Philox's integers with the round as their key, the same for ever.
     """
-    integers = np.asarray(np.random.Philox(key=number).random_raw(rehearsals * _SEGMENTS))
-    share = (integers >> np.uint64(11)).astype(np.float64).reshape(rehearsals, _SEGMENTS) * 2.0**-52 - 1.0
-    kind = np.arange(rehearsals)
+    integers = np.asarray(np.random.Philox(key=number).random_raw(tries * _SEGMENTS))
+    share = (integers >> np.uint64(11)).astype(np.float64).reshape(tries, _SEGMENTS) * 2.0**-52 - 1.0
+    kind = np.arange(tries)
     hold = np.array(HOLDS)[(kind // len(SIZES)) % len(HOLDS), np.newaxis]
     held = np.take_along_axis(share, np.arange(_SEGMENTS) // hold, axis=1)
     return np.array(SIZES)[kind % len(SIZES), np.newaxis] * held
 
 
-def deviated(command_mps2: Floats, deviation: Floats, worlds: Worlds, vehicle: int) -> Floats:
+def deviate(command_mps2: Floats, deviation: Floats, worlds: Worlds, vehicle: int) -> Floats:
     """Commands [n] plus the deviations [n, segments] in force now, within the vehicle's capacities."""
     segment = np.minimum((worlds.time_s / SEGMENT_S).astype(np.int64), _SEGMENTS - 1)
     braking = worlds.vehicles.braking_capacity_mps2[:, vehicle]

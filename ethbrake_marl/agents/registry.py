@@ -27,11 +27,17 @@ HORIZON_S = 8.0  # until when an agent looks ahead that knows no scenario
 
 @dataclass(frozen=True, slots=True)
 class AgentSettings:
-    """What an agent may need beyond its own argument."""
+    """What an agent may need beyond its own argument.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.AgentSettings("planner:64", scenario=eb.load_scenario("paper-random")).needed_scenario().name
+    'paper-random'
+
+    """
 
     spec: str  # as it is written, with what is around it so far
     policy: str | None = None  # what stands after the @
-    scenario: Scenario | None = None
+    scenario: Scenario | None = None  # in which it drives, where that is known
     harm_count: HarmCount = "first"  # which harm an optimising agent minimises
     horizon_s: float = HORIZON_S  # until when it looks ahead
     most_candidates: int | None = None  # of a search, whatever its argument says; None: what that says
@@ -161,12 +167,16 @@ def make_agent(
             ``ppo@shipped+refined+step``; ``ethbrake agents`` lists all.
         scenario: needed by teams, by what is put around an agent, and to find the shipped policy of this scenario.
         harm_count: which harm an optimising agent minimises, ``first`` or ``total``.
-        horizon_s: until when it looks ahead; by default the scenario's horizon, or 8 s.
+        horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: for trying an agent out: no search of it takes more.
         uncertainty: what a robust shield does not know, such as ``"gaps_m=0.5"``.
 
     Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, harm count or
     horizon, and for a scenario that is missing.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.make_agent("ppo@shipped+step", scenario=eb.load_scenario("paper-random")).name
+    'ppo@shipped+step'
 
     """
     check_harm_count(harm_count)
@@ -241,10 +251,15 @@ def register_agent(
 ) -> None:
     """Make ``name``, ``name:argument`` and ``name@policy`` known to ``make_agent``, and so to every command.
 
-    This is how code outside this folder, yours included, adds agents. ``factory`` gets what stands after the colon (or
-    None) and ``AgentSettings``, whose ``policy`` is what stands after the ``@``; ``about`` and ``knows`` are what
-    ``ethbrake agents`` shows. Registering the same factory again changes nothing; another one under a taken name raises
-    ``AlreadyExists``, a name that is not plain ``InvalidInput``.
+    Args:
+        name: plain, without argument.
+        factory: makes the agent, from what stands after the colon (or None) and ``AgentSettings``, whose ``policy`` is
+            what stands after the ``@``. The same one again changes nothing.
+        about: one line for ``ethbrake agents``.
+        knows: of the line while it drives, for ``ethbrake agents`` too.
+
+    Raises ``AlreadyExists`` for a name that another factory has, ``InvalidInput`` for one that is not plain.
+
     """
     if parse_spec(name) != AgentSpec(name, None, None, ()):
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")

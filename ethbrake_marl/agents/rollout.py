@@ -39,17 +39,17 @@ class Watch(Protocol):
         ...
 
 
-def scripted(scenario: Scenario, *, but: int | Collection[int] | None = None) -> dict[int, Agent]:
-    """Fresh agents for the scenario's scripts, by vehicle, ``but`` some; those that look ahead know the others."""
-    left_out = () if but is None else (but,) if isinstance(but, int) else but
+def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
+    """Fresh agents for the scenario's scripts, by vehicle; those that look ahead know the others."""
+    left_out = () if except_for is None else (except_for,) if isinstance(except_for, int) else except_for
     specs = {i: spec for i, spec in scenario.scripts.items() if i not in left_out}
     scripts = {i: make_single_agent(spec, horizon_s=scenario.horizon_s) for i, spec in specs.items()}
     for vehicle, script in scripts.items():
-        introduce(script, vehicle, scripts)
+        set_others(script, vehicle, scripts)
     return scripts
 
 
-def introduce(agent: Agent, vehicle: int, scripts: Mapping[int, Script]) -> None:
+def set_others(agent: Agent, vehicle: int, scripts: Mapping[int, Script]) -> None:
     """Tell an agent that looks ahead, and will drive ``vehicle``, who drives the others."""
     if isinstance(agent, LookingAhead):
         agent.others = {i: script for i, script in scripts.items() if i != vehicle}
@@ -69,11 +69,11 @@ def episode_engine(worlds: Worlds, agent: Agent | Team, scenario: Scenario, vehi
         raise InvalidInput(
             f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
             f" {', '.join(undriven)} of scenario {scenario.name!r} must be driven too. An agent that rolls itself out"
-            " (hybrid, rehearsed, step) can drive one learner, the others need scripts: --vehicle NAME"
+            " (+refined, +episode, +step) can drive one learner, the others need scripts: --vehicle NAME"
         )
-    scripts = scripted(scenario, but=drivers)
+    scripts = script_agents(scenario, except_for=drivers)
     for i, driver in drivers.items():
-        introduce(driver, i, scripts)
+        set_others(driver, i, scripts)
     engine = Engine(
         scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, deciders=tuple(drivers), worlds=worlds
     )

@@ -1,4 +1,4 @@
-"""How an agent is written: ``name[:argument][@policy]``, and behind it what is put around that agent.
+"""The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
 
 ``+refined`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``.
 """

@@ -1,4 +1,4 @@
-"""Who drives when several vehicles learn: one agent for each of them."""
+"""Teams: one agent for each of several vehicles."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from ethbrake_marl.agents.knowledge import Knowledge, combined
+from ethbrake_marl.agents.knowledge import Knowledge, combine
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput
 
@@ -17,6 +17,12 @@ class Team:
 
     One object cannot drive two vehicles, because it may remember its episodes: ``copies`` makes a team of one agent.
     Raises ``InvalidInput`` for what is not an agent, an index that is no whole number from 0, or one object twice.
+
+    >>> import ethbrake_marl as eb
+    >>> team = eb.Team({1: eb.make_agent("full_brake"), 2: eb.make_agent("copy_leader")}, "mixed")
+    >>> sorted(team.drivers)
+    [1, 2]
+
     """
 
     def __init__(self, drivers: Mapping[int, Agent], name: str) -> None:
@@ -35,7 +41,7 @@ class Team:
     @property
     def knows(self) -> Knowledge:
         """What its drivers know between them; nothing where nobody is driven."""
-        return combined(*self.drivers.values())
+        return combine(*self.drivers.values())
 
     @classmethod
     def copies(cls, agent: Agent, vehicles: Collection[int]) -> Team:

@@ -12,12 +12,11 @@ import typer
 from typer.exceptions import TyperException
 
 from ethbrake_marl.cli.ablate import ablate_command, generalise_command
-from ethbrake_marl.cli.agents import agents_command
 from ethbrake_marl.cli.bench import bench_command
 from ethbrake_marl.cli.best_harm import best_harm_command
 from ethbrake_marl.cli.doctor import diagnose
 from ethbrake_marl.cli.equal_time import equal_time_command
-from ethbrake_marl.cli.evaluate import evaluate_command, shield_command, show_beside, show_rows
+from ethbrake_marl.cli.evaluate import agents_command, evaluate_command, shield_command, show_beside, show_rows
 from ethbrake_marl.cli.options import (
     ForceOption,
     JsonOption,

@@ -40,7 +40,7 @@ def bench_command(
         return
     machine = this_machine()
     with interruptible(_NOTHING):
-        speeds = _watched(measure(QUICK if quick else FULL), len(BENCHMARKS))
+        speeds = _watch(measure(QUICK if quick else FULL), len(BENCHMARKS))
     if as_json:
         write_json({"machine": asdict(machine), "figures": [asdict(speed) for speed in speeds]})
         return
@@ -63,8 +63,8 @@ def _bench_scaling(output: Path, *, quick: bool, force: bool, as_json: bool) -> 
 
     machine, effort = this_machine(), QUICK if quick else EFFORT
     with interruptible(_NOTHING):
-        by_worlds = _watched(costs_by_worlds(effort), 2 * len(WORLDS))
-        by_vehicles = _watched(costs_by_vehicles(effort), 2 * len(VEHICLES))
+        by_worlds = _watch(costs_by_worlds(effort), 2 * len(WORLDS))
+        by_vehicles = _watch(costs_by_vehicles(effort), 2 * len(VEHICLES))
     caption = f"Processor time, one core, medians. {machine}."
     write_output(target, png_bytes(scaling_figure(by_worlds, by_vehicles, caption)), force=force)
     costs = [*by_worlds, *by_vehicles]
@@ -78,7 +78,7 @@ def _bench_scaling(output: Path, *, quick: bool, force: bool, as_json: bool) -> 
     say(f"picture: {target}")
 
 
-def _watched(measurements: Iterable[Measured], total: int) -> list[Measured]:
+def _watch(measurements: Iterable[Measured], total: int) -> list[Measured]:
     """All of them, with a bar on stderr while they are made."""
     found = []
     with progress_bars() as bars:

@@ -92,7 +92,7 @@ def best_harm_command(
         shutil.rmtree(parts)
         say(f"every world: {output}")
     _show(
-        {**best_harm_figures(table), **_proven(sample.worlds, Task(chosen, controlled or chosen.learners), table)},
+        {**best_harm_figures(table), **_prove(sample.worlds, Task(chosen, controlled or chosen.learners), table)},
         as_json=as_json,
     )
 
@@ -169,7 +169,7 @@ def _command_text(
     return shlex.join([*words, "--output", "FILE.npz"])
 
 
-def _proven(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[str, object]:
+def _prove(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[str, object]:
     """What is proven beside what was found, where one of three vehicles is controlled; see ``evaluation.bounds``."""
     found = proven_of_table(worlds, task, table)
     if found is None:

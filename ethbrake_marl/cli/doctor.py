@@ -40,17 +40,17 @@ def diagnose() -> list[Check]:
     """All checks, in the order in which they should be repaired; none of them raises."""
     return [
         Check("ethbrake_marl", True, f"{__version__} in {_PACKAGE}"),
-        _checked("python", _python),
+        _check("python", _python),
         *_dependencies(),
-        _checked("processor", _processor),
-        _checked("kernel cache", _kernel_cache),
-        _checked("scenarios", _scenarios),
-        _checked("physics", _golden_impact),
-        _checked("baseline", _golden_baseline),
+        _check("processor", _processor),
+        _check("kernel cache", _kernel_cache),
+        _check("scenarios", _scenarios),
+        _check("physics", _golden_impact),
+        _check("baseline", _golden_baseline),
     ]
 
 
-def _checked(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
+def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
     """The finding of ``look``; whatever it raises is a finding too, so that the other checks are still made."""
     try:
         return Check(name, *look())

@@ -20,7 +20,7 @@ from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.studies.equal_time import equal_time, timed_table
 
 REFINED = "ppo@shipped+refined+episode"
-SEARCHES = (  # without a policy, from a millisecond per world to what rehearsing takes and more
+SEARCHES = (  # without a policy, from a millisecond per world to what refining takes and more
     "best_harm:1000,best_harm:3000,best_harm:10000,best_harm:20000,best_harm:40000,"
     "planner:64,planner:256,planner:1024,planner:2048"
 )

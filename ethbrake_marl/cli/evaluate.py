@@ -7,10 +7,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich import box
+from rich.table import Table
 
+from ethbrake_marl.agents.knowledge import knowledge_text
+from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, VehicleOption
 from ethbrake_marl.cli.picture import PictureOption, counted_without, picture_app, picture_target, tell_left_out
-from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
+from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation import (
     Rescored,
@@ -19,7 +23,7 @@ from ethbrake_marl.evaluation import (
     declared_objectives,
     evaluate,
     horizon_note,
-    rescored,
+    rescore,
     rescored_table,
     rich_table,
     summarise,
@@ -106,7 +110,7 @@ def evaluate_command(
     if per_world is not None:
         write_per_world_csv(per_world, evaluation, objectives=objectives, force=force)
         say(f"every world: {per_world}")
-    told = rescored(evaluation, objectives)
+    told = rescore(evaluation, objectives)
     rows = summarise(evaluation)
     show_rows(rows, as_json, told)
     moving = {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
@@ -158,7 +162,7 @@ def shield_command(
     (the same), costly (lower).
     """
     chosen = load_driven(scenario, vehicle)
-    rows = measured_modes(agents, chosen, episodes, harm_count)
+    rows = measure_modes(agents, chosen, episodes, harm_count)
     if as_json:
         write_json([row.to_json() for row in rows])
     else:
@@ -186,7 +190,7 @@ def picture_shield_modes(
     from ethbrake_marl.figures.style import png_bytes
 
     chosen = load_driven(scenario, vehicle)
-    rows = measured_modes(agents, chosen, episodes, harm_count)
+    rows = measure_modes(agents, chosen, episodes, harm_count)
     caption = (
         f"{chosen.name}, {count_of(episodes, 'world')} of the list of seed {LIST_SEED}, {harm_count} harm; mean and 95"
         " % interval of the difference, paired by world."
@@ -197,7 +201,7 @@ def picture_shield_modes(
     say(f"picture: {target}")
 
 
-def measured_modes(agents: str, scenario: Scenario, episodes: int, harm_count: HarmCount) -> list[ModeRow]:
+def measure_modes(agents: str, scenario: Scenario, episodes: int, harm_count: HarmCount) -> list[ModeRow]:
     """The rows of these agents, with progress on stderr."""
     worlds = scenario.sample(episodes, LIST_SEED).worlds
     lineup = make_proposers(agents.split(","), scenario, harm_count=harm_count)
@@ -208,3 +212,23 @@ def measured_modes(agents: str, scenario: Scenario, episodes: int, harm_count: H
             Task(scenario, scenario.learners, harm_count),
             on_progress=lambda name, done: bars.show(name, done, episodes),
         )
+
+
+def agents_command(as_json: JsonOption = False) -> None:
+    """List all agents: how each is written, what it does, what it knows.
+
+    What begins with + goes behind any agent, for instance full_brake+step: +refined first, then one shield.
+    """
+    entries = agent_entries()
+    if as_json:
+        write_json([{"agent": e.form, "about": e.about, "knows": list(e.knows)} for e in entries])
+        return
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("Agent", no_wrap=True)
+    table.add_column("Drives by", overflow="fold")
+    table.add_column("Knows", overflow="fold")
+    for entry in entries:
+        added = "also " if entry.form.startswith("+") else ""
+        table.add_row(entry.form, entry.about, added + knowledge_text(entry.knows))
+    result_console().print(table)
+    show("ladder stands for coast to best_harm; a typo gets a suggestion. See docs/baselines.md and docs/shield.md.")

@@ -1,4 +1,4 @@
-"""What the command line shows while it works and how it ends: lines and progress bars on stderr, JSON on stdout."""
+"""Output of the command line: lines and progress bars on stderr, results and JSON on stdout."""
 
 from __future__ import annotations
 

@@ -83,12 +83,27 @@ class Watcher(Protocol):
 class Engine:
     """A batch of ``n`` running episodes of one scenario.
 
-    ``learners`` are vehicle indices (0 = front); every other vehicle needs an entry in ``scripts``. Worlds come from
-    the scenario's training stream of ``seed`` unless they are given (``worlds``, at t = 0, here or in ``reset``).
-    Steps start when the first of the ``deciders`` may act: the learners, or the scripted vehicles named instead (an
-    evaluated agent drives its vehicle as a script, on a learner's grid of decisions). With none, they start at t = 0.
-    Whoever must see each episode's start and each step (a shield) follows it as a ``Watcher``. A world that the physics
-    cannot advance takes no other with it: its episode is cut off (truncated), and the ``roster`` names it.
+    Steps start when the first of the ``deciders`` may act; with none, at t = 0. Whoever must see each episode's start
+    and each step (a shield) follows it as a ``Watcher``. A world that the physics cannot advance takes no other with
+    it: its episode is cut off (truncated), and the ``roster`` names it.
+
+    Args:
+        scenario: of every episode.
+        n: worlds that are advanced together, at least 1.
+        learners: indices of the vehicles (0 = front) that need an action in every step.
+        scripts: vehicle index -> what drives it, for every vehicle that does not learn.
+        reward: a name, a mapping of settings, or ``RewardParams``.
+        observation: what a vehicle observes; None: ``observation_for(scenario)``.
+        seed: of the scenario's training stream, from which worlds come unless they are given.
+        deciders: indices of the vehicles that set the grid of decisions; None: the learners. An evaluated agent drives
+            its vehicle as a script, on a learner's grid.
+        worlds: of the first episodes, at t = 0; None: from the stream.
+
+    >>> import ethbrake_marl as eb
+    >>> engine = eb.make_sb3_vec_env("paper-random", 4, seed=7).engine
+    >>> engine.n, engine.learners, engine.worlds.time_s
+    (4, (1,), array([0.5, 0.5, 0.5, 0.5]))
+
     """
 
     roster: Roster  # who runs in which row, and which worlds failed

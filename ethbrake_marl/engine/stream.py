@@ -1,4 +1,4 @@
-"""Where episodes come from: worlds at the alert, made ready for their first decision, and the stream of training."""
+"""The stream of episodes: worlds at the alert, made ready for their first decision."""
 
 from __future__ import annotations
 

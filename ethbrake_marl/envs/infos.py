@@ -1,4 +1,4 @@
-"""Infos of every interface, computed once for all vehicles of all worlds.
+"""The infos of every interface, computed once for all vehicles of all worlds.
 
 After a reset: ``time_s``, ``command_in_force_mps2`` (in force now; 0 until the latency has elapsed), the vehicle's
 share of the harm so far under both counts, the same for the whole world, and whether anything has collided. After a
@@ -161,13 +161,13 @@ def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools | None) -
     always = {name: columns[name] for name in AT_ANY_TIME}
     if told.known_from_s is not None:
         always["known_from_s"] = told.known_from_s[:, vehicle]
-    info = _masked(always, rows)
+    info = _mask(always, rows)
     if stepped is None:
         return info
     columns["chosen_action"] = columns["chosen_action"].astype(np.float32)[:, np.newaxis]
-    info |= _masked({name: columns[name] for name in AFTER_A_STEP[len(AT_ANY_TIME) :]}, stepped)
+    info |= _mask({name: columns[name] for name in AFTER_A_STEP[len(AT_ANY_TIME) :]}, stepped)
     terms = {} if told.step is None else told.step.shared | _column(told.step.further, vehicle)
-    info["reward_terms"] = _masked(terms, stepped)
+    info["reward_terms"] = _mask(terms, stepped)
     info["_reward_terms"] = stepped.copy()
     return info
 
@@ -176,7 +176,7 @@ def _column(terms: dict[str, Floats], vehicle: int) -> dict[str, Floats]:
     return {name: term[:, vehicle] for name, term in terms.items()}
 
 
-def _masked(columns: dict[str, NDArray[Any]], rows: Bools) -> dict[str, Any]:
+def _mask(columns: dict[str, NDArray[Any]], rows: Bools) -> dict[str, Any]:
     """Each column where ``rows`` marks it, else zeros, and its mask beside it."""
     masked: dict[str, Any] = {}
     for name, column in columns.items():

@@ -36,12 +36,28 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
     """A line of vehicles ``vehicle_1`` (front) ... ``vehicle_N``, all of them agents from the alert to the end.
 
     Learners need an action [1] in [-1, 1] in each step: -1 full braking capacity, 0 coasts, +1 full driving capacity.
-    Scripted vehicles observe, are rewarded and get infos too; what is passed for them is ignored, and
-    ``infos[agent]["chosen_action"]`` shows what their script did. With ``agents="learners"`` only learners are agents:
-    for trainers that learn from every agent. ``max_cycles`` truncates an episode after so many steps, if it is not
-    over before. All agents end together: terminated when all are
-    at rest and no command would move one, truncated at the horizon. ``state()`` is the full state for centralised
-    critics. Observations, rewards, infos and ``reset``: as for ``EthBrakeEnv``; any number of ``learners``.
+    What is passed for scripted vehicles is ignored; ``infos[agent]`` shows what their script did. All agents end
+    together: terminated when all are at rest and no command would move one, truncated at the horizon. ``state()`` is
+    the full state of the line, for central critics. Observations, rewards, infos and ``reset`` are those of
+    ``EthBrakeEnv``.
+
+    Args:
+        scenario: a shipped name, the path of a YAML file, its content as a mapping, or a ``Scenario``.
+        render_mode: None; there is no drawing.
+        learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what every vehicle observes; None: ``observation_for(scenario)``.
+        agents: ``all`` vehicles, or ``learners`` only, for trainers that learn from every agent.
+        max_cycles: truncates an episode after so many steps, if it is not over before; None: the horizon does.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.parallel_env(scenario="paper-random")
+    >>> observations, infos = env.reset(seed=7)
+    >>> while env.agents:
+    ...     observations, rewards, terminations, truncations, infos = env.step({"vehicle_2": [-1.0]})
+    >>> terminations["vehicle_2"], round(infos["vehicle_2"]["world_total_harm"], 2)
+    (True, 39.95)
+
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "ethbrake_v0", "render_modes": [], "is_parallelizable": True}
@@ -153,7 +169,15 @@ parallel_env = EthBrakeParallelEnv
 
 
 def raw_env(**settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
-    """The same environment with agents acting in turn (AEC), front to rear; arguments as ``parallel_env``."""
+    """The same environment with agents acting in turn (AEC), front to rear; arguments as ``parallel_env``.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.raw_env(scenario="paper-random")
+    >>> env.reset(seed=7)
+    >>> env.agent_selection
+    'vehicle_1'
+
+    """
     return parallel_to_aec(parallel_env(**settings))
 
 

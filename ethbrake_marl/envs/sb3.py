@@ -48,12 +48,25 @@ def make_sb3_vec_env(
     horizon_is_end: bool = False,
     appended: Appended | None = None,
 ) -> EthBrakeVecEnv:
-    """``n_envs`` worlds for Stable-Baselines3; arguments as ``parallel_env``. ``seed=None``: fresh entropy.
+    """``n_envs`` worlds for Stable-Baselines3.
 
-    ``horizon_is_end``: infos report no truncation, so that an algorithm does not add the value it expects beyond the
-    horizon. Harm is counted to the horizon, so nothing lies beyond it; what is imagined there can grow without limit.
-    ``appended``: what a row holds behind the vehicle's own observation: ``number``, the learner's place among the
-    learners (0 = the foremost), or ``state``, the full state of the line (``envs.state``), for a central critic.
+    Args:
+        scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
+        n_envs: worlds that are advanced together, at least 1.
+        seed: of the stream of worlds; None: fresh entropy.
+        learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what the learners observe; None: ``observation_for(scenario)``.
+        horizon_is_end: infos report no truncation, so that an algorithm does not add the value it expects beyond the
+            horizon. Harm is counted to the horizon: nothing lies beyond it, and what is imagined there can grow without
+            limit.
+        appended: numbers of a row behind the vehicle's own observation. ``number``: the learner's place among the
+            learners (0 = the foremost); ``state``: the full state of the line (``envs.state``), for a central critic.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
+    (4, 27)
+
     """
     check_seed(seed)
     engine = make_engine(scenario, n_envs, learners=learners, reward=reward, observation=observation)
@@ -64,13 +77,28 @@ def make_sb3_vec_env(
 class EthBrakeVecEnv(VecEnv):
     """Rows are learners: row ``k * L + l`` is learner l (front to rear) of world k, for L learners in each world.
 
-    With one learner rows are worlds; with several, all rows share one policy (parameter sharing), and the rows of a
-    world end together. All worlds take their episodes from one stream, as in ``EthBrakeVectorEnv``.
+    With several learners all rows share one policy, and the rows of a world end together. All worlds take their
+    episodes from one stream, as in ``EthBrakeVectorEnv``. At the end of an episode its rows' infos hold
+    ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, steps ``l``; ``t`` is always 0, no
+    clock is read), and harm under both counts; all other infos are empty. Attributes and methods belong to the whole
+    batch: there are no environments inside.
 
-    At the end of an episode its rows' infos hold ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return
-    ``r``, steps ``l``; ``t`` is always 0, no clock is read), and harm under both counts as in ``envs.infos``; all other
-    infos are empty.
-    There are no environments inside: attributes and methods belong to the whole batch.
+    Args:
+        engine: the running worlds; ``make_sb3_vec_env`` makes them.
+        seed: of the stream of worlds.
+        horizon_is_end: as in ``make_sb3_vec_env``.
+        appended: as in ``make_sb3_vec_env``.
+
+    >>> import ethbrake_marl as eb
+    >>> import numpy as np
+    >>> env = eb.make_sb3_vec_env("paper-random", 4, learners=["vehicle_2", "vehicle_3"])
+    >>> env.num_envs
+    8
+    >>> observations = env.reset()
+    >>> observations, rewards, dones, infos = env.step(np.full((8, 1), -1.0))
+    >>> rewards.shape, dones.any()
+    ((8,), np.False_)
+
     """
 
     render_mode: str | None = None
@@ -107,7 +135,7 @@ class EthBrakeVecEnv(VecEnv):
         Options hold for one reset; unusable ones are an ``InvalidInput`` of that reset, and the next one is without.
         """
         try:
-            worlds = self._given_worlds()
+            worlds = self._read_options()
         finally:
             self._reset_options()
         restart_from(self.engine, self._next_seed, worlds)
@@ -225,7 +253,7 @@ class EthBrakeVecEnv(VecEnv):
     def _by_row(self, worlds: Bools) -> Bools:
         return worlds.repeat(len(self._learners))
 
-    def _given_worlds(self) -> Worlds | None:
+    def _read_options(self) -> Worlds | None:
         """The worlds that the options of the rows ask for; None for the stream's."""
         options = [row or {} for row in self._options]
         if len(options) != self.num_envs:

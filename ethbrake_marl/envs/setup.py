@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ethbrake_marl.actions import checked_action
-from ethbrake_marl.agents.rollout import scripted
+from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number
 from ethbrake_marl.observations import Feature, ObservationSpec
@@ -64,7 +64,7 @@ def make_engine(
         loaded,
         int(n),
         learners=loaded.learners,
-        scripts=scripted(loaded),
+        scripts=script_agents(loaded),
         reward=reward,
         observation=observation,
         seed=seed,

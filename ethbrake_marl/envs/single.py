@@ -29,14 +29,28 @@ from ethbrake_marl.rewards import Reward
 class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
     """One learner brakes in a line of vehicles that follow their scripts: ``gymnasium.make("EthBrake-v0")``.
 
-    Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity,
-    0 coasts, +1 full driving capacity. Reward: by name (``"harm"``, ``"total-harm"``, ``"paper"``) or
-    ``RewardParams``. Terminated: all at rest and no command that would move one. Truncated: the horizon.
-    Infos: see ``envs.infos``. ``reset(seed=s)`` starts the stream of worlds of s, ``reset()`` goes on in it;
-    ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from there.
+    Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity, 0
+    coasts, +1 full driving capacity. Terminated: all at rest and no command that would move one. Truncated: the
+    horizon. Infos: see ``envs.infos``. ``reset(seed=s)`` starts the stream of worlds of s, ``reset()`` goes on in it;
+    ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from there. Raises
+    ``InvalidInput`` for more or fewer than one learner, an action outside [-1, 1], a step without an episode.
 
-    ``learners`` (one vehicle, by name or index from 0) replaces the scenario's. Raises ``InvalidInput`` for more or
-    fewer than one learner, an action that is not in [-1, 1], and a step without a running episode.
+    Args:
+        scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
+        render_mode: None; there is no drawing.
+        learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what the learner observes; None: ``observation_for(scenario)``.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.EthBrakeEnv("paper-random")
+    >>> observation, info = env.reset(seed=7)
+    >>> observation.shape, info["time_s"]
+    ((27,), 0.5)
+    >>> observation, reward, terminated, truncated, info = env.step([-1.0])
+    >>> reward, terminated, truncated
+    (0.0, False, False)
+
     """
 
     def __init__(

@@ -31,13 +31,30 @@ _MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 
 
 class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
-    """``num_envs`` worlds of ``EthBrakeEnv``: ``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``.
+    """Many worlds of ``EthBrakeEnv``: ``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``.
 
     All worlds take their episodes from one stream: row k of ``reset(seed=s)`` is world k of s, and each new episode is
-    the next world of it. ``autoreset_mode`` is Gymnasium's: ``"SameStep"`` (default) returns the first observation
-    of the new episode, with the last one of the old in ``infos["final_obs"]`` and its infos in
-    ``infos["final_info"]``; ``"NextStep"`` returns the last observation and spends the next step, whose action is
-    ignored and whose reward is 0, on the reset. Every array that is returned has its own memory.
+    the next world of it. Every array that is returned has its own memory.
+
+    Args:
+        num_envs: worlds that are advanced together, at least 1.
+        scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
+        render_mode: None; there is no drawing.
+        learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what the learner observes; None: ``observation_for(scenario)``.
+        autoreset_mode: Gymnasium's. ``SameStep`` returns the first observation of the new episode, with the last one of
+            the old in ``infos["final_obs"]`` and its infos in ``infos["final_info"]``. ``NextStep`` returns the last
+            observation and spends the next step, whose action is ignored and whose reward is 0, on the reset.
+
+    >>> import ethbrake_marl as eb
+    >>> import numpy as np
+    >>> env = eb.EthBrakeVectorEnv(num_envs=4, scenario="paper-random")
+    >>> observations, infos = env.reset(seed=7)
+    >>> observations, rewards, terminated, truncated, infos = env.step(np.full((4, 1), -1.0))
+    >>> observations.shape, rewards.shape
+    ((4, 27), (4,))
+
     """
 
     def __init__(
@@ -52,7 +69,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     ) -> None:
         check_render_mode(render_mode)
         self.render_mode = render_mode
-        self.autoreset_mode = _checked_mode(autoreset_mode)
+        self.autoreset_mode = _check_mode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.engine = make_engine(scenario, num_envs, learners=learners, reward=reward, observation=observation)
         self.learner = only_learner(self.engine)
@@ -81,7 +98,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         if not self._started:
             raise InvalidInput("step: no episode is running; call reset first")
         engine, before = self.engine, self.engine.ended
-        step = engine.step(self._without_ignored(actions, before))
+        step = engine.step(self._fill_ignored(actions, before))
         # all that have ended: an interrupted step may have left some that nobody renewed
         renewed = engine.ended if self.autoreset_mode is AutoresetMode.SAME_STEP else before
         infos: dict[str, Any] = {}
@@ -93,7 +110,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         reward = step.reward[:, self.learner].copy()
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
 
-    def _without_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
+    def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
         """The actions with those that the autoreset mode ignores replaced: their worlds had ended ``before``."""
         ignoring = self.autoreset_mode is AutoresetMode.NEXT_STEP and before.any()
         if not ignoring or np.shape(actions)[:1] != (self.num_envs,):
@@ -113,7 +130,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         return {"final_obs": final, "_final_obs": ended, "final_info": info, "_final_info": ended.copy()}
 
 
-def _checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
+def _check_mode(mode: str | AutoresetMode) -> AutoresetMode:
     if isinstance(mode, AutoresetMode) and mode in _MODES:
         return mode
     for known in _MODES:

@@ -4,16 +4,17 @@
 """
 
 from ethbrake_marl.evaluation.conditions import parameter_line, parameters
+from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.evaluation.per_world import check_target, write_per_world_csv
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
-from ethbrake_marl.evaluation.rollout import Evaluation, LeftOut, Outcome, evaluate
+from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.evaluation.table import (
     Rescored,
     SummaryRow,
     declared_objectives,
     horizon_note,
-    rescored,
+    rescore,
     rescored_table,
     summarise,
 )
@@ -35,7 +36,7 @@ __all__ = [
     "parameter_line",
     "parameters",
     "record_episode",
-    "rescored",
+    "rescore",
     "rescored_table",
     "rich_table",
     "summarise",

@@ -1,4 +1,4 @@
-"""Where Vehicle 1 ends: how far it travels, and how much of that others pushed it.
+"""The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
 
 Worlds know gaps and speeds, no places. A post far ahead, out of reach, makes the way of Vehicle 1 the change of one
 more gap; it changes no motion.

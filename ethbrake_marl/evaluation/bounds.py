@@ -1,4 +1,4 @@
-"""What is proven about a list of worlds, beside the least harm known there: two bounds and the gap between them.
+"""The proven bounds of a list of worlds, beside the least harm known there.
 
 *Contact proven* is not *impact proven*: in the worlds between, every command leads to contact, and it is open whether
 to an impact. Either vehicles get away with leaning on each other there, or the proof is loose. The harm of the best

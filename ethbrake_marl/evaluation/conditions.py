@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.rollout import Evaluation
+from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.scenario.quantities import DECLARED, OPTIONAL, QUANTITIES, QuantityRule

@@ -9,7 +9,8 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.rollout import Evaluation, Outcome, controlled_vehicle, evaluate
+from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
+from ethbrake_marl.evaluation.rollout import controlled_vehicle, evaluate
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.avoidability import avoidability
 from ethbrake_marl.limits.limits import Unproven, unproven_because

@@ -83,11 +83,11 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
     closed_form = Choice(float(chosen[0]), float(predicted[np.searchsorted(at, chosen[0])]))
     return DecelerationCurve(
         task, world, at, predicted, first[0], total[0], regimes, closed_form,
-        {rule: _coupled(world, task, rule, others) for rule in HARM_COUNTS}, known_limits(world, task),
+        {rule: _choose_coupled(world, task, rule, others) for rule in HARM_COUNTS}, known_limits(world, task),
     )  # fmt: skip
 
 
-def _coupled(world: Worlds, task: Task, harm_count: HarmCount, others_mps2: Floats) -> Choice:
+def _choose_coupled(world: Worlds, task: Task, harm_count: HarmCount, others_mps2: Floats) -> Choice:
     best = optimise_coupled(
         world, task.vehicle, harm_count=harm_count, horizon_s=task.scenario.horizon_s, others_mps2=others_mps2
     )

@@ -1,4 +1,4 @@
-"""What an evaluation is given: who drives (agents from their specs, trained policies among them), in which worlds."""
+"""Inputs of an evaluation: agents from their specs, trained policies among them, and worlds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import current_spelling, make_agent, make_single_agent
-from ethbrake_marl.agents.rollout import introduce, scripted
+from ethbrake_marl.agents.rollout import script_agents, set_others
 from ethbrake_marl.agents.spelling import AgentSpec, parse_spec
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.errors import InvalidInput, OldSpelling, check_one_learner, unknown_name
@@ -95,9 +95,9 @@ def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenari
     """
     for agent in agents.values():
         team = team_of(agent, scenario.learners)
-        scripts = scripted(scenario, but=team.drivers)
+        scripts = script_agents(scenario, except_for=team.drivers)
         for vehicle, driver in team.drivers.items():
-            introduce(driver, vehicle, scripts)
+            set_others(driver, vehicle, scripts)
             _try_out(driver, worlds if getattr(driver, "state_free", False) else worlds.take([0]), vehicle)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ethbrake_marl.evaluation.rollout import Evaluation
+from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.scenario import Scenario, load_scenario
 
 MAIN_TEST = "paper-random"

@@ -1,4 +1,4 @@
-"""Where results go: nothing is overwritten by accident, and a file is there whole or not at all."""
+"""The CSV file with one row per agent and world, written whole or not at all, and never over another by accident."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 from ethbrake_marl.agents.knowledge import knowledge_text
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.conditions import quantity, quantity_rules
+from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
 from ethbrake_marl.evaluation.regret import Regrets, assess
-from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
 from ethbrake_marl.files.durable import check_writable, write_file
 from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.objectives import Declared, scored

@@ -29,10 +29,19 @@ Segment = tuple[Worlds, Floats, float]  # world (n = 1) at its start, constant c
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRecord:
-    """One world from the alert to its end, at k times; row 0 is the alert."""
+    """One world from the alert to its end, at k times; row 0 is the alert.
 
-    agent: str
-    scenario: Scenario
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> world = scenario.sample(1, seed=7).worlds
+    >>> record = eb.record_episode(world, eb.make_agent("full_brake"), scenario=scenario)
+    >>> record.positions_m.shape, record.impacts.time_s.round(2), record.at_rest
+    ((196, 3), array([2.17, 3.3 ]), True)
+
+    """
+
+    agent: str  # its name
+    scenario: Scenario  # of the world
     vehicle: int  # index (0 = front) of the vehicle that the agent drove
     initial: Worlds  # n = 1, at the alert
     time_s: Floats  # [k] since Vehicle 1 began to brake, ascending
@@ -48,10 +57,18 @@ class EpisodeRecord:
 def record_episode(
     world: Worlds, agent: Agent, *, scenario: Scenario, vehicle: int | str | None = None, sample_s: float = SAMPLE_S
 ) -> EpisodeRecord:
-    """Record ``agent`` driving ``vehicle`` through one world (n = 1, at t = 0), exactly as ``evaluate`` runs it.
+    """Record one world from the alert on, exactly as ``evaluate`` runs it.
 
-    Samples lie at most ``sample_s`` apart, and at every decision. Positions count from Vehicle 1's at the alert,
-    forward. Raises ``InvalidInput`` for more than one world or ``sample_s`` not above 0.
+    Args:
+        world: at the alert, n = 1.
+        agent: drives one vehicle; it is left as it is.
+        scenario: of the world; its scripts drive the other vehicles.
+        vehicle: the one that is driven, by name (``vehicle_2``) or index (0 = front); None: the scenario's only
+            learner.
+        sample_s: samples lie at most so far apart (s), and at every decision.
+
+    Raises ``InvalidInput`` for more than one world or ``sample_s`` not above 0.
+
     """
     if world.n != 1:
         raise InvalidInput(

@@ -1,4 +1,4 @@
-"""How far each agent stays from the best that is known: which collisions nobody avoids, and regret world by world.
+"""The distance of each agent from the best that is known: unavoidable collisions, and regret world by world.
 
 The least harm known is that of the limits (``limits.limits``), or what an agent of the same evaluation achieved,
 whichever is less.
@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.evaluation.rollout import Evaluation, Outcome
+from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate, relative_decrease
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.limits import Limits, Unproven

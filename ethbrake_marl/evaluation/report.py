@@ -9,20 +9,12 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from ethbrake_marl.evaluation.cells import COLUMNS, MEANINGS, Line, our_lines, paper_blocks
 from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.table import SummaryRow
-from ethbrake_marl.evaluation.text import (
-    COLUMNS,
-    MEANINGS,
-    Line,
-    knowledge_lines,
-    left_out_lines,
-    limit_lines,
-    our_lines,
-    paper_blocks,
-)
+from ethbrake_marl.evaluation.text import knowledge_lines, left_out_lines, limit_lines
 
 _TEMPLATE = "report.html.j2"
 

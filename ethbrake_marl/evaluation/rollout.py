@@ -1,4 +1,4 @@
-"""Every agent on the same fixed list of worlds, each world once.
+"""The evaluation of every agent on the same fixed list of worlds, each world once.
 
 Counting "the first episodes that finish" instead would over-count short ones, and crashes end early.
 """
@@ -6,144 +6,27 @@ Counting "the first episodes that finish" instead would over-count short ones, a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from functools import cached_property
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_of
+from ethbrake_marl.agents.knowledge import knowledge_of
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.engine.stream import check_alert
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_one_learner, check_whole_number, unknown_name
 from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
-from ethbrake_marl.harm import HarmCount, Ledger
-from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate, leaving_out_failed
+from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
+from ethbrake_marl.harm import Ledger
+from ethbrake_marl.physics import Ints, Worlds, concatenate, leaving_out_failed
 from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.scenario.v2x import hidden_from
 
 CHUNK = 10_000  # worlds advanced together: bounds memory, changes no result
 
-Progress = Callable[[str, int], None]  # agent, worlds done so far
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What one agent achieved, world by world."""
-
-    ledger: Ledger
-    final: Worlds  # each world as its episode left it
-    at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
-    predicted_harm: Floats | None  # [n] what the agent expected at the alert, if it predicts and drives alone
-    chosen_policy: Bools | None  # [n] a hybrid drove by its policy; else by its backup
-    knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
-    shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself, see ``travel``
-    sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands, see ``sampled_harm``
-
-    def take(self, rows: Ints | Bools) -> Outcome:
-        """That of some of the worlds."""
-        ledger = Ledger(*(getattr(self.ledger, f.name)[rows] for f in fields(Ledger)))
-        names = ("predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")
-        columns = {name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in names}
-        return Outcome(ledger, self.final.take(rows), self.at_rest[rows], knows=self.knows, **columns)
-
-    @property
-    def collided(self) -> Bools:
-        """Whether any impact happened, [n]."""
-        return self.ledger.collided
-
-    @property
-    def impacts(self) -> Ints:
-        """Number of impacts of all pairs, and with an obstacle ahead, [n]."""
-        return self.ledger.impacts
-
-    def world_harm(self, harm_count: HarmCount) -> Floats:
-        """Harm of all vehicles under a counting rule, [n] m2/s2."""
-        return self.ledger.world_harm(harm_count)
-
-    @property
-    def first_impact_harm(self) -> Floats:
-        """Harm of all vehicles, each pair's first impact only, [n] m2/s2."""
-        return self.ledger.world_harm("first")
-
-    @property
-    def total_harm(self) -> Floats:
-        """Harm of all vehicles, every impact, [n] m2/s2."""
-        return self.ledger.world_harm("total")
-
-    def vehicle_harm(self, harm_count: HarmCount) -> Floats:
-        """Harm of each vehicle, [n, N] m2/s2."""
-        return self.ledger.vehicle_harm(harm_count)
-
-    @property
-    def ended(self) -> NDArray[np.str_]:
-        """How each episode ended, [n]: ``at_rest`` or ``horizon``."""
-        return np.where(self.at_rest, "at_rest", "horizon")
-
-
-class LeftOut(NamedTuple):
-    """A world that is in no outcome, because it could not be advanced with one of the agents."""
-
-    world: int  # number in its list
-    seed: int | None  # of the list; None for worlds that were given
-    agent: str  # the first one that met it
-    reason: str
-
-    def __str__(self) -> str:
-        of = "" if self.seed is None else f" of seed {self.seed}"
-        return f"world {self.world}{of} ({self.agent}: {self.reason})"
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Outcomes of agents that drove the same vehicles in the same worlds, row k of every array being world k."""
-
-    scenario: Scenario
-    vehicles: tuple[int, ...]  # indices (0 = front) of the vehicles that were driven; the others followed scripts
-    worlds: Worlds  # at the alert
-    index: Ints  # [n] number of each world in its list
-    seed: int | None  # of the list; None for worlds that were given
-    outcomes: dict[str, Outcome]
-    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
-
-    @property
-    def vehicle(self) -> int:
-        """The vehicle that was driven; raises ``InvalidInput`` if it is not exactly one."""
-        return self.task.vehicle
-
-    @property
-    def task(self) -> Task:
-        """What was asked of the agents."""
-        return Task(self.scenario, self.vehicles)
-
-    @cached_property
-    def limits(self) -> Limits | Unproven:
-        """What is known of each world whoever drives: found once, for everything that tells of this evaluation."""
-        return known_limits(self.worlds, self.task)
-
-    @property
-    def hidden(self) -> Bools:
-        """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
-        hidden = np.zeros(self.worlds.n, np.bool_)
-        for vehicle in self.vehicles:
-            hidden |= hidden_from(self.worlds.vehicles, vehicle)
-        return hidden
-
-    def complete(self) -> Evaluation:
-        """The evaluation itself, for who needs every world; raises ``PhysicsError`` if some were left out."""
-        if self.left_out:
-            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
-        return self
-
-    def outcome(self, agent: str) -> Outcome:
-        """The outcome of one agent; raises ``InvalidInput`` naming those that were evaluated."""
-        if agent not in self.outcomes:
-            raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated: {', '.join(self.outcomes)}")
-        return self.outcomes[agent]
+OnWorlds = Callable[[str, int], None]  # agent, worlds done so far
 
 
 def evaluate(
@@ -154,20 +37,28 @@ def evaluate(
     vehicle: int | str | None = None,
     seed: int | None = None,
     chunk: int = CHUNK,
-    on_progress: Progress | None = None,
+    on_progress: OnWorlds | None = None,
     aftermath: bool = True,
 ) -> Evaluation:
     """Let each agent drive every world once, from the alert to the episode's end.
 
-    The scenario's learners are driven, each by its own copy of the agent, or by its driver in a ``Team``; or just
-    ``vehicle``, a name (``vehicle_2``) or an index (0 = front). All others follow the scenario's scripts (see
-    ``agents.rollout``). A world's outcome depends neither on ``chunk`` nor on the other worlds, and the given agents
-    are left as they are. ``seed`` is noted, not used. Without ``aftermath`` nobody looks how far Vehicle 1 was shoved
-    and what the paper's sum over samples is, which saves time where only the harm counts. A world that cannot be
-    advanced with one of the agents (a defect of the physics) is left out for all of them, and stands in ``left_out``;
-    all others are as if it were not in the list. Raises ``PhysicsError`` if no world is left, and ``InvalidInput`` for
-    worlds that do not fit the scenario or are not at the alert, no agents, no vehicle to drive, a team of other
-    vehicles, or a learner that nobody drives.
+    Vehicles that are not driven follow the scenario's scripts. A world's outcome depends neither on ``chunk`` nor
+    on the other worlds. One that cannot be advanced with one of the agents (a defect of the physics) is left out for
+    all of them, and stands in ``left_out``.
+
+    Args:
+        worlds: at the alert, or a sample of the scenario's list.
+        agents: name -> agent, of which each driven vehicle gets its own copy, or ``Team``; they are left as they are.
+        scenario: of the worlds.
+        vehicle: the one that is driven, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
+        seed: of the list; noted, not used.
+        chunk: worlds advanced together.
+        on_progress: is called with an agent's name and its worlds done so far.
+        aftermath: look how far Vehicle 1 is shoved, and what the paper's sum over samples is; costs time.
+
+    Raises ``PhysicsError`` if no world is left; ``InvalidInput`` for worlds that do not fit the scenario or are not at
+    the alert, no agents, no vehicle to drive, a team of other vehicles, or a learner that nobody drives.
+
     """
     _check_request(worlds, agents, scenario, chunk)
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
@@ -264,7 +155,7 @@ class _Whole(NamedTuple):
         good = np.setdiff1d(np.arange(worlds.n), self.lost)
         if self.left_out and not good.size:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
-        outcomes = {name: _joined([part.among(good) for part in parts]) for name, parts in self.parts.items()}
+        outcomes = {name: _join([part.among(good) for part in parts]) for name, parts in self.parts.items()}
         if self.left_out:
             worlds, index = worlds.take(good), index[good]
         return Evaluation(scenario, driven, worlds, index, seed, outcomes, self.left_out)
@@ -291,7 +182,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     sampled = SampledHarm.of(worlds, task) if aftermath else None
     episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled) if w is not None])
     alone = next(iter(team.drivers.values())) if len(team.drivers) == 1 else None
-    predicted, chosen = (_said(alone, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
+    predicted, chosen = (_read_column(alone, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
     return Outcome(
         episodes.ledger,
         episodes.final,
@@ -304,7 +195,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     )
 
 
-def _said(agent: Agent | None, attribute: str, n: int) -> NDArray[np.generic] | None:
+def _read_column(agent: Agent | None, attribute: str, n: int) -> NDArray[np.generic] | None:
     """What the agent says about each world of the batch, or None when it says nothing."""
     value = getattr(agent, attribute, None)
     if agent is None or value is None:
@@ -317,7 +208,7 @@ def _said(agent: Agent | None, attribute: str, n: int) -> NDArray[np.generic] | 
     return column
 
 
-def _joined(parts: list[Outcome]) -> Outcome:
+def _join(parts: list[Outcome]) -> Outcome:
     """One outcome from those of consecutive chunks."""
     ledger = Ledger(*(np.concatenate([getattr(part.ledger, f.name) for part in parts]) for f in fields(Ledger)))
 

@@ -31,7 +31,7 @@ def interquartile_mean(
     out at either end. The interval is None when no task has two seeds. Raises ``InvalidInput`` for a task without
     figures, or with one that is not finite.
     """
-    strata = [_checked(figures, f"task {k}") for k, figures in enumerate(tasks)]
+    strata = [_check(figures, f"task {k}") for k, figures in enumerate(tasks)]
     if not strata:
         raise InvalidInput("interquartile_mean: no tasks; at least one list of figures is needed")
 
@@ -45,12 +45,12 @@ def interquartile_mean(
         return Estimate(value, None)
     fixed = [figures for figures in strata if len(figures) == 1]
 
-    def resampled(*drawn: Floats, axis: int) -> Floats:
+    def resample(*drawn: Floats, axis: int) -> Floats:
         shape = drawn[0].shape[:-1]
         return statistic(*drawn, *(np.broadcast_to(one, (*shape, 1)) for one in fixed), axis=axis)
 
     found = bootstrap(
-        again, resampled, n_resamples=resamples, confidence_level=confidence, method="percentile", rng=seed,
+        again, resample, n_resamples=resamples, confidence_level=confidence, method="percentile", rng=seed,
         vectorized=True,
     )  # fmt: skip
     return Estimate(value, (float(found.confidence_interval.low), float(found.confidence_interval.high)))
@@ -65,11 +65,11 @@ def paired_over_seeds(
     that leaves out 0 holds for other seeds *and* other worlds. None with a single world. Raises ``InvalidInput`` for
     arrays that cannot be paired or are not finite.
     """
-    first, second = _paired("paired_over_seeds", values, baseline)
+    first, second = _pair_sides("paired_over_seeds", values, baseline)
     value = float((first.mean(axis=0) - second.mean(axis=0)).mean())
     if first.shape[1] < 2:
         return Estimate(value, None)
-    means = _resampled_means((first, second), resamples, seed)
+    means = _resample_means((first, second), resamples, seed)
     return _with_percentiles(value, means[:, 0] - means[:, 1], confidence)
 
 
@@ -97,19 +97,19 @@ def share_over_seeds(
     Which part of the way from ``worst`` to ``best`` the values are; the interval is as in ``paired_over_seeds``. None
     where ``best`` is not below ``worst``.
     """
-    sides = _paired("share_over_seeds", values, worst, best)
+    sides = _pair_sides("share_over_seeds", values, worst, best)
     reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
     if not high > low:
         return None
     share = (high - reached) / (high - low)
     if sides[0].shape[1] < 2:
         return Estimate(share, None)
-    means = _resampled_means(sides, resamples, seed)
+    means = _resample_means(sides, resamples, seed)
     means = means[means[:, 1] > means[:, 2]]
     return _with_percentiles(share, (means[:, 1] - means[:, 0]) / (means[:, 1] - means[:, 2]), confidence)
 
 
-def _paired(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
+def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
     """The sides as [seeds, worlds], all with the same worlds; raises ``InvalidInput``."""
     arrays = tuple(np.atleast_2d(np.asarray(given, np.float64)) for given in sides)
     if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
@@ -120,7 +120,7 @@ def _paired(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
     return arrays
 
 
-def _resampled_means(sides: Sequence[Floats], resamples: int, seed: int) -> Floats:
+def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Floats:
     """Means [resamples, sides] over seeds of each side and over worlds, which all sides share, drawn anew."""
     worlds = sides[0].shape[1]
     rng = np.random.default_rng(seed)
@@ -143,7 +143,7 @@ def _with_percentiles(value: float, resampled: Floats, confidence: float) -> Est
     return Estimate(value, (float(low), float(high)))
 
 
-def _checked(figures: ArrayLike, name: str) -> Floats:
+def _check(figures: ArrayLike, name: str) -> Floats:
     data = np.asarray(figures, np.float64)
     if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():
         raise InvalidInput(f"interquartile_mean: {name}: one finite figure per seed is needed, at least one")

@@ -1,9 +1,9 @@
-"""What each mode of the shield makes of an agent, on the same worlds: harm, and what each intervention was good for."""
+"""The modes of the shield compared on the same worlds: harm, and what each intervention was good for."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from rich.table import Table
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import renumbered
+from ethbrake_marl.evaluation.rollout import OnWorlds
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
 from ethbrake_marl.physics import Floats, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Task
@@ -22,8 +23,6 @@ from ethbrake_marl.shield.review import VERDICTS, review
 
 NONE, EPISODE, STEP, STEP_ALERT = "none", "episode", "step", "step-alert"  # the last: rollout at the alert only
 CHUNK = 500  # worlds advanced together: bounds memory, changes no result
-
-Progress = Callable[[str, int], None]  # agent, worlds done so far
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +59,7 @@ def compare_modes(
     worlds: Worlds,
     task: Task,
     *,
-    on_progress: Progress | None = None,
+    on_progress: OnWorlds | None = None,
 ) -> list[ModeRow]:
     """Let every agent drive the vehicle alone, in episode mode and in step mode, through every world; see ``ModeRow``.
 
@@ -69,12 +68,12 @@ def compare_modes(
     ``left_out``. Raises ``InvalidInput`` where a shield refuses the scenario, ``PhysicsError`` where no world is left.
     """
     rows, _, left_out = measured_without_failed(
-        lambda at: _compared(agents, worlds.take(at), task, on_progress), worlds.n
+        lambda at: _compare(agents, worlds.take(at), task, on_progress), worlds.n
     )
     return [replace(row, left_out=left_out) for row in rows]
 
 
-def _compared(agents: Mapping[str, Agent], worlds: Worlds, task: Task, on_progress: Progress | None) -> list[ModeRow]:
+def _compare(agents: Mapping[str, Agent], worlds: Worlds, task: Task, on_progress: OnWorlds | None) -> list[ModeRow]:
     """The rows of worlds that can all be advanced; ``PhysicsError`` names those that cannot."""
     rows = []
     for name, agent in agents.items():
@@ -103,7 +102,7 @@ def modes_table(rows: list[ModeRow]) -> Table:
         table.add_row(
             f"  {row.mode}",
             f"{row.harm.value:.2f}",
-            _shown(row.against_episode),
+            _write_estimate(row.against_episode),
             *(_percent(share) for share in (row.replaced, *shares)),
             "–" if row.above_bound is None else str(row.above_bound),
         )
@@ -156,7 +155,7 @@ def _rows(name: str, parts: list[dict[str, Any]]) -> list[ModeRow]:
     return rows
 
 
-def _shown(estimate: Estimate | None) -> str:
+def _write_estimate(estimate: Estimate | None) -> str:
     if estimate is None:
         return "–"
     interval = "" if estimate.interval is None else f" [{estimate.interval[0]:+.2f}, {estimate.interval[1]:+.2f}]"

@@ -68,13 +68,13 @@ def mean(values: Floats, *, confidence: float = CONFIDENCE) -> Estimate:
     At thousands of worlds the mean is normal whatever the harm's own distribution, and the interval equals the
     bootstrap's. Raises ``InvalidInput`` when ``values`` is empty or not finite.
     """
-    data = _checked(values)
+    data = _check(values)
     return _around(float(data.mean()), data, 1.0, confidence)
 
 
 def paired_difference(values: Floats, baseline: Floats, *, confidence: float = CONFIDENCE) -> Estimate:
     """Mean of ``values - baseline`` world by world, with the t interval of that mean."""
-    data, reference = _checked_pair(values, baseline)
+    data, reference = _check_pair(values, baseline)
     return mean(data - reference, confidence=confidence)
 
 
@@ -84,7 +84,7 @@ def relative_decrease(values: Floats, baseline: Floats, *, confidence: float = C
     Interval by the delta method: with ``r`` the ratio of the means, the residuals ``values - r baseline`` have mean 0
     and the standard error of r is ``s_residual / (sqrt(n) mean(baseline))``.
     """
-    data, reference = _checked_pair(values, baseline)
+    data, reference = _check_pair(values, baseline)
     scale = float(reference.mean())
     if scale == 0.0:
         return None
@@ -106,15 +106,15 @@ def _normal_quantile(confidence: float) -> float:
     return float(ndtri(0.5 + 0.5 * confidence))
 
 
-def _checked(values: Floats) -> Floats:
+def _check(values: Floats) -> Floats:
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():
         raise InvalidInput(f"statistics: shape {data.shape}; at least one finite number per world is needed, as [n]")
     return data
 
 
-def _checked_pair(values: Floats, baseline: Floats) -> tuple[Floats, Floats]:
-    data, reference = _checked(values), _checked(baseline)
+def _check_pair(values: Floats, baseline: Floats) -> tuple[Floats, Floats]:
+    data, reference = _check(values), _check(baseline)
     if data.shape != reference.shape:
         raise InvalidInput(f"statistics: {len(data)} values cannot be paired with {len(reference)} of the baseline")
     return data, reference

@@ -1,4 +1,4 @@
-"""The same outcomes told under other objectives: what each vehicle's would be, whatever the agents were made for."""
+"""Tables of an evaluation: one row per agent, and the same outcomes under other objectives."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from rich.text import Text
 from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_text, sees_through
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import parameters
+from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.evaluation.paper import is_papers_test
 from ethbrake_marl.evaluation.regret import Distance, assess, distance
-from ethbrake_marl.evaluation.rollout import Evaluation, LeftOut, Outcome
 from ethbrake_marl.evaluation.statistics import (
     Estimate,
     estimates_to_json,
@@ -58,7 +58,7 @@ def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
     return names
 
 
-def rescored(evaluation: Evaluation, declared: Sequence[Declared] = STANDARD) -> list[Rescored]:
+def rescore(evaluation: Evaluation, declared: Sequence[Declared] = STANDARD) -> list[Rescored]:
     """Every agent under every objective and both counts, in that order."""
     return [
         Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
@@ -91,22 +91,31 @@ FAR_M = 5.0  # Vehicle 1 counts as shoved far beyond this
 
 @dataclass(frozen=True, slots=True)
 class SummaryRow:
-    """What one agent achieved over the list of worlds; harms are means per world, m2/s2."""
+    """What one agent achieved over the list of worlds; harms are means per world, m2/s2.
 
-    agent: str
-    episodes: int
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
+    >>> rows = eb.summarise(eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario))
+    >>> rows[0].agent, rows[0].collisions, round(rows[0].total_harm.value, 2)
+    ('full_brake', 2, 36.99)
+
+    """
+
+    agent: str  # its name
+    episodes: int  # worlds
     collisions: int  # worlds with at least one impact
     horizon_ends: int  # worlds that the horizon cut off before the line stood
-    collision_rate: Estimate
-    first_impact_harm: Estimate
-    total_harm: Estimate
+    collision_rate: Estimate  # share of worlds
+    first_impact_harm: Estimate  # each pair's first impact
+    total_harm: Estimate  # every impact
     first_difference: Estimate | None  # first-impact harm minus the baseline's, paired by world
-    total_difference: Estimate | None
+    total_difference: Estimate | None  # the same of total harm
     first_decrease: Estimate | None  # 1 - harm / the baseline's harm
-    total_decrease: Estimate | None
+    total_decrease: Estimate | None  # the same of total harm
     predicted_harm: Estimate | None  # where the agent predicts
     policy_share: float | None  # share of worlds in which a hybrid drove by its policy
-    parameters: dict[str, Any]
+    parameters: dict[str, Any]  # of the test, for JSON
     distance: Distance = field(default_factory=Distance)  # to the best known harm
     shoved_m: Estimate | None = None  # how far Vehicle 1 ends beyond where it would by itself
     shoved_far: Estimate | None = None  # share of worlds in which that is more than ``FAR_M``

@@ -1,4 +1,4 @@
-"""The summary table as text: for a terminal (rich), for a document (markdown), and its cells for the report."""
+"""The summary table as text, for a terminal (rich) and for a document (markdown), and the sentences below it."""
 
 from __future__ import annotations
 
@@ -10,16 +10,22 @@ from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderR
 from rich.table import Table
 from rich.text import Text
 
-from ethbrake_marl.agents.knowledge import Source, knowledge_text
+from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.errors import count_of
+from ethbrake_marl.evaluation.cells import (
+    COLUMNS,
+    NONE,
+    SEES_THROUGH,
+    Cell,
+    Line,
+    our_lines,
+    paper_blocks,
+    percent_cell,
+)
 from ethbrake_marl.evaluation.conditions import parameter_line
-from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS, PAPER_ROWS, PaperRow
-from ethbrake_marl.evaluation.regret import Between, Distance
-from ethbrake_marl.evaluation.statistics import Estimate
+from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
+from ethbrake_marl.evaluation.regret import Between
 from ethbrake_marl.evaluation.table import SummaryRow
-
-NONE = "–"
-SEES_THROUGH = "† "  # before what an agent knows that no channel brought
 
 _TERMINAL_HEADINGS = (
     "Collisions",
@@ -38,100 +44,6 @@ _ALL = tuple(range(len(_TERMINAL_HEADINGS)))
 _NARROW, _NARROW_WITHOUT = (0, 1, 2, 3, 4, 9, 10), (0, 1, 2, 3, 4, 6, 7)  # with and without a regret to show
 _NAMED = 10  # worlds left out that are named one by one; all stand in the JSON
 _WIDE = 120  # terminal columns that all of them need
-
-
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """One entry of the table: the value, and its 95 % interval or nothing."""
-
-    value: str
-    interval: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """One line of the table."""
-
-    agent: str
-    cells: tuple[Cell, ...]
-    knows: str = NONE
-
-
-COLUMNS = (
-    "Collisions",
-    "First-impact harm",
-    "Total harm",
-    "Sampled harm",
-    "Vehicle 1 shoved (m)",
-    "Vehicle 1 shoved > 5 m",
-    "Decrease, first-impact",
-    "Decrease, total",
-    "Predicted harm",
-    "Regret, first-impact",
-    "Realised share, first-impact",
-)
-
-MEANINGS = {
-    "Agent": "What drives the controlled vehicle; all other vehicles follow the scenario. full_brake is the paper's"
-    " non-ethical strategy (Non-E). e_v2x_bm is the best constant deceleration found in this simulation;"
-    " e_v2x_bm:pairwise is the paper's closed form, which treats the pairs as independent.",
-    "Knows": "What the agent has to know of the line. own sensors: its own vehicle and what its sensors see. messages:"
-    " also the messages that have reached it. true state: the others' states, capacities and latencies as they are,"
-    " received or not. true model: also masses, restitution and scripts, enough to simulate the line ahead. Of a policy"
-    " behind a shield, or one that rehearses, both parts are told. † marks agents that see through a channel that hides"
-    " something here.",
-    "Collisions": "Share of worlds with at least one impact; Wilson's interval. Every agent meets the same worlds, each"
-    " once.",
-    "First-impact harm": "Squared closing speed (m²/s²), summed over the pairs, each pair's first impact only (the"
-    " paper's protocol); mean per world.",
-    "Total harm": "The same over every impact. A light early touch makes a later, harder impact of the same pair free"
-    " under the first count, so both are shown.",
-    "Sampled harm": "The paper's own sum (its eq. Jharm): the agent's commands replayed through the paper's fixed-step"
-    " map at the time step; at every sample each pair that overlaps and closes adds its squared closing speed (m²/s²),"
-    " so pushing costs harm for as long as it lasts.",
-    "Vehicle 1 shoved (m)": "How far Vehicle 1 ends beyond the point where it would stop by itself, mean per world; and"
-    " the share of worlds in which that is more than 5 m. Both counts of harm leave pushing free unless something"
-    " stands ahead; Vehicle 1 brakes for something.",
-    "Decrease": "1 − harm / harm of full braking in the same worlds; interval by the delta method, paired by world.",
-    "Predicted harm": "What the agent itself expected at the alert, under the count that it minimises.",
-    "Regret": "First-impact harm minus the best known first-impact harm of the same world; mean per world. The best"
-    " known is 0 where contact is proven avoidable, else the result of a search over whole profiles of Vehicle 2,"
-    " or of an agent in this table that did better. With ≥: the best of some world is known from these agents alone.",
-    "Realised share": "(Full braking − agent) / (full braking − best known), first-impact harm: how much of the"
-    " reduction of harm that is known to be possible the agent brings.",
-}
-
-
-def our_lines(rows: Sequence[SummaryRow]) -> list[Line]:
-    """Our results, one line per agent."""
-    return [
-        Line(
-            row.agent,
-            (
-                _percent(row.collision_rate, 1),
-                _number(row.first_impact_harm),
-                _number(row.total_harm),
-                _number(row.sampled_harm),
-                _number(row.shoved_m),
-                _percent(row.shoved_far, 1),
-                _percent(row.first_decrease, 1),
-                _percent(row.total_decrease, 1),
-                _number(row.predicted_harm),
-                _regret(row.distance),
-                _percent(row.distance.realised_first, 1),
-            ),
-            SEES_THROUGH * row.sees_through + knowledge_text(row.knows),
-        )
-        for row in rows
-    ]
-
-
-def paper_blocks(rows: Sequence[SummaryRow]) -> list[tuple[str, list[Line]]]:
-    """The paper's tables that belong beside these rows, as (table, lines)."""
-    blocks: dict[str, list[Line]] = {}
-    for paper in PAPER_ROWS if rows and rows[0].beside_paper else ():
-        blocks.setdefault(paper.table, []).append(_paper_line(paper))
-    return list(blocks.items())
 
 
 def rich_table(rows: Sequence[SummaryRow]) -> RenderableType:
@@ -183,12 +95,12 @@ def markdown_table(rows: Sequence[SummaryRow]) -> str:
     return "\n".join([*lines, "", _conditions(rows), ""])
 
 
-def _bracketed(cell: Cell) -> str:
+def _bracket(cell: Cell) -> str:
     return f"{cell.value} [{cell.interval}]" if cell.interval else cell.value
 
 
 def _markdown_line(line: Line) -> str:
-    cells = map(_bracketed, line.cells)
+    cells = map(_bracket, line.cells)
     return "| " + " | ".join([line.agent.replace("|", "\\|"), line.knows, *cells]) + " |"
 
 
@@ -228,7 +140,7 @@ def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
     found = rows[0].distance if rows else None
     if found is None or not (found.best_known_first and found.best_known_total):
         return []
-    contact = _bracketed(_percent(found.unavoidable_rate, 1))
+    contact = _bracket(percent_cell(found.unavoidable_rate, 1))
     first, total = found.best_known_first.value, found.best_known_total.value
     text = f"In {contact} of these worlds no command of Vehicle 2 avoids contact"
     if found.proven_harm is None:
@@ -237,9 +149,9 @@ def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
             " harm is proven."
         )
     else:
-        impact, proven = _bracketed(_percent(found.impact_proven_rate, 1)), found.proven_harm.value
+        impact, proven = _bracket(percent_cell(found.impact_proven_rate, 1)), found.proven_harm.value
         text += (
-            f", in {impact} none avoids an impact (both proven).{_between(found.between)} Best known harm: {first:.2f}"
+            f", in {impact} none avoids an impact (both proven).{_tell_gap(found.between)} Best known harm: {first:.2f}"
             f" first-impact, {total:.2f} total; proven: no less than {proven:.2f}; gap: {first - proven:.2f}"
             f" ({_share(first - proven, first)}) and {total - proven:.2f} ({_share(total - proven, total)})."
         )
@@ -255,7 +167,7 @@ def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
     return [text]
 
 
-def _between(found: Between | None) -> str:
+def _tell_gap(found: Between | None) -> str:
     """What is known of the worlds with proven contact and no proven impact, as a sentence."""
     if found is None or found.rate == 0.0:
         return ""
@@ -289,34 +201,3 @@ def knowledge_lines(rows: Sequence[SummaryRow]) -> list[str]:
         )
     silent = ", ".join(row.agent for row in rows if Source.UNSTATED in row.knows)
     return [text + (f" Not stated what it knows: {silent}." if silent else "")]
-
-
-def _paper_line(row: PaperRow) -> Line:
-    """The paper's figures with the digits that it prints."""
-    decrease = NONE if row.harm_decrease is None else f"{100 * row.harm_decrease:.4g} %"
-    cells = (f"{100 * row.collision_rate:.4g} %", f"{row.average_harm:.6g}", *[NONE] * 4, decrease, *[NONE] * 4)
-    return Line(row.agent, tuple(Cell(cell) for cell in cells))
-
-
-def _regret(distance: Distance) -> Cell:
-    cell = _number(distance.regret_first)
-    lower_bound = distance.known_best_share is not None and distance.known_best_share < 1.0
-    return Cell(f"≥ {cell.value}", cell.interval) if lower_bound else cell
-
-
-def _percent(estimate: Estimate | None, digits: int) -> Cell:
-    return _cell(estimate, 100.0, digits, " %")
-
-
-def _number(estimate: Estimate | None) -> Cell:
-    return _cell(estimate, 1.0, 2, "")
-
-
-def _cell(estimate: Estimate | None, scale: float, digits: int, unit: str) -> Cell:
-    if estimate is None:
-        return Cell(NONE)
-    value = f"{scale * estimate.value:.{digits}f}{unit}"
-    if estimate.interval is None:
-        return Cell(value)
-    low, high = (f"{scale * end:.{digits}f}" for end in estimate.interval)
-    return Cell(value, f"{low}, {high}")

@@ -11,7 +11,7 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import parameter_line, parameters
-from ethbrake_marl.evaluation.rollout import Evaluation
+from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.evaluation.table import SummaryRow
 from ethbrake_marl.figures.style import (

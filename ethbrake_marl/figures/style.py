@@ -1,4 +1,4 @@
-"""How every figure looks: sizes, colours that colour-blind readers tell apart, captions, and the way to a PNG."""
+"""The style of every figure: sizes, colours that colour-blind readers tell apart, captions, PNG."""
 
 from __future__ import annotations
 

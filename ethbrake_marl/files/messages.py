@@ -88,12 +88,12 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
     if detail["type"] == "missing":
         return f"{place}: missing; {wording.needed(path)}"
     ctx = detail.get("ctx", {})
-    value = ctx["value"] if "value" in ctx else _shown(detail)
-    right = _unquoted(detail) or wording.right(detail) or _right(detail)
+    value = ctx["value"] if "value" in ctx else _show(detail)
+    right = _unquote(detail) or wording.right(detail) or _right(detail)
     return f"{place}{f' = {value}' if value else ''}: {right}".removeprefix(": ")
 
 
-def _shown(detail: ErrorDetails) -> str:
+def _show(detail: ErrorDetails) -> str:
     """The value, unless the whole file is meant; a number keeps the point that makes it wrong."""
     given = detail["input"]
     if isinstance(given, BaseModel) or not detail["loc"]:
@@ -107,7 +107,7 @@ def _place(path: YamlPath, wording: Wording) -> str:
     return f"{text} ({owner})" if owner else text
 
 
-def _unquoted(detail: ErrorDetails) -> str:
+def _unquote(detail: ErrorDetails) -> str:
     """What would be right for a number in quotes; empty for anything else."""
     given = detail["input"]
     quoted = detail["type"] == "float_type" and isinstance(given, str) and parse_numeral(given) is not None

@@ -1,13 +1,16 @@
-"""Reading files that somebody else may have written: plain files only, never more of them than is expected."""
+"""Files that somebody else may have written: plain files only, no more of them than is expected, and strict JSON."""
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
+from typing import Any, NoReturn
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 
@@ -89,3 +92,33 @@ def _check_kind(file: Path, found: os.stat_result, limit_bytes: int, refusal: ty
 def _too_large(file: Path, limit_bytes: int, refusal: type[EthBrakeError]) -> EthBrakeError:
     size = f"{limit_bytes >> 20} MiB" if limit_bytes >= 1 << 20 else f"{limit_bytes >> 10} KiB"
     return refusal(f"{file}: larger than {size}, the limit for such a file")
+
+
+def parse_strict_json(data: bytes) -> Any:
+    """Parse ``data``; raises ``ValueError`` with a one-line reason on anything ambiguous or not in the standard."""
+    try:
+        return json.loads(
+            data.decode("utf-8"), object_pairs_hook=_object, parse_constant=_not_a_number, parse_float=_finite
+        )
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    parsed: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in parsed:
+            raise ValueError(f"key {key!r} stands twice")
+        parsed[key] = value
+    return parsed
+
+
+def _not_a_number(text: str) -> NoReturn:
+    raise ValueError(f"{text} is not a JSON number")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text} is too large for a number")
+    return number

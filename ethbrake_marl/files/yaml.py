@@ -1,4 +1,4 @@
-"""How a number is written in every file and option: digits, a point, an exponent; no blanks inside, no underscores."""
+"""Strict YAML: every value with its line, and one way to write a number."""
 
 from __future__ import annotations
 

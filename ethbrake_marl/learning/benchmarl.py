@@ -51,8 +51,8 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         self.horizon_is_end = horizon_is_end
         self._learners = np.array(self.engine.learners, np.int64)
         rows = (n, len(self._learners))
-        seen = _bounded(feature_box(self.engine.observation.features), rows)
-        state = _bounded(feature_box(state_features(scenario)), (n,))
+        seen = _bound(feature_box(self.engine.observation.features), rows)
+        state = _bound(feature_box(state_features(scenario)), (n,))
         self.observation_spec = Composite(
             {GROUP: Composite({"observation": seen}, shape=rows), "state": state}, shape=(n,)
         )
@@ -71,7 +71,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
             self.engine.reset()
         else:
             self.engine.renew(np.flatnonzero(asked.numpy().reshape(-1)))
-        return TensorDict(self._seen(), batch_size=self.batch_size)
+        return TensorDict(self._observe_all(), batch_size=self.batch_size)
 
     def _step(self, tensordict: Any) -> Any:
         action = tensordict[GROUP, "action"].numpy()[:, :, 0].clip(-1.0, 1.0)
@@ -80,7 +80,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         terminated, truncated = step.terminated.copy(), step.truncated.copy()
         if self.horizon_is_end:
             terminated, truncated = terminated | truncated, np.zeros_like(truncated)
-        content = self._seen()
+        content = self._observe_all()
         content[GROUP]["reward"] = reward
         for name, flag in (("done", step.ended), ("terminated", terminated), ("truncated", truncated)):
             content[name] = torch.from_numpy(np.array(flag, np.bool_)[:, np.newaxis])
@@ -91,7 +91,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         if seed is not None:
             self.engine.reset(seed=seed)
 
-    def _seen(self) -> dict[str, Any]:
+    def _observe_all(self) -> dict[str, Any]:
         every = torch.from_numpy(self.engine.observe_all(self._learners).copy())
         state = torch.from_numpy(full_state(self.engine.worlds, self.engine.scenario))
         own = TensorDict({"observation": every}, batch_size=every.shape[:2])
@@ -242,6 +242,6 @@ def _tensors(actor: Any, hidden: int) -> dict[str, Float32s]:
     return found
 
 
-def _bounded(box: Any, shape: tuple[int, ...]) -> Any:
+def _bound(box: Any, shape: tuple[int, ...]) -> Any:
     low, high = (torch.from_numpy(side).expand(*shape, len(side)) for side in (box.low, box.high))
     return Bounded(low, high, shape=low.shape, dtype=torch.float32)

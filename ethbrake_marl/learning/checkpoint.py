@@ -24,7 +24,7 @@ from ethbrake_marl.errors import CorruptBundle, EthBrakeError
 from ethbrake_marl.files.arrays import map_npy, safetensors_headers
 from ethbrake_marl.files.durable import new_folder, remove_folder, write_file
 from ethbrake_marl.files.plain import open_plain, read_plain
-from ethbrake_marl.learning.checkpoint_schema import Listing, Numbers, checked_json
+from ethbrake_marl.learning.checkpoint_schema import Listing, Numbers, check_json
 from ethbrake_marl.learning.run_log import parse_progress
 from ethbrake_marl.policies.team import Trained, read_trained, save_trained
 
@@ -89,10 +89,10 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
 
 def read_checkpoint(folder: Path) -> TrainingState:
     """Read and check every file of ``folder``; raises ``CorruptBundle`` naming the file and what is wrong with it."""
-    listing, data = _checked_files(folder)
+    listing, data = _check_files(folder)
     try:
         place = folder / _NUMBERS
-        numbers = checked_json(Numbers, data[_NUMBERS])
+        numbers = check_json(Numbers, data[_NUMBERS])
         place = folder / _ARRAYS
         arrays = _arrays(data[_ARRAYS])
         replay = {}
@@ -151,11 +151,11 @@ def prune(folder: Path, keep: int = KEPT) -> None:
         remove_folder(path)
 
 
-def _checked_files(folder: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
+def _check_files(folder: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     """The listing, and the content of the files beside it; every file is there, and is what the listing says."""
     path = folder / LISTING
     try:
-        listing = checked_json(Listing, _read(path, _LISTING_LIMIT_BYTES))
+        listing = check_json(Listing, _read(path, _LISTING_LIMIT_BYTES))
         found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if not _is_folder(path)}
     except OSError as error:
         raise CorruptBundle(f"{folder}: cannot be read ({error.strerror})") from None

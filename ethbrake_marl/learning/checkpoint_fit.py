@@ -1,4 +1,4 @@
-"""Whether a checkpoint belongs to a model: every array, counter and policy is as this model would have written it.
+"""The check that a checkpoint belongs to a model: arrays, counters and policies as this model would write them.
 
 A listing whose hashes agree says that a checkpoint was not damaged, not that it is of this training.
 """

@@ -1,4 +1,4 @@
-"""What the JSON files of a checkpoint must say: which keys, of which types, within which bounds."""
+"""The schema of a checkpoint's JSON files: their keys, types and bounds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from typing_extensions import TypedDict
 
-from ethbrake_marl.files.json import parse_strict_json
+from ethbrake_marl.files.plain import parse_strict_json
 from ethbrake_marl.learning.loop import EPISODE_COLUMNS
 from ethbrake_marl.policies.manifest import Sha256
 from ethbrake_marl.policies.policy import first_line
@@ -72,7 +72,7 @@ class _Replay(_Part):
     full: bool | None = None
 
 
-def _placed(evaluation: dict[str, Number]) -> dict[str, Number]:
+def _check_place(evaluation: dict[str, Number]) -> dict[str, Number]:
     for key in ("steps", "updates"):
         if not isinstance(evaluation.get(key), int):
             raise ValueError(f"{key} is missing or no whole number")
@@ -80,7 +80,7 @@ def _placed(evaluation: dict[str, Number]) -> dict[str, Number]:
 
 
 class _Course(_Part):
-    evaluations: list[Annotated[dict[str, Number], AfterValidator(_placed)]]
+    evaluations: list[Annotated[dict[str, Number], AfterValidator(_check_place)]]
     alarms: list[str]
     best_harm: Number | None
     wall_s: Seconds
@@ -111,7 +111,7 @@ class Numbers(_Part):
     events: dict[str, Count]
 
 
-def checked_json(schema: type[Listing | Numbers], data: bytes) -> dict[str, Any]:
+def check_json(schema: type[Listing | Numbers], data: bytes) -> dict[str, Any]:
     """The content of a JSON file of a checkpoint; raises ``ValueError``, in one line, unless ``schema`` fits it."""
     content: dict[str, Any] = parse_strict_json(data)
     try:

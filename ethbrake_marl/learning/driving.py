@@ -1,4 +1,4 @@
-"""What was trained, as agents: ``ppo@PATH``, ``sac@PATH``, ``universal@shipped`` and ``team@RUN``. Needs no torch."""
+"""Trained policies as agents: ``ppo@PATH``, ``sac@PATH``, ``universal@shipped`` and ``team@RUN``. Needs no torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happens between two updates: measure, log, save, report, and stop when asked to."""
+"""The work between two updates of a training: measure, log, save, report, and stop when asked to."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.team import Driver, Team
+from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.learning.algorithms.protocol import Algorithm
 from ethbrake_marl.learning.model_state import Model
 from ethbrake_marl.learning.progress import RETURN, Course, check_losses, check_rollout, check_step, check_weights
 from ethbrake_marl.learning.recipe import TrainingRecipe
+from ethbrake_marl.learning.training import Training
+from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.team import Trained
 from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.scenario import Scenario
 
 # Column of the log -> info of an episode's end; means over the episodes since the last row, exploration included.
 EPISODE_COLUMNS = {
@@ -150,7 +156,7 @@ class BetweenUpdates(BaseCallback):
     def _measure(self) -> None:
         assert self.course.policy is not None and self._evaluate is not None
         metrics = {name: float(value) for name, value in self._evaluate(self.course.policy).items()}
-        alarm = self.course.measured(self.course.policy, metrics, self._recent_return())
+        alarm = self.course.add_evaluation(self.course.policy, metrics, self._recent_return())
         for name, value in metrics.items():
             self.logger.record(f"eval/{name}", value)
         self.logger.record("eval/alarm", int(alarm is not None))
@@ -175,3 +181,28 @@ class BetweenUpdates(BaseCallback):
         elif self.course.evaluations:
             self.logger.dump(step=0)
         self.tell()
+
+
+METRICS = ("first_impact_harm", "total_harm", "collision_rate")
+
+
+def measure_on_list(training: Training) -> Evaluate:
+    """What measures the learners' policies on the recipe's fixed list: the means that ``evaluate`` gives on it."""
+    recipe, scenario = training.recipe, training.scenario
+    worlds = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
+
+    def measure(trained: Trained) -> dict[str, float]:
+        row = summarise(evaluate(worlds, {"policy": driver_of(trained, scenario)}, scenario=scenario, aftermath=False))[
+            0
+        ]
+        return {name: getattr(row, name).value for name in METRICS}
+
+    return measure
+
+
+def driver_of(trained: Trained, scenario: Scenario, name: str = "policy") -> Driver:
+    """What drives the scenario's learners by what was trained for them."""
+    if isinstance(trained, Policy):
+        return LearnedAgent(trained, name)
+    numbers = {each: i for i, each in enumerate(scenario.vehicle_names)}
+    return Team({numbers[each]: LearnedAgent(policy, name) for each, policy in trained.members.items()}, name)

@@ -73,14 +73,14 @@ _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_r
 
 def capture_model(model: Model, algorithm: Algorithm) -> tuple[Arrays, dict[str, Any]]:
     """Weights, optimisers, environment, random generators and counters between two updates, replay memory aside."""
-    arrays: Arrays = {f"policy.{name}": _copied(tensor) for name, tensor in model.policy.state_dict().items()}
-    arrays |= {name: _copied(tensor) for name, tensor in algorithm.learned_beside(model).items()}
+    arrays: Arrays = {f"policy.{name}": _copy(tensor) for name, tensor in model.policy.state_dict().items()}
+    arrays |= {name: _copy(tensor) for name, tensor in algorithm.learned_beside(model).items()}
     rates: dict[str, float] = {}
     for name, optimizer in algorithm.optimizers(model).items():
         content = optimizer.state_dict()
         rates[name] = float(content["param_groups"][0]["lr"])
         for index, entries in content["state"].items():
-            arrays |= {f"optimizer.{name}.{index}.{key}": _copied(value) for key, value in entries.items()}
+            arrays |= {f"optimizer.{name}.{index}.{key}": _copy(value) for key, value in entries.items()}
     environment: Any = model.env
     arrays |= {f"environment.{name}": array for name, array in environment.snapshot().items()}
     generators, random_plain = capture_random(model.action_space)
@@ -172,5 +172,5 @@ def _group(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
-def _copied(tensor: Any) -> NDArray[Any]:
+def _copy(tensor: Any) -> NDArray[Any]:
     return np.array(torch.as_tensor(tensor).detach().cpu().numpy())

@@ -41,15 +41,15 @@ def policy_maker(algorithm: Algorithm, training: Training) -> Callable[[Model], 
         "versions": installed_versions(),
     }
 
-    def made(actor: BasePolicy, learners: tuple[str, ...], steps: int) -> Policy:
+    def make(actor: BasePolicy, learners: tuple[str, ...], steps: int) -> Policy:
         return make_policy(tensors_of(actor, network), learners=learners, steps=steps, **fixed)
 
     def policies(model: Model) -> Trained:
         actors = algorithm.actors(model)
         if training.scheme != "independent":
             (actor,) = actors
-            return made(actor, names, model.num_timesteps)
+            return make(actor, names, model.num_timesteps)
         members = zip(names, actors, strict=True)
-        return PolicyTeam({name: made(actor, (name,), model.num_timesteps) for name, actor in members})
+        return PolicyTeam({name: make(actor, (name,), model.num_timesteps) for name, actor in members})
 
     return policies

@@ -1,4 +1,4 @@
-"""What a training has reached: its policies, its evaluations, and an alarm when the return misleads."""
+"""The progress of a training: its policies, its evaluations, and an alarm when the return misleads."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Course:
         """The policy to use: the best, or the last where nothing was measured."""
         return self.best or self.policy
 
-    def measured(self, policy: Trained, metrics: Mapping[str, float], episode_return: float | None) -> str | None:
+    def add_evaluation(self, policy: Trained, metrics: Mapping[str, float], episode_return: float | None) -> str | None:
         """Take in an evaluation of ``policy``; gives the alarm, if this one raises it."""
         extra = {} if episode_return is None else {RETURN: episode_return}
         self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **extra})

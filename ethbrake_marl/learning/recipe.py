@@ -95,25 +95,31 @@ class TrainingRecipe(_Part):
     """How to train, whatever the algorithm: its name, reward, seed, and what is saved and measured on the way.
 
     An update is one round of collecting and learning. The recipes of an algorithm are a class made from this one.
+
+    >>> import ethbrake_marl as eb
+    >>> recipe = eb.load_recipe("ppo").replace(seed=3, total_steps=100_000)
+    >>> recipe.algorithm, recipe.seed, recipe.total_steps
+    ('ppo', 3, 100000)
+
     """
 
     schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # under which the algorithm can learn
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")
-    title: str = ""
-    description: str = ""
-    source: str = ""
-    algorithm: str
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")  # equal to the file's without .yaml
+    title: str = ""  # one line for lists
+    description: str = ""  # what it is for
+    source: str = ""  # where the values come from
+    algorithm: str  # a registered name
     scheme: Scheme | None = None  # None: single for one learner, shared for several
-    total_steps: Annotated[int, Field(ge=1)]
-    n_envs: Annotated[int, Field(ge=1)]
-    learning_rate: LearningRate
-    gamma: Fraction
-    reward: RewardParams
-    horizon_is_end: bool = False
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    evaluation: EvaluationPlan
-    checkpoint_every_updates: Annotated[int, Field(ge=1)]
+    total_steps: Annotated[int, Field(ge=1)]  # decisions of all learners
+    n_envs: Annotated[int, Field(ge=1)]  # worlds that are advanced together
+    learning_rate: LearningRate  # from its start to its end
+    gamma: Fraction  # discount of one time step
+    reward: RewardParams  # what is learned for
+    horizon_is_end: bool = False  # nothing is expected beyond the horizon
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of worlds, networks and exploration
+    evaluation: EvaluationPlan  # the fixed list, and how often
+    checkpoint_every_updates: Annotated[int, Field(ge=1)]  # updates
 
     @field_validator("reward")
     @classmethod

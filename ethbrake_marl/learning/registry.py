@@ -59,12 +59,12 @@ def algorithm_names() -> tuple[str, ...]:
 
 def recipe_class(name: str) -> Any:
     """The class of the recipes of an algorithm; raises ``UnknownName``."""
-    return _imported(_entry(name).recipe)
+    return _import(_entry(name).recipe)
 
 
 def algorithm_named(name: str) -> Any:
     """The algorithm of this name, new; raises ``UnknownName``."""
-    return _imported(_entry(name).algorithm)()
+    return _import(_entry(name).algorithm)()
 
 
 def _entry(name: str) -> _Entry:
@@ -73,7 +73,7 @@ def _entry(name: str) -> _Entry:
     return _ENTRIES[name]
 
 
-def _imported(entry: str | Any) -> Any:
+def _import(entry: str | Any) -> Any:
     if not isinstance(entry, str):
         return entry
     module, _, attribute = entry.partition(":")

@@ -14,8 +14,7 @@ from typing import Any, Literal, get_args
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.durable import new_folder, write_file
-from ethbrake_marl.files.json import parse_strict_json
-from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.plain import parse_strict_json, read_plain
 
 _LIMIT_BYTES = 16 << 20  # of a JSON file
 

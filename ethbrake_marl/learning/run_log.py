@@ -1,4 +1,4 @@
-"""What a run writes while it learns: ``progress.csv`` and TensorBoard's event files.
+"""The logs of a run while it learns: ``progress.csv`` and TensorBoard's event files.
 
 ``progress.csv`` has one row per update, its columns in an order that is the same in every run.
 """

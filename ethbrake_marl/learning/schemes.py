@@ -1,4 +1,4 @@
-"""How the learners of a scenario are trained together, and which network therefore drives which vehicle."""
+"""Schemes of training several learners together, and the network that therefore drives each vehicle."""
 
 from __future__ import annotations
 

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
 from typing import Any, Literal
 
 from stable_baselines3.common.logger import Logger
@@ -92,7 +97,7 @@ class Session:
         except StopRequested:
             status = "interrupted"
         except BaseException as error:
-            cause = self._diverged(error)
+            cause = self._explain(error)
             self._close(between, "interrupted" if isinstance(error, KeyboardInterrupt) else "failed", cause)
             if cause is error:
                 raise
@@ -123,7 +128,7 @@ class Session:
         if policy is not None:
             save_trained(policy, self._run.path / name, replace=True)
 
-    def _diverged(self, error: BaseException) -> BaseException:
+    def _explain(self, error: BaseException) -> BaseException:
         """The error to report: torch's own when a distribution gets a NaN says little about a training."""
         if isinstance(error, ValueError) and not weights_are_finite(self._model, self._algorithm):
             return TrainingDiverged(
@@ -131,3 +136,34 @@ class Session:
                 " try a smaller learning_rate"
             )
         return error
+
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[Callable[[], bool]]:
+    """Give a function that says whether to stop; the second signal acts as if nobody listened.
+
+    Outside the main thread, where Python delivers no signals, the function always says no.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+
+    def listen(number: int, frame: FrameType | None) -> None:
+        asked.set()
+        restore()
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    try:
+        for number in _SIGNALS:
+            signal.signal(number, listen)
+        yield asked.is_set
+    finally:
+        restore()

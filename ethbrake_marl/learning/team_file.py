@@ -12,9 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
-from ethbrake_marl.files.json import parse_strict_json
 from ethbrake_marl.files.messages import Wording, explain
-from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.yaml import Document, YamlPath
 from ethbrake_marl.learning.recipe import Scheme
 from ethbrake_marl.learning.schemes import driver, drivers

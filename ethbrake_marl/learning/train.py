@@ -12,16 +12,14 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.durable import remove_unfinished
 from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
 from ethbrake_marl.learning.checkpoint_fit import check_fits
-from ethbrake_marl.learning.loop import BetweenUpdates, Evaluate
-from ethbrake_marl.learning.measure import measure_on_list
+from ethbrake_marl.learning.loop import BetweenUpdates, Evaluate, measure_on_list
 from ethbrake_marl.learning.model_state import own_random_state
 from ethbrake_marl.learning.models import make_model, policy_maker
 from ethbrake_marl.learning.progress import Course
 from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe
 from ethbrake_marl.learning.registry import algorithm_named
 from ethbrake_marl.learning.run_folder import RunDirectory, create_run, has_finished, only_process, open_run
-from ethbrake_marl.learning.session import Ended, Session
-from ethbrake_marl.learning.stop_signal import stop_on_signal
+from ethbrake_marl.learning.session import Ended, Session, stop_on_signal
 from ethbrake_marl.learning.team_file import team_content
 from ethbrake_marl.learning.training import Training, resolve, training_in
 from ethbrake_marl.policies.manifest import installed_versions
@@ -40,17 +38,25 @@ class TrainResult:
     """What a training left behind.
 
     ``trained`` is of the moment of least harm on the fixed list, or of the end where nothing was measured.
+
+    >>> import ethbrake_marl as eb
+    >>> short = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_epochs": 1}
+    >>> recipe = eb.load_recipe("ppo").replace(**short, network={"policy": [8], "value": [8]})
+    >>> result = eb.train(recipe, "paper-random", "runs/example", steps=128, measure=None)
+    >>> result.status, result.steps, result.policy.manifest.algorithm
+    ('finished', 128, 'ppo')
+
     """
 
-    directory: Path
-    training: Training
+    directory: Path  # the run's folder
+    training: Training  # recipe, scenario and what they come to
     trained: Trained  # one policy for all learners, or one for each; also saved as directory/policy
     last: Trained  # of the end; also saved as directory/policy-last
-    status: Ended
+    status: Ended  # finished or interrupted
     steps: int  # decisions of all learners, a multiple of rows x rounds
-    updates: int
-    wall_s: float
-    evaluations: tuple[Mapping[str, float], ...]
+    updates: int  # rounds of collecting and learning
+    wall_s: float  # s, of all stretches together
+    evaluations: tuple[Mapping[str, float], ...]  # what was measured on the way, in order
     alarms: tuple[str, ...]  # return up, harm not down
 
     @property
@@ -125,11 +131,18 @@ def resume(
 ) -> TrainResult:
     """Go on with a training that was stopped or killed, to the policies that it would have come to: the same bits.
 
-    It goes on from the newest checkpoint that is whole, or from the beginning when there is none; rows and events
-    after that checkpoint are dropped, so that nothing stands twice. ``measure`` must be that of ``train``. Raises
-    ``InvalidInput`` for a folder without a training, one that has finished, one in which another process trains, one
-    whose ``config.json`` was edited since the checkpoint, and a checkpoint written by other versions, whose numbers may
-    differ, unless ``other_versions``.
+    It goes on from the newest checkpoint that is whole, or from the beginning when there is none; rows and events after
+    that checkpoint are dropped, so that nothing stands twice.
+
+    Args:
+        directory: the run's folder.
+        measure: as it was given to ``train``.
+        on_progress: is told how far the training is.
+        other_versions: go on from a checkpoint that other versions wrote, although its numbers may differ.
+
+    Raises ``InvalidInput`` for a folder without a training, one that has finished, one in which another process trains,
+    one whose ``config.json`` was edited since the checkpoint, and a checkpoint of other versions.
+
     """
     run, config = open_run(Path(directory))
     training = training_in(run.path, config)

@@ -1,1 +1,1 @@
-"""What was avoidable, the least harm that is known, and how far an agent is from it."""
+"""Limits of a world, whoever drives: what is avoidable, the least harm known, the harm that is proven."""

@@ -1,4 +1,4 @@
-"""Which contacts nobody could have avoided: exact, world by world, with a witness or the reason.
+"""Contacts that nobody could have avoided: exact, world by world, with a witness or the reason.
 
 One vehicle is controlled, its neighbours brake with their whole capacity from their latencies on. Let z be the
 pointwise largest trajectory behind the vehicle in front: coast to the own latency, drive as long as possible, brake at

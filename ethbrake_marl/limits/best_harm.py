@@ -17,7 +17,7 @@ import numpy as np
 
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.protocol import fixed_commands
-from ethbrake_marl.agents.rollout import scripted
+from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, BestKnown, join_tables, load_table, save_table
@@ -195,7 +195,7 @@ def scripted_commands(worlds: Worlds, task: Task) -> Floats:
 
     Raises ``InvalidInput`` for a script whose command is not fixed at the alert.
     """
-    others = {i: script for i, script in scripted(task.scenario).items() if i not in task.vehicles}
+    others = {i: script for i, script in script_agents(task.scenario).items() if i not in task.vehicles}
     return fixed_commands(others, worlds, f"scenario {task.scenario.name!r}, search for the best profiles")
 
 

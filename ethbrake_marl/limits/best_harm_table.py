@@ -17,8 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
 from ethbrake_marl.files.durable import write_file
-from ethbrake_marl.files.json import parse_strict_json
-from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, UInt64s
 from ethbrake_marl.search.problem import ProfileProblem

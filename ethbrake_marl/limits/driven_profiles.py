@@ -8,8 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from ethbrake_marl.agents.around import AgentAround
-from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.protocol import Agent, AgentAround
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import check_one_learner
 from ethbrake_marl.harm import HarmCount

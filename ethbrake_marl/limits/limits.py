@@ -1,4 +1,4 @@
-"""What is known of each world of a list before anybody drives: what is avoidable, proven, and the best known harm.
+"""The limits of a list of worlds, found before anybody drives: avoidable, proven, and the best known harm.
 
 Three vehicles, Vehicle 2 driven, the others braking fully: for these it is proven world by world whether some command
 avoids all contact (``limits.avoidability``) and which harm no command undercuts (``limits.lower_bound``). The least

@@ -131,13 +131,16 @@ def advance(
 ) -> tuple[Worlds, Impacts]:
     """Advance ``worlds`` exactly, each under its constant command, and report the impacts on the way.
 
-    ``command_mps2`` [n, N] is the signed acceleration each vehicle wants; it is ignored before the vehicle's
-    latency has elapsed, also when that falls inside the segment. Give either ``duration_s`` or the absolute end
-    ``until_s`` (scalar or [n]). The result of a world does not depend on the batch it is in, nor on ``threads``, which
-    pay from about 10,000 worlds on. Inputs are left alone.
+    Raises ``InvalidInput`` for an unusable command, end or ``threads``, ``PhysicsError`` naming the worlds that failed.
 
-    Raises ``InvalidInput`` for a command that is not finite or exceeds a vehicle's capacity, an end before the worlds'
-    time, or ``threads`` below 1; ``PhysicsError``, which names every world in which a check inside the kernel failed.
+    Args:
+        worlds: n worlds of N vehicles.
+        command_mps2: signed acceleration wanted, [n, N] m/s2, within capacities; nothing before the latency elapsed.
+        duration_s: length of the segment, one number or [n], s; or give ``until_s``.
+        until_s: its absolute end, not before the worlds' time.
+        record: also report every impact, as ``Impacts.rows``.
+        threads: pay from about 10,000 worlds on; neither they nor the batch change a result.
+
     """
     command = _shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
     if (duration_s is None) == (until_s is None):

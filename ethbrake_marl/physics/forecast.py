@@ -1,4 +1,4 @@
-"""What constant commands would lead to: the same physics as ``advance``, for many candidate commands of one vehicle.
+"""The forecast of constant commands: the physics of ``advance``, for many candidate commands of one vehicle.
 
 Nothing of the motion is kept, only the harm, so a candidate costs little more than its events.
 """

@@ -57,9 +57,19 @@ _WITHOUT_NEWS = _OF_VEHICLES[:-2]
 
 @dataclass(frozen=True, slots=True)
 class Worlds:
-    """The state of ``n`` worlds at their times ``time_s``."""
+    """The state of ``n`` worlds at their times ``time_s``.
 
-    vehicles: Vehicles
+    >>> import ethbrake_marl as eb
+    >>> worlds = eb.make_worlds(
+    ...     [7.0, 7.0], [20.0, 18.0, 20.0], braking_capacity_mps2=[6.0, 7.0, 6.0], driving_capacity_mps2=3.0,
+    ...     latency_s=[0.0, 0.5, 0.8], mass_t=[4.5, 5.5, 5.9], restitution=0.1,
+    ... )
+    >>> worlds.n, worlds.N, worlds.gaps_m
+    (1, 3, array([[7., 7.]]))
+
+    """
+
+    vehicles: Vehicles  # what does not change
     gaps_m: Floats  # [n, P] bumper to bumper, >= 0 (below only in the sampled map)
     speeds_mps: Floats  # [n, N] forward positive; negative only after a bounce-back
     time_s: Floats  # [n] since Vehicle 1 began to brake
@@ -168,9 +178,19 @@ def make_worlds(
 ) -> Worlds:
     """Build checked worlds at ``t = 0``; every parameter broadcasts to its full shape.
 
-    ``speeds_mps`` is [n, N] or [N]; ``gaps_m`` is [n, P], [P] or a scalar; vehicle parameters broadcast to
-    [n, N]; ``restitution`` to [n], and so does ``obstacle_gap_m``, the distance to an obstacle ahead of Vehicle 1
-    (None: there is none). Raises ``InvalidInput`` naming the field, the first bad entry and its range.
+    Args:
+        gaps_m: bumper to bumper, [n, P], [P] or one number, m.
+        speeds_mps: [n, N] or [N], m/s.
+        braking_capacity_mps2: largest deceleration, to [n, N], m/s2.
+        driving_capacity_mps2: largest forward acceleration, to [n, N], m/s2.
+        latency_s: commands are ignored before this time, to [n, N], s.
+        mass_t: to [n, N], t.
+        restitution: of every impact, in [0, 1], to [n].
+        speed_limit_mps: driving stops here, to [n, N], m/s.
+        obstacle_gap_m: distance to an obstacle ahead of Vehicle 1, to [n], m; None: there is none.
+
+    Raises ``InvalidInput`` naming the field, the first bad entry and its range.
+
     """
     speeds = np.atleast_2d(np.asarray(speeds_mps, dtype=np.float64))
     if speeds.ndim != 2 or speeds.shape[1] < 2:

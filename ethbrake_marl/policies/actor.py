@@ -72,7 +72,7 @@ class Actor:
 
     def __call__(self, observation: Float32s) -> Float32s:
         """Return the action of each row; raises ``InvalidInput`` on a wrong shape, dtype or a non-finite entry."""
-        seen = self._checked(observation)
+        seen = self._check(observation)
         action = np.empty((seen.shape[0], self.spec.action_size), dtype=np.float32)
         for start in range(0, seen.shape[0], BLOCK_ROWS):
             rows = slice(start, start + BLOCK_ROWS)
@@ -96,7 +96,7 @@ class Actor:
         squash(y)
         return y
 
-    def _checked(self, observation: Float32s) -> Float32s:
+    def _check(self, observation: Float32s) -> Float32s:
         wanted = (observation.shape[0] if observation.ndim else 0, self.spec.observation_size)
         if observation.shape != wanted or observation.dtype != np.float32:
             raise InvalidInput(

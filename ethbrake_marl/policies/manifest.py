@@ -1,4 +1,4 @@
-"""Which versions made a run or a policy."""
+"""The manifest of a policy: network, observation, training, versions and hashes."""
 
 from __future__ import annotations
 

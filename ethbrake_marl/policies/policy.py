@@ -21,8 +21,7 @@ from safetensors import SafetensorError
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
 from ethbrake_marl.files.durable import new_folder, write_file
-from ethbrake_marl.files.json import parse_strict_json
-from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.policies.actor import Actor, Float32s
 from ethbrake_marl.policies.manifest import Manifest, content_sha256, observation_schema, tensor_table
@@ -35,7 +34,17 @@ WEIGHTS_LIMIT_BYTES = 256 << 20
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy in memory: its manifest, its tensors, and ``policy(observation)`` for the deterministic action."""
+    """A policy in memory: its manifest, its tensors, and ``policy(observation)`` for the deterministic action.
+
+    >>> import ethbrake_marl as eb
+    >>> import numpy as np
+    >>> policy = eb.load_shipped("ppo")
+    >>> policy.manifest.algorithm, policy.observation.size
+    ('ppo', 27)
+    >>> policy(np.zeros((2, 27), np.float32)).shape
+    (2, 1)
+
+    """
 
     manifest: Manifest
     tensors: Mapping[str, Float32s] = field(repr=False)

@@ -1,4 +1,4 @@
-"""Where the files are that come with the package: in a checkout, or inside the installed package."""
+"""The catalogue of scenarios: those that ship, in a checkout or inside the installed package, and files by path."""
 
 from __future__ import annotations
 

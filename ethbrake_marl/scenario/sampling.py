@@ -101,7 +101,14 @@ _NUMBERS_PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Worlds at the alert, and where in the list they stand."""
+    """Worlds at the alert, and where in the list they stand.
+
+    >>> import ethbrake_marl as eb
+    >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
+    >>> sample.index, sample.worlds.gaps_m.round(2)
+    (array([0, 1]), array([[6.62, 8.49], [5.33, 7.79]]))
+
+    """
 
     worlds: Worlds  # at t = 0
     index: Ints  # [n] number of each world in the list of its seed

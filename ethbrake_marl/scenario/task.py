@@ -1,4 +1,4 @@
-"""What is asked of whoever drives: a scenario, the vehicles that are driven in it, and the harm that counts."""
+"""The task of whoever drives: a scenario, the vehicles that are driven in it, and the harm that counts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who hears of whom, and when: V2X messages per link, lost information, on-board sensing as the fall-back.
+"""The channel between vehicles: V2X messages per link, lost information, on-board sensing as the fall-back.
 
 A message carries its sender's state, capacities and latency. On the link from vehicle j to vehicle i it is of use from
 

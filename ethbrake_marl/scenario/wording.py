@@ -1,4 +1,4 @@
-"""What messages about a scenario file know of its keys: which may stand where, what each means, whose value it is."""
+"""The wording of messages about a scenario file: its keys, their places and their meanings."""
 
 from __future__ import annotations
 

@@ -4,11 +4,9 @@ from ethbrake_marl.shield.agents import HybridAgent, StepShieldAgent
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
 from ethbrake_marl.shield.engine_shield import MovingAtHorizon
 from ethbrake_marl.shield.options import ShieldOptions
-from ethbrake_marl.shield.parallel import HybridShield, shielded_aec
-from ethbrake_marl.shield.single import ShieldedEnv
 from ethbrake_marl.shield.step_shield import Certified, StepShield
 from ethbrake_marl.shield.uncertainty import Interval, Uncertainty, parse_uncertainty
-from ethbrake_marl.shield.vector import ShieldedVectorEnv
+from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 
 __all__ = [
     "Backup",

@@ -14,13 +14,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents.around import AgentAround
 from ethbrake_marl.agents.e_v2x_bm.agent import EV2XBM
 from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.protocol import Agent, check_agent, place, recall
-from ethbrake_marl.agents.refined import Rehearsed
+from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place, recall
+from ethbrake_marl.agents.refined import Refined
 from ethbrake_marl.agents.registry import AgentSettings
-from ethbrake_marl.agents.rollout import drive, introduce, scripted
+from ethbrake_marl.agents.rollout import drive, script_agents, set_others
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
@@ -59,7 +58,7 @@ class HybridAgent(AgentAround):
         self.harm_count: HarmCount = harm_count
         self.policy_harm: Floats = np.zeros(0)
         self.bound_harm: Floats = np.zeros(0)
-        self._rehearsal = copy.deepcopy(policy)  # predicting must not disturb the policy's memory of running episodes
+        self._stage = copy.deepcopy(policy)  # predicting must not disturb the policy's memory of running episodes
 
     @property
     def chosen_policy(self) -> Bools:
@@ -74,14 +73,14 @@ class HybridAgent(AgentAround):
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Choose for these rows; ``worlds`` holds those rows only, at the alert."""
-        scripts = scripted(self.scenario, but=vehicle)
+        scripts = script_agents(self.scenario, except_for=vehicle)
         for agent in (self.policy, self.backup):
-            introduce(agent, vehicle, scripts)
+            set_others(agent, vehicle, scripts)
             agent.begin(worlds, vehicle, rows)
-        if isinstance(self.policy, Rehearsed):  # was rolled out just now
+        if isinstance(self.policy, Refined):  # was rolled out just now
             policy_harm = self.policy.predicted_harm[rows]
         else:
-            policy_harm = self._harm(worlds, self._rehearsal, vehicle)
+            policy_harm = self._harm(worlds, self._stage, vehicle)
         bound = self.backup.predicted_harm[rows]
         if self.bound == "coupled":
             bound = self._harm(worlds, FixedCommand(-self.backup.deceleration_mps2[rows]), vehicle)
@@ -123,17 +122,19 @@ class _Asked(NamedTuple):
 
 
 class StepShieldAgent(AgentAround):
-    """Drives by ``policy`` as far as ``StepShield`` certifies it.
+    """Drives by ``policy``, any agent, as far as ``StepShield`` certifies it in the ``scenario``.
 
     At the alert the policy is rolled out once: where it harms no more than the coupled optimum, it drives unhindered,
-    and its harm is the bound. Elsewhere each of its actions must be certified: by the rest of the plan, by a constant,
-    or (``later_rollouts``) by the policy itself, rolled out from the state after the action. After ``begin``,
-    ``predicted_harm`` [n] is the bound: realised harm (``harm_count``) is at most that. ``chosen_policy`` [n]: no
-    intervention so far; ``shield`` holds the rest. Raises ``InvalidInput`` for what is not an agent, and what
-    ``StepShield`` raises.
+    and its harm is the bound. Elsewhere each action must be certified: by the rest of the plan, by a constant, or by
+    the policy, rolled out from the state after the action. After ``begin``, ``predicted_harm`` [n] is the bound. Raises
+    ``InvalidInput`` for what is not an agent, and what ``StepShield`` raises.
 
-    With an ``uncertainty`` this is robust mode: what is certified must hold in every member. ``believed`` (row k for
-    row k of the batch) is what the shield takes for the worlds at the alert; the policy sees the worlds themselves.
+    Args:
+        harm_count, allowance, logging: as ``ShieldOptions``.
+        later_rollouts: whether the policy itself may certify an action.
+        uncertainty: robust mode: what is certified must hold in every member.
+        believed: worlds at the alert as the shield takes them to be; None: as they are, which is what the policy sees.
+
     """
 
     adds = Source.MODEL  # in which actions are certified
@@ -188,7 +189,7 @@ class StepShieldAgent(AgentAround):
             self.shield, self._asked = self._make(vehicle), None
         if self._asked is not None and len(rows) < len(self._wanted):
             self._commit(self._asked)  # some episodes of a batch are renewed: that step was made
-        introduce(self.policy, vehicle, scripted(self.scenario, but=vehicle))
+        set_others(self.policy, vehicle, script_agents(self.scenario, except_for=vehicle))
         self.policy.begin(worlds, vehicle, rows)
         self.shield.begin(worlds if self._believed is None else self._believed.take(rows), rows, self.policy)
         bound = self.shield.first_bound[rows] + self.shield.allowance

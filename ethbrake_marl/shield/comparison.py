@@ -1,4 +1,4 @@
-"""What happened, beside what was predicted: to the last bit, the harm so far included."""
+"""The comparison of what happened with what was predicted: to the last bit, the harm so far included."""
 
 from __future__ import annotations
 

@@ -43,12 +43,12 @@ def interventions(
 
 def write_down(log: list[Intervention], found: list[Intervention], now: Running, episode: Ints) -> None:
     """Add what was found at ``now`` to the log, in place of what an interrupted step may have left at its end."""
-    while log and _undone(log[-1], now, episode):
+    while log and _is_undone(log[-1], now, episode):
         log.pop()
     log.extend(found)
 
 
-def _undone(entry: Intervention, now: Running, episode: Ints) -> bool:
+def _is_undone(entry: Intervention, now: Running, episode: Ints) -> bool:
     """Whether the running episodes have not come as far as this entry."""
     k = entry.world
     return k < now.n and entry.episode == episode[k] and entry.step >= now.steps[k]

@@ -1,4 +1,4 @@
-"""What a shield around an interface is set to: its settings and their checks, the same for every interface."""
+"""The options of a shield around an interface, and their checks, the same for every interface."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ShieldOptions:
             replaced) or ``robust`` (``step`` against an uncertainty). None: ``robust`` with an uncertainty, else
             ``step``.
         bound: the ``H*`` of mode ``episode``, ``coupled`` or the paper's ``pairwise``.
-        count: the harm that is guaranteed, ``first`` or ``total``.
+        harm_count: the harm that is guaranteed, ``first`` or ``total``.
         allowance: how far above the bound is allowed, m2/s2; not in mode ``episode``.
         uncertainty: what mode ``robust`` does not know, such as ``"gaps_m=0.5"``.
         intervention_penalty: taken off the reward of a step in which something else than the proposal was applied.
@@ -33,7 +33,8 @@ class ShieldOptions:
 
     Raises ``InvalidInput`` naming the setting that does not fit, ``UnknownName`` for a mode.
 
-    >>> ShieldOptions(uncertainty="gaps_m=0.5").mode
+    >>> import ethbrake_marl as eb
+    >>> eb.ShieldOptions(uncertainty="gaps_m=0.5").mode
     'robust'
 
     """

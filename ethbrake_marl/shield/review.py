@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents.around import AgentAround
-from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.protocol import Agent, AgentAround
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.harm import HarmCount

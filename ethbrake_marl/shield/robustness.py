@@ -1,4 +1,4 @@
-"""What not knowing costs: robust mode's price, and what happens where the truth is not what the shield believes."""
+"""The cost of not knowing: robust mode's price, and harm where the truth is not what the shield believes."""
 
 from __future__ import annotations
 

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command, command_to_action
-from ethbrake_marl.agents.around import AgentAround, is_divisible
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.rollout import drive, introduce, scripted
+from ethbrake_marl.agents.protocol import Agent, AgentAround, is_divisible
+from ethbrake_marl.agents.rollout import drive, script_agents, set_others
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.episode import HARM_IS_TOTAL, START, TIME_STEP, decision_at
@@ -41,7 +40,7 @@ def rolled_out(
 ) -> Floats:
     """The actions [n, width] of a policy that drives alone from the alert; full braking beyond its episode's end."""
     recorder = _Recorder(copy.deepcopy(policy), problem, width)
-    introduce(recorder.policy, vehicle, scripted(scenario, but=vehicle))
+    set_others(recorder.policy, vehicle, script_agents(scenario, except_for=vehicle))
     drive(worlds, recorder, scenario, vehicle)
     return recorder.actions
 

@@ -24,8 +24,17 @@ class ShieldedVecEnv(VecEnvWrapper):
     """``make_sb3_vec_env`` with one learner behind a shield, by default in mode ``step``.
 
     The ``options`` are those of ``ShieldOptions``; the penalty is not taken off the return in
-    ``infos[row]["episode"]``. Without a ``policy`` the bound is the coupled optimum's harm. Each row's
-    infos hold ``shield`` in every step. Raises ``InvalidInput`` for another environment or number of learners.
+    ``infos[row]["episode"]``. Without a ``policy`` the bound is the coupled optimum's harm. Each row's infos hold
+    ``shield`` in every step. Raises ``InvalidInput`` for another environment or number of learners.
+
+    >>> import ethbrake_marl as eb
+    >>> import numpy as np
+    >>> env = eb.ShieldedVecEnv(eb.make_sb3_vec_env("paper-random", 4, seed=7))
+    >>> observations = env.reset()
+    >>> observations, rewards, dones, infos = env.step(np.full((4, 1), 1.0))
+    >>> [info["shield"]["intervened"] for info in infos]
+    [True, True, True, True]
+
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What a shield is given, checked where it is built."""
+"""Checks of what a shield is built with: amounts, scenario, policy, environment."""
 
 from __future__ import annotations
 

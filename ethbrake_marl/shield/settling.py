@@ -1,4 +1,4 @@
-"""Whether a world comes to rest before the horizon, where every bound ends."""
+"""The test whether a world comes to rest before the horizon, where every bound ends."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.actions import command_to_action
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.protocol import Agent, fixed_commands
-from ethbrake_marl.agents.rollout import scripted
+from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.harm import HarmCount, check_harm_count
@@ -111,7 +111,7 @@ class StepShield:
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
         self.episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode
         self.distrusted: Bools = np.zeros(0, np.bool_)
-        self._others = scripted(scenario, but=vehicle) if others is None else others
+        self._others = script_agents(scenario, except_for=vehicle) if others is None else others
         self._width = int(number_of_decisions(np.zeros(1), scenario.time_step_s, scenario.horizon_s)[0]) + 1
 
     @property

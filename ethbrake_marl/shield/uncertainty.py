@@ -1,4 +1,4 @@
-"""What is not known exactly: intervals around the quantities of a world, and the members that stand for them.
+"""Uncertainty as intervals around the quantities of a world, and the members that stand for them.
 
 A quantity of one vehicle (or pair) that was told as x lies in [x - h, x + h], h being a number in its unit or a share
 of x, cut to what is possible (no latency, speed or gap below 0, no speed above the vehicle's limit). The *members* of

@@ -19,7 +19,8 @@ from rich.text import Text
 from ethbrake_marl.agents.knowledge import Knowledge, knowledge_text
 from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.errors import check_whole_number, unknown_name
-from ethbrake_marl.evaluation.rollout import Outcome, evaluate
+from ethbrake_marl.evaluation.outcome import Outcome
+from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.progress import OnProgress, Progress

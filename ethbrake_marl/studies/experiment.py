@@ -111,13 +111,13 @@ def run_experiment(
     run = RunDirectory(trained.directory)
     with _status(run, trained.status):
         agents = _agents(trained.policy, scenario)
-        evaluation = _evaluated(sample, agents, scenario, vehicle, list_seed, trained, tell)
+        evaluation = _evaluate(sample, agents, scenario, vehicle, list_seed, trained, tell)
         tell(Progress("figures", 0, 1))
         rows = summarise(evaluation)
         beside = _beside(trained.policy, scenario, min(episodes, BESIDE_EPISODES), list_seed)
         write_results(run.path, evaluation, rows)
         write_beside(run.path, beside)
-        report = _shown(run, evaluation, rows, beside, trained, agents, wall_s=time.monotonic() - started)
+        report = _show(run, evaluation, rows, beside, trained, agents, wall_s=time.monotonic() - started)
         tell(Progress("figures", 1, 1))
     return ExperimentResult(run.path, trained.status, trained.steps, rows, report, beside)
 
@@ -142,7 +142,7 @@ def _agents(policy: Policy, scenario: Scenario, baselines: Sequence[str] = BASEL
     return {**make_agents(baselines, scenario), **learned}
 
 
-def _evaluated(
+def _evaluate(
     sample: Sample,
     agents: Mapping[str, Agent],
     scenario: Scenario,
@@ -167,7 +167,7 @@ def _evaluated(
     )
 
 
-def _shown(
+def _show(
     run: RunDirectory,
     evaluation: Evaluation,
     rows: list[SummaryRow],

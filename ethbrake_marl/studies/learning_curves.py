@@ -15,7 +15,7 @@ from typing import Any
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
-from ethbrake_marl.figures.learning_curves import SeedCurve, at_common_steps, seed_curves
+from ethbrake_marl.figures.curves import SeedCurve, at_common_steps, seed_curves
 from ethbrake_marl.figures.style import png_bytes
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
@@ -81,7 +81,7 @@ def train_all(
         if RunDirectory(path).status.is_file():
             check_same(path, training)
     return all(
-        _train_one(training, path, None if tell is None else partial(_named, tell, path.name))
+        _train_one(training, path, None if tell is None else partial(_tell_named, tell, path.name))
         for path, training in wanted.items()
     )
 
@@ -127,7 +127,7 @@ def _train_one(training: Training, path: Path, tell: OnProgress | None) -> bool:
     return resume(path, on_progress=tell).status == "finished"
 
 
-def _named(tell: OnProgress, name: str, progress: Progress) -> None:
+def _tell_named(tell: OnProgress, name: str, progress: Progress) -> None:
     tell(replace(progress, name=name))
 
 

@@ -1,4 +1,4 @@
-"""What an experiment leaves beside its policy: results as CSV and JSON, every world, three figures and one page."""
+"""The results of an experiment beside its policy: CSV and JSON, every world, three figures and one page."""
 
 from __future__ import annotations
 

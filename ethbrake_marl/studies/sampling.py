@@ -1,4 +1,4 @@
-"""How the harm of the paper's fixed-step map approaches the exact one as its step shrinks: table and figure.
+"""The convergence of the paper's fixed-step map to the exact harm as its step shrinks: table and figure.
 
 Both integrators take the same worlds, under the same constant commands, to the scenario's horizon; Vehicle 2 is driven
 by one agent, all others brake fully. An error is the sampled harm minus the exact one.
@@ -15,7 +15,7 @@ import numpy as np
 from ethbrake_marl.agents.registry import make_single_agent
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.figures.sampling import draw_errors
+from ethbrake_marl.figures.curves import draw_errors
 from ethbrake_marl.figures.style import Figure, png_bytes
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Impacts, Worlds, advance, advance_sampled

@@ -1,4 +1,4 @@
-"""How the cost of a step grows with the numbers of worlds and vehicles: the figure of ``ethbrake bench --scaling``."""
+"""The cost of a step over the numbers of worlds and vehicles: the figure of ``ethbrake bench --scaling``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ethbrake_marl.figures.scaling import draw_costs
+from ethbrake_marl.figures.curves import draw_costs
 from ethbrake_marl.figures.style import Figure
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.studies.speed import SEED, STEP_S, Effort, Work, braking, rates, stepping, until_rest

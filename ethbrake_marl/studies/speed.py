@@ -1,4 +1,4 @@
-"""What this machine does per second of processor time: the figures of ``ethbrake bench``.
+"""The speed of a machine per second of processor time: the figures of ``ethbrake bench``.
 
 Every rate is the median over repetitions of work done per second of this process's own processor time, on one core and
 after a first round that does not count (it compiles and fills caches). Programs that run beside it therefore weigh

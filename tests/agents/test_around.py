@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.around import AgentAround, is_divisible
 from ethbrake_marl.agents.knowledge import Source, knowledge_of
 from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.agents.refined import Rehearsed
+from ethbrake_marl.agents.protocol import AgentAround, is_divisible
+from ethbrake_marl.agents.refined import Refined
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
@@ -27,18 +27,18 @@ def test_around__drives_knows_and_is_called_as_the_agent_inside():
     assert (around.name, knowledge_of(around)) == ("e_v2x_bm", (Source.MODEL,))
 
 
-def test_refined__a_planner_is_told_the_others_scripts_while_it_rehearses():
+def test_refined__a_planner_is_told_the_others_scripts_while_it_searches():
     scenario = SCENARIO.replace(roles={"vehicle_1": "constant:3", "vehicle_2": "learner", "vehicle_3": "coast"})
     worlds = scenario.sample(6, 4).worlds
-    agent = Rehearsed(make_agent("planner:8", scenario=scenario), scenario, rehearsals=1, rounds=1)
+    agent = Refined(make_agent("planner:8", scenario=scenario), scenario, tries=1, rounds=1)
     harm = drive(worlds, agent, scenario, 1).ledger.world_harm("first")
     assert harm.tolist() == agent.predicted_harm.tolist()
 
 
 def test_take__goes_on_apart_only_where_both_can():
     policy = LearnedAgent(load_named_policy("shipped"))
-    assert is_divisible(policy) and is_divisible(Rehearsed(policy, SCENARIO))
-    for agent in (AgentAround(policy), Rehearsed(make_agent("full_brake"), SCENARIO)):
+    assert is_divisible(policy) and is_divisible(Refined(policy, SCENARIO))
+    for agent in (AgentAround(policy), Refined(make_agent("full_brake"), SCENARIO)):
         assert not is_divisible(agent)
         with pytest.raises(InvalidInput, match=r"has no take\(rows\)"):
             agent.take(np.array([0]))

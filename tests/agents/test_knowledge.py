@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.knowledge import Source, combined, knowledge_of, knowledge_text, sees_through
+from ethbrake_marl.agents.knowledge import Source, combine, knowledge_of, knowledge_text, sees_through
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import agent_names, find_entry
-from ethbrake_marl.agents.rollout import introduce, scripted
+from ethbrake_marl.agents.rollout import script_agents, set_others
 from ethbrake_marl.agents.spelling import parse_spec
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
@@ -87,7 +87,7 @@ def test_knowledge__every_agent_of_the_registry_states_it():
 def test_knowledge__a_wrapper_adds_the_model_to_what_its_policy_knows():
     for shield in ("episode", "step"):
         assert knowledge_of(agent_of(f"ppo@shipped/ppo+{shield}")) == (MESSAGES, MODEL)
-    assert combined(Silent(), also=MODEL) == (MODEL, Source.UNSTATED)
+    assert combine(Silent(), also=MODEL) == (MODEL, Source.UNSTATED)
 
 
 def test_knowledge__a_team_knows_what_its_drivers_know():
@@ -155,11 +155,11 @@ def changed_actions(agent: Agent, scenario: Scenario, vehicle: int = 1, *, steps
     """Decisions that differ when what has not been received is altered, at the alert and at each of the first steps."""
     rng = np.random.default_rng(3)
     alert = scenario.sample(n, 11).worlds
-    scripts = scripted(scenario, but=vehicle)
+    scripts = script_agents(scenario, except_for=vehicle)
     knowing, wondering = copy.deepcopy(agent), copy.deepcopy(agent)
     engine = Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=alert)
     for driver, at_alert in ((knowing, alert), (wondering, altered(alert, vehicle, rng))):
-        introduce(driver, vehicle, scripts)
+        set_others(driver, vehicle, scripts)
         driver.begin(at_alert, vehicle, np.arange(n))
     differing = 0
     for _ in range(steps):

@@ -1,12 +1,12 @@
-"""A rehearsed policy: never worse than the policy, and it does what it predicted."""
+"""A refined policy: never worse than the policy, and it does what it predicted."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents import refined as rehearsed
-from ethbrake_marl.agents.refined import HOLDS, SIZES, Rehearsed, changes, deviated
+from ethbrake_marl.agents import refined
+from ethbrake_marl.agents.refined import HOLDS, SIZES, Refined, changes, deviate
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_agent, make_lineup
@@ -21,46 +21,46 @@ def harm(agent, harm_count="first", worlds=WORLDS):
 
 
 @pytest.mark.parametrize("harm_count", ["first", "total"])
-def test_rehearsed__is_never_worse_and_as_predicted(harm_count):
+def test_refined__is_never_worse_and_as_predicted(harm_count):
     plain = harm(make_agent("constant:5"), harm_count)
-    agent = Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=8, harm_count=harm_count)
+    agent = Refined(make_agent("constant:5"), SCENARIO, tries=8, harm_count=harm_count)
     realised = harm(agent, harm_count)
     assert (realised <= plain).all() and (realised < plain - 1.0).any()
     assert realised.tolist() == agent.predicted_harm.tolist()
 
 
-def test_rehearsed__of_more_is_never_worse():
-    few, many = (harm(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=k, rounds=1)) for k in (3, 9))
+def test_refined__of_more_is_never_worse():
+    few, many = (harm(Refined(make_agent("constant:5"), SCENARIO, tries=k, rounds=1)) for k in (3, 9))
     assert (many <= few).all() and (many < few).any()
 
 
-def test_rehearsed__of_more_rounds_is_never_worse():
-    few, many = (harm(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=5, rounds=r)) for r in (1, 3))
+def test_refined__of_more_rounds_is_never_worse():
+    few, many = (harm(Refined(make_agent("constant:5"), SCENARIO, tries=5, rounds=r)) for r in (1, 3))
     assert (many <= few).all() and (many < few).any()
 
 
-def test_rehearsed__does_not_depend_on_how_the_trials_are_cut(monkeypatch):
-    whole = harm(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=5, rounds=2))
-    monkeypatch.setattr(rehearsed, "_BLOCK", 12)
-    cut = harm(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=5, rounds=2))
+def test_refined__does_not_depend_on_how_the_trials_are_cut(monkeypatch):
+    whole = harm(Refined(make_agent("constant:5"), SCENARIO, tries=5, rounds=2))
+    monkeypatch.setattr(refined, "_BLOCK", 12)
+    cut = harm(Refined(make_agent("constant:5"), SCENARIO, tries=5, rounds=2))
     assert cut.tolist() == whole.tolist()
 
 
-def test_rehearsed__where_nothing_is_better_drives_as_the_policy_does():
+def test_refined__where_nothing_is_better_drives_as_the_policy_does():
     apart = WORLDS.take(np.flatnonzero(harm(make_agent("full_brake")) == 0.0))
-    agent = Rehearsed(make_agent("full_brake"), SCENARIO, rehearsals=4)
+    agent = Refined(make_agent("full_brake"), SCENARIO, tries=4)
     agent.begin(apart, 1, np.arange(apart.n))
     assert agent.act(apart, 1).tolist() == (-apart.vehicles.braking_capacity_mps2[:, 1]).tolist()
 
 
-def test_rehearsed__of_one_world_is_that_of_the_batch():
-    agent, alone = (Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=5) for _ in range(2))
+def test_refined__of_one_world_is_that_of_the_batch():
+    agent, alone = (Refined(make_agent("constant:5"), SCENARIO, tries=5) for _ in range(2))
     every = harm(agent)
     assert harm(alone, worlds=WORLDS.take([17])).tolist() == [every[17]]
 
 
 def test_begin__of_some_rows_leaves_the_others_alone():
-    agent = Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=3)
+    agent = Refined(make_agent("constant:5"), SCENARIO, tries=3)
     agent.begin(WORLDS, 1, np.arange(WORLDS.n))
     before = agent.predicted_harm.copy()
     agent.begin(WORLDS.take([7]), 1, np.array([2]))
@@ -81,21 +81,21 @@ def test_changes__keep_their_sizes_and_hold():
 
 def test_deviated__stays_within_the_capacities():
     command = np.full(WORLDS.n, -6.9)
-    low = deviated(command, np.full((WORLDS.n, 64), -0.5), WORLDS, 1)
-    high = deviated(-command, np.full((WORLDS.n, 64), 0.5), WORLDS, 1)
+    low = deviate(command, np.full((WORLDS.n, 64), -0.5), WORLDS, 1)
+    high = deviate(-command, np.full((WORLDS.n, 64), 0.5), WORLDS, 1)
     assert set(low.tolist()) == {-7.0} and set(high.tolist()) == {7.0}
 
 
-@pytest.mark.parametrize("name", ["rehearsals", "rounds"])
+@pytest.mark.parametrize("name", ["tries", "rounds"])
 @pytest.mark.parametrize("number", [0, -1, True, 2.0, 10_001])
-def test_rehearsed__refuses_a_number_that_is_none(name, number):
+def test_refined__refuses_a_number_that_is_none(name, number):
     with pytest.raises(InvalidInput, match=rf"{name} = .*whole number in 1\.\.10000"):
-        Rehearsed(make_agent("coast"), SCENARIO, **{name: number})
+        Refined(make_agent("coast"), SCENARIO, **{name: number})
 
 
 def test_take__goes_on_in_some_worlds_only():
     policy = make_lineup(["ppo@shipped"], SCENARIO)["ppo@shipped"]
-    agent = Rehearsed(policy, SCENARIO, rehearsals=3, rounds=1)
+    agent = Refined(policy, SCENARIO, tries=3, rounds=1)
     agent.begin(WORLDS, 1, np.arange(WORLDS.n))
     rows = np.array([5, 90])
     assert agent.take(rows).act(WORLDS.take(rows), 1).tolist() == agent.act(WORLDS, 1)[rows].tolist()
@@ -103,9 +103,9 @@ def test_take__goes_on_in_some_worlds_only():
 
 def test_take__of_a_policy_that_cannot_is_refused():
     with pytest.raises(InvalidInput, match=r"no take\(rows\)"):
-        Rehearsed(make_agent("coast"), SCENARIO).take(np.array([0]))
+        Refined(make_agent("coast"), SCENARIO).take(np.array([0]))
 
 
 def test_act__before_begin_is_refused():
     with pytest.raises(InvalidInput, match="begin was not called"):
-        Rehearsed(make_agent("coast"), SCENARIO).act(WORLDS, 1)
+        Refined(make_agent("coast"), SCENARIO).act(WORLDS, 1)

@@ -11,7 +11,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.refined import Rehearsed
+from ethbrake_marl.agents.refined import Refined
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.spelling import OLD_SPELLINGS, AgentSpec, parse_spec
 from ethbrake_marl.cli.app import run_command
@@ -80,7 +80,7 @@ def test_make_agent__says_where_a_scenario_is_needed(spec):
         ("full_brake+step", StepShieldAgent),
         ("constant:-5+step", StepShieldAgent),
         ("planner:8+episode", HybridAgent),
-        ("best_harm:20+refined", Rehearsed),
+        ("best_harm:20+refined", Refined),
         ("e_v2x_bm+refined+episode", HybridAgent),
         ("gentlest_front+robust", StepShieldAgent),
         ("ppo@shipped+refined+step", StepShieldAgent),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive, scripted
+from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.setup import make_engine
 from ethbrake_marl.errors import InvalidInput
@@ -49,7 +49,7 @@ def test_e_v2x_bm__knows_who_drives_in_the_engines_of_all_interfaces():
     scenario = PAPER.replace(
         roles={"vehicle_1": "full_brake", "vehicle_2": "e_v2x_bm", "vehicle_3": "constant:3"}, early_impacts="keep"
     )
-    scripts = scripted(scenario)
+    scripts = script_agents(scenario)
     assert scripts[1].others == {0: scripts[0], 2: scripts[2]}
 
 
@@ -123,7 +123,7 @@ class Looking(Steering):
 def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
     worlds, agent = PAPER.sample(20, 7).worlds, Looking()
     drive(worlds, agent, PAPER, 1)
-    engine = Engine(PAPER, 20, learners=(1,), scripts=scripted(PAPER, but=1), worlds=worlds)
+    engine = Engine(PAPER, 20, learners=(1,), scripts=script_agents(PAPER, except_for=1), worlds=worlds)
     for seen in agent.seen[:3]:
         assert engine.observe(1).tobytes() == seen.tobytes()
         engine.step(np.full((20, 1), -0.5))

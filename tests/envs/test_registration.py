@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import ast
 import os
 import subprocess
 import sys
@@ -67,20 +66,6 @@ def test_import__stays_light_until_a_name_is_used() -> None:
 def test_public_name__is_found_and_listed(name: str) -> None:
     assert getattr(ethbrake_marl, name) is not None
     assert name in dir(ethbrake_marl)
-
-
-def test_public_name__has_a_type_for_checkers() -> None:
-    tree = ast.parse(Path(str(ethbrake_marl.__file__)).read_text("utf-8"))
-    typed = {
-        alias.asname: (node.module, alias.name)
-        for block in ast.walk(tree)
-        if isinstance(block, ast.If)
-        for node in block.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    found = {name: (f"ethbrake_marl.{home}", name) for name, home in ethbrake_marl._HOME.items()}
-    assert typed == found
 
 
 def test_public_name__a_wrong_one_is_an_attribute_error() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.evaluation import declared_objectives, evaluate, rescored, write_per_world_csv
+from ethbrake_marl.evaluation import declared_objectives, evaluate, rescore, write_per_world_csv
 from ethbrake_marl.objectives import STANDARD
 from ethbrake_marl.scenario import Scenario
 
@@ -19,7 +19,7 @@ from ethbrake_marl.scenario import Scenario
 def test_rescored__one_impact_by_hand(pair: Scenario) -> None:
     # Harm 9, of which the vehicles bear 4.95 and 4.05 (see conftest).
     result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
-    rows = {row.objective: row for row in rescored(result, [*STANDARD, "weighted:1,3"]) if row.harm_count == "total"}
+    rows = {row.objective: row for row in rescore(result, [*STANDARD, "weighted:1,3"]) if row.harm_count == "total"}
     borne, root = (4.95, 4.05), math.sqrt(0.5)
     expected = {
         "total": (9.0, 9.0),

@@ -113,7 +113,7 @@ def test_intervals__two_worlds_have_one_and_a_single_world_has_none() -> None:
 def test_resamples__are_as_many_as_asked_for(resamples: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(seed_statistics, "_AT_ONCE", 4)  # two at a time
     sides = (np.arange(4.0).reshape(2, 2),)
-    assert seed_statistics._resampled_means(sides, resamples, 0).shape == (resamples, 1)
+    assert seed_statistics._resample_means(sides, resamples, 0).shape == (resamples, 1)
 
 
 def test_mean_over_seeds__is_the_mean_with_the_spread_between_seeds() -> None:

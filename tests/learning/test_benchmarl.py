@@ -35,7 +35,7 @@ def test_line_env__keeps_torchrls_contract_and_shows_the_native_worlds() -> None
     own = env.engine.observation.size
     env.engine.reset(seed=5)  # reset goes on with the stream; the native interface has just begun it
     assert seen["learners", "observation"].shape == (4, 2, own)
-    first = env._seen()
+    first = env._observe_all()
     np.testing.assert_array_equal(first["learners"]["observation"].reshape(8, own).numpy(), rows[:, :own])
     np.testing.assert_array_equal(first["state"].numpy(), rows[::2, own:])
     actions = torch.full((4, 2, 1), -0.7)
@@ -51,7 +51,7 @@ def test_line_env__keeps_torchrls_contract_and_shows_the_native_worlds() -> None
             restart = stepped.select("done", "terminated", "truncated").clone()
             restart["_reset"] = stepped["done"].clone()
             env._reset(restart)
-        again = env._seen()
+        again = env._observe_all()
         np.testing.assert_array_equal(again["learners"]["observation"].reshape(8, own).numpy(), rows[:, :own])
     assert ended > 0
 

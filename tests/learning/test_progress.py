@@ -44,8 +44,8 @@ def test_misleading_return__entries_without_a_return_or_harm_do_not_count() -> N
 def test_course__the_best_is_judged_by_the_count_of_the_reward(policy) -> None:
     other = policy.__class__(policy.manifest.model_copy(update={"steps": 5}), policy.tensors)
     course = Course("total")
-    assert course.measured(policy, {"first_impact_harm": 9.0, "total_harm": 10.0}, None) is None
-    course.measured(other, {"first_impact_harm": 1.0, "total_harm": 11.0}, -3.0)
+    assert course.add_evaluation(policy, {"first_impact_harm": 9.0, "total_harm": 10.0}, None) is None
+    course.add_evaluation(other, {"first_impact_harm": 1.0, "total_harm": 11.0}, -3.0)
     assert course.kept is policy and course.best_harm == 10.0
     assert course.evaluations[1] == {
         "steps": 0, "updates": 0, "first_impact_harm": 1.0, "total_harm": 11.0, "episode_return": -3.0,
@@ -54,7 +54,7 @@ def test_course__the_best_is_judged_by_the_count_of_the_reward(policy) -> None:
 
 def test_course__comes_back_from_its_json(policy) -> None:
     course = Course()
-    course.measured(policy, {"first_impact_harm": 9.0}, None)
+    course.add_evaluation(policy, {"first_impact_harm": 9.0}, None)
     again = Course()
     again.restore(course.to_json())
     assert (again.evaluations, again.best_harm, again.alarms) == (course.evaluations, 9.0, [])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.protocol import fixed_commands
-from ethbrake_marl.agents.rollout import drive, scripted
+from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.engine import step as engine_step
 from ethbrake_marl.physics import episode, segment
 from ethbrake_marl.physics.episode import decision_at, first_decision_s, number_of_decisions
@@ -70,7 +70,7 @@ def test_profiles__step_by_step_realise_what_the_engine_does_to_the_bit(name, le
     shares = rng.uniform(-1.0, 0.3, (worlds.n, 100 // length))
     commands = shares * worlds.vehicles.braking_capacity_mps2[:, [vehicle]]
     commands = np.clip(commands, None, worlds.vehicles.driving_capacity_mps2[:, [vehicle]])
-    others = fixed_commands(scripted(scenario), worlds, "test", vehicle=vehicle)
+    others = fixed_commands(script_agents(scenario), worlds, "test", vehicle=vehicle)
     problem = profile_problem(worlds, [vehicle], horizon_s=scenario.horizon_s, others_mps2=others)
     ends = np.minimum((np.arange(commands.shape[1]) + 1) * length, problem.last_step[:, np.newaxis])
     ends[:, -1] = problem.last_step

@@ -137,14 +137,15 @@ ABLATION = Suite(
 TABLES = ("tests/evaluation/test_table.py", "tests/evaluation/test_rollout.py")
 EVALUATION = Suite(
     files=(
-        "evaluation/*.py", "figures/learning_curves.py", "figures/criticality.py", "figures/deceleration.py",
-        "figures/sampling.py", "studies/sampling.py",
+        "evaluation/*.py", "figures/curves.py", "figures/criticality.py", "figures/deceleration.py",
+        "studies/sampling.py",
     ),
     quick={
         "evaluation/statistics.py": ("tests/evaluation/test_statistics.py",),
         "evaluation/seed_statistics.py": ("tests/evaluation/test_seed_statistics.py",),
-        "figures/learning_curves.py": ("tests/figures/test_learning_curves.py",),
+        "figures/curves.py": ("tests/figures/test_learning_curves.py", "tests/studies/test_sampling.py"),
         "evaluation/rollout.py": ("tests/evaluation/test_rollout.py", "tests/agents/test_team.py"),
+        "evaluation/outcome.py": ("tests/evaluation/test_rollout.py", "tests/evaluation/test_left_out.py"),
         "evaluation/regret.py": ("tests/evaluation/test_regret.py",),
         "evaluation/record.py": ("tests/evaluation/test_record.py",),
         "evaluation/table.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
@@ -152,7 +153,6 @@ EVALUATION = Suite(
         "evaluation/deceleration.py": ("tests/figures/test_deceleration.py",),
         "figures/criticality.py": ("tests/figures/test_criticality.py",),
         "figures/deceleration.py": ("tests/figures/test_deceleration.py",),
-        "figures/sampling.py": ("tests/studies/test_sampling.py",),
         "evaluation/shield_modes.py": ("tests/evaluation/test_shield_modes.py",),
         "studies/sampling.py": ("tests/studies/test_sampling.py",),
         "evaluation/per_world.py": ("tests/evaluation/test_report.py", "tests/evaluation/test_per_world.py"),
@@ -160,21 +160,25 @@ EVALUATION = Suite(
     otherwise=TABLES,
     whole=("tests/evaluation", "tests/cli/test_commands.py"),
     left_out=frozenset({
-        "__init__.py", "text.py", "report.py",
+        "__init__.py", "cells.py", "text.py", "report.py",
     }),  # what a figure or a page looks like is judged by eye
     preloaded=SCIENCE,
 )  # fmt: skip
 
 TRAINED = ("tests/learning/test_train.py", "tests/learning/test_teams.py", "tests/learning/test_resume.py")
 LEARNING = Suite(
-    files=("learning/*.py", "learning/algorithms/*.py", "policies/*.py", "files/json.py"),
+    files=("learning/*.py", "learning/algorithms/*.py", "policies/*.py", "files/plain.py"),
     quick={
         "learning/progress.py": ("tests/learning/test_progress.py",),
         "learning/recipe.py": ("tests/learning/test_recipe.py",),
         "policies/policy.py": ("tests/policies/test_policy.py",),
         "policies/manifest.py": ("tests/policies/test_policy.py", "tests/policies/test_actor.py"),
         "policies/actor.py": ("tests/policies/test_actor.py",),
-        "files/json.py": ("tests/policies/test_policy.py", "tests/learning/test_run_files.py"),
+        "files/plain.py": (
+            "tests/files/test_plain.py",
+            "tests/policies/test_policy.py",
+            "tests/learning/test_run_files.py",
+        ),
         "learning/training.py": ("tests/learning/test_training.py", "tests/learning/test_teams.py"),
         "learning/run_folder.py": ("tests/learning/test_run_files.py", "tests/learning/test_event_files.py", *TRAINED),
         "learning/run_log.py": ("tests/learning/test_run_files.py", "tests/learning/test_event_files.py", *TRAINED),
@@ -186,7 +190,7 @@ LEARNING = Suite(
         "learning/models.py": ("tests/learning/test_sb3_policy.py", *TRAINED),
         "policies/shipped.py": ("tests/policies/test_shipped.py",),
         "learning/checkpoint.py": ("tests/learning/test_resume.py",),
-        "learning/stop_signal.py": ("tests/learning/test_resume.py",),
+        "learning/session.py": ("tests/learning/test_resume.py",),
     },
     otherwise=TRAINED,
     whole=("tests/learning", "tests/cli/test_training_commands.py"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test
 
-from ethbrake_marl.agents.refined import Rehearsed
+from ethbrake_marl.agents.refined import Refined
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.envs.parallel import parallel_env
@@ -45,8 +45,8 @@ def test_coupled__is_never_worse_than_either_part(harm_count):
     assert 0 < hybrid.chosen_policy.sum() < WORLDS.n
 
 
-def test_rehearsed__policy_is_taken_at_its_word():
-    hybrid = HybridAgent(Rehearsed(make_agent("constant:5"), SCENARIO, rehearsals=6), SCENARIO)
+def test_refined__policy_is_taken_at_its_word():
+    hybrid = HybridAgent(Refined(make_agent("constant:5"), SCENARIO, tries=6), SCENARIO)
     realised = harm(hybrid)
     plain = harm(HybridAgent(make_agent("constant:5"), SCENARIO))
     assert realised.tolist() == hybrid.predicted_harm.tolist()

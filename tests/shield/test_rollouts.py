@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.agents.refined import Rehearsed
+from ethbrake_marl.agents.refined import Refined
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.envs.parallel import parallel_env
@@ -208,14 +208,14 @@ def test_wrapper__tries_its_policy_where_the_proposal_is_rejected_and_keeps_the_
     assert {"policy rollout", "no certificate"} <= reasons
 
 
-def test_rehearsed__also_where_its_policy_cannot_be_divided():
-    agent = StepShieldAgent(Rehearsed(Remembering(), PAPER, rehearsals=2), PAPER)
+def test_refined__also_where_its_policy_cannot_be_divided():
+    agent = StepShieldAgent(Refined(Remembering(), PAPER, tries=2), PAPER)
     harm = drive(WORLDS.take(np.arange(20)), agent, PAPER, 1).ledger.world_harm("first")
     assert harm.tolist() == agent.shield.bound.tolist()
 
 
-def test_take__of_a_rehearsed_policy_drives_on_in_those_rows():
+def test_take__of_a_refined_policy_drives_on_in_those_rows():
     worlds, rows = WORLDS.take(np.arange(6)), np.array([4, 1])
-    agent = Rehearsed(LearnedAgent(Weights()), PAPER, rehearsals=4)
+    agent = Refined(LearnedAgent(Weights()), PAPER, tries=4)
     agent.begin(worlds, 1, np.arange(6))
     assert agent.take(rows).act(worlds.take(rows), 1).tolist() == agent.act(worlds, 1)[rows].tolist()

@@ -1,4 +1,4 @@
-"""What a learning algorithm must do so that a training of it is measured, saved, resumed and made a policy."""
+"""The protocol of a learning algorithm: what training, saving, resuming and making a policy need of it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What each step of cooperation is worth: levels x seeds x recipes on common worlds, measured, compared, drawn.
+"""The ablation of cooperation: levels x seeds x recipes on common worlds, trained, measured, compared, drawn.
 
-``levels`` says which levels belong together, ``plan`` what is trained and what it costs, ``trainings`` trains,
-``measurement`` lets everything drive the same worlds, ``joint_optimum`` says how well it could be done, ``comparison``
-makes the figures of it, ``tables`` and ``figures`` show them. ``figures`` loads matplotlib, ``trainings`` torch.
+``plan`` says what is trained, ``cost`` what it takes, ``run`` trains and lets everything drive the same worlds,
+``joint_optimum`` finds how well it could be done, ``comparison`` makes the figures of it, ``report`` shows them, and
+``longer_lines`` does the same for more vehicles. ``run`` loads torch, ``report`` matplotlib.
 """

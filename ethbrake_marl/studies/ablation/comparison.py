@@ -1,4 +1,4 @@
-"""What an ablation says: harm per level, what each step is worth, who pays, how near the joint optimum it comes.
+"""The comparison of levels: harm of each, what each step is worth, who pays, the distance to the joint optimum.
 
 Intervals hold for other training seeds and other worlds: both are drawn anew (``evaluation.seed_statistics``).
 """
@@ -72,13 +72,13 @@ def _under_count(one: Measured, harm_count: HarmCount, searched: int) -> Json:
         "each_seed": each.tolist(),
         "interquartile_mean": interquartile_mean([each], resamples=2000).to_json(),
         "vehicles": [mean_over_seeds(column).to_json() for column in _columns(one.reached, harm_count)],
-        "searched": _searched(
+        "searched": _compare_searched(
             reached[:, :searched], braking[:, :searched], None if one.best is None else one.best[harm_count]
         ),
     }
 
 
-def _searched(reached: Floats, braking: Floats, best: Floats | None) -> Json:
+def _compare_searched(reached: Floats, braking: Floats, best: Floats | None) -> Json:
     """Everything in the worlds in which the joint optimum was searched."""
     share = None if best is None else share_over_seeds(reached, braking, best)
     return {

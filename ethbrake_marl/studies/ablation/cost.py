@@ -1,4 +1,4 @@
-"""What an ablation will take, measured on this machine before it starts."""
+"""The cost of an ablation, measured on this machine before it starts."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def cost_of(plan: Plan) -> Cost:
         steps = sum(number for training, number in left if (training.level.name, training.algorithm) == same)
         if not steps:
             continue
-        per_step_s, world_s = _timed(kind, samples[kind.level.name])
+        per_step_s, world_s = _time(kind, samples[kind.level.name])
         worlds_s.append(world_s)
         runs = steps / kind.recipe.total_steps
         training_s += steps * per_step_s + runs * _measurements(kind) * kind.recipe.evaluation.worlds * world_s
@@ -81,7 +81,7 @@ def _first(sample: Sample) -> Sample:
     return Sample(sample.worlds.take(rows), sample.index[rows], 0)
 
 
-def _timed(training: Training, sample: Sample) -> tuple[float, float]:
+def _time(training: Training, sample: Sample) -> tuple[float, float]:
     """Seconds per decision, and per world that the policy drives."""
     told: list[Progress] = []
     recipe, scenario = training.recipe, training.level.scenario

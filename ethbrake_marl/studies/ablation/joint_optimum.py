@@ -82,13 +82,13 @@ def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgres
             budget=plan.budget,
             threads=jobs,
             chunks=plan.optimum_folder(level),
-            on_progress=partial(_told, tell, f"joint optimum of {level.name}"),
+            on_progress=partial(_tell, tell, f"joint optimum of {level.name}"),
         )
         found |= {each.name: table for each in alike}
     return found
 
 
-def _told(tell: OnProgress, name: str, done: int, total: int) -> None:
+def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
     tell(Progress(name, done, total))
 
 

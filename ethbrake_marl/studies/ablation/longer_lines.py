@@ -37,7 +37,7 @@ from ethbrake_marl.studies.ablation.run import Harms, harms_of
 class LineQuestion:
     """On which lines the policies are measured."""
 
-    scenario: Scenario  # of any length; see ``lengthened``
+    scenario: Scenario  # of any length; see ``lengthen``
     vehicles: tuple[int, ...]  # lengths of the lines
     episodes: int
     list_seed: int
@@ -64,7 +64,7 @@ class LineResult:
         return {"vehicles": self.vehicles, **estimates_to_json({name: getattr(self, name) for name in names})}
 
 
-def lengthened(scenario: Scenario, vehicles: int) -> Scenario:
+def lengthen(scenario: Scenario, vehicles: int) -> Scenario:
     """The scenario with a line of ``vehicles``: shorter ones lose the rear, vehicle i > N is like vehicle i - 2.
 
     All followers learn; Vehicle 1 keeps its role. Raises ``InvalidInput`` for fewer than 2 vehicles.
@@ -145,7 +145,7 @@ def drive_longer(question: LineQuestion, agents: Sequence[Agent], tell: OnProgre
     """
     if len(set(question.vehicles)) < len(question.vehicles):
         raise InvalidInput(f"vehicles {', '.join(map(str, question.vehicles))}: each length once")
-    lines = [lengthened(question.scenario, vehicles) for vehicles in question.vehicles]
+    lines = [lengthen(question.scenario, vehicles) for vehicles in question.vehicles]
     lists = [line.sample(question.episodes, question.list_seed) for line in lines]
     return [_of_length(question, *line, agents, tell) for line in zip(lines, lists, strict=True)]
 
@@ -154,12 +154,12 @@ def _of_length(
     question: LineQuestion, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: OnProgress | None
 ) -> LineResult:
     count = question.harm_count
-    braking = _driven([make_single_agent("full_brake")], scenario, sample, tell)
-    reached = _driven(agents, scenario, sample, tell)
+    braking = _drive([make_single_agent("full_brake")], scenario, sample, tell)
+    reached = _drive(agents, scenario, sample, tell)
     worst, own = braking.world[count], reached.world[count]
     none = np.zeros_like(worst)
     worse = (reached.vehicle[count] > braking.vehicle[count] + TOLERANCE).any(axis=2)
-    best = _searched(question, scenario, sample, own, tell)
+    best = _search(question, scenario, sample, own, tell)
     known = slice(0, question.search_episodes)
     return LineResult(
         scenario.vehicles,
@@ -172,7 +172,7 @@ def _of_length(
     )
 
 
-def _driven(agents: Sequence[Agent], scenario: Scenario, sample: Sample, tell: OnProgress | None) -> Harms:
+def _drive(agents: Sequence[Agent], scenario: Scenario, sample: Sample, tell: OnProgress | None) -> Harms:
     named = {str(k): agent for k, agent in enumerate(agents)}
     result = evaluate(sample, named, scenario=scenario, chunk=PROGRESS_EVERY).complete()
     if tell is not None:
@@ -180,7 +180,7 @@ def _driven(agents: Sequence[Agent], scenario: Scenario, sample: Sample, tell: O
     return harms_of([result.outcome(name) for name in named])
 
 
-def _searched(
+def _search(
     question: LineQuestion, scenario: Scenario, sample: Sample, reached: Floats, tell: OnProgress | None
 ) -> Floats | None:
     """Least harm known of all followers together in the first worlds, [1, search_episodes]."""

@@ -15,7 +15,8 @@ import numpy as np
 
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
-from ethbrake_marl.evaluation.rollout import Outcome, evaluate
+from ethbrake_marl.evaluation.outcome import Outcome
+from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.learning.run_folder import RunDirectory
 from ethbrake_marl.learning.team_file import load_team
@@ -36,7 +37,7 @@ def train_all(trainings: Sequence[Training], jobs: int, tell: OnProgress | None 
     left = [training for training in trainings if training.steps_left()]
     say = tell or (lambda progress: None)
     if jobs == 1 or len(left) < 2:
-        return all(_train(training, partial(_told, say, training.folder.name)) for training in left)
+        return all(_train(training, partial(_tell, say, training.folder.name)) for training in left)
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin_worker) as pool:
         futures = [pool.submit(_train, training) for training in left]
         say(Progress("trainings", 0, len(left)))
@@ -85,7 +86,7 @@ def _train(training: Training, tell: OnProgress | None = None) -> bool:
     return result.status == "finished"
 
 
-def _told(tell: OnProgress, name: str, progress: Progress) -> None:
+def _tell(tell: OnProgress, name: str, progress: Progress) -> None:
     tell(Progress(name, progress.done, progress.total))
 
 
@@ -136,15 +137,15 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
             answers[level.name] = LevelOptimum(level, part, tables[level.name], tuple(own))
     found: list[Measured] = []
     for level, sample in zip(plan.levels, samples, strict=True):
-        braking = _driven(_all_brake(level.scenario), sample, [Team({}, f"full braking in {level.name}")], say)
+        braking = _drive(_all_brake(level.scenario), sample, [Team({}, f"full braking in {level.name}")], say)
         if not level.trained:
-            scripts = _driven(level.scenario, sample, [Team({}, f"scripts of {level.name}")], say)
+            scripts = _drive(level.scenario, sample, [Team({}, f"scripts of {level.name}")], say)
             found.append(Measured(level, None, scripts, braking, None))
             continue
         known = best_known(answers[level.name], list(answers.values()))
         best = {harm_count: harm[np.newaxis] for harm_count, harm in known.items()}
         for algorithm in plan.algorithms:
-            reached = _driven(level.scenario, sample, teams[level.name, algorithm], say)
+            reached = _drive(level.scenario, sample, teams[level.name, algorithm], say)
             found.append(Measured(level, algorithm, reached, braking, best))
     return found
 
@@ -154,7 +155,7 @@ def _all_brake(scenario: Scenario) -> Scenario:
     return scenario.replace(roles=dict.fromkeys(scenario.vehicle_names, "full_brake"))
 
 
-def _driven(scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: OnProgress) -> Harms:
+def _drive(scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: OnProgress) -> Harms:
     """Harms of several teams of one level."""
     outcomes = []
     for team in teams:

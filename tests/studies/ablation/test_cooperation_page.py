@@ -49,7 +49,7 @@ def test_page__names_every_key_objective_and_level():
 
 def test_page__its_example_of_a_training_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (block,) = (b for b in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "result = train(" in b)
+    (block,) = (b for b in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "result = eb.train(" in b)
     names: dict[str, object] = {}
     exec(
         block.replace('("cooperation")', '("cooperation").replace(total_steps=1, n_envs=8)').replace("1000", "20"),
@@ -61,7 +61,7 @@ def test_page__its_example_of_a_training_runs(tmp_path, monkeypatch):
 
 def test_page__its_examples_run():
     names: dict[str, object] = {}
-    blocks = [b for b in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "result = train(" not in b]
+    blocks = [b for b in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "result = eb.train(" not in b]
     assert len(blocks) == 3
     exec(blocks[0], names)
     exec(blocks[2].replace("1000", "20"), names)

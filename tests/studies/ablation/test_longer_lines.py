@@ -19,30 +19,30 @@ from ethbrake_marl.policies.manifest import Manifest
 from ethbrake_marl.policies.policy import load_policy, make_policy, save_policy
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.ablation import longer_lines
-from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, drive_longer, lengthened
+from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, drive_longer, lengthen
 
 PAIR = load_scenario("cooperation-3-pair")
 
 
 def test_lengthened__vehicle_i_is_like_vehicle_i_minus_2():
-    line = lengthened(PAIR, 6)
+    line = lengthen(PAIR, 6)
     vehicles = line.sample(2, 7).worlds.vehicles
     assert vehicles.mass_t[0].tolist() == [4.5, 5.5, 5.9, 5.5, 5.9, 5.5]
     assert vehicles.latency_s[0].tolist() == [0.0, 0.5, 0.8, 0.5, 0.8, 0.5]
     assert line.learners == (1, 2, 3, 4, 5)
     assert line.scripts == {0: "full_brake"}
-    assert lengthened(PAIR, 2).sample(1, 7).worlds.N == 2
+    assert lengthen(PAIR, 2).sample(1, 7).worlds.N == 2
 
 
 def test_lengthened__the_same_length_is_the_same_line():
-    one, other = lengthened(PAIR, 3).sample(5, 7).worlds, PAIR.sample(5, 7).worlds
+    one, other = lengthen(PAIR, 3).sample(5, 7).worlds, PAIR.sample(5, 7).worlds
     np.testing.assert_array_equal(one.gaps_m, other.gaps_m)
     np.testing.assert_array_equal(one.vehicles.mass_t, other.vehicles.mass_t)
 
 
 def test_lengthened__lists_of_pairs_and_objectives_go_on_too():
     listed = PAIR.replace(gaps_m=[6.0, 8.0], objective=["own", "total", "social:45"])
-    line = lengthened(listed, 5)
+    line = lengthen(listed, 5)
     assert line.sample(1, 7).worlds.gaps_m[0].tolist() == [6.0, 8.0, 6.0, 8.0]
     assert line.objective == ("own", "total", "social:45", "total", "social:45")
 

@@ -1,0 +1,151 @@
+"""The outcomes of agents that drove the same worlds, world by world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.knowledge import Knowledge, Source
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.harm import HarmCount, Ledger
+from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.scenario import Scenario, Task
+from ethbrake_marl.scenario.v2x import hidden_from
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one agent achieved, world by world.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> agents = {"full_brake": eb.make_agent("full_brake")}
+    >>> outcome = eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario).outcome("full_brake")
+    >>> outcome.total_harm.round(2), outcome.collided
+    (array([33.79, 77.19,  0.  ]), array([ True,  True, False]))
+
+    """
+
+    ledger: Ledger  # of every impact
+    final: Worlds  # each world as its episode left it
+    at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
+    predicted_harm: Floats | None  # [n] what the agent expected at the alert, if it predicts and drives alone
+    chosen_policy: Bools | None  # [n] a hybrid drove by its policy; else by its backup
+    knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
+    shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself, see ``travel``
+    sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands, see ``sampled_harm``
+
+    def take(self, rows: Ints | Bools) -> Outcome:
+        """That of some of the worlds."""
+        ledger = Ledger(*(getattr(self.ledger, f.name)[rows] for f in fields(Ledger)))
+        names = ("predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")
+        columns = {name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in names}
+        return Outcome(ledger, self.final.take(rows), self.at_rest[rows], knows=self.knows, **columns)
+
+    @property
+    def collided(self) -> Bools:
+        """Whether any impact happened, [n]."""
+        return self.ledger.collided
+
+    @property
+    def impacts(self) -> Ints:
+        """Number of impacts of all pairs, and with an obstacle ahead, [n]."""
+        return self.ledger.impacts
+
+    def world_harm(self, harm_count: HarmCount) -> Floats:
+        """Harm of all vehicles under a counting rule, [n] m2/s2."""
+        return self.ledger.world_harm(harm_count)
+
+    @property
+    def first_impact_harm(self) -> Floats:
+        """Harm of all vehicles, each pair's first impact only, [n] m2/s2."""
+        return self.ledger.world_harm("first")
+
+    @property
+    def total_harm(self) -> Floats:
+        """Harm of all vehicles, every impact, [n] m2/s2."""
+        return self.ledger.world_harm("total")
+
+    def vehicle_harm(self, harm_count: HarmCount) -> Floats:
+        """Harm of each vehicle, [n, N] m2/s2."""
+        return self.ledger.vehicle_harm(harm_count)
+
+    @property
+    def ended(self) -> NDArray[np.str_]:
+        """How each episode ended, [n]: ``at_rest`` or ``horizon``."""
+        return np.where(self.at_rest, "at_rest", "horizon")
+
+
+class LeftOut(NamedTuple):
+    """A world that is in no outcome, because it could not be advanced with one of the agents."""
+
+    world: int  # number in its list
+    seed: int | None  # of the list; None for worlds that were given
+    agent: str  # the first one that met it
+    reason: str
+
+    def __str__(self) -> str:
+        of = "" if self.seed is None else f" of seed {self.seed}"
+        return f"world {self.world}{of} ({self.agent}: {self.reason})"
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Outcomes of agents that drove the same vehicles in the same worlds, row k of every array being world k.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
+    >>> evaluation = eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario)
+    >>> list(evaluation.outcomes), evaluation.vehicle, evaluation.index
+    (['full_brake', 'coast'], 1, array([0, 1, 2]))
+
+    """
+
+    scenario: Scenario  # of the worlds
+    vehicles: tuple[int, ...]  # indices (0 = front) of the vehicles that were driven; the others followed scripts
+    worlds: Worlds  # at the alert
+    index: Ints  # [n] number of each world in its list
+    seed: int | None  # of the list; None for worlds that were given
+    outcomes: dict[str, Outcome]  # by the agent's name
+    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
+
+    @property
+    def vehicle(self) -> int:
+        """The vehicle that was driven; raises ``InvalidInput`` if it is not exactly one."""
+        return self.task.vehicle
+
+    @property
+    def task(self) -> Task:
+        """What was asked of the agents."""
+        return Task(self.scenario, self.vehicles)
+
+    @cached_property
+    def limits(self) -> Limits | Unproven:
+        """What is known of each world whoever drives: found once, for everything that tells of this evaluation."""
+        return known_limits(self.worlds, self.task)
+
+    @property
+    def hidden(self) -> Bools:
+        """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
+        hidden = np.zeros(self.worlds.n, np.bool_)
+        for vehicle in self.vehicles:
+            hidden |= hidden_from(self.worlds.vehicles, vehicle)
+        return hidden
+
+    def complete(self) -> Evaluation:
+        """The evaluation itself, for who needs every world; raises ``PhysicsError`` if some were left out."""
+        if self.left_out:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
+        return self
+
+    def outcome(self, agent: str) -> Outcome:
+        """The outcome of one agent; raises ``InvalidInput`` naming those that were evaluated."""
+        if agent not in self.outcomes:
+            raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated: {', '.join(self.outcomes)}")
+        return self.outcomes[agent]

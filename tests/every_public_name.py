@@ -1,0 +1,100 @@
+"""A user's file that uses every public name: `make lint` gives it to mypy, tests/test_surface.py reads its names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, assert_type
+
+import numpy as np
+
+import ethbrake_marl as eb
+
+
+class Cautious:
+    """An agent of one's own."""
+
+    name = "cautious"
+
+    def begin(self, worlds: eb.Worlds, vehicle: int, rows: Any) -> None:
+        """Nothing to prepare."""
+
+    def act(self, worlds: eb.Worlds, vehicle: int) -> Any:
+        return np.full(worlds.n, -1.0)
+
+
+def make_cautious(argument: str | None, settings: eb.AgentSettings) -> eb.Agent:
+    return Cautious()
+
+
+def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str, ...]:
+    eb.register_agent("cautious", make_cautious)
+    eb.register_algorithm("own", recipe, algorithm)
+    return eb.agent_names()
+
+
+def interfaces() -> list[Any]:
+    reward = eb.RewardParams(harm=2.0)
+    observation = eb.ObservationSpec(front=2)
+    batch: eb.EthBrakeVecEnv = eb.make_sb3_vec_env("paper-random", 4, reward=reward, observation=observation)
+    engine: eb.Engine = batch.engine
+    parallel: eb.EthBrakeParallelEnv = eb.parallel_env(scenario="paper-random")
+    single, vector = eb.EthBrakeEnv(), eb.EthBrakeVectorEnv(num_envs=4)
+    return [batch, engine, parallel, single, vector, eb.env(), eb.raw_env()]
+
+
+def shields(policy: eb.Policy) -> list[Any]:
+    options = eb.ShieldOptions(mode="step")
+    parallel, batch = eb.parallel_env(), eb.make_sb3_vec_env("paper-random", 4)
+    return [
+        options,
+        eb.HybridShield(parallel, policy, mode="step"),
+        eb.shielded_aec(eb.parallel_env(), mode="step"),
+        eb.ShieldedEnv(eb.EthBrakeEnv()),
+        eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv()),
+        eb.ShieldedVecEnv(batch),
+    ]
+
+
+def worlds_of(name: str) -> eb.Worlds:
+    scenario = eb.load_scenario(name)
+    assert_type(scenario, eb.Scenario)
+    assert_type(eb.observation_for(scenario), eb.ObservationSpec)
+    sample: eb.Sample = scenario.sample(10, 7)
+    moved, _ = eb.advance(sample.worlds, -5.0, 0.1)
+    return moved
+
+
+def line() -> eb.Worlds:
+    return eb.make_worlds(
+        [7.0], [20.0, 20.0], braking_capacity_mps2=6.0, driving_capacity_mps2=3.0, latency_s=0.5, mass_t=5.0,
+        restitution=0.1,
+    )  # fmt: skip
+
+
+def learn(folder: Path) -> eb.TrainResult:
+    def tell(progress: eb.Progress) -> None:
+        return None
+
+    recipe: eb.TrainingRecipe = eb.load_recipe("ppo")
+    try:
+        result = eb.train(recipe, "paper-random", folder, steps=1000, on_progress=tell)
+    except eb.EthBrakeError:
+        result = eb.resume(folder)
+    assert_type(result, eb.TrainResult)
+    return result
+
+
+def measure(folder: Path) -> list[eb.SummaryRow]:
+    scenario = eb.load_scenario(eb.list_scenarios()[0].name)
+    policies = [eb.load_policy(folder), eb.load_shipped("ppo")]
+    driver = eb.make_agent("full_brake")
+    agents: dict[str, eb.Agent | eb.Team] = {"full_brake": driver, "learned": eb.LearnedAgent(policies[0])}
+    found: eb.Evaluation = eb.evaluate(scenario.sample(10, 7), agents, scenario=scenario)
+    outcome: eb.Outcome = found.outcome("learned")
+    record: eb.EpisodeRecord = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=scenario)
+    assert record.ledger.world_harm("first").shape == outcome.first_impact_harm[:1].shape
+    return eb.summarise(found)
+
+
+def version() -> str:
+    return eb.__version__
