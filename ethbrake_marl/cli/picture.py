@@ -19,6 +19,7 @@ from ethbrake_marl.evaluation.text import left_out_line
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import LeftOutRows
 from ethbrake_marl.scenario import Task
+from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 PICTURE_ENDING = ".png"
@@ -119,7 +120,7 @@ def picture_shield(
     lineup = make_proposers(agents.split(","), chosen, harm_count=harm_count)
     with interruptible("nothing was written"), progress_bars() as bars:
         curves = operating_curves(
-            worlds, lineup, chosen, chosen.learners[0], ALLOWANCES, harm_count=harm_count,
+            worlds, lineup, Task(chosen, chosen.learners, harm_count), ALLOWANCES,
             on_progress=lambda name: bars.show(name, episodes, episodes),
         )  # fmt: skip
     caption = (
@@ -165,7 +166,7 @@ def picture_robustness(
     (policy,) = make_proposers([agent], chosen, harm_count=harm_count).values()
     with interruptible("nothing was written"), progress_bars() as bars:
         points = robustness(
-            worlds, policy, chosen, chosen.learners[0], intervals, harm_count=harm_count,
+            worlds, policy, Task(chosen, chosen.learners, harm_count), intervals,
             on_progress=lambda what, done: bars.show(what, done, episodes),
         )  # fmt: skip
     caption = (

@@ -13,10 +13,9 @@ from ethbrake_marl.actions import action_to_command
 from ethbrake_marl.agents.protocol import Agent, AgentAround
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.physics.episode import decision_at, first_decision_s
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.agents import StepShieldAgent
 from ethbrake_marl.shield.rollouts import proposed_action
 
@@ -88,11 +87,9 @@ class OperatingPoint(NamedTuple):
 def operating_curves(
     worlds: Worlds,
     policies: Mapping[str, Agent],
-    scenario: Scenario,
-    vehicle: int,
+    task: Task,
     allowances: Sequence[float],
     *,
-    harm_count: HarmCount = "first",
     on_progress: Callable[[str], None] | None = None,
 ) -> dict[str, list[OperatingPoint]]:
     """Interventions against residual harm for each policy: one point per allowance, from none to very large.
@@ -104,7 +101,7 @@ def operating_curves(
     def measured(at: Ints) -> dict[str, list[OperatingPoint]]:
         curves = {}
         for name, policy in policies.items():
-            curves[name] = _operating_points(worlds.take(at), policy, scenario, vehicle, allowances, harm_count)
+            curves[name] = _operating_points(worlds.take(at), policy, task, allowances)
             if on_progress is not None:
                 on_progress(name)
         return curves
@@ -113,13 +110,11 @@ def operating_curves(
     return {name: [point._replace(left_out=left_out) for point in points] for name, points in curves.items()}
 
 
-def _operating_points(
-    worlds: Worlds, policy: Agent, scenario: Scenario, vehicle: int, allowances: Sequence[float], harm_count: HarmCount
-) -> list[OperatingPoint]:
-    points = []
+def _operating_points(worlds: Worlds, policy: Agent, task: Task, allowances: Sequence[float]) -> list[OperatingPoint]:
+    points, scenario, harm_count = [], task.scenario, task.harm_count
     for allowance in allowances:
         driver = StepShieldAgent(copy.deepcopy(policy), scenario, harm_count=harm_count, allowance=allowance)
-        harm = drive(worlds, driver, scenario, vehicle).ledger.world_harm(harm_count)
+        harm = drive(worlds, driver, scenario, task.vehicle).ledger.world_harm(harm_count)
         shield = driver.shield
         assert shield is not None and shield.running is not None
         decisions = int(shield.running.steps.sum())

@@ -12,9 +12,8 @@ import numpy as np
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Ints, LeftOutRows, Worlds, measured_without_failed
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.agents import StepShieldAgent
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
@@ -42,12 +41,10 @@ class RobustnessPoint(NamedTuple):
 def robustness(
     worlds: Worlds,
     policy: Agent,
-    scenario: Scenario,
-    vehicle: int,
+    task: Task,
     uncertainty: Uncertainty,
     *,
     widths: Sequence[float] = WIDTHS,
-    harm_count: HarmCount = "first",
     seed: int = 0,
     on_progress: Progress | None = None,
 ) -> list[RobustnessPoint]:
@@ -73,13 +70,13 @@ def robustness(
             if key not in known:
                 intervals = uncertainty.scaled(width)
                 shielded = StepShieldAgent(
-                    copy.deepcopy(policy), scenario, harm_count=harm_count, believed=told,
+                    copy.deepcopy(policy), task.scenario, harm_count=task.harm_count, believed=told,
                     uncertainty=intervals if mode == "robust" else None,
                 )  # fmt: skip
                 driven = worlds
                 if key[1] != "as told":  # drawn for all worlds: a truth does not depend on which of them are left out
                     driven = intervals.draw(worlds, np.random.default_rng(seed), corners=truth == "corner")
-                known[key] = _point(driven.take(at), shielded, vehicle, harm_count)
+                known[key] = _point(driven.take(at), shielded, task)
             points.append(known[key]._replace(mode=mode, truth=truth, width=width))
             if on_progress is not None:
                 on_progress(f"{mode}, {truth}, width {width:g}", worlds.n)
@@ -89,9 +86,9 @@ def robustness(
     return [point._replace(left_out=left_out) for point in found]
 
 
-def _point(worlds: Worlds, shielded: StepShieldAgent, vehicle: int, harm_count: HarmCount) -> RobustnessPoint:
+def _point(worlds: Worlds, shielded: StepShieldAgent, task: Task) -> RobustnessPoint:
     """What a shield makes of the worlds that it is driven through; which case that is, the caller says."""
-    harm = drive(worlds, shielded, shielded.scenario, vehicle).ledger.world_harm(harm_count)
+    harm = drive(worlds, shielded, task.scenario, task.vehicle).ledger.world_harm(task.harm_count)
     bound, shield = shielded.predicted_harm, shielded.shield
     assert shield is not None
     above = np.maximum(harm - bound, 0.0)

@@ -9,18 +9,20 @@ from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.figures.shield import robustness_figure, robustness_table
 from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.robustness import MODES, TRUTHS, robustness
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.failing_worlds import plant, without
 
 SCENARIO = load_scenario("paper-random")
+TASK = Task(SCENARIO, (1,))
 WORLDS = SCENARIO.sample(25, 3).worlds
 INTERVALS = parse_uncertainty("gaps_m=1,mass_t.vehicle_3=20%")
 
 
 @pytest.fixture(scope="module")
 def points():
-    return robustness(WORLDS, make_agent("full_brake"), SCENARIO, 1, INTERVALS, widths=(0.0, 1.0))
+    return robustness(WORLDS, make_agent("full_brake"), TASK, INTERVALS, widths=(0.0, 1.0))
 
 
 def of(points, width):
@@ -55,13 +57,13 @@ def test_step__breaks_its_bound_where_the_truth_differs_and_robust_pays_for_keep
 def test_same_case__is_driven_once(monkeypatch):
     drives = []
     monkeypatch.setattr("ethbrake_marl.shield.robustness.drive", lambda *given: drives.append(given) or drive(*given))
-    robustness(WORLDS.take([0]), make_agent("full_brake"), SCENARIO, 1, INTERVALS, widths=(0.0, 1.0))
+    robustness(WORLDS.take([0]), make_agent("full_brake"), TASK, INTERVALS, widths=(0.0, 1.0))
     assert len(drives) == 1 + 5  # nothing differs at width 0, nor for step mode where the world is as told
 
 
 def test_refused__an_interval_that_is_possible_only_at_its_own_width():
     with pytest.raises(InvalidInput, match="widths of up to 2 times those given are measured"):
-        robustness(WORLDS, make_agent("full_brake"), SCENARIO, 1, parse_uncertainty("mass_t=60%"))
+        robustness(WORLDS, make_agent("full_brake"), TASK, parse_uncertainty("mass_t=60%"))
 
 
 def test_figure__draws_the_points(points):
@@ -82,12 +84,12 @@ def test_refused__nothing_to_draw_and_widths_that_are_none():
         robustness_figure([])
     for widths in ((), (-1.0,), (float("nan"),)):
         with pytest.raises(InvalidInput, match="widths"):
-            robustness(WORLDS, make_agent("full_brake"), SCENARIO, 1, INTERVALS, widths=widths)
+            robustness(WORLDS, make_agent("full_brake"), TASK, INTERVALS, widths=widths)
 
 
 def test_worlds_that_cannot_be_advanced__are_in_no_point_and_named():
-    found = robustness(plant(WORLDS, [3]), make_agent("full_brake"), SCENARIO, 1, INTERVALS, widths=(0.0, 1.0))
+    found = robustness(plant(WORLDS, [3]), make_agent("full_brake"), TASK, INTERVALS, widths=(0.0, 1.0))
     assert {point.left_out for point in found} == {((3, found[0].left_out[0][1]),)}
     rest = WORLDS.take(without(25, [3]))
-    (expected, *_) = robustness(rest, make_agent("full_brake"), SCENARIO, 1, INTERVALS, widths=(0.0,))
+    (expected, *_) = robustness(rest, make_agent("full_brake"), TASK, INTERVALS, widths=(0.0,))
     assert found[0][:-1] == expected[:-1] and expected.left_out == ()

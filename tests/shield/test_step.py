@@ -11,6 +11,7 @@ from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.figures.shield import operating_figure
 from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield import HybridAgent, StepShield, StepShieldAgent, parse_uncertainty
 from ethbrake_marl.shield.certify import REASONS
 from ethbrake_marl.shield.review import operating_curves, review
@@ -20,6 +21,7 @@ from tests.shield.lines import ADVERSARIES, attack, line
 pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
 
 SCENARIO = load_scenario("paper-random")
+TASK = Task(SCENARIO, (1,))
 WORLDS = SCENARIO.sample(120, 3).worlds
 
 
@@ -223,9 +225,9 @@ def test_agent__what_is_no_number_is_replaced_and_told(capacity):
 def test_operating_curve__fewer_interventions_cost_harm():
     worlds = WORLDS.take(np.arange(60))
     done = []
-    points = operating_curves(
-        worlds, {"coast": make_agent("coast")}, SCENARIO, 1, [0.0, 20.0, 1e6], on_progress=done.append
-    )["coast"]
+    points = operating_curves(worlds, {"coast": make_agent("coast")}, TASK, [0.0, 20.0, 1e6], on_progress=done.append)[
+        "coast"
+    ]
     assert done == ["coast"]
     rates, harms = [p.intervention_rate for p in points], [p.harm for p in points]
     assert rates == sorted(rates, reverse=True) and rates[-1] == 0.0
@@ -239,8 +241,8 @@ def test_operating_curve__fewer_interventions_cost_harm():
 
 def test_operating_curve__leaves_worlds_out_that_cannot_be_advanced_and_names_them():
     agents = {"coast": make_agent("coast"), "brake": make_agent("full_brake")}
-    found = operating_curves(plant(WORLDS.take(np.arange(9)), [2, 6]), agents, SCENARIO, 1, [0.0, 20.0])
-    rest = operating_curves(WORLDS.take(without(9, [2, 6])), agents, SCENARIO, 1, [0.0, 20.0])
+    found = operating_curves(plant(WORLDS.take(np.arange(9)), [2, 6]), agents, TASK, [0.0, 20.0])
+    rest = operating_curves(WORLDS.take(without(9, [2, 6])), agents, TASK, [0.0, 20.0])
     for name in agents:
         assert [[world for world, _ in point.left_out] for point in found[name]] == [[2, 6]] * 2
         assert [point[:-1] for point in found[name]] == [point[:-1] for point in rest[name]]
