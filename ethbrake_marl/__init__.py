@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
     # Observations and rewards
     from ethbrake_marl.observations import ObservationSpec as ObservationSpec
+    from ethbrake_marl.observations import choose_observation as choose_observation
     from ethbrake_marl.observations import observation_for as observation_for
     from ethbrake_marl.rewards import RewardParams as RewardParams
 
@@ -82,6 +83,10 @@ if TYPE_CHECKING:
     # Registration of your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent
     from ethbrake_marl.learning.registry import register_algorithm as register_algorithm
+    from ethbrake_marl.objectives import register_objective as register_objective
+    from ethbrake_marl.observations import register_feature as register_feature
+    from ethbrake_marl.rewards import register_term as register_term
+    from ethbrake_marl.scenario.presets import register_preset as register_preset
 
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError

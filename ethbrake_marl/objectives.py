@@ -16,19 +16,24 @@ weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (1e-6 to 1e6) fo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.harm import HarmCount, Ledger
 from ethbrake_marl.physics.worlds import Floats
 
-KINDS = ("total", "own", "social", "maximin", "mass-weighted", "weighted")
 STANDARD = ("total", "own", "social:45", "maximin", "mass-weighted")  # those that need no knowledge of the scenario
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
 Declared = str | tuple[str, ...]  # one objective for all vehicles, or one for each
 
@@ -41,6 +46,26 @@ class Objective(NamedTuple):
     weights: tuple[float, ...] = ()
 
 
+class HarmSoFar(NamedTuple):
+    """What objectives are computed from, for n worlds of N vehicles; read it, do not change it."""
+
+    borne: Floats  # [n, N] what each vehicle bears, m2/s2
+    whole: Floats  # [n] what all do
+    mass_t: Floats  # [n, N]
+
+
+ObjectiveFunction = Callable[[HarmSoFar, int], Floats]
+
+
+class Kind(NamedTuple):
+    """One line of the table of objectives."""
+
+    form: str  # how it is written; without ":" it takes no argument
+    about: str
+    amount: Callable[[Objective, HarmSoFar, int], Floats]  # of a vehicle, [n]: less is better
+    function: ObjectiveFunction | None = None  # what somebody registered
+
+
 @lru_cache(maxsize=256)
 def parse_objective(text: str) -> Objective:
     """Read ``total``, ``own``, ``social:45``, ``maximin``, ``mass-weighted`` or ``weighted:1,4,1``.
@@ -50,7 +75,7 @@ def parse_objective(text: str) -> Objective:
     kind, colon, argument = text.partition(":")
     if kind not in KINDS:
         raise unknown_name("objective", kind, KINDS)
-    if kind not in ("social", "weighted"):
+    if ":" not in KINDS[kind].form:
         if colon:
             raise InvalidInput(f"objective {text!r}: {kind} takes no argument")
         return Objective(kind)
@@ -94,19 +119,76 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
 
 def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
     """What the objective of each vehicle makes of the harm so far, [n, N] (m2/s2): less is better."""
-    borne, whole = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
-    columns = [_of_vehicle(o, i, borne, whole, ledger.mass_t) for i, o in enumerate(objectives)]
-    return np.stack(columns, axis=1)
+    harm = HarmSoFar(ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count), ledger.mass_t)
+    return np.stack([KINDS[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
 
 
-def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] = STANDARD) -> dict[str, Floats]:
+def standard_objectives() -> tuple[str, ...]:
+    """The built-in objectives that need no knowledge of the scenario, then the registered ones."""
+    return (*STANDARD, *(name for name, kind in KINDS.items() if kind.function is not None))
+
+
+def register_objective(name: str, function: ObjectiveFunction) -> None:
+    """Make ``objective: name`` known to every scenario and reward, and to ``--objective``.
+
+    Args:
+        name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
+        function: from ``HarmSoFar`` and the vehicle (0 = front) to the amount of harm that this vehicle is to make
+            small, [n] (m2/s2); its docstring says what it is.
+
+    Registering the same again changes nothing. Raises ``AlreadyExists`` for another one under a name that is taken,
+    ``InvalidInput`` for a name that is none and for a function without a docstring.
+
+    """
+    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
+        raise InvalidInput(f"objective {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
+    if not callable(function) or not (function.__doc__ or "").strip():
+        raise InvalidInput(f"objective {name!r}: needs a function with a docstring that says what it is")
+
+    def amount(_: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
+        return _checked(name, function(harm, vehicle), vehicle, len(harm.whole))
+
+    entry = Kind(name, " ".join((function.__doc__ or "").split()), amount, function)
+    if KINDS.setdefault(name, entry).function is not function:
+        raise AlreadyExists(f"objective {name!r} is registered already; give another name")
+
+
+def _checked(name: str, value: object, vehicle: int, worlds: int) -> Floats:
+    amount = np.asarray(value)
+    if amount.shape != (worlds,) or amount.dtype.kind not in "fiub":
+        raise InvalidInput(
+            f"objective {name!r}: gave {amount.dtype} of shape {amount.shape}; must be numbers of shape ({worlds},),"
+            " one per world"
+        )
+    if not np.isfinite(amount).all():
+        world = int(np.argmin(np.isfinite(amount)))
+        raise InvalidInput(
+            f"objective {name!r}: is {amount[world]} for vehicle_{vehicle + 1} in world {world}; must be finite"
+        )
+    return amount.astype(np.float64)
+
+
+class _NameSchema:
+    """The JSON schema of an objective: what is known when it is asked for."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        plain = [name for name, kind in KINDS.items() if ":" not in kind.form]
+        with_argument = "|".join(name for name, kind in KINDS.items() if ":" in kind.form)
+        return {"type": "string", "anyOf": [{"enum": plain}, {"pattern": f"^({with_argument}):"}]}
+
+
+ObjectiveName = Annotated[str, _NameSchema]
+
+
+def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] | None = None) -> dict[str, Floats]:
     """The same ledger under several objectives: objective -> what it is for each vehicle, [n, N] (m2/s2).
 
     So one policy, whatever it was trained for, is told under all of them. ``InvalidInput`` for a name without its list.
     """
     if isinstance(declared, str):
         raise InvalidInput(f"scored: {declared!r}: must be a list of objectives, for instance [{declared!r}]")
-    vehicles = ledger.mass_t.shape[1]
+    vehicles, declared = ledger.mass_t.shape[1], standard_objectives() if declared is None else declared
     return {
         each if isinstance(each, str) else ", ".join(each): objective_harm(
             ledger, harm_count, objectives_of(each, vehicles)
@@ -115,20 +197,23 @@ def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] =
     }
 
 
-def _of_vehicle(objective: Objective, vehicle: int, borne: Floats, whole: Floats, mass_t: Floats) -> Floats:
-    if objective.kind == "total":
-        return whole
-    if objective.kind == "own":
-        return borne[:, vehicle]
-    if objective.kind == "social":
-        own, others = _social_weights(objective.angle_deg)
-        rest = whole - borne[:, vehicle]
-        return own * borne[:, vehicle] + others * rest
-    if objective.kind == "maximin":
-        worst: Floats = borne.max(axis=1)
-        return worst
-    weights = mass_t if objective.kind == "mass-weighted" else np.full(borne.shape, objective.weights)
-    return _weighted(borne, weights)
+def _social(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
+    own, others = _social_weights(objective.angle_deg)
+    rest = harm.whole - harm.borne[:, vehicle]
+    return own * harm.borne[:, vehicle] + others * rest
+
+
+def _maximin(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
+    worst: Floats = harm.borne.max(axis=1)
+    return worst
+
+
+def _mass_weighted(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
+    return _weighted(harm.borne, harm.mass_t)
+
+
+def _weighted_by_list(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
+    return _weighted(harm.borne, np.full(harm.borne.shape, objective.weights))
 
 
 def _social_weights(angle_deg: float) -> tuple[float, float]:
@@ -146,3 +231,13 @@ def _weighted(borne: Floats, weights: Floats) -> Floats:
         whole = whole + weights[:, j]
     mean: Floats = vehicles * harm / whole
     return mean
+
+
+KINDS: dict[str, Kind] = {
+    "total": Kind("total", "everybody's harm alike", lambda _, harm, vehicle: harm.whole),
+    "own": Kind("own", "what the vehicle itself bears", lambda _, harm, vehicle: harm.borne[:, vehicle]),
+    "social": Kind("social:ANGLE", "social value orientation: own harm at 0, the others' at 90 degrees", _social),
+    "maximin": Kind("maximin", "the harm of whoever bears most", _maximin),
+    "mass-weighted": Kind("mass-weighted", "harm in a heavy vehicle counts for more", _mass_weighted),
+    "weighted": Kind("weighted:W1,W2,...", "one weight for each vehicle", _weighted_by_list),
+}

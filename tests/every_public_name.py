@@ -29,12 +29,16 @@ def make_cautious(argument: str | None, settings: eb.AgentSettings) -> eb.Agent:
 def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str, ...]:
     eb.register_agent("cautious", make_cautious)
     eb.register_algorithm("own", recipe, algorithm)
+    eb.register_term("smooth", lambda step: -np.abs(step.command_mps2), weight=0.1, unit="m/s2")
+    eb.register_feature("load", lambda worlds, i: worlds.vehicles.mass_t[:, i], unit="t", scale=10.0, low=0.0, high=6.0)
+    eb.register_preset("deaf", {"preset": "nominal", "lost": 0.5})
+    eb.register_objective("front", lambda harm, vehicle: harm.borne[:, 0])
     return eb.agent_names()
 
 
 def interfaces() -> list[Any]:
     reward = eb.RewardParams(harm=2.0)
-    observation = eb.ObservationSpec(front=2)
+    observation = eb.ObservationSpec(front=2) if reward.harm else eb.choose_observation(["own", "front_1"])
     batch: eb.EthBrakeVecEnv = eb.make_sb3_vec_env("paper-random", 4, reward=reward, observation=observation)
     engine: eb.Engine = batch.engine
     parallel: eb.EthBrakeParallelEnv = eb.parallel_env(scenario="paper-random")

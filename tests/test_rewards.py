@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from ethbrake_marl import rewards
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.setup import make_engine
@@ -21,6 +20,7 @@ from ethbrake_marl.rewards import (
     potential,
     reward_params,
     reward_terms,
+    terms,
     weighted_sum,
 )
 from ethbrake_marl.scenario import load_scenario
@@ -34,7 +34,9 @@ def sigmoid(x: float) -> float:
 def outcome(before, after, impacts, safe_end) -> StepOutcome:
     harms = impacts.first_impact_harm.sum(axis=1), impacts.total_harm.sum(axis=1)
     motion = after.gaps_m, after.speeds_mps, after.command_mps2, before.command_mps2
-    return StepOutcome(*harms, np.array([safe_end]), *motion, 0.5)
+    vehicles, learners = after.vehicles, np.array([1])
+    given = vehicles.braking_capacity_mps2, vehicles.driving_capacity_mps2, vehicles.latency_s, vehicles.mass_t
+    return StepOutcome(*harms, np.array([safe_end]), *motion, 0.5, after.time_s, *given, learners)
 
 
 def step(params: RewardParams, *, safe_end: bool = False):
@@ -67,8 +69,11 @@ def test_collision__counts_every_impact_whatever_the_harm_counts():
     facts = {
         "gaps_m": np.ones((2, 2)), "speeds_mps": np.zeros((2, 3)), "command_mps2": np.zeros((2, 3)),
         "previous_mps2": np.zeros((2, 3)), "time_step_s": 0.1, "safe_end": np.zeros(2, np.bool_),
-        "first_impact_harm": np.array([100.0, 0.0]), "total_harm": np.array([130.0, 7.0]),
+        "first_impact_harm": np.array([100.0, 0.0]), "total_harm": np.array([130.0, 7.0]), "time_s": np.ones(2),
+        "learners": np.array([1]),
     }  # fmt: skip
+    given = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t")
+    facts |= dict.fromkeys(given, np.ones((2, 3)))
     for count, harm in (("first", [-100.0, 0.0]), ("total", [-130.0, -7.0])):
         terms = reward_terms(RewardParams(harm_count=count, collision=1.0, k_energy=0.5), StepOutcome(**facts))
         assert terms["collision"][:, 0].tolist() == [-65.0, -3.5]
@@ -236,7 +241,7 @@ def test_potential__asks_one_learner_once_and_several_twice(learners, asked, mon
         told.append(vehicle)
         return forecast(worlds, command, vehicle, candidates, horizon_s)
 
-    monkeypatch.setattr(rewards, "forecast", watched)
+    monkeypatch.setattr(terms, "forecast", watched)
     potential(RewardParams(), load_scenario("paper-random").sample(2, seed=3).worlds, learners, 8.0)
     assert told == asked
 

@@ -29,6 +29,7 @@ from ethbrake_marl.cli.options import (
     VehicleOption,
     rename_old_options,
 )
+from ethbrake_marl.cli.parts import CommandWithParts
 from ethbrake_marl.cli.picture import picture_app
 from ethbrake_marl.cli.terminal import (
     abandon_output,
@@ -87,9 +88,11 @@ scenario_app = typer.Typer(
 )
 app.add_typer(scenario_app, name="scenario")
 app.add_typer(picture_app, name="picture")
-app.command("train", epilog="Example: ethbrake train --scenario paper-random-early --steps 200000 --name early")(
-    train_command
-)
+app.command(
+    "train",
+    cls=CommandWithParts,
+    epilog="Example: ethbrake train --scenario paper-random-early --steps 200000 --name early",
+)(train_command)
 app.command("resume", epilog="Example: ethbrake resume runs/paper-random-ppo-seed0")(resume_command)
 app.command(
     "learning-curves", epilog="Example: ethbrake learning-curves --scenario paper-delay-low --output runs/low-delay"
@@ -182,9 +185,11 @@ def run(
     end_of_training(result.status, result.steps, folder)
 
 
-app.command("evaluate", epilog="Example: ethbrake evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000")(
-    evaluate_command
-)
+app.command(
+    "evaluate",
+    cls=CommandWithParts,
+    epilog="Example: ethbrake evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000",
+)(evaluate_command)
 
 
 @scenario_app.command("list", epilog="Example: ethbrake scenario list")

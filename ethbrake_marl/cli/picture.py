@@ -19,7 +19,6 @@ from ethbrake_marl.evaluation.text import left_out_line
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import LeftOutRows
 from ethbrake_marl.scenario import Task
-from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 PICTURE_ENDING = ".png"

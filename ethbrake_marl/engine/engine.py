@@ -29,10 +29,11 @@ from ethbrake_marl.engine.stream import (
 from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.objectives import objective_harm
-from ethbrake_marl.observations import Observations, ObservationSpec, observation_for, observe_packed, scaling
+from ethbrake_marl.observations import Observations, ObservationSpec, observation_for, observe_packed, plan_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.rows import (
     NO_ROWS,
+    TIME,
     Packed,
     command_at,
     gap_at,
@@ -54,7 +55,10 @@ from ethbrake_marl.rewards import (
     Reward,
     StepOutcome,
     further_terms,
+    moving_terms_of,
+    own_terms,
     potential,
+    registered_terms_of,
     resolved_objective,
     reward_params,
     weighted_sum,
@@ -145,7 +149,7 @@ class Engine:
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
         self.reward, self._objectives = resolved_objective(reward_params(reward), scenario.objective, scenario.vehicles)
         self.observation = observation or observation_for(scenario)
-        self._scaling = scaling(self.observation)
+        self._plan = plan_of(self.observation)
         self._memories: dict[Watcher, Any] = {}
         self.steps_made = 0  # steps of the batch that watchers let pass
         self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
@@ -155,7 +159,8 @@ class Engine:
         times = scenario.time_step_s, scenario.horizon_s
         shared_harm = 0.0 if self._objectives else self.reward.harm
         self._settings = np.array([*times, shared_harm, total, self.reward.terminal])
-        self._moves_reward = self.reward.collision + self.reward.risk + self.reward.jerk > 0.0
+        self._moving_terms, self._own_terms = moving_terms_of(self.reward), registered_terms_of(self.reward)
+        self._moves_reward = bool(self._moving_terms or self._own_terms)
         self._more_terms = self._moves_reward or self.reward.shaping > 0.0 or bool(self._objectives)
         self._stream = Stream(scenario, self.deciders, self.scripts, seed)
         self.reset(worlds=worlds)
@@ -289,7 +294,10 @@ class Engine:
         state, params = self._state, self._params
         if rows is not None:
             state, params = state.take(rows, axis=0), params.take(rows, axis=0)
-        return observe_packed(state, params, vehicles, self._scaling)
+        if not self._plan.extras:
+            return observe_packed(state, params, vehicles, self._plan)
+        steps = self._clock[:, STEP] if rows is None else self._clock[rows, STEP]
+        return observe_packed(state, params, vehicles, self._plan, steps)
 
     def step(self, actions: Actions) -> Step:
         """Advance every running episode by one time step.
@@ -299,7 +307,7 @@ class Engine:
         refuses does not happen: the worlds stay as they are.
         """
         columns = self._columns(actions)
-        if not self._memories:
+        if not (self._memories or self._own_terms):  # nobody can refuse what happens
             step = self._advance(columns)
         else:
             new = self._apart()
@@ -365,25 +373,42 @@ class Engine:
 
     def _add_further_terms(self, step: Step) -> None:
         """Add the terms that need the motion, or the future, to a step's reward; nothing for rows that stood still."""
-        vehicles, state = self.scenario.vehicles, self._state
-        gaps = gap_at(vehicles)
+        standing = self.ended & ~step.ended
         if self._moves_reward:
-            outcome = StepOutcome(
-                step.first_impact_harm,
-                step.total_harm,
-                step.safe_end,
-                state[:, gaps : gaps + vehicles - 1],
-                state[:, speed_at(vehicles) : command_at(vehicles)],
-                state[:, command_at(vehicles) : previous_at(vehicles)],
-                state[:, previous_at(vehicles) : gaps],
-                self.scenario.time_step_s,
-            )
-            step.further.update(further_terms(self.reward, outcome))
+            outcome = self._outcome(step)
+            step.further.update(further_terms(self._moving_terms, self.reward, outcome))
+            if self._own_terms:
+                counts = ~standing & (step.failed == 0)
+                step.further.update(own_terms(self._own_terms, outcome, counts, self.steps))
         if self.reward.shaping > 0.0:
             step.further["shaping"] = self._shaping(step.terminated)
         extra = weighted_sum(self.reward, step.further, step.reward.shape)
-        extra[self.ended & ~step.ended] = 0.0
+        extra[standing] = 0.0
         step.reward[:] += extra
+
+    def _outcome(self, step: Step) -> StepOutcome:
+        """What terms are computed from: views of this engine's rows."""
+        vehicles, state, params = self.scenario.vehicles, self._state, self._params
+        gaps = gap_at(vehicles)
+        braking, driving, latency, mass = (
+            params[:, params_at(k, vehicles) : params_at(k + 1, vehicles)] for k in range(4)
+        )
+        return StepOutcome(
+            step.first_impact_harm,
+            step.total_harm,
+            step.safe_end,
+            state[:, gaps : gaps + vehicles - 1],
+            state[:, speed_at(vehicles) : command_at(vehicles)],
+            state[:, command_at(vehicles) : previous_at(vehicles)],
+            state[:, previous_at(vehicles) : gaps],
+            self.scenario.time_step_s,
+            state[:, TIME],
+            braking,
+            driving,
+            latency,
+            mass,
+            self._learner_index.view(),
+        )
 
     def _shaping(self, terminated: Bools) -> Floats:
         """The shaping term [n, N] of this step; keeps the new potentials, which are 0 where an episode terminated."""

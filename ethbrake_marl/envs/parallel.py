@@ -24,7 +24,7 @@ from ethbrake_marl.envs.setup import (
 )
 from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
-from ethbrake_marl.observations import Observations, ObservationSpec
+from ethbrake_marl.observations import Observation, Observations
 from ethbrake_marl.physics import Ints
 from ethbrake_marl.rewards import Reward
 
@@ -68,7 +68,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         render_mode: str | None = None,
         learners: Sequence[str | int] | None = None,
         reward: Reward = "harm",
-        observation: ObservationSpec | None = None,
+        observation: Observation | None = None,
         agents: WhoIsAgent = "all",
         max_cycles: int | None = None,
     ) -> None:

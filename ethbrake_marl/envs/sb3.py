@@ -28,7 +28,7 @@ from ethbrake_marl.envs.setup import (
 )
 from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Feature, Observations, ObservationSpec
+from ethbrake_marl.observations import Feature, Observation, Observations
 from ethbrake_marl.physics import Bools, Ints, Worlds, concatenate
 from ethbrake_marl.physics.rows import Packed, unpack
 from ethbrake_marl.rewards import Reward
@@ -44,7 +44,7 @@ def make_sb3_vec_env(
     seed: int | None = 0,
     learners: Sequence[str | int] | None = None,
     reward: Reward = "harm",
-    observation: ObservationSpec | None = None,
+    observation: Observation | None = None,
     horizon_is_end: bool = False,
     appended: Appended | None = None,
 ) -> EthBrakeVecEnv:

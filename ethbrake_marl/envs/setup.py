@@ -14,7 +14,7 @@ from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number
-from ethbrake_marl.observations import Feature, ObservationSpec
+from ethbrake_marl.observations import Feature, Observation, ObservationSpec, choose_observation
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
@@ -39,7 +39,7 @@ def make_engine(
     *,
     learners: Sequence[str | int] | None = None,
     reward: Reward = "harm",
-    observation: ObservationSpec | None = None,
+    observation: Observation | None = None,
     seed: int = 0,
 ) -> Engine:
     """Build ``n`` running worlds of a scenario: a shipped name, a path to a YAML file, its content, or a ``Scenario``.
@@ -52,10 +52,12 @@ def make_engine(
         loaded = Scenario(**scenario)
     else:
         loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-    if observation is not None and not isinstance(observation, ObservationSpec):
+    if not (observation is None or isinstance(observation, ObservationSpec | list | tuple)):
         raise InvalidInput(
-            f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1)"
+            f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1), or a list"
+            " of groups and features, for instance ['own', 'front_1']"
         )
+    chosen = None if observation is None else choose_observation(observation)
     if learners is not None and not isinstance(learners, Iterable):
         raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
     if learners is not None:
@@ -66,7 +68,7 @@ def make_engine(
         learners=loaded.learners,
         scripts=script_agents(loaded),
         reward=reward,
-        observation=observation,
+        observation=chosen,
         seed=seed,
     )
 

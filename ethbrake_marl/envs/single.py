@@ -22,7 +22,7 @@ from ethbrake_marl.envs.setup import (
     restart,
 )
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Observations, ObservationSpec
+from ethbrake_marl.observations import Observation, Observations
 from ethbrake_marl.rewards import Reward
 
 
@@ -59,7 +59,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         render_mode: str | None = None,
         learners: Sequence[str | int] | None = None,
         reward: Reward = "harm",
-        observation: ObservationSpec | None = None,
+        observation: Observation | None = None,
     ) -> None:
         check_render_mode(render_mode)
         self.render_mode = render_mode

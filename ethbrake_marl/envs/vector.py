@@ -23,7 +23,7 @@ from ethbrake_marl.envs.setup import (
     restart,
 )
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Observations, ObservationSpec
+from ethbrake_marl.observations import Observation, Observations
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.rewards import Reward
 
@@ -64,7 +64,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         render_mode: str | None = None,
         learners: Sequence[str | int] | None = None,
         reward: Reward = "harm",
-        observation: ObservationSpec | None = None,
+        observation: Observation | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
     ) -> None:
         check_render_mode(render_mode)

@@ -25,7 +25,7 @@ from ethbrake_marl.evaluation.statistics import (
     relative_decrease,
 )
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.objectives import STANDARD, Declared, objectives_of, scored
+from ethbrake_marl.objectives import Declared, objectives_of, scored, standard_objectives
 
 ALL = "standard"
 
@@ -50,7 +50,7 @@ def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
 
     Raises ``InvalidInput`` for one that is unknown, given twice, or made for another number of vehicles.
     """
-    names = [name for text in texts for name in (STANDARD if text == ALL else (text,))]
+    names = [name for text in texts for name in (standard_objectives() if text == ALL else (text,))]
     for k, name in enumerate(names):
         objectives_of(name, vehicles)
         if name in names[:k]:
@@ -58,7 +58,7 @@ def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
     return names
 
 
-def rescore(evaluation: Evaluation, declared: Sequence[Declared] = STANDARD) -> list[Rescored]:
+def rescore(evaluation: Evaluation, declared: Sequence[Declared] | None = None) -> list[Rescored]:
     """Every agent under every objective and both counts, in that order."""
     return [
         Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))

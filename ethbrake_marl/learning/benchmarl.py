@@ -165,6 +165,8 @@ def train_mappo(recipe: PpoRecipe, scenario: Scenario, directory: str | Path, *,
     there are no checkpoints and nothing is measured on the way. Raises what ``learning.train.train`` raises.
     """
     recipe = recipe.replace(scheme="centralised")
+    if recipe.observation is not None:
+        scenario = scenario.replace(observation=list(recipe.observation))
     team = team_content(resolve(recipe, scenario).scheme, scenario)
     content = {"recipe": recipe.model_dump(mode="json"), "scenario": scenario.model_dump(mode="json")}
     run = create_run(Path(directory), {**content, "library": "benchmarl"}, team=team, force=force)

@@ -14,8 +14,9 @@ from ethbrake_marl.files.messages import Wording, explain
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.learning.registry import algorithm_names, recipe_class
 from ethbrake_marl.policies.manifest import Activation, NetworkSpec, Width
-from ethbrake_marl.rewards import RewardParams
+from ethbrake_marl.rewards import RewardParams, setting_names
 from ethbrake_marl.scenario.catalogue import shipped_folder
+from ethbrake_marl.scenario.features import ListedFeatures, listed_features
 
 WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
 
@@ -91,6 +92,10 @@ class EvaluationPlan(_Part):
     seed: Annotated[int, Field(ge=0)]
 
 
+def _none(value: Any) -> bool:
+    return value is None
+
+
 class TrainingRecipe(_Part):
     """How to train, whatever the algorithm: its name, reward, seed, and what is saved and measured on the way.
 
@@ -116,6 +121,9 @@ class TrainingRecipe(_Part):
     learning_rate: LearningRate  # from its start to its end
     gamma: Fraction  # discount of one time step
     reward: RewardParams  # what is learned for
+    observation: Annotated[ListedFeatures | None, Field(exclude_if=_none)] = (
+        None  # groups and features; None: the scenario's
+    )
     horizon_is_end: bool = False  # nothing is expected beyond the horizon
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of worlds, networks and exploration
     evaluation: EvaluationPlan  # the fixed list, and how often
@@ -124,8 +132,18 @@ class TrainingRecipe(_Part):
     @field_validator("reward")
     @classmethod
     def _some_reward(cls, value: RewardParams) -> RewardParams:
-        if not any((value.harm, value.collision, value.risk, value.jerk, value.terminal)):
+        if not any(weight for name, weight in value.weights.items() if name != "shaping"):
             raise ValueError("every weight is 0; nothing could be learned")
+        return value
+
+    @field_validator("observation", mode="before")
+    @classmethod
+    def _known_features(cls, value: Any) -> Any:
+        if value is not None:
+            try:
+                listed_features(value)
+            except InvalidInput as error:
+                raise ValueError(str(error).removeprefix("observation: ")) from None
         return value
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
@@ -211,7 +229,7 @@ class RecipeWording(Wording):
             inner = model.model_fields[str(part)].annotation
             if isinstance(inner, type) and issubclass(inner, BaseModel):
                 model = inner
-        return list(model.model_fields)
+        return setting_names() if model is RewardParams else list(model.model_fields)
 
     def needed(self, path: YamlPath) -> str:
         """Where an example stands."""

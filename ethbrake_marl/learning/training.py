@@ -21,7 +21,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe, load_recipe, recipe_of
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
 from ethbrake_marl.learning.schemes import drivers, scheme_of
-from ethbrake_marl.observations import ObservationSpec, observation_for
+from ethbrake_marl.observations import ObservationSpec, choose_observation, observation_for
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import first_line
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -63,7 +63,12 @@ def resolve(recipe: TrainingRecipe | str | Path, scenario: Scenario | str | Path
     scheme = scheme_of(recipe, scenario)
     recipe.check_learners(len(scenario.learners))
     identity = hashlib.sha256(json.dumps(_content(recipe, scenario), sort_keys=True).encode()).hexdigest()
-    return Training(recipe, scenario, scheme, drivers(scheme, scenario), observation_for(scenario), identity)
+    return Training(recipe, scenario, scheme, drivers(scheme, scenario), observation_of(recipe, scenario), identity)
+
+
+def observation_of(recipe: TrainingRecipe, scenario: Scenario) -> ObservationSpec:
+    """What learners observe: what the recipe says; where it says nothing, what the scenario says."""
+    return observation_for(scenario) if recipe.observation is None else choose_observation(recipe.observation)
 
 
 def training_in(folder: Path, config: Mapping[str, Any]) -> Training:

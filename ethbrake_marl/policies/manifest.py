@@ -6,14 +6,15 @@ import hashlib
 import json
 import platform
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
-from ethbrake_marl.observations import ObservationSpec
+from ethbrake_marl.observations import ObservationSpec, choose_observation
+from ethbrake_marl.scenario.features import Of, registered_in
 
 _PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "stable-baselines3", "torch")
 
@@ -104,6 +105,23 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
+class FeatureDefinition(_Strict):
+    """A registered feature as it was when the policy was trained."""
+
+    name: Annotated[str, Field(max_length=64)]
+    of: Of
+    unit: str
+    scale: float
+    low: float
+    high: float
+    unknown: float
+    tried: Annotated[tuple[float, ...], Field(max_length=64)]  # what it gave in a few worlds
+
+
+def _empty(value: tuple[FeatureDefinition, ...]) -> bool:
+    return not value
+
+
 class ObservationSchema(_Strict):
     """What the policy sees: neighbours on each side, feature names in order, and a hash of how each is scaled."""
 
@@ -111,12 +129,12 @@ class ObservationSchema(_Strict):
     rear: Neighbours
     features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]
     scaling_sha256: Sha256
+    registered: Annotated[tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=_empty)] = ()
 
     @property
     def spec(self) -> ObservationSpec:
-        """The observation as the environment builds it; what follows the neighbours is told by the features' names."""
-        groups = {name.partition(".")[0] for name in self.features}
-        return ObservationSpec(front=self.front, rear=self.rear, role="role" in groups, obstacle="obstacle" in groups)
+        """The observation as the environment builds it, from the names; raises ``UnknownName``."""
+        return choose_observation(self.features)
 
 
 class Manifest(_Strict):
@@ -171,10 +189,23 @@ def content_sha256(content: Mapping[str, Any]) -> str:
 
 def observation_schema(spec: ObservationSpec) -> ObservationSchema:
     """Describe ``spec`` so that a later change of a name, unit, scale or bound is noticed."""
-    rows = [[f.name, f.unit, f.scale, f.low, f.high] for f in spec.features]
+    names = tuple(f.name for f in spec.features)
     return ObservationSchema(
         front=spec.front,
         rear=spec.rear,
-        features=tuple(f.name for f in spec.features),
-        scaling_sha256=hashlib.sha256(json.dumps(rows).encode()).hexdigest(),
-    )
+        features=names,
+        scaling_sha256=scaling_sha256(spec, names),
+        registered=tuple(
+            FeatureDefinition(
+                name=name, of=entry.of, unit=entry.feature.unit, scale=entry.feature.scale, low=entry.feature.low,
+                high=entry.feature.high, unknown=entry.unknown, tried=entry.tried,
+            )
+            for name, entry in registered_in(names).items()
+        ),
+    )  # fmt: skip
+
+
+def scaling_sha256(spec: ObservationSpec, names: Sequence[str]) -> str:
+    """SHA-256 of how each feature is scaled, under these names."""
+    rows = [[name, f.unit, f.scale, f.low, f.high] for name, f in zip(names, spec.features, strict=True)]
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()

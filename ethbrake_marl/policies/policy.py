@@ -24,7 +24,8 @@ from ethbrake_marl.files.durable import new_folder, write_file
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.policies.actor import Actor, Float32s
-from ethbrake_marl.policies.manifest import Manifest, content_sha256, observation_schema, tensor_table
+from ethbrake_marl.policies.manifest import Manifest, content_sha256, tensor_table
+from ethbrake_marl.policies.observed import check_observed
 
 MANIFEST = "manifest.json"
 WEIGHTS = "weights.safetensors"
@@ -165,12 +166,7 @@ def _manifest(path: Path) -> Manifest:
             f"{path}: its content has SHA-256 {found}, but it says {manifest.manifest_sha256}; it was changed after it"
             " was saved"
         )
-    if manifest.observation != observation_schema(manifest.observation.spec):
-        raise CorruptBundle(
-            f"{path}: observation: features or their scaling are not those of this version of the package;"
-            f" use the one it was made with ({manifest.versions.get('ethbrake-marl', 'unknown')}), or train again"
-        )
-    return manifest
+    return check_observed(path, manifest)
 
 
 def first_line(error: ValidationError) -> str:

@@ -140,7 +140,9 @@ def new_scenario_text(name: str, based_on: str = "paper-random") -> str:
 
 def _line(key: str, values: Mapping[str, object]) -> str:
     """``key: value``; a key that goes only with the other way to declare the same stands in a comment."""
-    return f"{key}:{_value(values[key])}" if key in values else f"# {key}: {DECLARED[key].example}"
+    if key in values:
+        return f"{key}:{_value(values[key])}"
+    return f"# {key}: {DECLARED[key].example if key in DECLARED else '[own, front_1, rear_1]'}"
 
 
 def _comment(key: str) -> str:

@@ -17,6 +17,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import YamlPath, flow_text
 from ethbrake_marl.objectives import Declared, objectives_of
 from ethbrake_marl.scenario.distributions import support
+from ethbrake_marl.scenario.features import listed_features
 from ethbrake_marl.scenario.fields import ScenarioFields
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, OPTIONAL, QUANTITIES, QuantityRule
 from ethbrake_marl.scenario.roles import (
@@ -71,6 +72,14 @@ def check_objective(declared: Declared, vehicles: int) -> None:
         objectives_of(declared, vehicles)
     except InvalidInput as error:
         refuse((), declared, str(error).removeprefix("objective: "))
+
+
+def check_observation(listed: object) -> None:
+    """An observation is a list of groups and features that are known, none of them twice."""
+    try:
+        listed_features(listed)
+    except InvalidInput as error:
+        refuse((), listed, str(error).removeprefix("observation: "))
 
 
 def check_alternatives(scenario: ScenarioFields) -> None:

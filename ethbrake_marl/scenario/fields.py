@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.objectives import ObjectiveName
 from ethbrake_marl.scenario.distributions import Choice, LogUniform, Normal, Quantity, Uniform
+from ethbrake_marl.scenario.features import ListedFeatures
 from ethbrake_marl.scenario.quantities import DECLARED
 from ethbrake_marl.scenario.roles import LEARNER, complete_roles
 from ethbrake_marl.scenario.v2x import V2X
@@ -19,6 +21,10 @@ NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
 def _one_or_each(value: object) -> str:
     return "#each" if isinstance(value, list | tuple) else "#one"
+
+
+def _none(value: Any) -> bool:
+    return value is None
 
 
 PerVehicle = Annotated[
@@ -62,8 +68,11 @@ class ScenarioFields(BaseModel):
         default="keep", description="what happens to worlds with an impact before the first learner may act"
     )
 
-    objective: str | Annotated[tuple[str, ...], Field(strict=False)] = Field(
+    objective: ObjectiveName | Annotated[tuple[ObjectiveName, ...], Field(strict=False)] = Field(
         default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
+    )
+    observation: ListedFeatures | None = Field(
+        default=None, exclude_if=_none, description="what vehicles observe: groups and single features, in this order"
     )
     v2x: V2X = Field(
         default_factory=V2X, description="what each vehicle knows when: a preset, and what differs from it"

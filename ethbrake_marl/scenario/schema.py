@@ -17,6 +17,7 @@ from ethbrake_marl.scenario.checks import (
     check_alternatives,
     check_entries,
     check_objective,
+    check_observation,
     check_roles,
     check_whole,
     refuse,
@@ -85,6 +86,12 @@ class Scenario(ScenarioFields):
     def _objective(cls, value: Any, info: ValidationInfo) -> Any:
         if "vehicles" in info.data:
             check_objective(value, info.data["vehicles"])
+        return value
+
+    @field_validator("observation", mode="before")
+    @classmethod
+    def _observation(cls, value: Any) -> Any:
+        check_observation(value)
         return value
 
     @model_validator(mode="after")

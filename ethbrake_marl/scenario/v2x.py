@@ -22,17 +22,15 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles
 
-PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
 PER_LINK = 4  # uniform numbers of one link: wait, burst, loss, hop; one Philox counter
 
-Preset = Literal["paper", "clear", "nominal", "congested", "blocked", "sensors-only"]
 Hears = Literal["all", "front", "none"]
 Senses = Literal["both", "front", "none"]
 Seconds = Annotated[float, Field(ge=0.0, le=60.0, allow_inf_nan=False)]
@@ -64,8 +62,25 @@ CHANNELS = {
     "blocked": Channel("messages", loss_begins=0.20, loss_ends=0.20, lost=0.20),
     "sensors-only": Channel("messages", hears="none"),
 }
+PRESETS = tuple(CHANNELS)  # those that are built in; ``register_preset`` adds to the channels
 _LATEST = np.array([[1.0, 0.0, 1.0, 1.0]])  # uniform numbers of one link: a whole period, the longest burst, not lost
 _OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
+
+
+def _known_preset(name: str) -> str:
+    if name not in CHANNELS:
+        *names, last = CHANNELS
+        raise PydanticCustomError("scenario", "{right}", {"right": f"must be {', '.join(names)} or {last}"})
+    return name
+
+
+class _PresetSchema:
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return {"enum": list(CHANNELS), "type": "string"}
+
+
+Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
 class V2X(BaseModel):
@@ -90,7 +105,7 @@ class V2X(BaseModel):
     @classmethod
     def _by_name(cls, value: Any) -> Any:
         if not isinstance(value, str | dict | V2X):
-            right = f"must be a preset ({', '.join(PRESETS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
+            right = f"must be a preset ({', '.join(CHANNELS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
             raise PydanticCustomError("scenario", "{right}", {"right": right})
         return {"preset": value} if isinstance(value, str) else value
 
@@ -99,7 +114,7 @@ class V2X(BaseModel):
         channel = self.channel
         if channel.hears == "none":
             self._leave_out(("link_latency_s", "lost", *_OF_MESSAGES), "hears none has no messages")
-        elif self.link_latency_s is not None:
+        elif channel.timing == "fixed":
             self._leave_out(_OF_MESSAGES, "a fixed link_latency_s has no generated messages")
         elif channel.timing == "latency":
             self._leave_out(_OF_MESSAGES, f"preset {self.preset} has no generated messages")
@@ -125,7 +140,7 @@ class V2X(BaseModel):
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """A preset's name, or a mapping."""
         mapping = handler(core)
-        return {"anyOf": [{"enum": list(PRESETS), "type": "string"}, mapping]}
+        return {"anyOf": [{"enum": list(CHANNELS), "type": "string"}, mapping]}
 
     @property
     def channel(self) -> Channel:

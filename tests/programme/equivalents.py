@@ -16,5 +16,5 @@ EQUIVALENT: dict[str, str] = {
     "studies/ablation/comparison.py: `Json = dict[str, Any]` removed (1)": ONLY_TYPES,
     "figures/criticality.py: True -> False in `True` (2)": "two panels for two counts, always",
     "evaluation/seed_statistics.py: 0 -> 1 in `0` (5)": "all sides have as many worlds, which was checked just before",
-    "rewards.py: `Value = TypeVar('Value', float, Floats)` removed (1)": ONLY_TYPES,
+    "rewards/terms.py: `Value = TypeVar('Value', float, Floats)` removed (1)": ONLY_TYPES,
 }

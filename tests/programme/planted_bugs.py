@@ -23,7 +23,7 @@ from tests.programme.suites import ROOT
 REWARDS, V2X, ENGINE, STEPPING, STARTS, OBJECTIVES = (
     f"ethbrake_marl/{name}.py"
     for name in (
-        "rewards", "scenario/v2x", "engine/engine", "engine/step", "engine/stream", "objectives",
+        "rewards/terms", "scenario/v2x", "engine/engine", "engine/step", "engine/stream", "objectives",
     )
 )  # fmt: skip
 SB3 = "ethbrake_marl/envs/sb3.py"
@@ -143,9 +143,7 @@ BUGS: dict[str, Bug] = {
     "one step more where the division rounds up": Bug(
         "ethbrake_marl/physics/episode.py", " / time_step_s - _ROUNDING)", " / time_step_s)", OF_ENGINE
     ),
-    "rows that have ended are paid again": Bug(
-        ENGINE, "        extra[self.ended & ~step.ended] = 0.0\n", "", OF_ENGINE
-    ),
+    "rows that have ended are paid again": Bug(ENGINE, "        extra[standing] = 0.0\n", "", OF_ENGINE),
     "the last observation taken from the next episode": Bug(
         SB3,
         "            self._close_episodes(ended, step, infos)\n            engine.renew(ended)\n",

@@ -76,7 +76,7 @@ PHYSICS = Suite(
 )  # fmt: skip
 
 REWARDS = Suite(
-    files=("rewards.py", "objectives.py"),
+    files=("rewards/params.py", "rewards/terms.py", "objectives.py"),
     quick={"objectives.py": ("tests/test_objectives.py",)},
     otherwise=("tests/test_rewards.py", "tests/test_objectives.py"),
     whole=("tests/test_rewards.py", "tests/test_objectives.py", "tests/envs", "tests/contract"),

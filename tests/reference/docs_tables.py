@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from ethbrake_marl.envs.state import state_features
 from ethbrake_marl.observations import Feature, ObservationSpec
-from ethbrake_marl.rewards import REWARDS, RewardParams
+from ethbrake_marl.rewards import REWARDS, TERMS, RewardParams, Term
 from ethbrake_marl.scenario import load_scenario
 
 
@@ -23,9 +23,16 @@ def reward_table(rewards: Mapping[str, RewardParams]) -> str:
     """Markdown table of the named rewards: one line for each setting, one column for each reward."""
     settings = {name: params.model_dump() for name, params in rewards.items()}
     rows = [
-        (f"`{field}`", *(_plain(params[field]) for params in settings.values())) for field in RewardParams.model_fields
+        (f"`{field}`", *(_plain(params[field]) for params in settings.values()))
+        for field in RewardParams.model_fields
+        if field != "terms"
     ]
     return _markdown(("setting", *(f"`{name}`" for name in settings)), rows)
+
+
+def term_table(terms: Iterable[Term]) -> str:
+    """Markdown table of reward terms."""
+    return _markdown(("term", "unit", "meaning"), [(f"`{t.name}`", t.unit, t.meaning) for t in terms])
 
 
 def environment_tables() -> dict[str, str]:
@@ -34,6 +41,7 @@ def environment_tables() -> dict[str, str]:
         "observation": feature_table(ObservationSpec().features),
         "obstacle": feature_table(ObservationSpec(role=True, obstacle=True).features, ObservationSpec().size),
         "state": feature_table(state_features(load_scenario("paper-random"))),
+        "terms": term_table(TERMS.values()),
         "rewards": reward_table(REWARDS),
     }
 

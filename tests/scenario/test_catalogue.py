@@ -37,11 +37,11 @@ PAPER = {
 
 
 def not_used(scenario: Scenario) -> set[str]:
-    """The keys of the ways to declare gaps, speeds and an obstacle that the scenario does not use."""
+    """The keys of the ways to declare gaps, speeds and an obstacle that it does not use; what it does not choose."""
     gaps = "gaps_m" if scenario.gaps_m is None else "time_gaps_s"
     speeds = {"speeds_mps"} if scenario.speeds_mps is None else {"line_speed_mps", "speed_deviations_mps"}
     obstacle = {key for key in ("obstacle_gap_m", "obstacle_margin_m") if getattr(scenario, key) is None}
-    return {gaps, *speeds, *obstacle}
+    return {gaps, *speeds, *obstacle, *(["observation"] if scenario.observation is None else [])}
 
 
 def test_list__is_sorted_and_has_the_papers_scenarios():
@@ -177,7 +177,7 @@ def test_docs__the_table_of_keys_has_every_field_with_its_default():
         elif field.default is None:
             other = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps"}
             other |= {new: usual for usual, new in other.items()}
-            assert cells[0] == ("none" if key.startswith("obstacle_") else f"this or `{other[key]}`")
+            assert cells[0] == ("none" if key.startswith(("obstacle_", "observation")) else f"this or `{other[key]}`")
         elif field.default_factory is None:
             assert cells[0] == (f"`{flow_text(field.default)}`" if field.default != "" else "empty"), key
 

@@ -1,0 +1,35 @@
+"""What a command's ``--help`` says of parts that can be registered: the names there are when it is asked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from typer.core import TyperCommand
+
+from ethbrake_marl.learning.registry import algorithm_names
+from ethbrake_marl.objectives import KINDS
+from ethbrake_marl.rewards import TERMS
+from ethbrake_marl.scenario.features import FEATURES
+from ethbrake_marl.scenario.v2x import CHANNELS
+
+
+def part_names() -> list[tuple[str, str]]:
+    """Kinds of parts, each with its names; what is registered is among them."""
+    own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in FEATURES.items()]
+    return [
+        ("Reward terms", ", ".join(TERMS)),
+        ("Observation", ", ".join(["own", "front_K", "rear_K", "role", "obstacle", *own])),
+        ("V2X presets", ", ".join(CHANNELS)),
+        ("Objectives", ", ".join(kind.form for kind in KINDS.values())),
+        ("Algorithms", ", ".join(algorithm_names())),
+    ]
+
+
+class CommandWithParts(TyperCommand):
+    """A command whose help ends with these names."""
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """The epilog, and the names behind it."""
+        super().format_epilog(ctx, formatter)
+        with formatter.section("What recipes and scenarios may name"):
+            formatter.write_dl(part_names())

@@ -1,0 +1,122 @@
+"""Which features an observation holds, in which order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario.features import (
+    MOST_NEIGHBOURS,
+    NEIGHBOUR_FEATURES,
+    OBSTACLE_FEATURES,
+    OWN_FEATURES,
+    ROLE_FEATURES,
+    Feature,
+    feature_named,
+    listed_features,
+    side_of,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ObservationSpec:
+    """How many neighbours an observation holds on each side, and whether its own place and an obstacle follow.
+
+    With ``chosen`` it holds these features alone, in this order; ``choose_observation`` makes such a one.
+
+    >>> import ethbrake_marl as eb
+    >>> spec = eb.ObservationSpec(front=2, rear=0)
+    >>> spec.size, spec.features[7].name
+    (27, 'front_1.known')
+    >>> eb.choose_observation(["own", "front_1.gap"]).size
+    8
+
+    """
+
+    front: int = 1  # neighbours ahead, 0 to 64
+    rear: int = 1  # neighbours behind
+    role: bool = False  # ROLE_FEATURES
+    obstacle: bool = False  # OBSTACLE_FEATURES
+    chosen: tuple[str, ...] = ()  # full names; the fields above say how far these look
+
+    def __post_init__(self) -> None:
+        """Refuse what is not a number of neighbours, and features that the rest does not fit."""
+        for side, count in (("front", self.front), ("rear", self.rear)):
+            whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+            if not whole or not 0 <= count <= MOST_NEIGHBOURS:
+                raise InvalidInput(f"observation: {side} = {count!r}; must be a whole number in 0..{MOST_NEIGHBOURS}")
+        for name, shown in (("role", self.role), ("obstacle", self.obstacle)):
+            if not isinstance(shown, bool):
+                raise InvalidInput(f"observation: {name} = {shown!r}; must be True or False")
+        if self.chosen and _reach(self.chosen) != (self.front, self.rear, self.role, self.obstacle):
+            raise InvalidInput("observation: chosen: the other fields do not fit; use eb.choose_observation([...])")
+
+    @property
+    def sides(self) -> tuple[tuple[str, int], ...]:
+        """Neighbours as (prefix, offset in the line), front ones first, nearest first."""
+        fronts = tuple((f"front_{k}", -k) for k in range(1, self.front + 1))
+        return fronts + tuple((f"rear_{k}", k) for k in range(1, self.rear + 1))
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """Every number of an observation in order; names are unique (``own.speed``, ``front_1.gap``)."""
+        return tuple(feature_named(name) for name in self.chosen) or self.whole
+
+    @property
+    def whole(self) -> tuple[Feature, ...]:
+        """The same with all built-in features of every group that it looks at."""
+        groups = [("own", OWN_FEATURES), *((prefix, NEIGHBOUR_FEATURES) for prefix, _ in self.sides)]
+        groups += [("role", ROLE_FEATURES)] if self.role else []
+        groups += [("obstacle", OBSTACLE_FEATURES)] if self.obstacle else []
+        return tuple(
+            Feature(f"{prefix}.{f.name}", f.unit, f.scale, f.low, f.high, f.meaning)
+            for prefix, group in groups
+            for f in group
+        )
+
+    @property
+    def size(self) -> int:
+        """Length F of an observation."""
+        further = self.role * len(ROLE_FEATURES) + self.obstacle * len(OBSTACLE_FEATURES)
+        return len(self.chosen) or len(OWN_FEATURES) + (self.front + self.rear) * len(NEIGHBOUR_FEATURES) + further
+
+
+Observation = ObservationSpec | Sequence[str]  # or a list of groups and features
+
+
+def choose_observation(listed: Observation) -> ObservationSpec:
+    """The observation of a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
+
+    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no such list.
+    """
+    if isinstance(listed, ObservationSpec):
+        return listed
+    names = listed_features(listed)
+    front, rear, role, obstacle = _reach(names)
+    usual = ObservationSpec(front, rear, role, obstacle)
+    if tuple(feature.name for feature in usual.features) == names:
+        return usual
+    return ObservationSpec(front, rear, role, obstacle, names)
+
+
+def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool]:
+    """How far features look: neighbours in front and behind, the own place, the obstacle."""
+    sides = [side for name in names if (side := side_of(name)) is not None]
+    front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
+    groups = {name.partition(".")[0] for name in names}
+    return front, rear, "role" in groups, "obstacle" in groups
+
+
+def observation_for(scenario: Scenario) -> ObservationSpec:
+    """What vehicles observe in this scenario unless somebody says otherwise: what it declares.
+
+    Where it declares nothing: one neighbour on each side; where Vehicle 1 has an obstacle ahead, also the own place in
+    the line and the obstacle.
+    """
+    if scenario.observation is not None:
+        return choose_observation(scenario.observation)
+    return ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)

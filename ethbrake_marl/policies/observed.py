@@ -1,0 +1,75 @@
+"""Whether what a policy observes is still what its names stand for; names of an earlier version are read as today's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.observations import choose_observation
+from ethbrake_marl.policies.manifest import (
+    FeatureDefinition,
+    Manifest,
+    content_sha256,
+    observation_schema,
+    scaling_sha256,
+)
+from ethbrake_marl.scenario.features import FEATURES
+
+_OLD, _TODAY = "hazard.", "obstacle."  # a group of features that was renamed
+
+
+def check_observed(path: Path, manifest: Manifest) -> Manifest:
+    """The manifest, in today's names.
+
+    Raises ``InvalidInput`` naming a registered feature that is missing or was changed, ``CorruptBundle`` for features
+    that this version does not have, or scales otherwise.
+    """
+    seen = manifest.observation
+    for feature in seen.registered:
+        _check_registered(path, feature)
+    names = tuple(_TODAY + name.removeprefix(_OLD) if name.startswith(_OLD) else name for name in seen.features)
+    try:
+        spec = choose_observation(names)
+    except InvalidInput:
+        raise _other_features(path, manifest) from None
+    today = observation_schema(spec)
+    same = (seen.front, seen.rear, names, [each.name for each in seen.registered]) == (
+        today.front, today.rear, today.features, [each.name for each in today.registered],
+    )  # fmt: skip
+    if not same or seen.scaling_sha256 != scaling_sha256(spec, seen.features):
+        raise _other_features(path, manifest)
+    if names == seen.features:
+        return manifest
+    renamed = manifest.model_copy(update={"observation": today})
+    return renamed.model_copy(update={"manifest_sha256": content_sha256(renamed.model_dump(mode="json"))})
+
+
+def _check_registered(path: Path, was: FeatureDefinition) -> None:
+    if was.name not in FEATURES:
+        raise InvalidInput(
+            f"{path}: the policy observes {was.name!r:.80}, which is not registered; import the file that registers it"
+            " (eb.register_feature) first"
+        )
+    entry = FEATURES[was.name]
+    now = {name: getattr(entry.feature, name) for name in ("unit", "scale", "low", "high")}
+    now |= {"of": entry.of, "unknown": entry.unknown}
+    for key, value in now.items():
+        if getattr(was, key) != value:
+            raise InvalidInput(
+                f"{path}: the policy observes {was.name!r:.80}, whose {key} was {getattr(was, key)!r:.60} when it was"
+                f" trained and is {value!r:.60} now; register it as it was, or train again"
+            )
+    if len(was.tried) != len(entry.tried) or not np.allclose(was.tried, entry.tried, rtol=1e-6, atol=1e-6):
+        raise InvalidInput(
+            f"{path}: the policy observes {was.name!r:.80}, whose function gives other numbers than when it was"
+            " trained; register it as it was, or train again"
+        )
+
+
+def _other_features(path: Path, manifest: Manifest) -> CorruptBundle:
+    return CorruptBundle(
+        f"{path}: observation: features or their scaling are not those of this version of the package;"
+        f" use the one it was made with ({manifest.versions.get('ethbrake-marl', 'unknown')}), or train again"
+    )

@@ -1,0 +1,187 @@
+"""What a vehicle can observe: named features with fixed analytic scalings, built in or registered."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
+
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.physics import Floats
+
+MOST_NEIGHBOURS = 64  # on each side
+
+Of = Literal["own", "neighbour"]
+
+
+@dataclass(frozen=True, slots=True)
+class Feature:
+    """One number of an observation: ``clip(value / scale, low, high)``."""
+
+    name: str
+    unit: str
+    scale: float
+    low: float
+    high: float
+    meaning: str
+
+
+OWN_FEATURES = (
+    Feature("speed", "m/s", 20.0, -2.0, 4.0, "own speed"),
+    Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "own command in force"),
+    Feature("braking_capacity", "m/s2", 10.0, 0.0, 2.0, "own largest deceleration"),
+    Feature("driving_capacity", "m/s2", 10.0, 0.0, 2.0, "own largest forward acceleration"),
+    Feature("mass", "t", 10.0, 0.0, 8.0, "own mass"),
+    Feature("latency_left", "s", 1.0, 0.0, 4.0, "time until own commands take effect"),
+    Feature("restitution", "1", 1.0, 0.0, 1.0, "coefficient of restitution"),
+)
+NEIGHBOUR_FEATURES = (
+    Feature("known", "1", 1.0, 0.0, 1.0, "1 if this neighbour exists and its message has arrived"),
+    Feature("gap", "m", 10.0, 0.0, 10.0, "free distance to it, other vehicles between not counted as length"),
+    Feature("closing_speed", "m/s", 10.0, -4.0, 4.0, "positive when the two approach"),
+    Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "its command in force"),
+    Feature("braking_capacity", "m/s2", 10.0, 0.0, 2.0, "its largest deceleration"),
+    Feature("mass", "t", 10.0, 0.0, 8.0, "its mass"),
+    Feature("latency_left", "s", 1.0, 0.0, 4.0, "time until its commands take effect"),
+    Feature("hit", "1", 1.0, 0.0, 1.0, "1 if the pair on its side has had an impact"),
+    Feature("stopping_margin", "m", 10.0, -15.0, 20.0, "gap left at rest if both brake fully as soon as they can"),
+    Feature(
+        "fitting_deceleration",
+        "m/s2",
+        10.0,
+        0.0,
+        2.0,
+        "own constant deceleration with which the two would come to rest touching, the neighbour braking fully",
+    ),
+)
+
+ROLE_FEATURES = (
+    Feature("vehicles_ahead", "1", 1.0, 0.0, 2.0, "how many vehicles are ahead in the line; 2 stands for 2 or more"),
+    Feature("vehicles_behind", "1", 1.0, 0.0, 2.0, "how many are behind"),
+)
+OBSTACLE_FEATURES = (
+    Feature("known", "1", 1.0, 0.0, 1.0, "1 if there is an obstacle ahead of the line and this vehicle knows of it"),
+    Feature("gap", "m", 10.0, 0.0, 10.0, "free distance to it, vehicles between not counted as length"),
+    Feature("hit", "1", 1.0, 0.0, 1.0, "1 if Vehicle 1 has had an impact with it"),
+    Feature("stopping_margin", "m", 10.0, -15.0, 20.0, "distance left at rest after braking fully as soon as possible"),
+    Feature("fitting_deceleration", "m/s2", 10.0, 0.0, 2.0, "own constant deceleration that ends at rest, touching it"),
+)
+
+_BUILT_IN = {"own": OWN_FEATURES, "role": ROLE_FEATURES, "obstacle": OBSTACLE_FEATURES}
+_SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
+
+
+@dataclass(frozen=True, slots=True)
+class RegisteredFeature:
+    """A feature that somebody registered."""
+
+    feature: Feature
+    function: Callable[..., Floats]
+    of: Of
+    unknown: float  # in the feature's unit
+    tried: tuple[float, ...]  # what it gave in a few worlds: a changed function shows there
+
+    def scaled(self, value: Floats) -> Floats:
+        """``clip(value / scale, low, high)``."""
+        feature = self.feature
+        return np.clip(value * (1.0 / feature.scale), feature.low, feature.high)
+
+
+FEATURES: dict[str, RegisteredFeature] = {}
+
+
+def listed_features(listed: object) -> tuple[str, ...]:
+    """The full names of the features that a list of groups (``own``, ``front_1``) and single features stands for.
+
+    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no list, is empty, or names one twice.
+    """
+    if isinstance(listed, str) or not isinstance(listed, Sequence) or not listed:
+        raise InvalidInput("observation: must be a list of groups and features, for instance [own, front_1, rear_1]")
+    names = [name for each in listed for name in _expanded(each)]
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise InvalidInput(f"observation: {name} is listed twice")
+    return tuple(names)
+
+
+class _ListSchema:
+    """The JSON schema of an observation: a list of what is known when it is asked for."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        further = {"type": "string", "pattern": r"^(front|rear)_[1-9][0-9]?(\.[a-z0-9_]+)?$"}
+        items = {"anyOf": [{"type": "string", "enum": choices()}, further]}
+        return {"type": "array", "items": items, "minItems": 1, "uniqueItems": True}
+
+
+ListedFeatures = Annotated[tuple[str, ...], Field(strict=False), _ListSchema]
+
+
+def feature_named(name: str) -> Feature:
+    """One feature by its full name; raises ``UnknownName``."""
+    group, dot, own = name.partition(".")
+    if name in FEATURES and FEATURES[name].of == "own":
+        return FEATURES[name].feature
+    if _is_side(group) and own in FEATURES and FEATURES[own].of == "neighbour":
+        return replace(FEATURES[own].feature, name=name)
+    for feature in _group(group) if dot else ():
+        if feature.name == own:
+            return replace(feature, name=name)
+    raise _unknown(name)
+
+
+def side_of(name: str) -> tuple[str, int] | None:
+    """Of which neighbour a feature with this full name is: ``("front", 1)``; None: of none."""
+    match = _SIDE.fullmatch(name.partition(".")[0])
+    return (match[1], int(match[2])) if match and int(match[2]) <= MOST_NEIGHBOURS else None
+
+
+def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
+    """The registered features among those of full names, by their own names."""
+    own = [name.partition(".")[2] or name for name in names]
+    return {name: FEATURES[name] for name in own if name in FEATURES}
+
+
+def built_in_names() -> set[str]:
+    """Names of groups and of the features in them."""
+    return {*_BUILT_IN, *(feature.name for group in (*_BUILT_IN.values(), NEIGHBOUR_FEATURES) for feature in group)}
+
+
+def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
+    """What an ``observation:`` may list: groups, then single features, of these neighbours."""
+    groups = ["own", *sides, "role", "obstacle"]
+    single = [f"{group}.{feature.name}" for group in groups for feature in _group(group)]
+    own = [name for name, entry in FEATURES.items() if entry.of == "own"]
+    each = [f"{side}.{name}" for side in sides for name, entry in FEATURES.items() if entry.of == "neighbour"]
+    return [*groups, *single, *own, *each]
+
+
+def _expanded(each: object) -> tuple[str, ...]:
+    if not isinstance(each, str):
+        raise InvalidInput(f"observation: {each!r:.60}: must be the name of a group or a feature")
+    if group := _group(each):
+        return tuple(f"{each}.{feature.name}" for feature in group)
+    return (feature_named(each).name,)
+
+
+def _group(name: str) -> tuple[Feature, ...]:
+    return NEIGHBOUR_FEATURES if _is_side(name) else _BUILT_IN.get(name, ())
+
+
+def _is_side(name: str) -> bool:
+    return side_of(name) is not None and "." not in name
+
+
+def _unknown(name: str) -> InvalidInput:
+    if name in FEATURES:
+        return InvalidInput(f"feature {name!r} is of a neighbour: write front_1.{name} or rear_1.{name}")
+    side = name.partition(".")[0]
+    sides = ["front_1", "rear_1"] + ([side] if _is_side(side) else [])
+    return unknown_name("feature", name, choices(dict.fromkeys(sides)))
