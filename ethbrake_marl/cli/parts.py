@@ -1,4 +1,4 @@
-"""What a command's ``--help`` says of parts that can be registered: the names there are when it is asked."""
+"""The registered parts in a command's ``--help``: the names there are when it is asked."""
 
 from __future__ import annotations
 

@@ -121,9 +121,7 @@ class TrainingRecipe(_Part):
     learning_rate: LearningRate  # from its start to its end
     gamma: Fraction  # discount of one time step
     reward: RewardParams  # what is learned for
-    observation: Annotated[ListedFeatures | None, Field(exclude_if=_none)] = (
-        None  # groups and features; None: the scenario's
-    )
+    observation: Annotated[ListedFeatures | None, Field(exclude_if=_none)] = None  # of learners; None: the scenario's
     horizon_is_end: bool = False  # nothing is expected beyond the horizon
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of worlds, networks and exploration
     evaluation: EvaluationPlan  # the fixed list, and how often

@@ -1,4 +1,4 @@
-"""Which features an observation holds, in which order."""
+"""The features that an observation holds, in order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether what a policy observes is still what its names stand for; names of an earlier version are read as today's."""
+"""The check that a policy's features are still what their names stand for; earlier names are read as today's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a vehicle can observe: named features with fixed analytic scalings, built in or registered."""
+"""Named features that a vehicle can observe, with fixed analytic scalings, built in or registered."""
 
 from __future__ import annotations
 
