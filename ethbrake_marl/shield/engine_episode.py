@@ -86,8 +86,8 @@ class AttachedHybrid(Attached):
         """Who will drive the episode of world ``k``, before the first decision."""
         return {
             "mode": "episode",
-            "proposed_action": np.nan,
-            "chosen_action": np.nan,
+            "proposed_action": 0.0,
+            "chosen_action": 0.0,
             "intervened": False,
             "chosen_policy": bool(self.hybrid.chosen_policy[k]),
             "policy_harm": float(self.hybrid.policy_harm[k]),

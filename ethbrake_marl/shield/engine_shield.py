@@ -141,7 +141,7 @@ class Attached(ABC):
 
     @abstractmethod
     def start_info(self, k: int) -> dict[str, Any]:
-        """The same keys before the first decision of world ``k``; NaN where nothing was proposed or chosen yet."""
+        """The same keys before the first decision of world ``k``; 0 for what was not proposed or chosen yet."""
 
     @abstractmethod
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
@@ -232,12 +232,12 @@ class AttachedShield(Attached):
         assert shield.running is not None
         return {
             "mode": "step" if shield.uncertainty is None else "robust",
-            "proposed_action": np.nan,
-            "chosen_action": np.nan,
+            "proposed_action": 0.0,
+            "chosen_action": 0.0,
             "intervened": False,
             "reason": "",
             "bound_harm": float(shield.bound[k]),
-            "margin": np.nan,
+            "margin": 0.0,
             "trusted": not shield.distrusted[k],
             "settles": bool(shield.settles[k]),
             **({} if shield.uncertainty is None else {"members": shield.running.members}),
