@@ -110,7 +110,7 @@ def test_infos__tell_the_harm_term_of_each_vehicle():
     while env.agents:
         _, rewards, _, _, infos = env.step({"vehicle_2": np.array([0.5], np.float32)})
         for agent, info in infos.items():
-            assert info["reward_terms"] == {"harm": rewards[agent]}
+            assert info["reward_harm"] == rewards[agent]
             total[agent] += rewards[agent]
     for agent, info in infos.items():
         assert total[agent] == pytest.approx(before[agent]["first_impact_harm"] - info["first_impact_harm"])

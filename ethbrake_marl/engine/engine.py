@@ -54,6 +54,7 @@ from ethbrake_marl.physics.segment import DONE
 from ethbrake_marl.rewards import (
     Reward,
     StepOutcome,
+    counted_terms,
     further_terms,
     moving_terms_of,
     own_terms,
@@ -161,6 +162,7 @@ class Engine:
         self._settings = np.array([*times, shared_harm, total, self.reward.terminal])
         self._moving_terms, self._own_terms = moving_terms_of(self.reward), registered_terms_of(self.reward)
         self._moves_reward = bool(self._moving_terms or self._own_terms)
+        self.reward_terms = counted_terms(self.reward)  # names of those whose values each step tells
         self._more_terms = self._moves_reward or self.reward.shaping > 0.0 or bool(self._objectives)
         self._stream = Stream(scenario, self.deciders, self.scripts, seed)
         self.reset(worlds=worlds)

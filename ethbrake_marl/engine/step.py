@@ -109,12 +109,13 @@ class Step(NamedTuple):
     @property
     def shared(self) -> dict[str, Floats]:
         """Unweighted reward terms that are the same for all vehicles of a world, each [n]."""
-        return shared_terms(self.params, self.outcome[self._counted], self.outcome[SAFE_END])
+        return shared_terms(self.params, self.counted_harm, self.outcome[SAFE_END])
 
-    def shared_in(self, world: int) -> dict[str, float]:
-        """The same of one world, as plain numbers."""
-        tell = self.outcome.item
-        return shared_terms(self.params, tell(self._counted, world), tell(SAFE_END, world))
+    @property
+    def counted_harm(self) -> Floats:
+        """Harm of the whole line in this step, as the reward counts impacts, [n]."""
+        harm: Floats = self.outcome[self._counted]
+        return harm
 
     @property
     def _counted(self) -> int:

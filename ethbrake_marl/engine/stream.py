@@ -76,12 +76,12 @@ class Roster:
     def __init__(self, n: int, seed: int, first: int | None) -> None:
         self.failed: dict[int, str] = {}  # by row, and why; until a new episode begins there
         self.warns = True  # with a ``FailedWorld`` that names the world; off: the caller looks at ``failed``
-        self._seed = seed
-        self._numbers = np.full(n, -1, np.int64) if first is None else first + np.arange(n)
+        self.seed = seed
+        self.numbers = np.full(n, -1, np.int64) if first is None else first + np.arange(n)  # by row; -1: given
 
     def renew(self, rows: Ints, first: int) -> None:
         """World ``first`` of the stream and those after it now stand in these rows."""
-        self._numbers[rows] = first + np.arange(len(rows))
+        self.numbers[rows] = first + np.arange(len(rows))
         for row in self.failed.keys() & rows.tolist() if self.failed else ():
             del self.failed[row]
 
@@ -90,8 +90,8 @@ class Roster:
         new = failure(np.where(status == 0, DONE, status), from_s, until_s).worlds
         self.failed |= new
         for row, reason in new.items() if self.warns else ():
-            number = int(self._numbers[row])
-            name = f"world {number} of seed {self._seed}" if number >= 0 else f"the world of row {row}"
+            number = int(self.numbers[row])
+            name = f"world {number} of seed {self.seed}" if number >= 0 else f"the world of row {row}"
             warnings.warn(FailedWorld(f"{name}: {reason}; its episode was cut off there"), stacklevel=4)
 
 

@@ -1,10 +1,12 @@
-"""The infos of every interface, computed once for all vehicles of all worlds.
+"""Infos of every interface, computed once for all vehicles of all worlds: the same keys after a reset and a step.
 
-After a reset: ``time_s``, ``command_in_force_mps2`` (in force now; 0 until the latency has elapsed), the vehicle's
-share of the harm so far under both counts, the same for the whole world, and whether anything has collided. After a
-step also ``chosen_command_mps2``, ``chosen_action`` (the vehicle's command as an action, whoever chose it), and the
-reward terms before their weights. Where the scenario has a ``v2x`` channel, always also ``known_from_s`` [N]: from
-when on this vehicle acts on news of each one (infinite: never; of itself: its latency).
+``time_s``, ``command_in_force_mps2`` (in force now; 0 until the latency has elapsed), ``chosen_command_mps2`` and
+``chosen_action`` (what the vehicle asked for, whoever chose it; 0 before a learner's first step), the vehicle's share
+of the harm so far under both counts, the same for the whole world, and whether anything has collided. Of the last
+step: ``cost`` (the harm it added to the line, as the reward counts impacts; for safe-RL libraries) and
+``reward_NAME``, each term of the reward before its weight; after a reset they are 0. ``world_seed`` and ``world`` name
+the world, so that it can be played again (-1: it was given). Where the scenario has a ``v2x`` channel also
+``known_from_s`` [N]: from when on this vehicle acts on news of each one (infinite: never; of itself: its latency).
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from ethbrake_marl.physics.rows import (
     state_width,
 )
 
-AT_ANY_TIME = (
+COLUMNS = (
     "time_s",
     "command_in_force_mps2",
     "first_impact_harm",
@@ -38,28 +40,47 @@ AT_ANY_TIME = (
     "world_first_impact_harm",
     "world_total_harm",
     "collided",
+    "chosen_command_mps2",
+    "chosen_action",
 )
-AFTER_A_STEP = (*AT_ANY_TIME, "chosen_command_mps2", "chosen_action")
 _FLOAT32 = np.dtype(np.float32)
 
 
 class Report(NamedTuple):
-    """What there is to tell about some worlds."""
+    """What there is to tell about n worlds of N vehicles."""
 
-    values: Floats  # [n, N, len(AFTER_A_STEP)]
-    step: Step | None  # whose reward terms are told; None: there was none
-    known_from_s: Floats | None = None  # [n, N, N] where the news comes link by link
+    values: Floats  # [n, N, len(COLUMNS)]
+    cost: Floats  # [n] harm of the step (m2/s2); 0 without one
+    terms: dict[str, Floats]  # reward terms of the step, each [n], shared by all vehicles, or [n, N]; 0 without one
+    world_seed: int
+    world: Ints  # [n] numbers in the stream of that seed
+    known_from_s: Floats | None  # [n, N, N] where there is a channel
 
 
 def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
     """The engine's worlds as they are now, before any of them is renewed; only the worlds ``rows`` if given."""
-    (state, params), wanted = engine.packed, engine.wanted_mps2
+    (state, params), wanted, world = engine.packed, engine.wanted_mps2, engine.roster.numbers
     if rows is not None:
         state, params, wanted = (array.take(rows, axis=0) for array in (state, params, wanted))
-    values = np.empty((*wanted.shape, len(AFTER_A_STEP)))
+        world = world.take(rows)
+    values = np.empty((*wanted.shape, len(COLUMNS)))
     _report_rows(state, params, wanted, values)
     N = wanted.shape[1]
-    return Report(values, step, own_latency_and_news(params, N)[1] if has_news(params, N) else None)
+    known = own_latency_and_news(params, N)[1] if has_news(params, N) else None
+    cost, terms = _of_the_step(engine, step, rows)
+    return Report(values, cost, terms, engine.roster.seed, world, known)
+
+
+def _of_the_step(engine: Engine, step: Step | None, rows: Ints | None) -> tuple[Floats, dict[str, Floats]]:
+    """Cost and reward terms of a step in these worlds; without a step both are 0."""
+    if step is None:
+        nothing = np.zeros(engine.n if rows is None else len(rows))
+        return nothing, dict.fromkeys(engine.reward_terms, nothing)
+    every = step.shared | step.further
+    terms = {name: every[name] for name in engine.reward_terms}
+    if rows is None:
+        return step.counted_harm, terms
+    return step.counted_harm.take(rows), {name: term.take(rows, axis=0) for name, term in terms.items()}
 
 
 @compiled
@@ -98,82 +119,61 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 def plain_infos(told: Report, vehicles: Ints | None = None) -> list[dict[str, Any]]:
     """Infos of these vehicles (None: of all), world by world, as plain numbers; ``chosen_action`` is an array [1]."""
-    infos = _without_news(told, vehicles)
+    shown = np.arange(told.values.shape[1]) if vehicles is None else vehicles
+    worlds: list[list[list[Any]]] = told.values.take(shown, axis=1).tolist()
+    numbers, costs = told.world.tolist(), told.cost.tolist()
+    terms = [(f"reward_{name}", _by_vehicle(term, shown)) for name, term in told.terms.items()]
+    infos: list[dict[str, Any]] = []
+    for k, world in enumerate(worlds):
+        for v, (time, force, first, total, world_first, world_total, collided, chosen, action) in enumerate(world):
+            chosen_action = np.empty(1, _FLOAT32)
+            chosen_action[0] = action
+            info = {
+                "time_s": time,
+                "command_in_force_mps2": force,
+                "first_impact_harm": first,
+                "total_harm": total,
+                "world_first_impact_harm": world_first,
+                "world_total_harm": world_total,
+                "collided": collided == 1.0,
+                "chosen_command_mps2": chosen,
+                "chosen_action": chosen_action,
+                "cost": costs[k],
+                "world_seed": told.world_seed,
+                "world": numbers[k],
+            }
+            for name, term in terms:
+                info[name] = term[k][v]
+            infos.append(info)
     if told.known_from_s is not None:
-        news = told.known_from_s if vehicles is None else told.known_from_s.take(vehicles, axis=1)
+        news = told.known_from_s.take(shown, axis=1)
         for info, known in zip(infos, news.reshape(-1, news.shape[2]), strict=True):
             info["known_from_s"] = known.copy()
     return infos
 
 
-def _without_news(told: Report, vehicles: Ints | None) -> list[dict[str, Any]]:
-    worlds: list[list[list[Any]]] = (told.values if vehicles is None else told.values.take(vehicles, axis=1)).tolist()
-    if told.step is None:
-        return [_at_any_time(values) for world in worlds for values in world]
-    infos: list[dict[str, Any]] = []
-    for k, world in enumerate(worlds):
-        terms = told.step.shared_in(k)
-        for time, applied, first, total, world_first, world_total, collided, wanted, action in world:
-            chosen_action = np.empty(1, _FLOAT32)
-            chosen_action[0] = action
-            infos.append(
-                {
-                    "time_s": time,
-                    "command_in_force_mps2": applied,
-                    "first_impact_harm": first,
-                    "total_harm": total,
-                    "world_first_impact_harm": world_first,
-                    "world_total_harm": world_total,
-                    "collided": collided == 1.0,
-                    "chosen_command_mps2": wanted,
-                    "chosen_action": chosen_action,
-                    "reward_terms": terms.copy(),
-                }
-            )
-    for name, term in told.step.further.items():
-        told_of = term if vehicles is None else term.take(vehicles, axis=1)
-        for info, value in zip(infos, told_of.ravel().tolist(), strict=True):
-            info["reward_terms"][name] = value
-    return infos
+def _by_vehicle(term: Floats, vehicles: Ints) -> list[list[float]]:
+    """A term of every world and of these vehicles, [n][V]."""
+    each = term[:, np.newaxis].repeat(len(vehicles), axis=1) if term.ndim == 1 else term.take(vehicles, axis=1)
+    values: list[list[float]] = each.tolist()
+    return values
 
 
-def _at_any_time(values: list[Any]) -> dict[str, Any]:
-    time, applied, first, total, world_first, world_total, collided, *_ = values
-    return {
-        "time_s": time,
-        "command_in_force_mps2": applied,
-        "first_impact_harm": first,
-        "total_harm": total,
-        "world_first_impact_harm": world_first,
-        "world_total_harm": world_total,
-        "collided": collided == 1.0,
-    }
-
-
-def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools | None) -> dict[str, Any]:
+def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
     """One vehicle in many worlds as Gymnasium's vector infos: ``name`` [n] and its mask ``_name`` [n].
 
-    What can be told at any time is told of the worlds marked by ``rows``; what a step adds (None: nothing), of those
-    marked by ``stepped``.
+    The worlds marked by ``rows`` are told of. What a step brought is 0 but in the worlds marked by ``stepped``.
     """
-    columns: dict[str, NDArray[Any]] = {name: told.values[:, vehicle, c] for c, name in enumerate(AFTER_A_STEP)}
+    columns: dict[str, NDArray[Any]] = {name: told.values[:, vehicle, c] for c, name in enumerate(COLUMNS)}
     columns["collided"] = columns["collided"] == 1.0
-    always = {name: columns[name] for name in AT_ANY_TIME}
-    if told.known_from_s is not None:
-        always["known_from_s"] = told.known_from_s[:, vehicle]
-    info = _mask(always, rows)
-    if stepped is None:
-        return info
     columns["chosen_action"] = columns["chosen_action"].astype(np.float32)[:, np.newaxis]
-    info |= _mask({name: columns[name] for name in AFTER_A_STEP[len(AT_ANY_TIME) :]}, stepped)
-    terms = {} if told.step is None else told.step.shared | _column(told.step.further, vehicle)
-    info["reward_terms"] = _mask(terms, stepped)
-    info["_reward_terms"] = stepped.copy()
-    return info
-
-
-def _column(terms: dict[str, Floats], vehicle: int) -> dict[str, Floats]:
-    return {name: term[:, vehicle] for name, term in terms.items()}
+    columns["cost"] = np.where(stepped, told.cost, 0.0)
+    columns["world_seed"], columns["world"] = np.full(len(rows), told.world_seed), told.world
+    for name, term in told.terms.items():
+        columns[f"reward_{name}"] = np.where(stepped, term if term.ndim == 1 else term[:, vehicle], 0.0)
+    if told.known_from_s is not None:
+        columns["known_from_s"] = told.known_from_s[:, vehicle]
+    return _mask(columns, rows)
 
 
 def _mask(columns: dict[str, NDArray[Any]], rows: Bools) -> dict[str, Any]:

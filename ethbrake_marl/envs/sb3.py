@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.snapshot import Arrays, engine_snapshot, restore_engine
 from ethbrake_marl.engine.step import Step
-from ethbrake_marl.envs.infos import Report, plain_infos, report
+from ethbrake_marl.envs.infos import plain_infos, report
 from ethbrake_marl.envs.setup import (
     INITIAL_STATE,
     AnyScenario,
@@ -209,7 +209,7 @@ class EthBrakeVecEnv(VecEnv):
     def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
         """Fill in the infos of the rows whose world has ended, before the next episodes start."""
         rows, final = self._rows(ended), self._observe(ended)
-        told = plain_infos(report(self.engine, rows=ended), self._learners)
+        told = plain_infos(report(self.engine, step, ended), self._learners)
         truncated = self._by_row(step.truncated[ended]).tolist()
         gained, steps = self._return.take(rows).tolist(), self._steps.take(rows).tolist()
         for row, info, cut, seen, gain, count in zip(rows.tolist(), told, truncated, final, gained, steps, strict=True):
@@ -229,7 +229,7 @@ class EthBrakeVecEnv(VecEnv):
         """The infos with which the running episodes began, row by row; made when they are asked for."""
         if not self._started:
             return [{} for _ in range(self.num_envs)]
-        return plain_infos(Report(self._begun, None, report(self.engine).known_from_s), self._learners)
+        return plain_infos(report(self.engine)._replace(values=self._begun), self._learners)
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:

@@ -113,10 +113,10 @@ class UnknownResetOption(UserWarning):
 
 
 def fresh_seed() -> int:
-    """A seed from the operating system's entropy, for an environment that was never given one."""
+    """A seed of 63 bits from the operating system's entropy, for an environment that was never given one."""
     entropy = np.random.SeedSequence().entropy
     assert isinstance(entropy, int)  # always, when SeedSequence chooses it itself
-    return entropy
+    return entropy % 2**63  # fits the integers of every library that infos are handed to
 
 
 def restart(engine: Engine, seed: int | None, options: Mapping[str, Any] | None) -> None:

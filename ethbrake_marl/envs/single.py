@@ -16,6 +16,7 @@ from ethbrake_marl.envs.setup import (
     check_render_mode,
     check_seed,
     feature_box,
+    fresh_seed,
     learner_columns,
     make_engine,
     only_learner,
@@ -77,7 +78,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         """Start an episode; see ``envs.setup``."""
         check_seed(seed)
         if seed is None and self._np_random_seed is None:
-            seed = self.np_random_seed  # fresh entropy, kept by Gymnasium: reset(seed=env.np_random_seed) repeats it
+            seed = fresh_seed()  # kept by Gymnasium: reset(seed=env.np_random_seed) repeats it
         restart(self.engine, seed, options)
         super().reset(seed=seed)
         self._running = True

@@ -18,6 +18,7 @@ from ethbrake_marl.envs.setup import (
     check_render_mode,
     check_seed,
     feature_box,
+    fresh_seed,
     make_engine,
     only_learner,
     restart,
@@ -86,12 +87,12 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         """Start an episode in every world; see ``envs.setup``."""
         check_seed(seed)
         if seed is None and self._np_random_seed is None:
-            seed = self.np_random_seed  # fresh entropy, kept by Gymnasium
+            seed = fresh_seed()  # kept by Gymnasium: reset(seed=env.np_random_seed) repeats it
         restart(self.engine, seed, options)
         super().reset(seed=seed)
         self._started = True
         every = np.ones(self.num_envs, np.bool_)
-        return self.engine.observe(self.learner), batch_info(report(self.engine), self.learner, every, None)
+        return self.engine.observe(self.learner), batch_info(report(self.engine), self.learner, every, ~every)
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step, and start new episodes as the autoreset mode says."""

@@ -26,6 +26,7 @@ from ethbrake_marl.rewards.params import (
 )
 from ethbrake_marl.rewards.registry import TERMS, StepOutcome, Term, register_term
 from ethbrake_marl.rewards.terms import (
+    counted_terms,
     further_terms,
     moving_terms_of,
     own_terms,
@@ -43,6 +44,7 @@ __all__ = [
     "RewardParams",
     "StepOutcome",
     "Term",
+    "counted_terms",
     "further_terms",
     "moving_terms_of",
     "own_terms",

@@ -31,6 +31,11 @@ def shared_terms(params: RewardParams, harm: Value, safe_end: Value) -> dict[str
     return terms
 
 
+def counted_terms(params: RewardParams) -> tuple[str, ...]:
+    """Names of the terms that this reward counts, in the order of the table."""
+    return tuple(name for name in TERMS if params.weight(name) > 0.0)
+
+
 def reward_terms(params: RewardParams, step: StepOutcome) -> dict[str, Floats]:
     """Unweighted terms of one step, each [n, N]; only those with a weight above 0 (all but shaping)."""
     harm = step.first_impact_harm if params.harm_count == "first" else step.total_harm

@@ -82,6 +82,18 @@ class AttachedHybrid(Attached):
             "bound_harm": float(self.hybrid.bound_harm[k]),
         }
 
+    def start_info(self, k: int) -> dict[str, Any]:
+        """Who will drive the episode of world ``k``, before the first decision."""
+        return {
+            "mode": "episode",
+            "proposed_action": 0.0,
+            "chosen_action": 0.0,
+            "intervened": False,
+            "chosen_policy": bool(self.hybrid.chosen_policy[k]),
+            "policy_harm": float(self.hybrid.policy_harm[k]),
+            "bound_harm": float(self.hybrid.bound_harm[k]),
+        }
+
     def _carried_out(self, memory: EpisodeChoice, sent: Sent, after: Engine) -> EpisodeChoice:
         return EpisodeChoice(memory.hybrid)  # another one: the next decision is another one, too
 

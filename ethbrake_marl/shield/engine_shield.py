@@ -116,8 +116,11 @@ class Attached(ABC):
 
     def infos(self, proposed: Floats) -> dict[str, NDArray[Any]]:
         """``info`` of every world, one array per key."""
-        rows = [self.info(k, float(proposed[k])) for k in range(len(proposed))]
-        return {key: np.array([row[key] for row in rows]) for key in rows[0]}
+        return _columns([self.info(k, float(proposed[k])) for k in range(len(proposed))])
+
+    def start_infos(self) -> dict[str, NDArray[Any]]:
+        """``start_info`` of every world, one array per key."""
+        return _columns([self.start_info(k) for k in range(self.engine.n)])
 
     @property
     @abstractmethod
@@ -137,12 +140,20 @@ class Attached(ABC):
         """What the shield decided in world ``k``, for ``infos[agent]["shield"]``."""
 
     @abstractmethod
+    def start_info(self, k: int) -> dict[str, Any]:
+        """The same keys before the first decision of world ``k``; 0 for what was not proposed or chosen yet."""
+
+    @abstractmethod
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
         """The memory once episodes start in these rows."""
 
     @abstractmethod
     def _carried_out(self, memory: Any, sent: Sent, after: Engine) -> Any:
         """The memory after the certified command was applied."""
+
+
+def _columns(rows: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
+    return {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
 
 class AttachedShield(Attached):
@@ -213,6 +224,23 @@ class AttachedShield(Attached):
             "trusted": not after.distrusted[k],
             "settles": bool(after.settles[k]),
             **({} if after.uncertainty is None else {"members": decision.after.members}),
+        }
+
+    def start_info(self, k: int) -> dict[str, Any]:
+        """The bound that was told at the alert of world ``k``, before anything was decided."""
+        shield = self.shield
+        assert shield.running is not None
+        return {
+            "mode": "step" if shield.uncertainty is None else "robust",
+            "proposed_action": 0.0,
+            "chosen_action": 0.0,
+            "intervened": False,
+            "reason": "",
+            "bound_harm": float(shield.bound[k]),
+            "margin": 0.0,
+            "trusted": not shield.distrusted[k],
+            "settles": bool(shield.settles[k]),
+            **({} if shield.uncertainty is None else {"members": shield.running.members}),
         }
 
     def begun(self, memory: StepShield, alert: Worlds, rows: Ints) -> StepShield:

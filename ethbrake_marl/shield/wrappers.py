@@ -81,6 +81,14 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
             raise InvalidInput(f"HybridShield: hybrid: mode {self.mode} chooses nobody for a whole episode")
         return self.attached.hybrid
 
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observations], dict[str, dict[str, Any]]]:
+        """Start an episode; the bound stands in ``infos[agent]["shield"]`` already."""
+        observations, infos = super().reset(seed=seed, options=options)
+        infos[self.shielded]["shield"] = self.attached.start_info(0)
+        return observations, infos
+
     def step(self, actions: Mapping[str, Any]) -> Told:
         """Advance by one step with the shielded agent's action replaced; it may also be left out."""
         agent = self.shielded
@@ -152,6 +160,14 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
         self.attached = attach(engine, policy, settings)
         super().__init__(env)
 
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start an episode; the bound stands in ``info["shield"]`` already."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        info["shield"] = self.attached.start_info(0)
+        return observation, info
+
     def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Advance by one step with the action certified or replaced."""
         shield = self.attached
@@ -199,6 +215,14 @@ class ShieldedVectorEnv(VectorWrapper):
         engine = engine_of(env, EthBrakeVectorEnv, "ShieldedVectorEnv", "gymnasium.make_vec('EthBrake-v0')")
         self.attached = attach(engine, policy, settings)
         super().__init__(env)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start an episode in every row; the bounds stand in ``infos["shield"]`` already."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        infos |= {"shield": self.attached.start_infos(), "_shield": np.ones(self.num_envs, np.bool_)}
+        return observations, infos
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with the actions [rows, 1] certified or replaced."""

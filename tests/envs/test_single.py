@@ -36,7 +36,7 @@ def test_step__returns_plain_types() -> None:
     env.reset(seed=0)
     _, reward, terminated, truncated, info = env.step(BRAKE)
     assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
-    assert {type(value) for value in info.values()} == {float, bool, np.ndarray, dict}
+    assert {type(value) for value in info.values()} == {float, bool, int, np.ndarray}
     assert info["chosen_command_mps2"] == -8.0
 
 
@@ -44,9 +44,26 @@ def test_infos__hold_the_same_keys_in_every_step() -> None:
     env = EthBrakeEnv(REST)
     _, at_reset = env.reset(seed=0)
     infos = [env.step(BRAKE)[4] for _ in range(10)]
-    assert {frozenset(info) for info in infos} == {
-        frozenset(at_reset) | {"chosen_action", "chosen_command_mps2", "reward_terms"}
-    }
+    assert {frozenset(info) for info in infos} == {frozenset(at_reset)}
+    assert at_reset["chosen_action"] == at_reset["cost"] == at_reset["reward_harm"] == 0.0
+    assert (at_reset["world_seed"], at_reset["world"]) == (0, 0)
+    assert {(info["world_seed"], info["world"]) for info in infos} == {(0, 0)}
+    env.reset(options={"initial_state": {"gaps_m": 7}})
+    assert env.reset()[1]["world"] >= 1
+
+
+def test_infos__cost_is_the_harm_of_the_step_as_the_reward_counts_it() -> None:
+    for reward, total in (("harm", "world_first_impact_harm"), ("total-harm", "world_total_harm")):
+        env = EthBrakeEnv("paper-random", reward=reward)
+        for seed in range(5):
+            _, info = env.reset(seed=seed)
+            before, costs, over = info[total], [info["cost"]], False
+            while not over:
+                _, _, terminated, truncated, info = env.step(np.array([0.3], np.float32))
+                over = terminated or truncated
+                costs.append(info["cost"])
+            assert sum(costs) == pytest.approx(info[total] - before)
+            assert info["reward_harm"] == -info["cost"]
 
 
 def test_seed__of_an_unseeded_environment_can_be_read_and_repeated() -> None:

@@ -46,7 +46,7 @@ def test_autoreset__same_step_literally() -> None:
         ended = terminated | truncated
         rows.append((k, terminated.tolist(), truncated.tolist(), np.round(infos["time_s"], 9).tolist()))
         assert ("final_obs" in infos) == ended.any()
-        assert np.array_equal(infos["_chosen_action"], ~ended)
+        assert infos["_chosen_action"].all()
         assert (infos["chosen_action"][ended] == 0.0).all()
         if ended.any():
             assert np.array_equal(infos["_final_obs"], ended)
@@ -98,7 +98,8 @@ def test_autoreset__next_step_ignores_the_action_of_the_reset_and_rewards_nothin
         assert np.array_equal(reward, expected[1])
         assert reward == near(np.full(2, -12.0 if k in (1, 5, 9) else 0.0))
         assert truncated.all() == (k in (3, 7, 11))
-        assert np.array_equal(infos["_chosen_action"], [k not in (4, 8, 12)] * 2)
+        assert np.array_equal(infos["reward_harm"] == 0.0, [k not in (1, 5, 9)] * 2)
+        assert np.array_equal(infos["chosen_action"][:, 0] == 0.0, [True] * 2)
 
 
 def test_autoreset__both_modes_play_the_same_first_episodes() -> None:
@@ -142,10 +143,9 @@ def test_infos__are_gymnasiums_columns_and_masks() -> None:
         infos = env.step(action)[4]
     names = {name for name in infos if not name.startswith("_")}
     assert {f"_{name}" for name in names} == set(infos) - names
-    for name in names - {"reward_terms"}:
+    for name in names:
         assert infos[name].shape == ((3, 1) if name == "chosen_action" else (3,))
         assert infos[f"_{name}"].tolist() == [True] * 3
-    assert infos["reward_terms"]["harm"].shape == (3,)
     arrays = [value for value in infos.values() if isinstance(value, np.ndarray)]
     assert not any(np.shares_memory(a, b) for a, b in combinations(arrays, 2))
     assert np.array_equal(infos["chosen_action"], action)
@@ -160,6 +160,7 @@ def test_infos__are_those_of_an_environment_alone() -> None:
     worlds = FIVE.sample(n, 6, channel="training").worlds
     for k in range(n):
         info = alone[k].reset(options={"initial_state": initial_state(worlds, k)})[1]
+        del info["world"], info["world_seed"]  # it was given
         assert {name: starts[name][k] for name in info} == info
     running = set(range(n))
     for action in actions(3, 90, n):
@@ -167,9 +168,10 @@ def test_infos__are_those_of_an_environment_alone() -> None:
         for k in sorted(running):
             *_, terminated, truncated, info = alone[k].step(action[k])
             columns = infos["final_info"] if terminated or truncated else infos
-            terms = info.pop("reward_terms")
+            named = {name: info.pop(name) for name in ("world", "world_seed")}  # alone they were given
+            assert named["world"] == -1
+            assert (columns["world_seed"][k], columns["world"][k]) == (6, k)
             assert {name: columns[name][k] for name in info} == info
-            assert {name: columns["reward_terms"][name][k] for name in terms} == terms
             running -= {k} if terminated or truncated else set()
     assert not running
 

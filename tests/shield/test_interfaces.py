@@ -14,6 +14,8 @@ from stable_baselines3 import PPO
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
+from ethbrake_marl.envs.single import EthBrakeEnv
+from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
@@ -227,3 +229,23 @@ def test_close__lets_go_of_the_environment():
     shielded = ShieldedEnv(env)
     shielded.close()
     assert env.engine.watchers == ()
+
+
+@pytest.mark.parametrize(
+    "options", [{"mode": "step"}, {"mode": "episode"}, {"mode": "robust", "uncertainty": "gaps_m=0.2"}]
+)
+def test_infos__hold_the_bound_after_a_reset_already_with_the_keys_of_a_step(options):
+    policy = make_agent("full_brake")
+    parallel, single = HybridShield(parallel_env(), policy, **options), ShieldedEnv(EthBrakeEnv(), policy, **options)
+    vector = ShieldedVectorEnv(EthBrakeVectorEnv(2), policy, **options)
+    starts = [parallel.reset(seed=7)[1]["vehicle_2"]["shield"], single.reset(seed=7)[1]["shield"]]
+    rows = vector.reset(seed=7)[1]
+    assert rows["_shield"].all()
+    starts.append({key: column[0] for key, column in rows["shield"].items()})
+    action = np.array([0.5], np.float32)
+    steps = [parallel.step({"vehicle_2": action})[4]["vehicle_2"]["shield"], single.step(action)[4]["shield"]]
+    steps.append(vector.step(np.full((2, 1), 0.5, np.float32))[4]["shield"])
+    for start, step in zip(starts, steps, strict=True):
+        assert start.keys() == step.keys()
+        assert start["bound_harm"] == starts[0]["bound_harm"] > 0.0
+        assert not start["intervened"] and start["proposed_action"] == 0.0
