@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.paper import TESTS
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
@@ -97,3 +98,25 @@ def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_sh
     alone, shielded = (result.outcome(spec).ledger.world_harm(harm_count) for spec in lineup)
     assert shielded.mean() <= alone.mean()
     assert (shielded <= result.outcome("ppo@shipped+episode").predicted_harm + 1e-9).all()
+
+
+# Of each list of 10,000 (seed 7) the worlds in which a shipped policy, refined, was furthest below an earlier table.
+LOWERED = {
+    "paper-random": (["ppo", "sac"], [400, 1058, 1261, 2987, 4300, 4408, 5872, 5976, 8752]),
+    "paper-random-brake-only": (["ppo"], [1325, 2801, 5278, 5547, 5814, 5984, 7228, 8020, 8166]),
+}
+
+
+@pytest.mark.parametrize("count", HARM_COUNTS)
+@pytest.mark.parametrize("test", list(LOWERED))
+def test_shipped__refined_is_nowhere_below_the_shipped_table(test: str, harm_count: HarmCount) -> None:
+    scenario = load_scenario(test)
+    kinds, numbers = LOWERED[test]
+    every = scenario.sample(10_000, 7)
+    rows = np.array(numbers)
+    sample = replace(every, worlds=every.worlds.take(rows), index=every.index[rows])
+    lineup = make_lineup([f"{kind}@shipped+refined+episode" for kind in kinds], scenario, harm_count=harm_count)
+    found = summarise(evaluate(sample, lineup, scenario=scenario, seed=7))
+    assert [(row.agent, row.distance.known_best_share, row.distance.below_best_known) for row in found] == [
+        (name, 1.0, 0) for name in lineup
+    ]
