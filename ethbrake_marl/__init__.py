@@ -76,9 +76,21 @@ if TYPE_CHECKING:
     from ethbrake_marl.evaluation import Evaluation as Evaluation
     from ethbrake_marl.evaluation import Outcome as Outcome
     from ethbrake_marl.evaluation import SummaryRow as SummaryRow
+    from ethbrake_marl.evaluation import SummaryTable as SummaryTable
     from ethbrake_marl.evaluation import evaluate as evaluate
     from ethbrake_marl.evaluation import record_episode as record_episode
     from ethbrake_marl.evaluation import summarise as summarise
+    from ethbrake_marl.evaluation.compare import compare_results as compare_results
+    from ethbrake_marl.evaluation.compare import read_result as read_result
+
+    # Figures: matplotlib's, which a notebook shows
+    from ethbrake_marl.evaluation.criticality import criticality_map as criticality_map
+    from ethbrake_marl.evaluation.deceleration import deceleration_curve as deceleration_curve
+    from ethbrake_marl.figures.criticality import criticality_figure as criticality_figure
+    from ethbrake_marl.figures.deceleration import deceleration_figure as deceleration_figure
+    from ethbrake_marl.figures.episode import trajectories as trajectories
+    from ethbrake_marl.figures.run import harm_against_total_gap as harm_against_total_gap
+    from ethbrake_marl.figures.style import write_picture as write_picture
 
     # Registration of your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent

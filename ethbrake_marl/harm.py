@@ -17,7 +17,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics.advance import Impacts, no_obstacle_harm
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
@@ -46,6 +46,11 @@ class Ledger:
     obstacle_total_harm: Floats  # [n] likewise
     obstacle_count: Ints  # [n] impacts
     mass_t: Floats  # [n, N]
+
+    def __repr__(self) -> str:
+        return (
+            f"Ledger({count_of(len(self.mass_t), 'world')}, {self.count.sum() + self.obstacle_count.sum():,} impacts)"
+        )
 
     def add(self, impacts: Impacts) -> Ledger:
         """The ledger after a further segment."""

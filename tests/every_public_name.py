@@ -100,5 +100,18 @@ def measure(folder: Path) -> list[eb.SummaryRow]:
     return eb.summarise(found)
 
 
+def show(found: eb.Evaluation, folder: Path) -> list[Any]:
+    rows = eb.summarise(found)
+    assert_type(rows, eb.SummaryTable)
+    record = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=found.scenario)
+    eb.write_picture(folder / "episode.svg", eb.trajectories({"world 0": record}))
+    fixed = eb.load_scenario("paper-distance")
+    cells = eb.criticality_map(fixed, {"cautious": Cautious()}, cells=3)
+    curve = eb.deceleration_curve(found.worlds.take([0]), found.task)
+    eb.compare_results(eb.read_result(folder / "a.json"), eb.read_result(folder / "b.json"))
+    figures = [eb.criticality_figure(cells), eb.deceleration_figure(curve), eb.harm_against_total_gap(found)]
+    return [found.to_frame(), *figures]
+
+
 def version() -> str:
     return eb.__version__

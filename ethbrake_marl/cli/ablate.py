@@ -9,6 +9,7 @@ import typer
 
 from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import JsonOption, ScenarioOption
+from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, show, write_json
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import LIST_SEED, load_runnable
@@ -46,6 +47,7 @@ def ablate_command(
     budget: Annotated[
         int | None, typer.Option(help="Candidates per world and count of that search.", show_default="20000")
     ] = None,
+    settings: SetOption = None,
     quick: Annotated[bool, typer.Option("--quick", help="A first look: few seeds, worlds and decisions.")] = False,
     jobs: Annotated[int, typer.Option(help="Trainings at once; changes no result.")] = 1,
     cost: Annotated[bool, typer.Option("--cost", help="Say what is left to do and what it takes; stop.")] = False,
@@ -68,7 +70,7 @@ def ablate_command(
         names = [*(LADDER if quick else STANDARD)] if levels is None else [each.strip() for each in levels.split(",")]
         if not 1 <= jobs <= 64:
             raise InvalidInput(f"jobs {jobs}: must be from 1 to 64")
-        plan = _plan(names, recipes, scheme, list_seed, output, chosen)
+        plan = _plan(names, recipes, scheme, settings, list_seed, output, chosen)
         if not cost:
             check_settings(plan)
         check_finished(plan.trainings())
@@ -92,6 +94,7 @@ def generalise_command(
     harm_count: Annotated[HarmCount, typer.Option(help="Harm: first impacts only, or all.")] = "total",
     search_episodes: Annotated[int, typer.Option(help="Worlds of the joint optimum; 0: none.")] = 0,
     budget: Annotated[int, typer.Option(help="Candidates per world of that search.")] = 20_000,
+    settings: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Let trained policies drive longer lines with the same weights.
@@ -108,7 +111,7 @@ def generalise_command(
             f"episodes {episodes}, search-episodes {search_episodes}, budget {budget}: must be at least 1, from 0 to"
             " the episodes, and at least 1"
         )
-    line = load_runnable(scenario)
+    line = load_runnable(scenario, read_settings(settings).scenario)
     agents = load_runs([each.strip() for each in runs.split(",")], line)
     question = LineQuestion(line, lengths, episodes, seed, harm_count, search_episodes, budget)
     with interruptible("nothing was written"), progress_bars() as bars:
@@ -130,7 +133,13 @@ def _lengths(text: str) -> tuple[int, ...]:
 
 
 def _plan(
-    names: list[str], recipes: str, scheme: str | None, list_seed: int, output: Path, numbers: dict[str, int]
+    names: list[str],
+    recipes: str,
+    scheme: str | None,
+    settings: list[str] | None,
+    list_seed: int,
+    output: Path,
+    numbers: dict[str, int],
 ) -> Plan:
     from ethbrake_marl.learning.recipe import load_recipe
     from ethbrake_marl.learning.schemes import check_scheme, scheme_of
@@ -144,9 +153,12 @@ def _plan(
     )
 
     chosen = None if scheme is None else check_scheme(scheme)
+    loaded = [load_recipe(each.strip()) for each in recipes.split(",")]
+    given = read_settings(settings, loaded)
     plan = Plan(
-        levels=tuple(read_levels(names)),
-        recipes=tuple(with_scheme(load_recipe(each.strip()), chosen) for each in recipes.split(",")),
+        levels=tuple(read_levels(names, given.scenario)),
+        recipes=tuple(with_scheme(given.change(recipe), chosen) for recipe in loaded),
+        noted=given.texts,
         list_seed=list_seed,
         folder=output,
         **numbers,

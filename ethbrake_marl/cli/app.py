@@ -14,6 +14,7 @@ from typer.exceptions import TyperException
 from ethbrake_marl.cli.ablate import ablate_command, generalise_command
 from ethbrake_marl.cli.bench import bench_command
 from ethbrake_marl.cli.best_harm import best_harm_command
+from ethbrake_marl.cli.compare import compare_command
 from ethbrake_marl.cli.doctor import diagnose
 from ethbrake_marl.cli.equal_time import equal_time_command
 from ethbrake_marl.cli.evaluate import agents_command, evaluate_command, shield_command, show_beside, show_rows
@@ -31,6 +32,8 @@ from ethbrake_marl.cli.options import (
 )
 from ethbrake_marl.cli.parts import CommandWithParts
 from ethbrake_marl.cli.picture import picture_app
+from ethbrake_marl.cli.recipe import recipe_app
+from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import (
     abandon_output,
     interruptible,
@@ -87,6 +90,7 @@ scenario_app = typer.Typer(
     epilog="Example: ethbrake scenario show paper-random",
 )
 app.add_typer(scenario_app, name="scenario")
+app.add_typer(recipe_app, name="recipe")
 app.add_typer(picture_app, name="picture")
 app.command(
     "train",
@@ -104,6 +108,7 @@ app.command(
     "import-legacy", epilog="Example: ethbrake import-legacy old.zip --output old --algorithm sac --i-trust-this-file"
 )(import_legacy_command)
 app.command("best-harm", epilog="Example: ethbrake best-harm --episodes 200 --budget 20000 --json")(best_harm_command)
+app.command("compare", epilog="Example: ethbrake compare before.csv.json after.csv.json")(compare_command)
 app.command("agents", epilog="Example: ethbrake agents")(agents_command)
 app.command("shield", epilog="Example: ethbrake shield --agents ppo@shipped,full_brake --episodes 500")(shield_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
@@ -148,6 +153,7 @@ def run(
     episodes: Annotated[int, typer.Option(help="Worlds of the evaluation list.")] = EPISODES,
     list_seed: Annotated[int, typer.Option(help="Seed of the evaluation list.")] = LIST_SEED,
     recipe: RecipeOption = "ppo",
+    settings: SetOption = None,
     vehicle: VehicleOption = None,
     name: NameOption = None,
     output: OutputOption = None,
@@ -164,7 +170,9 @@ def run(
         # Here and in other commands that learn: torch takes seconds to load, and no other command needs it.
         from ethbrake_marl.studies.experiment import run_experiment, run_folder
 
-        chosen, plan = load_driven(scenario, vehicle), load_recipe(recipe)
+        plan = load_recipe(recipe)
+        given = read_settings(settings, [plan])
+        chosen, plan = load_driven(scenario, vehicle, given.scenario), given.change(plan)
         folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
         with progress_bars() as bars:
             result = run_experiment(
@@ -176,6 +184,7 @@ def run(
                 episodes=episodes,
                 list_seed=list_seed,
                 force=force,
+                settings=given.texts,
                 on_progress=bars.show_progress,
             )
     show_rows(result.rows, as_json)

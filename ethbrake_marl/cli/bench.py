@@ -14,7 +14,6 @@ from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import ForceOption, JsonOption
 from ethbrake_marl.cli.picture import picture_target
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
-from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.studies.speed import BENCHMARKS, FULL, QUICK, WORLD_STEPS, Speed, measure
 
 Measured = TypeVar("Measured")
@@ -26,7 +25,7 @@ def bench_command(
     quick: Annotated[bool, typer.Option("--quick", help="In about 20 s instead of a minute or two; coarser.")] = False,
     scaling: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.png", help="Instead: draw how cost grows with the number of worlds and vehicles."),
+        typer.Option(metavar="FILE", help="Instead: draw how cost grows with the number of worlds and vehicles."),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -51,7 +50,7 @@ def bench_command(
 def _bench_scaling(output: Path, *, quick: bool, force: bool, as_json: bool) -> None:
     target = picture_target(output, force=force)
     # matplotlib takes a second to load, and the table needs none.
-    from ethbrake_marl.figures.style import png_bytes
+    from ethbrake_marl.figures.style import write_picture
     from ethbrake_marl.studies.scaling import (
         EFFORT,
         VEHICLES,
@@ -66,7 +65,7 @@ def _bench_scaling(output: Path, *, quick: bool, force: bool, as_json: bool) -> 
         by_worlds = _watch(costs_by_worlds(effort), 2 * len(WORLDS))
         by_vehicles = _watch(costs_by_vehicles(effort), 2 * len(VEHICLES))
     caption = f"Processor time, one core, medians. {machine}."
-    write_output(target, png_bytes(scaling_figure(by_worlds, by_vehicles, caption)), force=force)
+    write_picture(target, scaling_figure(by_worlds, by_vehicles, caption), force=force)
     costs = [*by_worlds, *by_vehicles]
     if as_json:
         write_json({"machine": asdict(machine), "costs": [asdict(cost) for cost in costs]})

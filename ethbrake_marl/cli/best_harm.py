@@ -13,6 +13,7 @@ import typer
 
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption
+from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, say, show, write_json
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
@@ -57,6 +58,7 @@ def best_harm_command(
     shipped: Annotated[
         bool, typer.Option("--shipped", help="Instead: proven and best known harm of every shipped table, and the gap.")
     ] = False,
+    settings: SetOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -69,7 +71,8 @@ def best_harm_command(
         _show_shipped(as_json=as_json)
         return
     _check_output(output, force=force)
-    chosen = load_runnable(scenario)
+    given = read_settings(settings)
+    chosen = load_runnable(scenario, given.scenario)
     names = None if vehicles is None else [name.strip() for name in vehicles.split(",")]
     controlled = None if names is None else chosen.with_learners(names).learners
     if controlled is None and not chosen.learners:
@@ -85,7 +88,7 @@ def best_harm_command(
         chosen, sample, parts, drivers, counts=counts, vehicles=controlled, budget=budget, seed=search_seed,
         threads=threads, known=known,
     )  # fmt: skip
-    text = _command_text(scenario, episodes, seed, harm_count, names, budget, search_seed, start, specs)
+    text = _command_text(scenario, given.texts, episodes, seed, harm_count, names, budget, search_seed, start, specs)
     table = replace(table, header={**table.header, "episodes": episodes, "list_seed": seed, "command": text})
     if output is not None and parts is not None:
         save_table(output, table)
@@ -156,11 +159,12 @@ def best_harm_figures(table: BestHarmTable) -> dict[str, object]:
 
 
 def _command_text(
-    scenario: str, episodes: int, seed: int, harm_count: HarmCount | None, vehicles: Sequence[str] | None, budget: int,
-    search_seed: int, start: Path | None, agents: Sequence[str],
+    scenario: str, settings: Sequence[str], episodes: int, seed: int, harm_count: HarmCount | None,
+    vehicles: Sequence[str] | None, budget: int, search_seed: int, start: Path | None, agents: Sequence[str],
 ) -> str:  # fmt: skip
     """The command that makes the same table, for its header: every option that changes a result."""
     words = ["ethbrake", "best-harm", "--scenario", scenario, "--episodes", str(episodes), "--seed", str(seed)]
+    words += [word for text in settings for word in ("--set", text)]
     words += [] if harm_count is None else ["--harm-count", harm_count]
     words += [] if vehicles is None else ["--vehicles", ",".join(vehicles)]
     words += ["--budget", str(budget), "--search-seed", str(search_seed)]

@@ -10,6 +10,7 @@ import typer
 
 from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import JsonOption, ScenarioOption
+from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, write_json
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.inputs import check_agents, load_driven, make_lineup
@@ -39,6 +40,7 @@ def equal_time_command(
         HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")
     ] = "first",
     repeats: Annotated[int, typer.Option(help="How often each agent is timed; the median is told.")] = 3,
+    settings: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare agents at equal processor time: harm, and milliseconds per world.
@@ -46,7 +48,7 @@ def equal_time_command(
     The agents are those of evaluate. best_harm:K is a plain search with K candidates at the alert, without a policy;
     planner:K searches anew at every decision.
     """
-    chosen = load_driven(scenario, None)
+    chosen = load_driven(scenario, None, read_settings(settings).scenario)
     worlds = chosen.sample(episodes, seed)
     lineup = make_lineup(agents.split(","), chosen, harm_count=harm_count)
     check_agents(lineup, worlds.worlds, chosen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,7 @@ from ethbrake_marl.agents.knowledge import knowledge_text
 from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, VehicleOption
 from ethbrake_marl.cli.picture import PictureOption, counted_without, picture_app, picture_target, tell_left_out
+from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation import (
@@ -27,8 +29,9 @@ from ethbrake_marl.evaluation import (
     rescored_table,
     rich_table,
     summarise,
-    write_per_world_csv,
 )
+from ethbrake_marl.evaluation.compare import results_to_json
+from ethbrake_marl.evaluation.frame import check_parquet, write_per_world
 from ethbrake_marl.evaluation.inputs import (
     EPISODES,
     LIST_SEED,
@@ -71,8 +74,10 @@ def evaluate_command(
         Path | None, typer.Option(metavar="CSV", help="Your own worlds, one per row, instead of the list.")
     ] = None,
     vehicle: VehicleOption = None,
+    settings: SetOption = None,
     per_world: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Also write one row per world and agent to this file.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Also write one row per world and agent (.csv, .parquet), and FILE.json."),
     ] = None,
     objective: Annotated[
         list[str] | None,
@@ -91,8 +96,10 @@ def evaluate_command(
     PATH is a run or a policy bundle, or shipped.
     """
     if per_world is not None:
-        check_target(per_world, force=force)
-    chosen = load_evaluated(scenario, vehicle)
+        check_parquet(per_world)
+        for file in (per_world, results_beside(per_world)):
+            check_target(file, force=force)
+    chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
     objectives = declared_objectives(objective or (), chosen.vehicles)
     sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
     intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
@@ -107,12 +114,12 @@ def evaluate_command(
             chunk=PROGRESS_EVERY,
             on_progress=lambda agent, done: bars.show(agent, done, sample.worlds.n),
         )
-    if per_world is not None:
-        write_per_world_csv(per_world, evaluation, objectives=objectives, force=force)
-        say(f"every world: {per_world}")
     told = rescore(evaluation, objectives)
     rows = summarise(evaluation)
-    show_rows(rows, as_json, told)
+    if per_world is not None:
+        write_per_world(per_world, evaluation, objectives=objectives, force=force)
+        write_results_beside(per_world, rows, told, force=force)
+    show_rows(rows, as_json, told, per_world=per_world)
     moving = {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
     if note := horizon_note(moving, sample.worlds.n, chosen.horizon_s):
         say(note)
@@ -120,15 +127,26 @@ def evaluate_command(
         result_console().print(rescored_table(told, harm_count))
 
 
-def show_rows(rows: Sequence[SummaryRow], as_json: bool, told: Sequence[Rescored] = ()) -> None:
-    """The rows as a table, or as JSON with what was ``told`` under other objectives."""
+def results_beside(per_world: Path) -> Path:
+    """The results file that stands beside a file with one row per world."""
+    return per_world.with_name(f"{per_world.name}.json")
+
+
+def write_results_beside(per_world: Path, rows: Sequence[SummaryRow], told: Sequence[Rescored], *, force: bool) -> None:
+    """Write the results file of the file with one row per world that has just been written."""
+    content = json.dumps(results_to_json(rows, told=told, per_world=per_world), indent=2, allow_nan=False) + "\n"
+    write_output(results_beside(per_world), content.encode(), force=force)
+    say(f"every world: {per_world}; the results: {results_beside(per_world)}")
+
+
+def show_rows(
+    rows: Sequence[SummaryRow], as_json: bool, told: Sequence[Rescored] = (), *, per_world: Path | None = None
+) -> None:
+    """The rows as a table, or as a results file, see ``results_to_json``."""
     if not as_json:
         result_console().print(rich_table(rows))
         return
-    found = [row.to_json() for row in rows]
-    if told:
-        found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
-    write_json(found)
+    write_json(results_to_json(rows, told=told, per_world=per_world))
 
 
 def show_beside(beside: Mapping[str, Sequence[SummaryRow]]) -> None:
@@ -154,6 +172,7 @@ def shield_command(
     episodes: EpisodesOption = SHIELD_EPISODES,
     harm_count: CountOption = "first",
     vehicle: VehicleOption = None,
+    settings: SetOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare no shield, episode mode and step mode on the same worlds.
@@ -161,7 +180,7 @@ def shield_command(
     Each decision that step mode replaced is simulated again without it: needed (harm would have been higher), harmless
     (the same), costly (lower).
     """
-    chosen = load_driven(scenario, vehicle)
+    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
     rows = measure_modes(agents, chosen, episodes, harm_count)
     if as_json:
         write_json([row.to_json() for row in rows])
@@ -181,22 +200,23 @@ def picture_shield_modes(
     episodes: EpisodesOption = SHIELD_EPISODES,
     harm_count: CountOption = "first",
     vehicle: VehicleOption = None,
+    settings: SetOption = None,
     force: ForceOption = False,
 ) -> None:
     """Harm without a shield and in step mode beside episode mode, as ``ethbrake shield`` measures it."""
     target = picture_target(output, force=force)
     # Here: matplotlib takes a second to load, and most commands draw nothing.
     from ethbrake_marl.figures.shield import shield_modes_figure
-    from ethbrake_marl.figures.style import png_bytes
+    from ethbrake_marl.figures.style import write_picture
 
-    chosen = load_driven(scenario, vehicle)
+    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
     rows = measure_modes(agents, chosen, episodes, harm_count)
     caption = (
         f"{chosen.name}, {count_of(episodes, 'world')} of the list of seed {LIST_SEED}, {harm_count} harm; mean and 95"
         " % interval of the difference, paired by world."
     )
     caption += counted_without(rows[0].left_out)
-    write_output(target, png_bytes(shield_modes_figure(rows, caption=caption)), force=force)
+    write_picture(target, shield_modes_figure(rows, caption=caption), force=force)
     tell_left_out(rows[0].left_out, episodes)
     say(f"picture: {target}")
 

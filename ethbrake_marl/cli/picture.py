@@ -1,4 +1,4 @@
-"""The commands ``ethbrake picture ...``: parse, draw, write a PNG."""
+"""The commands ``ethbrake picture ...``: parse, draw, write the picture."""
 
 from __future__ import annotations
 
@@ -8,20 +8,19 @@ from typing import Annotated
 import typer
 
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, VehicleOption
+from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
-from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.criticality import CELLS, criticality_map
 from ethbrake_marl.evaluation.deceleration import deceleration_curve
 from ethbrake_marl.evaluation.inputs import LIST_SEED, load_driven, make_agents, make_proposers
-from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.text import left_out_line
+from ethbrake_marl.figures import picture_ending
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import LeftOutRows
 from ethbrake_marl.scenario import Task
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
-
-PICTURE_ENDING = ".png"
 
 picture_app = typer.Typer(
     rich_markup_mode=None,
@@ -29,7 +28,9 @@ picture_app = typer.Typer(
     epilog="Example: ethbrake picture criticality --output map.png",
 )
 
-PictureOption = Annotated[Path, typer.Option("--output", metavar="FILE.png", help="The picture to write.")]
+PictureOption = Annotated[
+    Path, typer.Option("--output", metavar="FILE", help="The picture to write: .png, .svg or .pdf.")
+]
 
 
 @picture_app.command(
@@ -46,6 +47,7 @@ def picture_criticality(
         tuple[float, float] | None,
         typer.Option(metavar="LOW HIGH", help="Range of both gaps (m).", show_default="the scenario's"),
     ] = None,
+    settings: SetOption = None,
     force: ForceOption = False,
 ) -> None:
     """Harm of an agent over both gaps, with the boundary of what is avoidable.
@@ -55,9 +57,9 @@ def picture_criticality(
     target = picture_target(output, force=force)
     # Here and below: matplotlib takes a second to load, and most commands draw nothing.
     from ethbrake_marl.figures.criticality import criticality_figure
-    from ethbrake_marl.figures.style import png_bytes
+    from ethbrake_marl.figures.style import write_picture
 
-    chosen = load_driven(scenario, None)
+    chosen = load_driven(scenario, None, read_settings(settings).scenario)
     lineup = make_agents([agent], chosen, harm_count=harm_count)
     with interruptible("nothing was written"), progress_bars() as bars:
         found = criticality_map(
@@ -67,7 +69,7 @@ def picture_criticality(
             gap_range_m=gaps,
             on_progress=lambda name, done, total: bars.show(name, done, total),
         )
-    write_output(target, png_bytes(criticality_figure(found)), force=force)
+    write_picture(target, criticality_figure(found), force=force)
     say(f"picture: {target}")
 
 
@@ -81,18 +83,19 @@ def picture_deceleration(
     world: Annotated[int, typer.Option(help="Number of the world in the list.", min=0)] = 0,
     seed: Annotated[int, typer.Option(help="Seed of the list.")] = LIST_SEED,
     vehicle: VehicleOption = None,
+    settings: SetOption = None,
     force: ForceOption = False,
 ) -> None:
     """Harm of one world against the constant deceleration of one vehicle: predicted, realised, and the best known."""
     target = picture_target(output, force=force)
     from ethbrake_marl.figures.deceleration import deceleration_figure
-    from ethbrake_marl.figures.style import png_bytes
+    from ethbrake_marl.figures.style import write_picture
 
-    chosen = load_driven(scenario, vehicle)
+    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
     sample = chosen.sample(1, seed, first=world)
     curve = deceleration_curve(sample.worlds, Task(chosen, chosen.learners))
     figure = deceleration_figure(curve, title=f"{chosen.name}, world {world} of the list of seed {seed}")
-    write_output(target, png_bytes(figure), force=force)
+    write_picture(target, figure, force=force)
     say(f"picture: {target}")
 
 
@@ -106,15 +109,16 @@ def picture_shield(
     episodes: Annotated[int, typer.Option(help="Worlds of the list.", min=1)] = 500,
     harm_count: Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")] = "first",
     vehicle: VehicleOption = None,
+    settings: SetOption = None,
     force: ForceOption = False,
 ) -> None:
     """How often the step shield intervenes against the harm that remains, from no allowance to any."""
     target = picture_target(output, force=force)
     from ethbrake_marl.figures.shield import operating_figure
-    from ethbrake_marl.figures.style import png_bytes
+    from ethbrake_marl.figures.style import write_picture
     from ethbrake_marl.shield.review import ALLOWANCES, operating_curves
 
-    chosen = load_driven(scenario, vehicle)
+    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
     worlds = chosen.sample(episodes, LIST_SEED).worlds
     lineup = make_proposers(agents.split(","), chosen, harm_count=harm_count)
     with interruptible("nothing was written"), progress_bars() as bars:
@@ -128,7 +132,7 @@ def picture_shield(
     )
     left_out = next(iter(curves.values()))[0].left_out
     figure = operating_figure(list(curves.items()), caption=caption + counted_without(left_out))
-    write_output(target, png_bytes(figure), force=force)
+    write_picture(target, figure, force=force)
     tell_left_out(left_out, episodes)
     say(f"picture: {target}")
 
@@ -148,6 +152,7 @@ def picture_robustness(
     episodes: Annotated[int, typer.Option(help="Worlds of the list.", min=1)] = 200,
     harm_count: Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")] = "first",
     vehicle: VehicleOption = None,
+    settings: SetOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -157,10 +162,10 @@ def picture_robustness(
     """
     target, intervals = picture_target(output, force=force), parse_uncertainty(uncertainty)
     from ethbrake_marl.figures.shield import robustness_figure, robustness_table
-    from ethbrake_marl.figures.style import png_bytes
+    from ethbrake_marl.figures.style import write_picture
     from ethbrake_marl.shield.robustness import robustness
 
-    chosen = load_driven(scenario, vehicle)
+    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
     worlds = chosen.sample(episodes, LIST_SEED).worlds
     (policy,) = make_proposers([agent], chosen, harm_count=harm_count).values()
     with interruptible("nothing was written"), progress_bars() as bars:
@@ -173,7 +178,7 @@ def picture_robustness(
         f" {harm_count} harm. Intervals of width 1: {intervals}."
     )
     caption += counted_without(points[0].left_out)
-    write_output(target, png_bytes(robustness_figure(points, caption=caption)), force=force)
+    write_picture(target, robustness_figure(points, caption=caption), force=force)
     if as_json:
         write_json([point._asdict() for point in points])
     else:
@@ -194,7 +199,6 @@ def tell_left_out(left_out: LeftOutRows, whole: int) -> None:
 
 
 def picture_target(output: Path, *, force: bool) -> Path:
-    """The file to write, checked before any work; only PNG is written."""
-    if output.suffix.lower() != PICTURE_ENDING:
-        raise InvalidInput(f"{output}: pictures are written as PNG; give a name that ends in {PICTURE_ENDING}")
+    """The file to write, checked before any work."""
+    picture_ending(output)
     return check_target(output, force=force)

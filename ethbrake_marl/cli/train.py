@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,6 +19,7 @@ from ethbrake_marl.cli.options import (
     StepsOption,
     TrainingSeedOption,
 )
+from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, write_json
 from ethbrake_marl.errors import AlreadyExists, check_one_learner
 from ethbrake_marl.evaluation.inputs import load_runnable
@@ -40,6 +42,7 @@ def train_command(
     scenario: ScenarioOption = "paper-random",
     recipe: RecipeOption = "ppo",
     scheme: SchemeOption = None,
+    settings: SetOption = None,
     steps: StepsOption = None,
     seed: TrainingSeedOption = None,
     name: NameOption = None,
@@ -58,7 +61,9 @@ def train_command(
         from ethbrake_marl.learning.training import resolve
         from ethbrake_marl.studies.experiment import run_folder
 
-        chosen, plan = load_runnable(scenario), load_recipe(recipe)
+        plan = load_recipe(recipe)
+        given = read_settings(settings, [plan])
+        chosen, plan = load_runnable(scenario, given.scenario), given.change(plan)
         if scheme is not None:
             plan = plan.replace(scheme=check_scheme(scheme))
         training = resolve(plan, chosen)
@@ -73,7 +78,9 @@ def train_command(
                     bars.tell(begun.pop())
                 bars.show_progress(progress)
 
-            result = train(plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell)
+            result = train(
+                plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell, settings=given.texts
+            )
     _show_result(result, as_json)
 
 
@@ -104,6 +111,7 @@ def learning_curves_command(
     recipes: Annotated[
         str, typer.Option(metavar="RECIPE:SEEDS,...", help="Recipes, each with its number of seeds (0, 1, ...).")
     ] = "ppo:5,sac:3",
+    settings: SetOption = None,
     steps: StepsOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -114,7 +122,10 @@ def learning_curves_command(
     with interruptible(KEPT):
         from ethbrake_marl.studies.learning_curves import FIGURE, parse_trainings, train_all, write_curves
 
-        chosen, plan = load_runnable(scenario), parse_trainings(recipes)
+        plan = parse_trainings(recipes)
+        given = read_settings(settings, [trainings.recipe for trainings in plan])
+        chosen = load_runnable(scenario, given.scenario)
+        plan = [replace(trainings, recipe=given.change(trainings.recipe)) for trainings in plan]
         check_one_learner(
             chosen.name, [chosen.vehicle_names[i] for i in chosen.learners], "learning curves need exactly one"
         )
@@ -125,6 +136,7 @@ def learning_curves_command(
                 output,
                 steps=steps,
                 tell=bars.show_progress,
+                settings=given.texts,
             )
         if not finished:
             say(f"interrupted; the same command goes on with what is in {output}")
@@ -172,6 +184,7 @@ def import_legacy_command(
     output: Annotated[Path, typer.Option("--output", metavar="FOLDER", help="The new policy bundle.")],
     scenario: ScenarioOption = "paper-random",
     algorithm: Annotated[Literal["ppo", "sac"], typer.Option(help="Which algorithm saved it.")] = "ppo",
+    settings: SetOption = None,
     trusted: Annotated[
         bool, typer.Option("--i-trust-this-file", help="Reading the file runs the code inside it: I know who wrote it.")
     ] = False,
@@ -184,5 +197,6 @@ def import_legacy_command(
         raise AlreadyExists(f"{output}: is there already; give another name")
     from ethbrake_marl.learning.legacy import import_legacy  # torch takes seconds to load
 
-    save_policy(import_legacy(file, load_runnable(scenario), algorithm=algorithm, trusted=trusted), output)
+    chosen = load_runnable(scenario, read_settings(settings).scenario)
+    save_policy(import_legacy(file, chosen, algorithm=algorithm, trusted=trusted), output)
     say(f"written: {output}; use it as {algorithm}@{output}")

@@ -12,6 +12,7 @@ from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.evaluation.table import (
     Rescored,
     SummaryRow,
+    SummaryTable,
     declared_objectives,
     horizon_note,
     rescore,
@@ -28,6 +29,7 @@ __all__ = [
     "Outcome",
     "Rescored",
     "SummaryRow",
+    "SummaryTable",
     "check_target",
     "declared_objectives",
     "evaluate",

@@ -54,10 +54,17 @@ def criticality_map(
 ) -> CriticalityMap:
     """Let one agent drive a grid of worlds that differ in the first two gaps only.
 
-    The gaps run over the ranges of ``scenario`` (a fixed gap: half to one and a half of it), or over ``gap_range_m``,
-    both; everything else must be a fixed number there. ``on_progress`` is told agent, worlds done, and all. Raises
-    ``InvalidInput`` for what is random, fewer than three vehicles, fewer than 2 cells, more or less than one agent, or
-    a range that is empty or below 0.
+    Args:
+        scenario: of the worlds; everything but the first two gaps must be a fixed number there.
+        agents: exactly one, by its name.
+        cells: worlds along each gap, at least 2.
+        gap_range_m: least and largest value of both gaps; None: the scenario's, and of a fixed gap half to one and a
+            half of it.
+        on_progress: is told agent, worlds done, and all.
+
+    Raises ``InvalidInput`` for what is random, fewer than three vehicles, fewer than 2 cells, more or less than one
+    agent, or a range that is empty or below 0.
+
     """
     if len(agents) != 1:
         raise InvalidInput(f"criticality map: {len(agents)} agents given; exactly one is drawn")

@@ -16,6 +16,7 @@ from ethbrake_marl.agents.rollout import script_agents, set_others
 from ethbrake_marl.agents.spelling import AgentSpec, parse_spec
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.errors import InvalidInput, OldSpelling, check_one_learner, unknown_name
+from ethbrake_marl.files.overrides import Override, changed_parts
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
@@ -41,12 +42,17 @@ _LEARNED = ("ppo", "sac", "universal", "team")  # around whom ``--shield`` puts 
 OLD_SHIELDS = ("none", "episode", "step", "robust")  # of ``--shield``, the old spelling of ``+episode`` and so on
 
 
-def load_runnable(name_or_path: str) -> Scenario:
+def load_runnable(name_or_path: str, settings: Sequence[Override] = ()) -> Scenario:
     """Load a scenario as ``load_scenario`` does, and try its scripts, which the file's own check cannot know.
+
+    ``settings`` are put in the place of what the file says.
 
     Raises ``InvalidInput`` naming the file, line, role and script that no agent of that name and argument can play.
     """
     scenario = load_scenario(name_or_path)
+    if settings:
+        content = {**scenario.model_dump(mode="json", exclude_none=True), **scenario.declared()}
+        scenario = scenario.replace(**changed_parts(content, settings))
     worlds = scenario.replace(early_impacts="keep").sample(1, LIST_SEED).worlds
     for vehicle, script in scenario.scripts.items():
         try:
@@ -59,12 +65,12 @@ def load_runnable(name_or_path: str) -> Scenario:
     return scenario
 
 
-def load_driven(name_or_path: str, vehicle: str | None) -> Scenario:
+def load_driven(name_or_path: str, vehicle: str | None, settings: Sequence[Override] = ()) -> Scenario:
     """A runnable scenario with one learner, the vehicle to drive: ``vehicle``, by default the only learner.
 
     Raises ``InvalidInput`` when there is no such vehicle, or nothing says which one it is.
     """
-    scenario = load_runnable(name_or_path)
+    scenario = load_runnable(name_or_path, settings)
     if vehicle is not None:
         return scenario.with_learners([vehicle])
     learners = [scenario.vehicle_names[i] for i in scenario.learners]
@@ -72,12 +78,12 @@ def load_driven(name_or_path: str, vehicle: str | None) -> Scenario:
     return scenario
 
 
-def load_evaluated(name_or_path: str, vehicle: str | None) -> Scenario:
+def load_evaluated(name_or_path: str, vehicle: str | None, settings: Sequence[Override] = ()) -> Scenario:
     """A runnable scenario whose learners are to be driven: ``vehicle`` alone, by default all learners there are.
 
     Raises ``InvalidInput`` when there is no such vehicle, or no learner.
     """
-    scenario = load_runnable(name_or_path)
+    scenario = load_runnable(name_or_path, settings)
     if vehicle is not None:
         return scenario.with_learners([vehicle])
     if not scenario.learners:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import NamedTuple
+from importlib import import_module
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source
-from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of
+from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl.files.html import html_table
 from ethbrake_marl.harm import HarmCount, Ledger
 from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.scenario.v2x import hidden_from
+
+_SHOWN_AGENTS = 5  # by name, in ``repr``
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +45,27 @@ class Outcome:
     knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
     shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself, see ``travel``
     sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands, see ``sampled_harm``
+    policies: Mapping[int, str] = field(default_factory=dict)  # vehicle (0 = front) -> SHA-256 of its policy's manifest
+
+    def __repr__(self) -> str:
+        return f"Outcome({count_of(len(self.collided), 'world')}, {int(self.collided.sum()):,} collided, {self._means})"
+
+    @property
+    def _means(self) -> str:
+        """Mean harms, for ``repr``; nothing is a mean where there are no worlds."""
+        if not len(self.collided):
+            return "no harm"
+        return f"harm {self.first_impact_harm.mean():.2f} first-impact, {self.total_harm.mean():.2f} total"
 
     def take(self, rows: Ints | Bools) -> Outcome:
         """That of some of the worlds."""
         ledger = Ledger(*(getattr(self.ledger, f.name)[rows] for f in fields(Ledger)))
         names = ("predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")
-        columns = {name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in names}
-        return Outcome(ledger, self.final.take(rows), self.at_rest[rows], knows=self.knows, **columns)
+        columns: dict[str, Any] = {
+            name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in names
+        }
+        columns |= {"knows": self.knows, "policies": self.policies}
+        return Outcome(ledger, self.final.take(rows), self.at_rest[rows], **columns)
 
     @property
     def collided(self) -> Bools:
@@ -115,6 +135,16 @@ class Evaluation:
     outcomes: dict[str, Outcome]  # by the agent's name
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
 
+    def __repr__(self) -> str:
+        drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
+        more = len(self.outcomes) - len(drivers)
+        drivers += [f"{more} more"] if more else []
+        seed = "" if self.seed is None else f" of seed {self.seed}"
+        return (
+            f"Evaluation({self.scenario.name!r}, {count_of(self.worlds.n, 'world')}{seed}, {self.task.names:.80} driven"
+            f" by {', '.join(drivers)})"
+        )
+
     @property
     def vehicle(self) -> int:
         """The vehicle that was driven; raises ``InvalidInput`` if it is not exactly one."""
@@ -137,6 +167,27 @@ class Evaluation:
         for vehicle in self.vehicles:
             hidden |= hidden_from(self.worlds.vehicles, vehicle)
         return hidden
+
+    def to_frame(self, library: str | None = None) -> Any:
+        """One row per agent and world: the columns of ``--per-world`` (docs/evaluation.md), NaN for no number.
+
+        A pandas ``DataFrame`` where pandas is installed, else one of polars, else a mapping of column names to arrays.
+        ``library`` asks for one of them: ``pandas``, ``polars`` or ``columns``. Raises ``UnknownName`` for another, and
+        ``InvalidInput`` for one that is not installed.
+        """
+        # by name, as an entry point: the columns are made above this file, from what it defines
+        return import_module(f"{__package__}.frame").make_frame(self, library)
+
+    def _repr_html_(self) -> str:
+        """What each agent did, for a notebook."""
+        harms = {"First-impact harm": "first_impact_harm", "Total harm": "total_harm"}
+        rows = []
+        for agent, outcome in self.outcomes.items():
+            collided = rate(int(outcome.collided.sum()), self.worlds.n)
+            means = [mean(getattr(outcome, name)).in_words() for name in harms.values()]
+            rows.append((agent, collided.in_words(digits=1, scale=100.0, unit=" %"), *means))
+        note = "Means per world in m²/s², with their 95 % intervals. eb.summarise tells more."
+        return html_table(("Agent", "Collisions", *harms), rows, caption=repr(self), note=note)
 
     def complete(self) -> Evaluation:
         """The evaluation itself, for who needs every world; raises ``PhysicsError`` if some were left out."""

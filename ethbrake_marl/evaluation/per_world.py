@@ -1,4 +1,4 @@
-"""The CSV file with one row per agent and world, written whole or not at all, and never over another by accident."""
+"""One row per agent and world: its columns, and its file, written whole and never over another by accident."""
 
 from __future__ import annotations
 
@@ -86,19 +86,26 @@ def write_per_world_csv(
     check_target(path, force=force)
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
+    columns = per_world_columns(evaluation, objectives)
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    write_output(path, text.getvalue().encode(), force=force)
+
+
+def per_world_columns(evaluation: Evaluation, objectives: Sequence[Declared] = ()) -> Columns:
+    """The columns of ``write_per_world_csv``, agent by agent, then world by world; None where there is no value."""
+    found: Columns = {}
     initial, regrets = initial_columns(evaluation), assess(evaluation)
     hidden: Columns = {"hidden": evaluation.hidden.astype(int).tolist()}
-    for number, (agent, outcome) in enumerate(evaluation.outcomes.items()):
+    for agent, outcome in evaluation.outcomes.items():
         columns = {"agent": [agent] * evaluation.worlds.n, **initial, **outcome_columns(outcome)}
         columns |= regret_columns(outcome, regrets) | objective_columns(outcome, objectives)
         columns |= {"knows": [knowledge_text(outcome.knows)] * evaluation.worlds.n, **hidden}
-        if number == 0:
-            writer.writerow(columns)
-        writer.writerows(zip(*columns.values(), strict=True))
         for left in evaluation.left_out:
             told = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
-            writer.writerow([told.get(name, "") for name in columns])
-    write_output(path, text.getvalue().encode(), force=force)
+            columns = {name: [*values, told.get(name)] for name, values in columns.items()}
+        found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
+    return found
 
 
 def initial_columns(evaluation: Evaluation) -> Columns:
@@ -117,7 +124,7 @@ def initial_columns(evaluation: Evaluation) -> Columns:
 def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
     """What was avoidable and the best known in each world; empty where nothing is proven."""
     if regrets is None:
-        return {name: [""] * len(outcome.collided) for name in REGRET_COLUMNS}
+        return {name: [None] * len(outcome.collided) for name in REGRET_COLUMNS}
     n, proof = len(outcome.collided), regrets.limits.proof
     columns = (
         proof.avoidable.astype(int),
@@ -125,8 +132,8 @@ def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
         regrets.first_impact_harm,
         regrets.total_harm,
         regrets.source,
-        np.full(n, "") if proof.impact is None else proof.impact.astype(int),
-        np.full(n, "") if proof.harm is None else proof.harm,
+        np.full(n, None) if proof.impact is None else proof.impact.astype(int),
+        np.full(n, None) if proof.harm is None else proof.harm,
         regrets.regret(outcome, "first"),
         regrets.regret(outcome, "total"),
     )
@@ -155,7 +162,7 @@ def outcome_columns(outcome: Outcome) -> Columns:
         columns |= {f"{name}_{i + 1}": harm[:, i].tolist() for i in range(harm.shape[1])}
     columns |= {"first_impact_harm": outcome.first_impact_harm.tolist(), "total_harm": outcome.total_harm.tolist()}
     for name, column in (("sampled_harm", outcome.sampled_harm), ("vehicle_1_shoved_m", outcome.shoved_m)):
-        columns[name] = [""] * n if column is None else column.tolist()
+        columns[name] = [None] * n if column is None else column.tolist()
     final = outcome.final
     if np.isfinite(final.obstacle_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
         columns |= {"obstacle_first_impact_harm": outcome.ledger.obstacle_harm("first").tolist()}
@@ -165,6 +172,6 @@ def outcome_columns(outcome: Outcome) -> Columns:
     columns |= {f"final_speed_{i + 1}_mps": final.speeds_mps[:, i].tolist() for i in range(final.N)}
     columns |= {"end_s": final.time_s.tolist(), "ended": outcome.ended.tolist()}
     predicted, chosen = outcome.predicted_harm, outcome.chosen_policy
-    columns["predicted_harm"] = [""] * n if predicted is None else predicted.tolist()
-    columns["chosen_policy"] = [""] * n if chosen is None else chosen.astype(int).tolist()
+    columns["predicted_harm"] = [None] * n if predicted is None else predicted.tolist()
+    columns["chosen_policy"] = [None] * n if chosen is None else chosen.astype(int).tolist()
     return columns

@@ -18,7 +18,7 @@ from ethbrake_marl.agents.rollout import episode_engine
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of
 from ethbrake_marl.evaluation.aftermath import with_post_ahead
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
-from ethbrake_marl.harm import Ledger
+from ethbrake_marl.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
 from ethbrake_marl.scenario import Scenario
 
@@ -52,6 +52,14 @@ class EpisodeRecord:
     impacts: ImpactRows  # in order of time; world is 0
     ledger: Ledger  # n = 1
     at_rest: bool  # the line came to rest; else the horizon cut the episode off
+
+    def __repr__(self) -> str:
+        first, total = (float(self.ledger.world_harm(harm_count)[0]) for harm_count in HARM_COUNTS)
+        return (
+            f"EpisodeRecord({self.agent!r:.60} on {self.scenario.name!r}, {len(self.time_s)} samples to"
+            f" {self.time_s[-1]:g} s, {count_of(len(self.impacts.time_s), 'impact')}, harm {first:.2f} first-impact,"
+            f" {total:.2f} total)"
+        )
 
 
 def record_episode(

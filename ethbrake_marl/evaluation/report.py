@@ -14,7 +14,7 @@ from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.table import SummaryRow
-from ethbrake_marl.evaluation.text import knowledge_lines, left_out_lines, limit_lines
+from ethbrake_marl.evaluation.text import identity_lines, knowledge_lines, left_out_lines, limit_lines
 
 _TEMPLATE = "report.html.j2"
 
@@ -49,7 +49,9 @@ class ReportTest:
     @property
     def conditions(self) -> list[str]:
         """Conditions and limits, as sentences."""
-        return [f"{parameter_line(self.rows[0].parameters)}.", *limit_lines(self.rows)] if self.rows else []
+        if not self.rows:
+            return []
+        return [f"{parameter_line(self.rows[0].parameters)}.", *limit_lines(self.rows), *identity_lines(self.rows)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +85,7 @@ def render_report(report: Report) -> str:
         conditions=parameter_line(report.rows[0].parameters) if report.rows else "",
         left_out=left_out_lines(report.rows),
         limits=limit_lines(report.rows),
+        identity=identity_lines(report.rows),
         knowledge=knowledge_lines(report.rows),
         paper=blocks,
         paper_conditions={name: PAPER_PARAMETERS[name] for name, _ in blocks},

@@ -19,6 +19,7 @@ from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.engine.stream import check_alert
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_one_learner, check_whole_number, unknown_name
 from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
+from ethbrake_marl.evaluation.identity import policy_sha256
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Ints, Worlds, concatenate, leaving_out_failed
@@ -192,6 +193,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
         knowledge_of(team),
         None if shoved is None else shoved.metres,
         None if sampled is None else sampled.finish(),
+        {vehicle: sha for vehicle, agent in team.drivers.items() if (sha := policy_sha256(agent)) is not None},
     )
 
 
@@ -225,4 +227,5 @@ def _join(parts: list[Outcome]) -> Outcome:
         parts[0].knows,
         column("shoved_m"),
         column("sampled_harm"),
+        parts[0].policies,
     )

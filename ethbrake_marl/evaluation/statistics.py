@@ -28,6 +28,14 @@ class Estimate:
     value: float
     interval: tuple[float, float] | None
 
+    def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
+        """``24.19 [23.85, 24.53]``: value and interval, each times ``scale``."""
+        value = f"{scale * self.value:.{digits}f}{unit}"
+        if self.interval is None:
+            return value
+        low, high = (f"{scale * end:.{digits}f}" for end in self.interval)
+        return f"{value} [{low}, {high}]"
+
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON: ``value``, and ``interval`` as ``[low, high]`` or null."""
         return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
@@ -76,6 +84,27 @@ def paired_difference(values: Floats, baseline: Floats, *, confidence: float = C
     """Mean of ``values - baseline`` world by world, with the t interval of that mean."""
     data, reference = _check_pair(values, baseline)
     return mean(data - reference, confidence=confidence)
+
+
+def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
+    """``value - baseline`` of two means over n and m worlds that are taken as independent, from their t intervals.
+
+    With half-widths ``h = t_(n-1) s``, Welch: ``s^2 = s_1^2 + s_2^2``, and degrees of freedom
+    ``s^4 / (s_1^4 / (n - 1) + s_2^4 / (m - 1))``. No interval where one of the two has none.
+    """
+    difference = value.value - baseline.value
+    if value.interval is None or baseline.interval is None:
+        return Estimate(difference, None)
+    shares = [
+        (0.5 * (high - low) / float(stdtrit(size - 1, 0.5 + 0.5 * CONFIDENCE))) ** 2
+        for (low, high), size in ((value.interval, n), (baseline.interval, m))
+    ]
+    variance = sum(shares)
+    if variance == 0.0:
+        return Estimate(difference, (difference, difference))
+    freedom = variance**2 / (shares[0] ** 2 / (n - 1) + shares[1] ** 2 / (m - 1))
+    half = float(stdtrit(freedom, 0.5 + 0.5 * CONFIDENCE)) * math.sqrt(variance)
+    return Estimate(difference, (difference - half, difference + half))
 
 
 def relative_decrease(values: Floats, baseline: Floats, *, confidence: float = CONFIDENCE) -> Estimate | None:

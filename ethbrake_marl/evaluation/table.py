@@ -11,8 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_text, sees_through
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.conditions import parameters
+from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.evaluation.paper import is_papers_test
 from ethbrake_marl.evaluation.regret import Distance, assess, distance
@@ -24,6 +25,7 @@ from ethbrake_marl.evaluation.statistics import (
     rate,
     relative_decrease,
 )
+from ethbrake_marl.files.html import html_table
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.objectives import Declared, objectives_of, scored, standard_objectives
 
@@ -124,6 +126,10 @@ class SummaryRow:
     beside_paper: bool = False  # these are results of the test that the paper's rows are about
     knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
     hidden_share: float = 0.0  # worlds in which the channel hides something from a driven vehicle, whoever drives
+    worlds_sha256: str = ""  # of the list; results on the same worlds have the same
+    scenario_sha256: str = ""  # of all that shapes an episode
+    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> its policy's, where one drives
+    versions: Mapping[str, str] = field(default_factory=dict)  # of what computed it
 
     @property
     def sees_through(self) -> bool:
@@ -144,6 +150,10 @@ class SummaryRow:
             **({"policy_share": self.policy_share} if self.policy_share is not None else {}),
             **self._distance_to_json(),
             "left_out": [left._asdict() for left in self.left_out],
+            "worlds_sha256": self.worlds_sha256,
+            "scenario_sha256": self.scenario_sha256,
+            "policy_sha256": dict(self.policy_sha256),
+            "versions": dict(self.versions),
             "parameters": self.parameters,
         }
 
@@ -172,14 +182,54 @@ class SummaryRow:
         }
 
 
-def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> list[SummaryRow]:
+class SummaryTable(list[SummaryRow]):
+    """The rows of ``summarise``: a list that a notebook shows as a table.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> agents = {"full_brake": eb.make_agent("full_brake")}
+    >>> rows = eb.summarise(eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario))
+    >>> isinstance(rows, eb.SummaryTable), len(rows)
+    (True, 1)
+
+    """
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for row in self:
+            harms = (row.first_impact_harm, row.total_harm, row.distance.regret_first)
+            shares = (row.collision_rate, row.first_decrease, row.distance.realised_first)
+            cells = [NO_VALUE if each is None else each.in_words() for each in harms]
+            rates = [NO_VALUE if each is None else each.in_words(digits=1, scale=100.0, unit=" %") for each in shares]
+            rows.append((row.agent, knowledge_text(row.knows), *rates[:1], *cells, *rates[1:]))
+        note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
+        worlds = f"{self[0].parameters['scenario']}, {count_of(self[0].episodes, 'world')}" if self else "no agent"
+        return html_table(_HEAD, rows, caption=worlds, note=note)
+
+
+NO_VALUE = "–"
+_HEAD = (
+    "Agent",
+    "Knows",
+    "Collisions",
+    "First-impact harm",
+    "Total harm",
+    "Regret, first",
+    "Decrease, first",
+    "Realised share, first",
+)
+
+
+def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
     """One row per agent, in the order of the evaluation; compared with ``baseline`` where that was evaluated."""
     conditions = parameters(evaluation)
     reference = evaluation.outcomes.get(baseline)
     beside, regrets, braking = is_papers_test(evaluation), assess(evaluation), evaluation.outcomes.get(BASELINE)
     hidden = float(evaluation.hidden.mean())
+    worlds, scenario = worlds_sha256(evaluation.worlds, evaluation.index), scenario_sha256(evaluation.scenario)
+    names, versions = evaluation.scenario.vehicle_names, result_versions()
     rows = [_row(agent, outcome, reference, conditions) for agent, outcome in evaluation.outcomes.items()]
-    return [
+    return SummaryTable(
         replace(
             row,
             beside_paper=beside,
@@ -187,9 +237,13 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> list[Summa
             distance=distance(regrets, evaluation.outcome(row.agent), braking),
             knows=evaluation.outcome(row.agent).knows,
             hidden_share=hidden,
+            worlds_sha256=worlds,
+            scenario_sha256=scenario,
+            policy_sha256={names[i]: sha for i, sha in evaluation.outcome(row.agent).policies.items()},
+            versions=versions,
         )
         for row in rows
-    ]
+    )
 
 
 def horizon_note(moving: Mapping[str, int], worlds: int, horizon_s: float) -> str:

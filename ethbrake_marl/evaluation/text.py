@@ -184,6 +184,15 @@ def _share(part: float, whole: float) -> str:
     return f"{100 * part / whole:.1f} %" if whole > 0.0 else NONE
 
 
+def identity_lines(rows: Sequence[SummaryRow]) -> list[str]:
+    """By which hashes this result is recognised, as a sentence; none without rows."""
+    if not rows:
+        return []
+    policies = [f"{row.agent} ({', '.join(row.policy_sha256.values())})" for row in rows if row.policy_sha256]
+    text = f"SHA-256 of the worlds {rows[0].worlds_sha256}, of the scenario {rows[0].scenario_sha256}"
+    return [f"{text}{', of policies: ' + '; '.join(policies) if policies else ''}."]
+
+
 def knowledge_lines(rows: Sequence[SummaryRow]) -> list[str]:
     """Who sees through the channel, and who does not say, as sentences; none where the channel hides nothing."""
     hidden = rows[0].hidden_share if rows else 0.0

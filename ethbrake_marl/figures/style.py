@@ -1,13 +1,17 @@
-"""The style of every figure: sizes, colours that colour-blind readers tell apart, captions, PNG."""
+"""The style of every figure: sizes, colours that colour-blind readers tell apart, captions, and its file."""
 
 from __future__ import annotations
 
 import io
 import textwrap
+from pathlib import Path
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Figure  # the type that every figure has, for modules outside this folder
+
+from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.figures import picture_ending
 
 # Okabe and Ito's palette without its yellow (invisible on white); markers and dashes repeat the distinction.
 COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -17,6 +21,18 @@ GREY = "#555555"
 DPI = 150
 
 _CHARACTERS_PER_INCH = 17.0  # of a caption
+_NO_DATES: dict[str, dict[str, None]] = {  # what would differ from one writing to the next, and from one version too
+    ".png": {"Software": None},
+    ".svg": {"Date": None, "Creator": None},
+    ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
+
+
+class ShownFigure(Figure):
+    """A figure that a notebook shows, whether or not pyplot is loaded there."""
+
+    def _repr_png_(self) -> bytes:
+        return picture_bytes(self, "shown.png")
 
 
 def series_style(number: int) -> dict[str, object]:
@@ -27,7 +43,7 @@ def series_style(number: int) -> dict[str, object]:
 
 def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure that lays itself out; it belongs to no window."""
-    return Figure(figsize=(width_in, height_in), layout="constrained")
+    return ShownFigure(figsize=(width_in, height_in), layout="constrained")
 
 
 def style_axes(axes: Axes) -> None:
@@ -44,9 +60,22 @@ def add_caption(figure: Figure, text: str) -> None:
     figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=7.5, color=GREY)
 
 
-def png_bytes(figure: Figure) -> bytes:
-    """The figure as PNG; the same figure gives the same bytes."""
+def picture_bytes(figure: Figure, path: str | Path) -> bytes:
+    """The figure as the ending of ``path`` says: ``.png``, ``.svg`` or ``.pdf``; the same figure gives the same bytes.
+
+    Raises ``InvalidInput`` for another ending.
+    """
+    ending = picture_ending(path)
     buffer = io.BytesIO()
-    with matplotlib.rc_context({"savefig.facecolor": "white"}):
-        figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    with matplotlib.rc_context({"savefig.facecolor": "white", "svg.hashsalt": "ethbrake"}):
+        figure.savefig(buffer, format=ending[1:], dpi=DPI, metadata=_NO_DATES[ending])
     return buffer.getvalue()
+
+
+def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
+    """Write a figure as the ending of ``path`` says, whole or not at all.
+
+    Raises ``InvalidInput`` for an ending other than ``.png``, ``.svg`` and ``.pdf`` or a file that cannot be written,
+    ``AlreadyExists`` unless ``force``.
+    """
+    write_output(path, picture_bytes(figure, path), force=force)

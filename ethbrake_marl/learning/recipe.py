@@ -179,13 +179,18 @@ def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
 
     Raises ``UnknownName`` with a suggestion, or ``InvalidInput`` with file, line, key, value and what would be right.
     """
+    return _checked(read_yaml(recipe_path(name_or_path)))
+
+
+def recipe_path(name_or_path: str | Path) -> Path:
+    """The file of a recipe, a shipped name or any path; it need not exist. Raises ``UnknownName`` with a suggestion."""
     text = str(name_or_path)
     if Path(text).suffix in (".yaml", ".yml") or "/" in text or "\\" in text:
-        return _checked(read_yaml(text))
+        return Path(text)
     shipped = shipped_recipes()
     if text not in shipped:
         raise unknown_name("recipe", text, shipped)
-    return _checked(read_yaml(shipped[text]))
+    return shipped[text]
 
 
 def shipped_recipes() -> dict[str, Path]:

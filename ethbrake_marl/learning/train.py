@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,6 +85,7 @@ def train(
     seed: int | None = None,
     steps: int | None = None,
     force: bool = False,
+    settings: Sequence[str] = (),
     measure: Measure | None = measure_on_list,
     on_progress: OnProgress | None = None,
 ) -> TrainResult:
@@ -104,6 +105,7 @@ def train(
         seed: overrides the recipe's.
         steps: overrides the recipe's decisions of learners; training ends after the first update at or beyond them.
         force: replace an earlier run.
+        settings: by which recipe and scenario differ from their files, ``KEY=VALUE`` each: noted in ``config.json``.
         measure: makes of the training what measures its policies before the first update, then as the recipe says, and
             at the end: by default on the recipe's fixed list. None: nothing is measured.
         on_progress: is told how far the training is.
@@ -117,7 +119,8 @@ def train(
 
     def begin() -> tuple[RunDirectory, None]:
         team = team_content(training.scheme, training.scenario)
-        return create_run(Path(directory), training.config(), team=team, force=force), None
+        config = {**training.config(), **({"settings": list(settings)} if settings else {})}
+        return create_run(Path(directory), config, team=team, force=force), None
 
     return _run(begin, training, measure, on_progress)
 

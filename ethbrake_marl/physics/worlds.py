@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, count_of
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -44,6 +44,10 @@ class Vehicles:
     # [n, N, N] from when on vehicle i acts on news of vehicle j; infinite: never. Never before latency_s of vehicle i,
     # and of itself (i is j) exactly from then on. Without a channel both of these share the memory of ``latency_s``
     known_from_s: Floats
+
+    def __repr__(self) -> str:
+        n, N = self.mass_t.shape
+        return f"Vehicles({count_of(n, 'world')} of {N}, masses {_span(self.mass_t)} t)"
 
     def take(self, rows: ArrayLike) -> Vehicles:
         """Select worlds by index or mask (always a copy)."""
@@ -78,6 +82,10 @@ class Worlds:
     obstacle_gap_m: Floats  # [n] from Vehicle 1's front to an unmovable obstacle ahead, >= 0; infinite: there is none
     obstacle_hit: Bools  # [n] Vehicle 1 has had an impact with it
 
+    def __repr__(self) -> str:
+        found = f"gaps {_span(self.gaps_m)} m, speeds {_span(self.speeds_mps)} m/s, at {_span(self.time_s)} s"
+        return f"Worlds({count_of(self.n, 'world')} of {self.N} vehicles: {found})"
+
     @property
     def n(self) -> int:
         """Number of worlds."""
@@ -95,6 +103,14 @@ class Worlds:
             self.vehicles.take(index),
             *(np.ascontiguousarray(getattr(self, f.name)[index]) for f in fields(self)[1:]),
         )
+
+
+def _span(values: Floats) -> str:
+    """The least and the largest of the values, or the one that all have; ``none`` where there are none."""
+    if not values.size:
+        return "none"
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
 
 
 def vehicles_at_once(

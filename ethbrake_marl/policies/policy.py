@@ -48,8 +48,15 @@ class Policy:
     """
 
     manifest: Manifest
-    tensors: Mapping[str, Float32s] = field(repr=False)
-    _actor: Actor = field(init=False, repr=False, compare=False)
+    tensors: Mapping[str, Float32s]
+    _actor: Actor = field(init=False, compare=False)
+
+    def __repr__(self) -> str:
+        told, scenario = self.manifest, self.manifest.scenario.get("name")
+        return (
+            f"Policy({told.algorithm!r}, {self.observation.size} observations, {told.steps:,} steps on"
+            f" {scenario!r:.66}, sha256 {told.manifest_sha256[:12]})"
+        )
 
     def __post_init__(self) -> None:
         """Build the forward pass."""

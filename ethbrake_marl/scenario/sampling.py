@@ -114,6 +114,10 @@ class Sample:
     index: Ints  # [n] number of each world in the list of its seed
     rejected: int  # draws refused because of an early impact
 
+    def __repr__(self) -> str:
+        numbers = f"numbers {self.index.min()} to {self.index.max()}" if len(self.index) else "no numbers"
+        return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
+
 
 def uniform_numbers(
     seed: int, channel: Channel, attempt: int, first: int, n: int, width: int, *, of: tuple[int, ...] = ()

@@ -11,8 +11,9 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core.core_schema import NullableSchema, ValidationInfo, WithDefaultSchema
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.files.html import html_table
 from ethbrake_marl.files.messages import explain
-from ethbrake_marl.files.yaml import Document
+from ethbrake_marl.files.yaml import Document, flow_text
 from ethbrake_marl.scenario.checks import (
     check_alternatives,
     check_entries,
@@ -99,6 +100,12 @@ class Scenario(ScenarioFields):
         check_alternatives(self)
         check_whole(self)
         return self
+
+    def _repr_html_(self) -> str:
+        """What it declares, for a notebook."""
+        told = {key: value for key, value in self.declared().items() if key not in ("name", "title")}
+        rows = [(key, value if isinstance(value, str) else flow_text(value)) for key, value in told.items()]
+        return html_table(("Key", "Value"), rows, caption=f"Scenario {self.name}: {self.title or 'no title'}")
 
     def bounds(self, field: str) -> tuple[tuple[float, float], ...]:
         """Smallest and largest value of each entry of ``gaps_m``, ``speeds_mps``, ..., however it is declared."""

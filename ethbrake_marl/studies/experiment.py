@@ -84,13 +84,15 @@ def run_experiment(
     episodes: int = EPISODES,
     list_seed: int = LIST_SEED,
     force: bool = False,
+    settings: Sequence[str] = (),
     on_progress: OnProgress | None = None,
 ) -> ExperimentResult:
     """Train a policy on ``scenario``, evaluate it, its hybrid and the baselines on a fixed list, write everything.
 
     On one of the three tests the policy also drives the other two, which it was not trained for.
 
-    ``seed`` is the training's; the list is ``episodes`` worlds of ``list_seed``. Ctrl-C during the training ends it
+    ``seed`` is the training's; the list is ``episodes`` worlds of ``list_seed``; ``settings`` are noted.
+    Ctrl-C during the training ends it
     after the update in progress, and the policy so far is evaluated; a second one, or one during the evaluation,
     raises ``KeyboardInterrupt``, and the folder keeps the policy. ``run.json`` always says which. Raises what
     ``train`` and ``evaluate`` raise, ``AlreadyExists`` for an existing run before any work.
@@ -106,6 +108,7 @@ def run_experiment(
         steps=steps,
         seed=seed,
         force=force,
+        settings=settings,
         on_progress=on_progress,
     )
     run = RunDirectory(trained.directory)
@@ -124,7 +127,7 @@ def run_experiment(
 
 def _beside(policy: Policy, scenario: Scenario, episodes: int, list_seed: int) -> dict[str, list[SummaryRow]]:
     """The same policy, trained on ``scenario`` alone, on the other two of the three tests, beside two baselines."""
-    found = {}
+    found: dict[str, list[SummaryRow]] = {}
     for other in other_tests(scenario):
         agents = _agents(policy, other, BESIDE)
         evaluation = evaluate(other.sample(episodes, list_seed), agents, scenario=other, seed=list_seed)
@@ -187,12 +190,13 @@ def _show(
     figures = write_figures(
         run.path, evaluation, rows, course=trained.evaluations, course_caption=caption, agents=agents
     )
-    settings = {
+    told = {
         "Training": f"{config['recipe']['title'] or config['recipe']['name']}: {trained.steps:,} steps"
         f" of {config['recipe']['total_steps']:,} ({trained.status}), {trained.wall_s:.0f} s",
         "Seeds": f"training {config['seeds']['training']}, evaluation list {evaluation.seed}",
         "Reward": _reward(config["recipe"]["reward"]),
         "Whole run": f"{wall_s:.0f} s",
+        **({"Settings": ", ".join(config["settings"])} if "settings" in config else {}),
     }
     manifest = trained.policy.manifest
     which = f"{manifest.algorithm.upper()} after {manifest.steps:,} steps (least harm on its own list)"
@@ -202,7 +206,7 @@ def _show(
     if trained.status == "interrupted":
         summary += " The training was interrupted; this is the policy it had by then."
     return write_page(
-        run.path, rows, figures, beside=beside, summary=summary, settings=settings, versions=installed_versions()
+        run.path, rows, figures, beside=beside, summary=summary, settings=told, versions=installed_versions()
     )
 
 

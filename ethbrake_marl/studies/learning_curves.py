@@ -16,7 +16,7 @@ from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
 from ethbrake_marl.figures.curves import SeedCurve, at_common_steps, seed_curves
-from ethbrake_marl.figures.style import png_bytes
+from ethbrake_marl.figures.style import write_picture
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
@@ -63,6 +63,7 @@ def train_all(
     folder: Path,
     *,
     steps: int | None = None,
+    settings: Sequence[str] = (),
     tell: OnProgress | None = None,
 ) -> bool:
     """Train every seed of every recipe into ``folder/RECIPE-seedK``: finished ones are kept, begun ones go on.
@@ -81,7 +82,7 @@ def train_all(
         if RunDirectory(path).status.is_file():
             check_same(path, training)
     return all(
-        _train_one(training, path, None if tell is None else partial(_tell_named, tell, path.name))
+        _train_one(training, path, settings, None if tell is None else partial(_tell_named, tell, path.name))
         for path, training in wanted.items()
     )
 
@@ -111,17 +112,17 @@ def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) ->
     caption = f"{scenario.name}: mean over seeds, bands: one standard deviation. {_conditions(plan)}"
     panels = {_LABELS[metric]: lines for metric, lines in curves.items()}
     figure = seed_curves(panels, logarithmic=[_LABELS[metric] for metric in metrics], caption=caption)
-    write_output(folder / FIGURE, png_bytes(figure), force=True)
+    write_picture(folder / FIGURE, figure, force=True)
     write_output(folder / TABLE, _csv(curves).encode(), force=True)
     write_output(folder / SUMMARY, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode(), force=True)
     return summary
 
 
-def _train_one(training: Training, path: Path, tell: OnProgress | None) -> bool:
+def _train_one(training: Training, path: Path, settings: Sequence[str], tell: OnProgress | None) -> bool:
     """Whether it is finished now."""
     run = RunDirectory(path)
     if not run.status.is_file():
-        return train(training.recipe, training.scenario, path, on_progress=tell).status == "finished"
+        return train(training.recipe, training.scenario, path, settings=settings, on_progress=tell).status == "finished"
     if read_object(run.status).get("status") == "finished":
         return True
     return resume(path, on_progress=tell).status == "finished"

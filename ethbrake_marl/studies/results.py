@@ -13,13 +13,14 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, record_episode, write_per_world_csv
+from ethbrake_marl.evaluation.compare import results_to_json
 from ethbrake_marl.evaluation.paper import MAIN_TEST, TESTS
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.report import Report, ReportFigure, ReportTest, write_report
 from ethbrake_marl.evaluation.table import BASELINE
 from ethbrake_marl.figures.episode import trajectories
 from ethbrake_marl.figures.run import harm_against_total_gap, learning_curve
-from ethbrake_marl.figures.style import png_bytes
+from ethbrake_marl.figures.style import picture_bytes
 from ethbrake_marl.learning.registry import algorithm_names
 
 REFERENCES = ("full_brake", "e_v2x_bm")  # level lines beside the learning curve
@@ -32,17 +33,18 @@ TRAJECTORIES = "trajectories.png"
 
 def write_results(folder: Path, evaluation: Evaluation, rows: Sequence[SummaryRow]) -> None:
     """Write ``results.json`` (the rows), ``results.csv`` (the same, flat) and ``per_world.csv``."""
-    content = json.dumps([row.to_json() for row in rows], indent=2, allow_nan=False) + "\n"
+    per_world = folder / "per_world.csv"
+    write_per_world_csv(per_world, evaluation, force=True)
+    content = json.dumps(results_to_json(rows, per_world=per_world), indent=2, allow_nan=False) + "\n"
     write_output(folder / "results.json", content.encode(), force=True)
     write_output(folder / "results.csv", results_csv(rows).encode(), force=True)
-    write_per_world_csv(folder / "per_world.csv", evaluation, force=True)
 
 
 def write_beside(folder: Path, beside: Mapping[str, Sequence[SummaryRow]]) -> None:
     """Write ``other_tests.json`` and ``other_tests.csv``: the rows of the other tests; nothing where there are none."""
     rows = [row for rows in beside.values() for row in rows]
     if rows:
-        content = json.dumps([row.to_json() for row in rows], indent=2, allow_nan=False) + "\n"
+        content = json.dumps(results_to_json(rows), indent=2, allow_nan=False) + "\n"
         write_output(folder / "other_tests.json", content.encode(), force=True)
         write_output(folder / "other_tests.csv", results_csv(rows).encode(), force=True)
 
@@ -94,7 +96,7 @@ def write_figures(
     figures = []
     for name, figure in drawn.items():
         title, description = FIGURE_TEXTS[name]
-        png = png_bytes(figure)
+        png = picture_bytes(figure, name)
         write_output(folder / name, png, force=True)
         figures.append(ReportFigure(title, description.format(world=int(evaluation.index[shown])), png))
     return figures

@@ -14,9 +14,8 @@ import numpy as np
 
 from ethbrake_marl.agents.registry import make_single_agent
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.figures.curves import draw_errors
-from ethbrake_marl.figures.style import Figure, png_bytes
+from ethbrake_marl.figures.style import Figure, write_picture
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Impacts, Worlds, advance, advance_sampled
 from ethbrake_marl.scenario import load_scenario
@@ -164,5 +163,5 @@ def sampling_report(figure_path: str | Path, *, scenario: str = "paper-random", 
         f"{scenario}: {count_of(n, 'world')}, seed {seed}; Vehicles 1 and 3 brake fully. Error: sampled minus"
         " exact harm. At 0.2 s the latency of Vehicle 3 falls between two samples, so it brakes 0.1 s late."
     )
-    write_output(figure_path, png_bytes(convergence_figure(studies, caption)), force=True)
+    write_picture(figure_path, convergence_figure(studies, caption), force=True)
     return "\n\n".join(convergence_table(study) for study in studies)

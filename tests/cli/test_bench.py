@@ -88,6 +88,6 @@ def test_bench_scaling__writes_a_picture_once(ethbrake, few_counts, tmp_path: Pa
     assert len(costs) == 8 and {cost["vehicles"] for cost in costs} == {2, 3}
 
 
-def test_bench_scaling__writes_png_only(ethbrake, tmp_path: Path):
-    answer = ethbrake("bench", "--scaling", tmp_path / "scaling.pdf")
-    assert answer.status == 2 and "pictures are written as PNG" in answer.err
+def test_bench_scaling__another_ending_is_refused(ethbrake, tmp_path: Path):
+    answer = ethbrake("bench", "--scaling", tmp_path / "scaling.jpg")
+    assert answer.status == 2 and "pictures are written as PNG, SVG or PDF" in answer.err

@@ -11,6 +11,7 @@ from typer.main import get_command
 
 from ethbrake_marl.agents.registry import agent_names
 from ethbrake_marl.cli.app import app, scenario_app
+from ethbrake_marl.cli.recipe import recipe_app
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 CLI = (DOCS / "cli.md").read_text("utf-8")
@@ -28,17 +29,21 @@ def names(typer_app) -> set[str]:
 
 def test_cli_page__has_every_command_and_agent():
     training = {"run", "train", "resume", "learning-curves", "ablate", "generalise", "export", "import-legacy"}
-    assert names(app) == training | {"evaluate", "agents", "shield", "doctor", "bench", "best-harm", "equal-time"}
-    for command in names(app) | {"scenario"}:
+    measuring = {"evaluate", "compare", "shield", "best-harm", "equal-time"}
+    assert names(app) == training | measuring | {"agents", "doctor", "bench"}
+    for command in names(app) | {"scenario", "recipe"}:
         assert f"\n## {command}\n" in CLI and f"`{command}" in TABLE_OF_COMMANDS
     about_scenarios = CLI.partition("\n## scenario\n")[2].partition("\n## ")[0]
     for command in names(scenario_app):
         assert f"ethbrake scenario {command}" in about_scenarios or f"`{command}" in about_scenarios
+    about_recipes = CLI.partition("\n## recipe\n")[2].partition("\n## ")[0]
+    for command in names(recipe_app):
+        assert f"`{command}" in about_recipes or f"ethbrake recipe {command}" in about_recipes
     for agent in agent_names():
         assert f"`{agent}" in CLI
 
 
-@pytest.mark.parametrize("command", ["", "scenario", "picture"])
+@pytest.mark.parametrize("command", ["", "scenario", "recipe", "picture"])
 def test_cli_page__has_every_option(command):
     group = get_command(app) if not command else get_command(app).commands[command]
     for name in sorted(group.commands.keys() - {"generalise"}):  # whose section shows the usual ones only

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -26,12 +28,24 @@ def test_deceleration__writes_a_png_of_that_world(ethbrake, tmp_path):
     assert (tmp_path / "curve-0.png").read_bytes() != (tmp_path / "curve-5.png").read_bytes()
 
 
+@pytest.mark.parametrize(("ending", "magic"), [(".svg", b"<?xml"), (".pdf", b"%PDF"), (".PNG", PNG)])
+def test_picture__is_written_as_its_name_ends_and_the_same_bytes_again(ethbrake, tmp_path, ending, magic):
+    written = []
+    for name in ("one", "other"):
+        out = tmp_path / f"{name}{ending}"
+        assert ethbrake("picture", "deceleration", "--output", out).status == 0
+        written.append(out.read_bytes())
+    assert written[0].startswith(magic)
+    assert written[0] == written[1]
+    assert not re.search(rb"20\d\d-\d\d|CreationDate|dc:date|Matplotlib v", written[0])
+
+
 @pytest.mark.parametrize("picture", ["criticality", "deceleration", "shield"])
-@pytest.mark.parametrize("name", ["map.pdf", "map", "map.png.svg"])
-def test_picture__only_png_is_written(ethbrake, tmp_path, picture, name):
+@pytest.mark.parametrize("name", ["map.jpg", "map", "map.png.eps"])
+def test_picture__another_ending_is_refused_at_once(ethbrake, tmp_path, picture, name):
     answer = ethbrake("picture", picture, "--output", tmp_path / name)
     assert answer.status == 2
-    assert "pictures are written as PNG; give a name that ends in .png" in answer.err
+    assert "pictures are written as PNG, SVG or PDF; end the name in .png, .svg or .pdf" in answer.err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -9,7 +9,7 @@ from ethbrake_marl.evaluation import criticality as module
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.criticality import avoidability_boundary, criticality_map
 from ethbrake_marl.figures.criticality import criticality_figure
-from ethbrake_marl.figures.style import png_bytes
+from ethbrake_marl.figures.style import picture_bytes
 from ethbrake_marl.limits.limits import Limits, known_limits
 from ethbrake_marl.scenario import Scenario, Task, load_scenario, worlds_from_table
 
@@ -78,7 +78,7 @@ def test_figure__draws_harm_and_boundary_and_names_both_sides() -> None:
         np.testing.assert_array_equal(line[:, 1], found.boundary_gap_2_m)
     assert "full_brake" in first.get_title(loc="left")
     assert "proven" in figure.get_supxlabel()
-    assert len(png_bytes(figure)) < 150_000
+    assert len(picture_bytes(figure, "figure.png")) < 150_000
 
 
 def test_map__without_a_proof_has_no_boundary_and_says_so() -> None:

@@ -10,7 +10,7 @@ from ethbrake_marl.evaluation import deceleration as module
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.deceleration import deceleration_curve, regimes_of
 from ethbrake_marl.figures.deceleration import deceleration_figure
-from ethbrake_marl.figures.style import png_bytes
+from ethbrake_marl.figures.style import picture_bytes
 from ethbrake_marl.limits.limits import Limits, Proof
 from ethbrake_marl.physics import Worlds, make_worlds
 from ethbrake_marl.scenario import Scenario, Task, load_scenario, worlds_from_table
@@ -114,7 +114,7 @@ def test_figure__marks_what_e_v2x_bm_takes_and_the_best_known(monkeypatch: pytes
     assert {(1.25, 1.25), (2.5, 2.5)} <= {tuple(line.get_ydata()) for line in axes.lines}
     assert axes.get_title(loc="left") == "a title"
     assert [label.get_text() for label in strips.get_yticklabels()] == ["front pair", "rear pair"]
-    assert len(png_bytes(figure)) < 150_000
+    assert len(picture_bytes(figure, "figure.png")) < 150_000
 
 
 def test_figure__of_a_vehicle_without_limits_has_no_level_line(pair: Scenario) -> None:

@@ -11,7 +11,7 @@ from ethbrake_marl.evaluation import EpisodeRecord, Evaluation, evaluate, record
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.figures.episode import trajectories
 from ethbrake_marl.figures.run import harm_against_total_gap, learning_curve
-from ethbrake_marl.figures.style import COLOURS, png_bytes, series_style
+from ethbrake_marl.figures.style import COLOURS, picture_bytes, series_style
 from ethbrake_marl.scenario import Scenario
 
 POINTS = [
@@ -118,7 +118,7 @@ def test_trajectories__one_column_per_record_on_common_scales(record: EpisodeRec
 
 
 def test_png__is_a_picture_and_the_same_every_time(record: EpisodeRecord) -> None:
-    one, other = (png_bytes(trajectories({"x": record})) for _ in range(2))
+    one, other = (picture_bytes(trajectories({"x": record}), "figure.png") for _ in range(2))
     assert one.startswith(b"\x89PNG\r\n\x1a\n")
     assert one == other
 
@@ -129,3 +129,8 @@ def test_series_style__neighbours_differ_in_more_than_colour() -> None:
         assert one["color"] != other["color"]
         assert one["marker"] != other["marker"]
         assert one["linestyle"] != other["linestyle"]
+
+
+def test_figure__a_notebook_shows_it_as_png(record: EpisodeRecord):
+    figure = trajectories({"x": record})
+    assert figure._repr_png_().startswith(b"\x89PNG")

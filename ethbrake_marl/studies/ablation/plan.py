@@ -13,6 +13,7 @@ import numpy as np
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.files.durable import check_writable, write_file
+from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
 from ethbrake_marl.learning.training import check_same, resolve
@@ -53,8 +54,8 @@ class Level:
         return bool(self.scenario.learners)
 
 
-def read_levels(names: Sequence[str]) -> list[Level]:
-    """Load the levels, by name or path, in this order.
+def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list[Level]:
+    """Load the levels, by name or path, in this order; ``settings`` hold in each.
 
     One that differs from an earlier one in ``v2x`` only is that level over another channel; the others are the ladder,
     each compared with the one before. Raises ``InvalidInput`` for fewer than two levels or one given twice, and what
@@ -62,7 +63,7 @@ def read_levels(names: Sequence[str]) -> list[Level]:
     """
     levels: list[Level] = []
     for name in names:
-        scenario = load_runnable(name)
+        scenario = load_runnable(name, settings)
         if any(level.name == scenario.name for level in levels):
             raise InvalidInput(f"levels: {scenario.name!r} is given twice")
         same = [level.name for level in levels if level.clear is None and _but_channel(level.scenario, scenario)]
@@ -124,6 +125,7 @@ class Training:
     algorithm: str
     recipe: TrainingRecipe
     folder: Path
+    noted: tuple[str, ...] = ()  # by which scenario and recipe differ from their files, for ``config.json``
 
     def steps_left(self) -> int:
         """Decisions that are still to do; raises ``InvalidInput`` for a folder that holds another training."""
@@ -153,6 +155,7 @@ class Plan:
     search_episodes: int  # of these, worlds in which the joint optimum is searched
     budget: int  # candidates per world and count of that search
     folder: Path
+    noted: tuple[str, ...] = ()  # see ``Training``
 
     @property
     def algorithms(self) -> tuple[str, ...]:
@@ -175,7 +178,7 @@ class Plan:
             changes |= dict.fromkeys({"scheme", "turns"} & type(recipe).model_fields.keys())
         name = recipe.name if learners == 1 else _algorithm(recipe)
         folder = self.folder / TRAININGS / f"{level.name}-{name}-seed{seed}"
-        return Training(level, _algorithm(recipe), recipe.replace(**changes), folder)
+        return Training(level, _algorithm(recipe), recipe.replace(**changes), folder, self.noted)
 
     def settings(self) -> dict[str, Any]:
         """Everything that shapes the results, as plain data."""

@@ -13,7 +13,7 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.ablation import change_figure, harm_curve, who_pays
-from ethbrake_marl.figures.style import png_bytes
+from ethbrake_marl.figures.style import write_picture
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.studies.ablation.comparison import compare
 from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, LineResult
@@ -201,7 +201,7 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> di
     write_output(plan.folder / PAGE, markdown(found, conditions).encode(), force=True)
     for name, draw in FIGURES.items():
         if found["steps"] or found["channels"]:
-            write_output(plan.folder / name, png_bytes(draw(found, conditions)), force=True)
+            write_picture(plan.folder / name, draw(found, conditions), force=True)
     return found
 
 

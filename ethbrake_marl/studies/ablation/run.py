@@ -82,7 +82,7 @@ def _train(training: Training, tell: OnProgress | None = None) -> bool:
     if RunDirectory(training.folder).status.is_file():
         return resume(training.folder, on_progress=tell).status == "finished"
     training.folder.parent.mkdir(parents=True, exist_ok=True)
-    result = train(training.recipe, training.level.scenario, training.folder, on_progress=tell)
+    result = train(training.recipe, training.level.scenario, training.folder, settings=training.noted, on_progress=tell)
     return result.status == "finished"
 
 

@@ -1,0 +1,206 @@
+"""Results as files, and two of them compared: the same worlds of the same scenario, or no comparison."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, count_of
+from ethbrake_marl.evaluation.frame import read_harms
+from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, paired_difference, unpaired_difference
+from ethbrake_marl.evaluation.table import Rescored, SummaryRow
+from ethbrake_marl.files.plain import parse_strict_json, read_plain
+from ethbrake_marl.physics import Floats
+
+HARMS = ("first_impact_harm", "total_harm")
+_LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one with every world
+_MOST_HARM = 1e100  # m2/s2; a number that can be squared
+_HASHES = {"worlds_sha256": "another list of worlds", "scenario_sha256": "another scenario"}
+_NEEDED = {"agent": str, "episodes": int, **dict.fromkeys(_HASHES, str), "policy_sha256": dict, "versions": dict}
+
+
+def results_to_json(
+    rows: Sequence[SummaryRow], *, told: Sequence[Rescored] = (), per_world: Path | None = None
+) -> list[dict[str, Any]]:
+    """What a results file holds: one object per row, with what was ``told`` of it under other objectives.
+
+    ``per_world`` is the file with one row per world, written before; its name and hash go into every object.
+    """
+    found = [row.to_json() for row in rows]
+    if told:
+        found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
+    if per_world is None:
+        return found
+    beside = {"file": per_world.name, "sha256": hashlib.sha256(per_world.read_bytes()).hexdigest()}
+    return [row | {"per_world": beside} for row in found]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One results file."""
+
+    path: Path
+    rows: Mapping[str, Mapping[str, Any]]  # by agent
+
+    @property
+    def about(self) -> Mapping[str, Any]:
+        """Any of the rows: what they say of the worlds is the same in all."""
+        return next(iter(self.rows.values()))
+
+    def estimate(self, agent: str, harm: str) -> Estimate:
+        """The mean of a harm, with its interval."""
+        row = self.rows[agent]
+        interval = row.get(f"{harm}_interval")
+        numbers = [row.get(harm), *(interval if isinstance(interval, list) else [])]
+        floats = [float(each) for each in numbers if isinstance(each, int | float) and not isinstance(each, bool)]
+        whole = len(floats) == len(numbers) == (1 if interval is None else 3)
+        if not (whole and all(abs(each) <= _MOST_HARM for each in floats) and row["episodes"] >= len(floats[:2])):
+            raise InvalidInput(f"{self.path}: {agent}: {harm} is no mean with an interval [low, high]")
+        return Estimate(floats[0], None if interval is None else (floats[1], floats[2]))
+
+    def harms(self) -> dict[str, dict[int, tuple[float, ...]]]:
+        """Those of every world; raises ``InvalidInput`` where the file that holds them is not to be had."""
+        beside = self.about.get("per_world")
+        if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
+            raise InvalidInput(f"{self.path} has none (--per-world)")
+        file = self.path.parent / Path(beside["file"]).name
+        if not file.is_file():
+            raise InvalidInput(f"{file} is not there")
+        data = read_plain(file, _MOST_BYTES)
+        if hashlib.sha256(data).hexdigest() != beside.get("sha256"):
+            raise InvalidInput(f"{file} is not the one that was written with {self.path}")
+        return read_harms(file, data)
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """What one agent does more in the second result than in the first, mean per world (m2/s2)."""
+
+    agent: str
+    policy: Literal["same", "other", "none"]  # whether both drove by the same one
+    first_impact_harm: Estimate
+    total_harm: Estimate
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        harms = {f"{harm}_difference": getattr(self, harm) for harm in HARMS}
+        return {"agent": self.agent, "policy": self.policy, **estimates_to_json(harms)}
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two results on the same worlds, the second minus the first, agent by agent."""
+
+    differences: tuple[Difference, ...]
+    unpaired_because: str | None  # None: intervals are paired by world
+    left_over: tuple[tuple[str, ...], tuple[str, ...]]  # agents of the first alone, and of the second
+    other_versions: Mapping[str, tuple[str | None, str | None]]  # of the first and of the second, where they differ
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "intervals": "paired" if self.unpaired_because is None else "unpaired",
+            "unpaired_because": self.unpaired_because,
+            "agents": [difference.to_json() for difference in self.differences],
+            "only_in_first": list(self.left_over[0]),
+            "only_in_second": list(self.left_over[1]),
+            "other_versions": {name: list(both) for name, both in self.other_versions.items()},
+        }
+
+
+def read_result(path: Path) -> Result:
+    """Read what ``ethbrake evaluate --json`` printed or ``ethbrake run`` wrote.
+
+    Raises ``InvalidInput`` for anything else, and for a result without hashes, as earlier versions wrote them.
+    """
+    try:
+        content = parse_strict_json(read_plain(path, _LIMIT_BYTES))
+    except ValueError as error:
+        if isinstance(error, EthBrakeError):
+            raise
+        raise InvalidInput(f"{path}: is no JSON: {error}") from None
+    if not isinstance(content, list) or not content or not all(isinstance(row, dict) for row in content):
+        raise InvalidInput(f"{path}: is no results file, as ethbrake evaluate --json prints one")
+    for row in content:
+        for key, kind in _NEEDED.items():
+            if not isinstance(row.get(key), kind):
+                raise InvalidInput(
+                    f"{path}: {key} is missing or no {kind.__name__}; a results file of an earlier version has no"
+                    " hashes: evaluate again"
+                )
+    if len({tuple(row[key] for key in _HASHES) for row in content}) > 1:
+        raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
+    return Result(path, {row["agent"]: row for row in content})
+
+
+def compare_results(first: Result, second: Result) -> Comparison:
+    """What agents of the same name did in both, the second minus the first.
+
+    Paired by world where both have every world beside them. Raises ``InvalidInput`` for results on different worlds or
+    scenarios, or without a common agent.
+    """
+    for key, what in _HASHES.items():
+        one, other = first.about[key], second.about[key]
+        if one != other:
+            raise InvalidInput(
+                f"{second.path}: is about {what} than {first.path} ({key} {other:.12} and {one:.12}): no comparison"
+            )
+    common = [agent for agent in first.rows if agent in second.rows]
+    left_over = [tuple(agent for agent in one.rows if agent not in common) for one in (first, second)]
+    if not common:
+        agents = " and ".join(f"{', '.join(names)}" for names in left_over)
+        raise InvalidInput(f"{first.path} and {second.path} have no agent in common: {agents}")
+    worlds, because = _worlds_of_both(first, second, common)
+    differences = tuple(
+        Difference(agent, _policies(first, second, agent), *_differences(first, second, agent, worlds))
+        for agent in common
+    )
+    return Comparison(differences, because, (left_over[0], left_over[1]), _other_versions(first, second))
+
+
+Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of the first and of the second, world by world
+
+
+def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tuple[Worlds | None, str | None]:
+    """The harms to pair, or why there are none."""
+    try:
+        one, other = first.harms(), second.harms()
+    except InvalidInput as error:
+        return None, f"one row per world is needed of both; {error}"
+    found = {}
+    for agent in common:
+        worlds = sorted(one.get(agent, {}))
+        if len(worlds) != first.rows[agent]["episodes"] or worlds != sorted(other.get(agent, {})):
+            return None, f"the rows per world of {agent} are not those of {count_of(len(worlds), 'same world')}"
+        found[agent] = tuple(np.array([side[agent][world] for world in worlds]) for side in (one, other))
+    return found, None  # type: ignore[return-value]  # two of them each
+
+
+def _differences(first: Result, second: Result, agent: str, worlds: Worlds | None) -> list[Estimate]:
+    """The second minus the first, under both counts."""
+    if worlds is not None:
+        before, after = worlds[agent]
+        return [paired_difference(after[:, k], before[:, k]) for k in range(len(HARMS))]
+    sizes = second.rows[agent]["episodes"], first.rows[agent]["episodes"]
+    return [
+        unpaired_difference(second.estimate(agent, harm), sizes[0], first.estimate(agent, harm), sizes[1])
+        for harm in HARMS
+    ]
+
+
+def _policies(first: Result, second: Result, agent: str) -> Literal["same", "other", "none"]:
+    one, other = (result.rows[agent]["policy_sha256"] for result in (first, second))
+    if not one and not other:
+        return "none"
+    return "same" if one == other else "other"
+
+
+def _other_versions(first: Result, second: Result) -> dict[str, tuple[str | None, str | None]]:
+    one, other = first.about["versions"], second.about["versions"]
+    names = dict.fromkeys([*one, *other])
+    return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}

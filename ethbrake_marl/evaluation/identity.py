@@ -1,0 +1,66 @@
+"""The identity of a result: the worlds, the scenario and the policies that it is about, and what computed it.
+
+Two results can be compared where worlds and scenario have the same hashes. Versions are told, and no reason to refuse.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from dataclasses import fields, is_dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.protocol import AgentAround
+from ethbrake_marl.physics import Ints, Worlds
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.scenario import Scenario
+
+_PACKAGES = ("ethbrake-marl", "numba", "numpy")
+_WORDS = {"name", "title", "description", "source"}  # what a scenario is called changes nothing
+_BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that takes no memory
+
+
+def worlds_sha256(worlds: Worlds, index: Ints) -> str:
+    """SHA-256 of a list of worlds: of every array (little-endian, by name) and the worlds' numbers in the list."""
+    digest = hashlib.sha256()
+    for name, array in {"index": index, **_arrays(worlds)}.items():
+        digest.update(f"{name} {array.dtype.kind} {array.shape}\n".encode())
+        for first in range(0, len(array), _BLOCK):
+            part = array[first : first + _BLOCK]
+            digest.update(np.ascontiguousarray(part, part.dtype.newbyteorder("<")).tobytes())
+    return digest.hexdigest()
+
+
+def _arrays(value: Any) -> dict[str, np.ndarray]:
+    """The arrays of a dataclass and of those inside it, by name."""
+    found: dict[str, np.ndarray] = {}
+    for field in fields(value):
+        part = getattr(value, field.name)
+        found |= _arrays(part) if is_dataclass(part) else {field.name: part}
+    return found
+
+
+def scenario_sha256(scenario: Scenario) -> str:
+    """SHA-256 of all that shapes an episode: every value of the scenario, defaults too, but neither name nor texts."""
+    content = scenario.model_dump(mode="json", exclude=_WORDS)
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def policy_sha256(agent: object) -> str | None:
+    """The hash in the manifest of the policy that an agent drives by, inside whatever is around it; None without one.
+
+    It binds names, network and weights (``Manifest.manifest_sha256``).
+    """
+    while isinstance(agent, AgentAround | LearnedAgent):
+        agent = agent.policy
+    return agent.manifest.manifest_sha256 if isinstance(agent, Policy) else None
+
+
+def result_versions() -> dict[str, str]:
+    """Name -> version of Python and of every package that a result's numbers depend on."""
+    return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}

@@ -1,0 +1,143 @@
+"""Two results on the same worlds, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import ttest_ind
+
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.compare import compare_results, read_result
+from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, unpaired_difference
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results on the same worlds, and one on others; not to be changed."""
+    folder = tmp_path_factory.mktemp("results")
+    asked = {
+        "a": ("full_brake,coast", "40", "7"),
+        "b": ("full_brake,e_v2x_bm", "40", "7"),
+        "c": ("full_brake,coast", "40", "8"),
+    }
+    for name, (agents, episodes, seed) in asked.items():
+        options = ("--agents", agents, "--episodes", episodes, "--seed", seed)
+        assert run_command(["evaluate", *options, "--per-world", str(folder / f"{name}.csv")]) == 0
+    content = json.loads((folder / "b.csv.json").read_text())
+    for row in content:  # what another policy of the same name would have left
+        row["agent"] = {"e_v2x_bm": "coast"}.get(row["agent"], row["agent"])
+    data = (folder / "b.csv").read_text().replace("\ne_v2x_bm,", "\ncoast,")
+    (folder / "d.csv").write_text(data)
+    beside = {"file": "d.csv", "sha256": hashlib.sha256(data.encode()).hexdigest()}
+    (folder / "d.csv.json").write_text(json.dumps([row | {"per_world": beside} for row in content]))
+    (folder / "alone.json").write_text(
+        json.dumps([{k: v for k, v in row.items() if k != "per_world"} for row in content])
+    )
+    return folder
+
+
+def test_same_agents__differ_by_nothing(results: Path) -> None:
+    found = compare_results(read_result(results / "a.csv.json"), read_result(results / "b.csv.json"))
+    (only,) = found.differences
+    assert only.agent == "full_brake" and only.policy == "none" and found.unpaired_because is None
+    assert only.first_impact_harm == Estimate(0.0, (0.0, 0.0)) == only.total_harm
+    assert found.left_over == (("coast",), ("e_v2x_bm",)) and found.other_versions == {}
+
+
+def test_difference__is_paired_by_world_where_every_world_is_there(results: Path) -> None:
+    paired = compare_results(read_result(results / "a.csv.json"), read_result(results / "d.csv.json"))
+    apart = compare_results(read_result(results / "a.csv.json"), read_result(results / "alone.json"))
+    columns = {}
+    for name in ("a", "d"):
+        rows = np.genfromtxt(results / f"{name}.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+        columns[name] = rows["total_harm"][rows["agent"] == "coast"]
+    assert paired.differences[1].total_harm == paired_difference(columns["d"], columns["a"])
+    assert paired.differences[1].total_harm.value == pytest.approx(apart.differences[1].total_harm.value)
+    assert paired.to_json()["intervals"] == "paired" and apart.to_json()["intervals"] == "unpaired"
+    assert "alone.json has none" in str(apart.unpaired_because)
+
+
+def test_edited_worlds__are_not_paired(results: Path, tmp_path: Path) -> None:
+    for name in ("a.csv.json", "d.csv.json", "a.csv"):
+        (tmp_path / name).write_bytes((results / name).read_bytes())
+    missing = compare_results(read_result(tmp_path / "a.csv.json"), read_result(tmp_path / "d.csv.json"))
+    assert "d.csv is not there" in str(missing.unpaired_because)
+    (tmp_path / "d.csv").write_bytes((results / "d.csv").read_bytes().replace(b"\ncoast,1,", b"\ncoast,2,"))
+    edited = compare_results(read_result(tmp_path / "a.csv.json"), read_result(tmp_path / "d.csv.json"))
+    assert "d.csv is not the one that was written with" in str(edited.unpaired_because)
+
+
+def test_other_worlds_or_scenarios__are_refused_in_one_line(results: Path, tmp_path: Path) -> None:
+    first = read_result(results / "a.csv.json")
+    with pytest.raises(InvalidInput, match=r"c.csv.json: is about another list of worlds than .*: no comparison$"):
+        compare_results(first, read_result(results / "c.csv.json"))
+    rows = [row | {"scenario_sha256": "0" * 64} for row in json.loads((results / "a.csv.json").read_text())]
+    (tmp_path / "other.json").write_text(json.dumps(rows))
+    with pytest.raises(InvalidInput, match="is about another scenario than"):
+        compare_results(first, read_result(tmp_path / "other.json"))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("[", "is no JSON"),
+        ("{}", "is no results file"),
+        ("[]", "is no results file"),
+        ("[1]", "is no results file"),
+        (
+            '[{"agent": "x", "episodes": 3}]',
+            "worlds_sha256 is missing .* earlier version has no hashes: evaluate again",
+        ),
+    ],
+)
+def test_read_result__refuses_what_is_no_result(tmp_path: Path, text: str, reason: str) -> None:
+    (tmp_path / "x.json").write_text(text)
+    with pytest.raises(InvalidInput, match=f"x.json: .*{reason}"):
+        read_result(tmp_path / "x.json")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"total_harm": "x"}, {"total_harm": None}, {"total_harm_interval": [1]}, {"total_harm": 1e300}, {"episodes": 1}],
+)
+def test_compare__refuses_means_that_are_none(results: Path, tmp_path: Path, change: dict[str, Any]) -> None:
+    rows = [row | change for row in json.loads((results / "alone.json").read_text())]
+    (tmp_path / "x.json").write_text(json.dumps(rows))
+    with pytest.raises(InvalidInput, match=r"x\.json: full_brake: .* is no mean with an interval"):
+        compare_results(read_result(results / "alone.json"), read_result(tmp_path / "x.json"))
+
+
+def test_unpaired_difference__is_welchs() -> None:
+    draw = np.random.default_rng(3)
+    one, other = draw.normal(5.0, 2.0, 30), draw.normal(4.0, 1.0, 50)
+    found = unpaired_difference(mean(one), 30, mean(other), 50)
+    low, high = ttest_ind(one, other, equal_var=False).confidence_interval(0.95)
+    assert found.interval == pytest.approx((low, high), rel=1e-12)
+
+
+def test_compare__prints_the_differences_and_says_which_intervals(ethbrake: Callable[..., Any], results: Path) -> None:
+    answer = ethbrake("compare", results / "a.csv.json", results / "d.csv.json")
+    assert answer.status == 0 and "coast" in answer.out and "paired by world" in answer.err
+    told = json.loads(ethbrake("compare", results / "a.csv.json", results / "alone.json", "--json").out)
+    assert told["intervals"] == "unpaired" and [each["agent"] for each in told["agents"]] == ["full_brake", "coast"]
+    refused = ethbrake("compare", results / "a.csv.json", results / "c.csv.json")
+    assert refused.status == 2 and refused.err.count("\n") == 1 and "another list of worlds" in refused.err
+
+
+def test_compare__a_run_and_its_report_are_results_too(ethbrake: Callable[..., Any], finished_run: Path) -> None:
+    results, other_tests = finished_run / "results.json", finished_run / "other_tests.json"
+    told = json.loads(ethbrake("compare", results, results, "--json").out)
+    assert told["intervals"] == "paired"
+    assert {each["agent"]: each["policy"] for each in told["agents"]}["ppo"] == "same"
+    assert all(each["total_harm_difference_interval"] == [0.0, 0.0] for each in told["agents"])
+    assert "each test needs a file of its own" in ethbrake("compare", results, other_tests).err
+    row = json.loads(results.read_text())[0]
+    page = (finished_run / "report.html").read_text()
+    assert row["worlds_sha256"] in page and row["scenario_sha256"] in page
