@@ -33,6 +33,7 @@ from ethbrake_marl.cli.options import (
 from ethbrake_marl.cli.parts import CommandWithParts
 from ethbrake_marl.cli.picture import picture_app
 from ethbrake_marl.cli.recipe import recipe_app
+from ethbrake_marl.cli.record import record_command
 from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import (
     abandon_output,
@@ -111,6 +112,9 @@ app.command("best-harm", epilog="Example: ethbrake best-harm --episodes 200 --bu
 app.command("compare", epilog="Example: ethbrake compare before.csv.json after.csv.json")(compare_command)
 app.command("agents", epilog="Example: ethbrake agents")(agents_command)
 app.command("shield", epilog="Example: ethbrake shield --agents ppo@shipped,full_brake --episodes 500")(shield_command)
+app.command("record", epilog="Example: ethbrake record --agents full_brake,e_v2x_bm --world 3 --output both.gif")(
+    record_command
+)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
 app.command("equal-time", epilog="Example: ethbrake equal-time --episodes 200 --repeats 1")(equal_time_command)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,11 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.envs.drawing.viewer import CLASS_METADATA, Viewer, render_metadata
 from ethbrake_marl.envs.infos import Report, plain_infos, report
 from ethbrake_marl.envs.setup import (
     AnyScenario,
     action_box,
-    check_render_mode,
     feature_box,
     fresh_seed,
     learner_columns,
@@ -43,7 +43,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
 
     Args:
         scenario: a shipped name, the path of a YAML file, its content as a mapping, or a ``Scenario``.
-        render_mode: None; there is no drawing.
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environment.md, Watching).
         learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what every vehicle observes; None: ``observation_for(scenario)``.
@@ -60,7 +60,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
 
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"name": "ethbrake_v0", "render_modes": [], "is_parallelizable": True}
+    metadata: dict[str, Any] = {"name": "ethbrake_v0", "is_parallelizable": True, **CLASS_METADATA}  # noqa: RUF012
 
     def __init__(
         self,
@@ -72,11 +72,12 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         agents: WhoIsAgent = "all",
         max_cycles: int | None = None,
     ) -> None:
-        check_render_mode(render_mode)
         if max_cycles is not None:
             check_whole_number("max_cycles", max_cycles, 1)
         self.render_mode, self.max_cycles = render_mode, max_cycles
         self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
+        self.viewer = Viewer(self.engine, render_mode)
+        self.metadata = {**self.metadata, **render_metadata(self.engine)}
         names = self.engine.scenario.vehicle_names
         self._learners = [names[i] for i in self.engine.learners]
         self._vehicles = _agent_vehicles(self.engine, agents)
@@ -104,6 +105,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         restart(self.engine, fresh_seed() if seed is None and not self._seeded else seed, options)
         self._seeded = self._started = True
         self.agents = self.possible_agents[:]
+        self.viewer.began()
         return self._observations(), self._infos(report(self.engine))
 
     def step(
@@ -122,6 +124,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         infos = self._infos(report(self.engine, step))
         if terminated or truncated:
             self.agents = []
+        self.viewer.play()
         return (
             self._observations(),
             dict(zip(agents, rewards, strict=True)),
@@ -129,6 +132,14 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
             dict.fromkeys(agents, truncated),
             infos,
         )
+
+    def render(self) -> Any:
+        """What the render mode says: a frame [H, W, 3] uint8, a list of new ones, a text, or None for ``human``."""
+        return self.viewer.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.viewer.close()
 
     def state(self) -> Observations:
         """The full state of all vehicles, float32 [S] within ``state_space``."""

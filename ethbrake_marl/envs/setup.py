@@ -99,12 +99,6 @@ def learner_columns(learners: Sequence[str], actions: Mapping[str, Any]) -> Floa
     return columns
 
 
-def check_render_mode(render_mode: str | None) -> None:
-    """Refuse every render mode: there is no drawing yet."""
-    if render_mode is not None:
-        raise InvalidInput(f"render_mode = {render_mode!r}: must be None; this environment draws nothing")
-
-
 INITIAL_STATE = "initial_state"
 
 

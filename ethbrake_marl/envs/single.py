@@ -9,11 +9,11 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.envs.drawing.viewer import CLASS_METADATA, Viewer, render_metadata
 from ethbrake_marl.envs.infos import plain_infos, report
 from ethbrake_marl.envs.setup import (
     AnyScenario,
     action_box,
-    check_render_mode,
     check_seed,
     feature_box,
     fresh_seed,
@@ -38,7 +38,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
     Args:
         scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
-        render_mode: None; there is no drawing.
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environment.md, Watching).
         learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what the learner observes; None: ``observation_for(scenario)``.
@@ -54,6 +54,8 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
     """
 
+    metadata: dict[str, Any] = dict(CLASS_METADATA)  # noqa: RUF012  # as Gymnasium declares it
+
     def __init__(
         self,
         scenario: AnyScenario = "paper-random",
@@ -62,9 +64,9 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         reward: Reward = "harm",
         observation: Observation | None = None,
     ) -> None:
-        check_render_mode(render_mode)
-        self.render_mode = render_mode
         self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
+        self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode)
+        self.metadata = {**self.metadata, **render_metadata(self.engine)}
         self.learner = only_learner(self.engine)
         self._column = np.array([self.learner])
         self._name = self.engine.scenario.vehicle_names[self.learner]
@@ -82,6 +84,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         restart(self.engine, seed, options)
         super().reset(seed=seed)
         self._running = True
+        self.viewer.began()
         return self._observe(), plain_infos(report(self.engine), self._column)[0]
 
     def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
@@ -90,9 +93,18 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
             raise InvalidInput("step: no episode is running; call reset first")
         step = self.engine.step(learner_columns((self._name,), {self._name: action}))
         self._running = not step.ended[0]
+        self.viewer.play()
         info = plain_infos(report(self.engine, step), self._column)[0]
         reward = float(step.reward[0, self.learner])
         return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info
+
+    def render(self) -> Any:
+        """What the render mode says: a frame [H, W, 3] uint8, a list of new ones, a text, or None for ``human``."""
+        return self.viewer.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.viewer.close()
 
     def _observe(self) -> Observations:
         observation: Observations = self.engine.observe(self.learner)[0].copy()

@@ -11,11 +11,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from ethbrake_marl.engine.step import Step
+from ethbrake_marl.envs.drawing.viewer import BATCH_MODES, Viewer, render_metadata
 from ethbrake_marl.envs.infos import batch_info, report
 from ethbrake_marl.envs.setup import (
     AnyScenario,
     action_box,
-    check_render_mode,
     check_seed,
     feature_box,
     fresh_seed,
@@ -40,7 +40,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     Args:
         num_envs: worlds that are advanced together, at least 1.
         scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
-        render_mode: None; there is no drawing.
+        render_mode: ``rgb_array``, ``ansi``, or None; ``render`` gives one frame or text for each world.
         learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what the learner observes; None: ``observation_for(scenario)``.
@@ -68,11 +68,10 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         observation: Observation | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
     ) -> None:
-        check_render_mode(render_mode)
-        self.render_mode = render_mode
         self.autoreset_mode = _check_mode(autoreset_mode)
-        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.engine = make_engine(scenario, num_envs, learners=learners, reward=reward, observation=observation)
+        self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode, BATCH_MODES)
+        self.metadata = {"autoreset_mode": self.autoreset_mode, **render_metadata(self.engine, BATCH_MODES)}
         self.learner = only_learner(self.engine)
         self.num_envs = num_envs
         self.single_observation_space = feature_box(self.engine.observation.features)
@@ -110,6 +109,10 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         infos |= batch_info(report(engine, step), self.learner, every, ~renewed)
         reward = step.reward[:, self.learner].copy()
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
+
+    def render(self) -> tuple[Any, ...]:
+        """A frame [H, W, 3] uint8, or a text, of every world; of a world that has just been renewed, its start."""
+        return self.viewer.render_each()
 
     def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
         """The actions with those that the autoreset mode ignores replaced: their worlds had ended ``before``."""

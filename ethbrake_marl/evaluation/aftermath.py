@@ -1,19 +1,16 @@
 """The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
 
-Worlds know gaps and speeds, no places. A post far ahead, out of reach, makes the way of Vehicle 1 the change of one
-more gap; it changes no motion.
+Worlds know gaps and speeds, no places: a post ahead (``physics.obstacle``) makes the way of Vehicle 1 one more gap.
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
 from ethbrake_marl.physics import Floats, Worlds, advance, advance_sampled
 from ethbrake_marl.physics.episode import decision_s, first_decision_s
 from ethbrake_marl.physics.events import solo_motion
-from ethbrake_marl.physics.obstacle import obstacle_ahead
+from ethbrake_marl.physics.obstacle import obstacle_ahead, with_post_ahead
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.scenario.roles import constant_command
 
@@ -56,24 +53,6 @@ class ShovedFront:
         """How far Vehicle 1 was shoved in each world so far, [n]."""
         shoved: Floats = self._way_m - self._own_way_m
         return shoved
-
-
-def with_post_ahead(worlds: Worlds, duration_s: Floats) -> Worlds:
-    """These worlds, each with an obstacle ahead: its own, or one that Vehicle 1 cannot reach in ``duration_s`` [n]."""
-    out_of_reach = _farthest(worlds, duration_s) + 1.0
-    return replace(worlds, obstacle_gap_m=np.where(obstacle_ahead(worlds), worlds.obstacle_gap_m, out_of_reach))
-
-
-def _farthest(worlds: Worlds, duration_s: Floats) -> Floats:
-    """More than Vehicle 1 can travel, [n] m: ``T sqrt(2 E / m_1)``, had it all the energy E the line can ever have.
-
-    Impacts and brakes only take energy; driving adds at most ``m a v`` per second, and never above the speed limit.
-    """
-    vehicles = worlds.vehicles
-    driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
-    energy = (vehicles.mass_t * (worlds.speeds_mps**2 / 2.0 + driving)).sum(axis=1)
-    farthest: Floats = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
-    return farthest
 
 
 VEHICLE_2 = 1  # the map's samples begin with its latency

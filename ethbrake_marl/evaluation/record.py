@@ -16,10 +16,10 @@ import numpy as np
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import episode_engine
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of
-from ethbrake_marl.evaluation.aftermath import with_post_ahead
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
+from ethbrake_marl.physics.obstacle import with_post_ahead
 from ethbrake_marl.scenario import Scenario
 
 SAMPLE_S = 0.02

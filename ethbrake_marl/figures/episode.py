@@ -9,10 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ethbrake_marl.envs.drawing.scene import vehicle_colour
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import quantities, quantity_line
 from ethbrake_marl.evaluation.record import EpisodeRecord
-from ethbrake_marl.figures.style import COLOURS, DASHES, GREY, add_caption, new_figure, style_axes
+from ethbrake_marl.figures.style import DASHES, GREY, add_caption, new_figure, style_axes
 from ethbrake_marl.physics import Floats
 
 
@@ -119,7 +120,7 @@ def _command_range(records: list[EpisodeRecord]) -> tuple[float, float]:
 
 def _vehicle_style(i: int) -> tuple[str, str | tuple[int, tuple[int, ...]]]:
     """Colour and dashes of Vehicle ``i + 1``, and of the gap ahead of it."""
-    return COLOURS[(i + 1) % len(COLOURS)], DASHES[i % len(DASHES)]
+    return vehicle_colour(i), DASHES[i % len(DASHES)]
 
 
 def _at(record: EpisodeRecord, time_s: Floats, pair: np.ndarray) -> Floats:

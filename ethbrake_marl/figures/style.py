@@ -10,11 +10,11 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Figure  # the type that every figure has, for modules outside this folder
 
+from ethbrake_marl.envs.drawing.scene import COLOURS as COLOURS  # one palette for figures and frames
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.figures import picture_ending
 
-# Okabe and Ito's palette without its yellow (invisible on white); markers and dashes repeat the distinction.
-COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+# Markers and dashes repeat the distinction of the colours.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1)), "-", "--")
 GREY = "#555555"

@@ -65,6 +65,28 @@ def without_obstacle(written_out: Worlds, vehicles: Vehicles) -> Worlds:
     )
 
 
+def with_post_ahead(worlds: Worlds, duration_s: Floats) -> Worlds:
+    """These worlds, each with an obstacle ahead: its own, or one that Vehicle 1 cannot reach in ``duration_s`` [n].
+
+    Worlds know gaps and speeds, no places. Such a post makes the way of Vehicle 1 the change of one more gap, and
+    changes no motion.
+    """
+    out_of_reach = _farthest(worlds, duration_s) + 1.0
+    return replace(worlds, obstacle_gap_m=np.where(obstacle_ahead(worlds), worlds.obstacle_gap_m, out_of_reach))
+
+
+def _farthest(worlds: Worlds, duration_s: Floats) -> Floats:
+    """More than Vehicle 1 can travel, [n] m: ``T sqrt(2 E / m_1)``, had it all the energy E the line can ever have.
+
+    Impacts and brakes only take energy; driving adds at most ``m a v`` per second, and never above the speed limit.
+    """
+    vehicles = worlds.vehicles
+    driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
+    energy = (vehicles.mass_t * (worlds.speeds_mps**2 / 2.0 + driving)).sum(axis=1)
+    farthest: Floats = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
+    return farthest
+
+
 def ahead(value: float, columns: Floats) -> Floats:
     """The columns of the vehicles [n, N] with one more in front, [n, N + 1]."""
     added: NDArray[np.float64] = np.concatenate([np.full((len(columns), 1), value), columns], axis=1)

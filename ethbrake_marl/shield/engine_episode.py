@@ -11,7 +11,7 @@ from ethbrake_marl.actions import command_to_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.shield.agents import HybridAgent
 from ethbrake_marl.shield.engine_shield import Attached, AttachedShield, Sent
 from ethbrake_marl.shield.options import ShieldOptions
@@ -44,6 +44,12 @@ class AttachedHybrid(Attached):
     def running(self) -> bool:
         """Whether any episode has begun."""
         return self.hybrid.policy_harm.size > 0
+
+    @property
+    def stepped_in(self) -> Bools:
+        """Where E-V2X-BM drives the episode instead of the policy, [n]."""
+        replaced: Bools = ~self.hybrid.chosen_policy
+        return replaced
 
     def proposal(self) -> Floats:
         """NaN: the agent that was chosen drives, whatever is proposed."""

@@ -75,6 +75,11 @@ class Attached(ABC):
         """What this shield knows now; once detached, what it knew last."""
         return self.engine.memory(self) if self in self.engine.watchers else self._left
 
+    @property
+    @abstractmethod
+    def stepped_in(self) -> Bools:
+        """Where something else than the proposal is applied in the step that was certified last, [n]; for pictures."""
+
     def confirm(self) -> None:
         """Raise ``UncertifiedStep`` unless the engine made the step that was handed to the environment last."""
         assert self.sent is not None
@@ -188,6 +193,12 @@ class AttachedShield(Attached):
     def running(self) -> bool:
         """Whether any episode has begun."""
         return self.shield.running is not None
+
+    @property
+    def stepped_in(self) -> Bools:
+        """Where the proposal was replaced, [n]."""
+        decision = self.decision
+        return np.zeros(self.engine.n, np.bool_) if decision is None else decision.intervened
 
     @property
     def decision(self) -> Decision | None:

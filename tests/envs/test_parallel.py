@@ -212,12 +212,6 @@ def test_state__before_the_first_reset_is_refused() -> None:
         parallel_env().state()
 
 
-@pytest.mark.parametrize("mode", ["human", "rgb_array"])
-def test_render_mode__is_refused(mode: str) -> None:
-    with pytest.raises(InvalidInput, match=f"render_mode = '{mode}': must be None"):
-        parallel_env(render_mode=mode)
-
-
 def test_metadata__names_the_environment() -> None:
     assert parallel_env.metadata["name"] == "ethbrake_v0"
     assert parallel_env.metadata["is_parallelizable"] is True

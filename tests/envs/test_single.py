@@ -88,7 +88,7 @@ def test_settings__reach_the_engine() -> None:
         ({"reward": "harmm"}, "did you mean 'harm'"),
         ({"learners": ["vehicle_9"]}, "vehicle_9"),
         ({"learners": "vehicle_2"}, r"must be a list of vehicles"),
-        ({"render_mode": "human"}, "render_mode = 'human': must be None"),
+        ({"render_mode": "depth"}, "render_mode = 'depth': must be 'human'"),
     ],
 )
 def test_settings__bad_ones_are_refused_when_the_environment_is_made(settings: dict[str, object], message: str) -> None:

@@ -1,0 +1,41 @@
+"""The command ``ethbrake record``: agents in one world, as a film."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ethbrake_marl.cli.options import ForceOption, ScenarioOption, VehicleOption
+from ethbrake_marl.cli.terminal import interruptible, say
+from ethbrake_marl.evaluation import check_target
+from ethbrake_marl.evaluation.film import check_ending, film_bytes, film_scenes
+from ethbrake_marl.evaluation.inputs import LIST_SEED, load_evaluated, make_lineup
+from ethbrake_marl.evaluation.per_world import write_output
+
+
+def record_command(
+    output: Annotated[Path, typer.Option("--output", metavar="FILE.gif|FILE.mp4", help="The film to write.")],
+    agents: Annotated[
+        str, typer.Option(metavar="A,B,...", help="Who drives, one below the other; as in `ethbrake evaluate`.")
+    ] = "e_v2x_bm",
+    scenario: ScenarioOption = "paper-random",
+    world: Annotated[int, typer.Option(help="Number of the world in the list.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the list.", min=0)] = LIST_SEED,
+    vehicle: VehicleOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Agents in one world of the list, in real time: the road to scale, commands, impacts, harm."""
+    ending = output.suffix.lower()
+    check_ending(ending)
+    target = check_target(output, force=force)
+    chosen = load_evaluated(scenario, vehicle)
+    lineup = make_lineup(agents.split(","), chosen)
+    worlds = chosen.sample(1, seed, first=world).worlds
+    films = {}
+    with interruptible("nothing was written"):
+        for name, agent in lineup.items():
+            films[f"{name}: world {world} of {chosen.name}"] = film_scenes(worlds, agent, scenario=chosen)
+        write_output(target, film_bytes(films, ending), force=force)
+    say(f"film: {target}")

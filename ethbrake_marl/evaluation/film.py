@@ -1,0 +1,117 @@
+"""An episode as a film: the frames of the environment's own pictures, in real time, as the bytes of a GIF or MP4."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ethbrake_marl.agents.rollout import episode_engine
+from ethbrake_marl.agents.team import Driver, team_of
+from ethbrake_marl.envs.drawing.scene import Scene
+from ethbrake_marl.envs.drawing.trace import Trace, kept_motions, scenes
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.scenario import Scenario
+
+if TYPE_CHECKING:
+    from ethbrake_marl.envs.drawing.frame import Frame
+
+FILM_FPS = 25
+_COLOURS = 64
+
+
+def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float = FILM_FPS) -> list[Scene]:
+    """What one world shows from the alert to the end of its episode, ``fps`` moments per second, then its end.
+
+    Args:
+        world: at the alert, n = 1.
+        agent: drives the learner, or, as a team, its vehicles; it is left as it is.
+        scenario: of the world; its scripts drive the other vehicles.
+        fps: moments per second of the world.
+
+    Raises ``InvalidInput`` for more than one world, ``PhysicsError`` for one that could not be advanced.
+
+    """
+    if world.n != 1:
+        raise InvalidInput(f"film_scenes: {count_of(world.n, 'world')} given; exactly 1 is needed: worlds.take([0])")
+    engine = episode_engine(world, team_of(agent, scenario.learners), scenario)
+    trace = Trace(engine, whole=True, alert=world)
+    while not engine.ended.all():
+        engine.step({})
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
+    end = float(engine.worlds.time_s[0])
+    times = np.append(np.arange(int(np.ceil(end * fps - 1e-9))) / fps, end)
+    shown: list[Scene] = []
+    for motion in kept_motions(engine, trace):
+        start, until = float(motion.start.time_s[0]), float(motion.until_s[0])
+        mine = times[(times >= start if motion.fresh[0] else times > start) & (times <= until)]
+        shown += scenes(engine, motion, 0, mine) if len(mine) else []
+    return shown
+
+
+def film_bytes(films: Mapping[str, Sequence[Scene]], ending: str, *, fps: int = FILM_FPS) -> bytes:
+    """Films of one world, titled and one below the other, in real time: an endless GIF, or an MP4.
+
+    A film that ends before the others shows its end. Raises ``InvalidInput`` without films, for an ``ending`` that is
+    neither ``.gif`` nor ``.mp4``, for an ``fps`` whose frames do not last whole hundredths of a second, as a GIF needs,
+    and for an MP4 where the library that writes it is missing.
+    """
+    check_ending(ending)
+    if not films or not all(films.values()):
+        raise InvalidInput("film_bytes: no films given")
+    if not fps > 0 or 100 % fps:
+        raise InvalidInput(f"film_bytes: fps = {fps}: must divide 100, for instance 10, 20, 25 or 50")
+    return _WRITERS[ending](list(_stacked(films)), fps)
+
+
+def check_ending(ending: str) -> None:
+    """Refuse, before any work, a film that cannot be written; raises as ``film_bytes``."""
+    if ending not in _WRITERS:
+        raise InvalidInput(f"a film that ends in {ending!r}: films are written as {' or '.join(_WRITERS)}")
+    if ending == ".mp4" and find_spec("imageio_ffmpeg") is None:
+        raise InvalidInput(
+            "an MP4 needs imageio-ffmpeg, which is not installed: python -m pip install 'ethbrake-marl[render]'; a GIF"
+            " does without"
+        )
+
+
+def _stacked(films: Mapping[str, Sequence[Scene]]) -> Iterator[Frame]:
+    """The frames of all films, one below the other."""
+    from ethbrake_marl.envs.drawing.frame import draw_frame
+
+    for k in range(max(map(len, films.values()))):
+        each = (shown[min(k, len(shown) - 1)]._replace(title=title) for title, shown in films.items())
+        yield np.concatenate([draw_frame(scene) for scene in each])
+
+
+def _write_gif(frames: Sequence[Frame], fps: int) -> bytes:
+    from PIL import Image
+
+    pictures = [Image.fromarray(frame).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE) for frame in frames]
+    buffer = io.BytesIO()
+    pictures[0].save(buffer, "GIF", save_all=True, append_images=pictures[1:], duration=1000 // fps, loop=0)
+    return buffer.getvalue()
+
+
+def _write_mp4(frames: Sequence[Frame], fps: int) -> bytes:
+    from imageio_ffmpeg import write_frames
+
+    height, width, _ = frames[0].shape
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "film.mp4"
+        writer = write_frames(str(path), (width, height), fps=fps, quality=8)
+        writer.send(None)
+        for frame in frames:
+            writer.send(frame)
+        writer.close()
+        return path.read_bytes()
+
+
+_WRITERS = {".gif": _write_gif, ".mp4": _write_mp4}

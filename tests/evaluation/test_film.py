@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import ethbrake_marl as eb
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import film
+from ethbrake_marl.evaluation.film import film_bytes, film_scenes
+from tests.envs.lines import CRASH
+
+WORLD = CRASH.sample(1, seed=0).worlds
+
+
+def test_film_scenes__are_evenly_spaced_from_the_alert_to_the_end() -> None:
+    shown = film_scenes(WORLD, eb.make_agent("coast"), scenario=CRASH, fps=25)
+    times = [scene.time_s for scene in shown]
+    assert times == pytest.approx([*(np.arange(33) / 25), 1.3])
+    assert [scene.ended for scene in shown] == [False] * (len(shown) - 1) + [True]
+    hit = [scene.time_s for scene in shown if scene.total_harm > 0.0]
+    assert hit[0] == pytest.approx(1.0, abs=0.0401) and shown[-1].total_harm == pytest.approx(36.0)
+
+
+def test_film_scenes__are_those_of_the_recorded_episode() -> None:
+    scenario = eb.load_scenario("paper-random")
+    world = scenario.sample(1, seed=7).worlds
+    record = eb.record_episode(world, eb.make_agent("e_v2x_bm"), scenario=scenario)
+    shown = film_scenes(world, eb.make_agent("e_v2x_bm"), scenario=scenario)
+    for scene in shown[::9]:
+        gaps = [np.interp(scene.time_s, record.time_s, record.gaps_m[:, p]) for p in range(2)]
+        assert scene.gaps_m == pytest.approx(gaps, abs=0.01)
+    assert shown[-1].first_harm == pytest.approx(float(record.ledger.world_harm("first")[0]))
+
+
+def test_film__as_gif_plays_in_real_time_and_ends_with_the_longest() -> None:
+    short = film_scenes(WORLD, eb.make_agent("coast"), scenario=CRASH, fps=10)
+    shown = Image.open(io.BytesIO(film_bytes({"a": short, "b": short[:3]}, ".gif", fps=10)))
+    assert (shown.n_frames, shown.size) == (len(short), (800, 608))
+    durations = []
+    for k in range(shown.n_frames):
+        shown.seek(k)
+        durations.append(shown.info["duration"])
+    assert durations == [100] * len(short)
+    with pytest.raises(InvalidInput, match="fps = 30: must divide 100"):
+        film_bytes({"a": short}, ".gif", fps=30)
+    with pytest.raises(InvalidInput, match="no films given"):
+        film_bytes({}, ".gif")
+
+
+def test_film__as_mp4_plays_in_real_time(tmp_path: Path) -> None:
+    library = pytest.importorskip("imageio_ffmpeg", reason="needs the extra: pip install 'ethbrake-marl[render]'")
+    shown = film_scenes(WORLD, eb.make_agent("coast"), scenario=CRASH)
+    path = tmp_path / "film.mp4"
+    path.write_bytes(film_bytes({"a": shown}, ".mp4"))
+    frames, seconds = library.count_frames_and_secs(str(path))
+    assert frames == len(shown) and seconds == pytest.approx(len(shown) / 25, abs=0.02)
+
+
+def test_film__as_mp4_without_its_library_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(film, "find_spec", lambda name: None)
+    with pytest.raises(InvalidInput, match=r"pip install 'ethbrake-marl\[render\]'"):
+        film.check_ending(".mp4")
+
+
+def test_record_command__writes_the_film_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "film.gif"
+    arguments = ["record", "--agents", "full_brake", "--world", "2", "--output", str(path)]
+    assert run_command(arguments) == 0
+    assert path.read_bytes()[:6] == b"GIF89a"
+    assert run_command(arguments) == 2
+    assert run_command(["record", "--output", str(tmp_path / "film.avi")]) == 2
+    assert "films are written as .gif or .mp4" in capsys.readouterr().err
