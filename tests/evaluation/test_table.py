@@ -25,7 +25,7 @@ ALWAYS = {
     "first_impact_harm_difference", "first_impact_harm_difference_interval", "total_harm_difference",
     "total_harm_difference_interval", "harm_decrease_first", "harm_decrease_first_interval", "harm_decrease_total",
     "harm_decrease_total_interval", "unavoidable_rate", "unavoidable_rate_interval", "impact_proven_rate",
-    "impact_unproven", "left_out",
+    "impact_unproven", "left_out", "worlds_sha256", "scenario_sha256", "policy_sha256", "versions",
     "impact_proven_rate_interval", "proven_harm", "proven_harm_interval", "best_known_minus_proven_first",
     "best_known_minus_proven_first_interval", "best_known_minus_proven_total", "best_known_minus_proven_total_interval",
     "avoidable_collision_rate",
