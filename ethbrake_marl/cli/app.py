@@ -61,7 +61,7 @@ from ethbrake_marl.evaluation.inputs import (
     load_driven,
     load_runnable,
 )
-from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.evaluation.per_world import PER_WORLD, write_output
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import SIZE_LIMIT
 from ethbrake_marl.learning.recipe import load_recipe
@@ -191,7 +191,7 @@ def run(
                 settings=given.texts,
                 on_progress=bars.show_progress,
             )
-    show_rows(result.rows, as_json)
+    show_rows(result.rows, as_json, per_world=result.directory / PER_WORLD)
     if not as_json:
         show_beside(result.beside)
     say(f"report: {result.report}")

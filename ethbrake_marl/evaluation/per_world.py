@@ -71,6 +71,8 @@ REGRET_COLUMNS = (
     "regret_total_harm",
 )
 
+PER_WORLD = "per_world.csv"  # its name in the folder of a run
+
 _ALWAYS = ("gaps_m", "speeds_mps", "obstacle_gap_m")
 
 

@@ -15,7 +15,7 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, record_episode, write_per_world_csv
 from ethbrake_marl.evaluation.compare import results_to_json
 from ethbrake_marl.evaluation.paper import MAIN_TEST, TESTS
-from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.evaluation.per_world import PER_WORLD, write_output
 from ethbrake_marl.evaluation.report import Report, ReportFigure, ReportTest, write_report
 from ethbrake_marl.evaluation.table import BASELINE
 from ethbrake_marl.figures.episode import trajectories
@@ -33,7 +33,7 @@ TRAJECTORIES = "trajectories.png"
 
 def write_results(folder: Path, evaluation: Evaluation, rows: Sequence[SummaryRow]) -> None:
     """Write ``results.json`` (the rows), ``results.csv`` (the same, flat) and ``per_world.csv``."""
-    per_world = folder / "per_world.csv"
+    per_world = folder / PER_WORLD
     write_per_world_csv(per_world, evaluation, force=True)
     content = json.dumps(results_to_json(rows, per_world=per_world), indent=2, allow_nan=False) + "\n"
     write_output(folder / "results.json", content.encode(), force=True)

@@ -113,6 +113,7 @@ def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake, fini
     )
     now = json.loads(answer.out)
     then = {row["agent"]: row for row in json.loads((finished_run / "results.json").read_text())}
+    assert {row.pop("per_world")["file"] for row in then.values()} == {"per_world.csv"}
     names = {f"ppo@{finished_run}": "ppo", f"ppo@{finished_run}+episode": "hybrid"}
     for row in now:
         assert row == {**then[names.get(row["agent"], row["agent"])], "agent": row["agent"]}

@@ -135,6 +135,11 @@ def _words() -> Iterator[Case]:
         for command in (
             ("scenario", "show", word),
             ("scenario", "new", word),
+            ("recipe", "show", word),
+            ("recipe", "new", word),
+            ("compare", word, word),
+            ("evaluate", *FEW, "--set", word),
+            ("evaluate", *FEW, "--set", f"mass_t={word}"),
             ("evaluate", *FEW, "--vehicle", word),
             ("resume", word),
             (word,),
@@ -188,5 +193,5 @@ def _case(category: str, command: tuple[str, ...], build: Build = lambda folder:
         command,
         build,
         certain=certain,
-        may_change=("file", "full/mine.yaml"),
+        may_change=("file", "file.json", "full/mine.yaml"),
     )
