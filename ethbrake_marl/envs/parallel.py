@@ -124,7 +124,8 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         infos = self._infos(report(self.engine, step))
         if terminated or truncated:
             self.agents = []
-        self.viewer.play()
+        if self.render_mode is not None:
+            self.viewer.play()
         return (
             self._observations(),
             dict(zip(agents, rewards, strict=True)),

@@ -93,7 +93,8 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
             raise InvalidInput("step: no episode is running; call reset first")
         step = self.engine.step(learner_columns((self._name,), {self._name: action}))
         self._running = not step.ended[0]
-        self.viewer.play()
+        if self.render_mode is not None:
+            self.viewer.play()
         info = plain_infos(report(self.engine, step), self._column)[0]
         reward = float(step.reward[0, self.learner])
         return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info

@@ -23,6 +23,11 @@ Maker = Callable[..., Any]
 
 
 @pytest.fixture(autouse=True)
+def _no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")  # Gymnasium's checker renders in every mode, in a window, too
+
+
+@pytest.fixture(autouse=True)
 def _every_warning_is_an_error() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("error")

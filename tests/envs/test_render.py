@@ -245,6 +245,13 @@ def test_human__shows_each_step_in_real_time() -> None:
     assert pygame.display.get_surface() is None
 
 
+def test_human__without_a_display_says_what_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
+    with pytest.raises(InvalidInput, match="no window can be opened here .*; 'rgb_array' needs no display"):
+        parallel_env(render_mode="human").reset(seed=0)
+
+
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")
 def test_checkers__pass_with_every_mode() -> None:
     pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
