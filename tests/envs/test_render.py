@@ -248,7 +248,7 @@ def test_human__shows_each_step_in_real_time() -> None:
 def test_human__without_a_display_says_what_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
     monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
-    with pytest.raises(InvalidInput, match="no window can be opened here .*; 'rgb_array' needs no display"):
+    with pytest.raises(InvalidInput, match=r"no window can be opened here .*; 'rgb_array' needs no display"):
         parallel_env(render_mode="human").reset(seed=0)
 
 

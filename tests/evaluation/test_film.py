@@ -9,6 +9,7 @@ from PIL import Image
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.envs.drawing.frame import draw_frame
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import film
 from ethbrake_marl.evaluation.film import film_bytes, film_scenes
@@ -50,6 +51,13 @@ def test_film__as_gif_plays_in_real_time_and_ends_with_the_longest() -> None:
         film_bytes({"a": short}, ".gif", fps=30)
     with pytest.raises(InvalidInput, match="no films given"):
         film_bytes({}, ".gif")
+
+
+def test_film__a_title_of_any_length_and_kind_stays_left_of_the_clock() -> None:
+    shown = film_scenes(WORLD, eb.make_agent("coast"), scenario=CRASH)[:1]
+    frames = [draw_frame(shown[0]._replace(title=title)) for title in ("", "\u202e\x1b" + "long/name " * 400)]
+    differs = (frames[0] != frames[1]).any(axis=2)
+    assert differs[:30, :560].any() and not differs[:, 560:].any() and not differs[30:].any()
 
 
 def test_film__as_mp4_plays_in_real_time(tmp_path: Path) -> None:

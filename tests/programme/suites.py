@@ -148,6 +148,7 @@ EVALUATION = Suite(
         "evaluation/outcome.py": ("tests/evaluation/test_rollout.py", "tests/evaluation/test_left_out.py"),
         "evaluation/regret.py": ("tests/evaluation/test_regret.py",),
         "evaluation/record.py": ("tests/evaluation/test_record.py",),
+        "evaluation/film.py": ("tests/evaluation/test_film.py",),
         "evaluation/table.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
         "evaluation/criticality.py": ("tests/figures/test_criticality.py",),
         "evaluation/deceleration.py": ("tests/figures/test_deceleration.py",),

@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ethbrake_marl.envs.drawing.scene import BODY_M, Scene, Struck, vehicle_colour
 from ethbrake_marl.envs.drawing.text import command_words, pair_words, shield_words, speed_words
+from ethbrake_marl.errors import plain_text
 
 Frame = NDArray[np.uint8]  # [HEIGHT, WIDTH, 3]
 
@@ -21,6 +22,7 @@ _ROAD_TOP, _ROAD_BOTTOM = 84, 138
 _LANE = (_ROAD_TOP + _ROAD_BOTTOM) // 2
 _BODY = 13  # half of a body's height
 _PANEL_TOP, _PANEL_BOTTOM = 172, 268
+_TITLE = 540  # width that is left beside the clock
 _FINE = 2  # shapes are drawn so many times larger, for smooth edges
 
 _PAPER, _INK, _GREY, _LIGHT = "#ffffff", "#1a1a1a", "#6b6b6b", "#d9d9d9"
@@ -129,7 +131,7 @@ def _draw_panel(pen: _Pen, scene: Scene, i: int) -> None:
 
 
 def _write_head(text: ImageDraw.ImageDraw, scene: Scene) -> None:
-    text.text((_MARGIN, 10), scene.title, _GREY, _font(15))
+    text.text((_MARGIN, 10), _shortened(plain_text(scene.title)[:200], _TITLE, 15), _GREY, _font(15))
     clock = f"{scene.time_s:.2f} s after the alert{', ended' if scene.ended else ''}"
     text.text((WIDTH - _MARGIN, 8), clock, _INK, _font(18), anchor="ra")
     harm = f"harm {scene.first_harm:.2f} by first impacts, {scene.total_harm:.2f} in total (m2/s2)"
@@ -193,6 +195,14 @@ def _write_panel(text: ImageDraw.ImageDraw, scene: Scene, i: int) -> None:
 def _fitting(words: list[str], width: float, size: int) -> str:
     """The first of these that is not wider than ``width``, else the last."""
     return next((each for each in words if _font(size).getlength(each) <= width), words[-1])
+
+
+def _shortened(words: str, width: float, size: int) -> str:
+    """The words, cut off at their end where they would be wider than ``width``."""
+    if _font(size).getlength(words) <= width:
+        return words
+    kept = next(k for k in range(len(words), -1, -1) if _font(size).getlength(words[:k] + "...") <= width)
+    return words[:kept] + "..."
 
 
 def _share(scene: Scene, i: int) -> float:
