@@ -23,6 +23,7 @@ _MEANINGS = {
     "learning_rate": "of the optimiser, from its start to its end",
     "gamma": "discount of one time step; equal to reward.shaping_discount",
     "reward": "weights and constants of the reward's terms (docs/learning.md)",
+    "observation": "groups and features that learners observe, [own, front_1, rear_1]; left out: the scenario's",
     "horizon_is_end": "true: nothing is expected beyond the horizon",
     "seed": "of worlds, networks and exploration",
     "evaluation": "the fixed list on which the policy is measured while it learns, and how often",
@@ -70,7 +71,7 @@ def new_recipe_text(name: str, based_on: str = "ppo") -> str:
         "source": f"Values of {base.name}, to be changed.",
     }
     head = f"# Recipe {name}, started from {base.name}. Train with it: ethbrake train --recipe {name}.yaml\n"
-    return head + "".join(_entry(key, values[key]) for key in type(base).model_fields)
+    return head + "".join(_entry(key, values.get(key)) for key in type(base).model_fields)
 
 
 def _entry(key: str, value: Any) -> str:

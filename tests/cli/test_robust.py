@@ -57,4 +57,4 @@ def test_picture__is_drawn_and_its_figures_are_told(ethbrake, tmp_path):
     told = json.loads(answer.out)
     assert len(told) == 5 * 3 * 2 and {row["mode"] for row in told} == {"step", "robust"}
     assert ethbrake("picture", "robustness", *options).status == 2
-    assert ethbrake("picture", "robustness", "--output", tmp_path / "robust.pdf").status == 2
+    assert ethbrake("picture", "robustness", "--output", tmp_path / "robust.docx").status == 2

@@ -12,7 +12,7 @@ import yaml
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import evaluate, parameters, rollout, summarise, write_per_world_csv
+from ethbrake_marl.evaluation import evaluate, outcome, parameters, rollout, summarise, write_per_world_csv
 from ethbrake_marl.evaluation.regret import assess
 from ethbrake_marl.limits import limits, lower_bound
 from ethbrake_marl.limits.limits import Limits, Unproven, known_limits, prove
@@ -40,7 +40,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     watch(lower_bound, "avoidability", "avoidability")
     watch(limits, "lower_bound", "bound")
     watch(limits, "best_known", "best known")
-    watch(rollout, "known_limits", "limits")
+    watch(outcome, "known_limits", "limits")
     watch(rollout._Whole, "evaluation", "evaluation")
     return found
 

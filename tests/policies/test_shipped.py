@@ -107,7 +107,7 @@ LOWERED = {
 }
 
 
-@pytest.mark.parametrize("count", HARM_COUNTS)
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
 @pytest.mark.parametrize("test", list(LOWERED))
 def test_shipped__refined_is_nowhere_below_the_shipped_table(test: str, harm_count: HarmCount) -> None:
     scenario = load_scenario(test)
