@@ -1,5 +1,5 @@
 # Everything runs in the project's own environment, .venv, made from Python >= 3.11 and this file alone.
-# TORCH_INDEX: index of CPU builds of torch, e.g. make run TORCH_INDEX=ADDRESS (README: how to find it)
+# TORCH_INDEX: index to take torch from, e.g. make run TORCH_INDEX=ADDRESS; without it uv picks the build (see below)
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # PEERS:       the environment of `make bench-peers`, apart from the project's own.
 # ARGS:        passed on by `make run` (to `ethbrake run`) and `make test` (to pytest).
@@ -16,18 +16,29 @@ ARGS ?=
 WORKERS ?= 2
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
+# The plain index has torch for NVIDIA's GPUs alone, with gigabytes of their libraries. uv looks what the machine has,
+# and takes the build for it (CPU where there is no GPU) from where torch publishes them, if that can be reached.
+define TORCH_FOR_THIS_MACHINE
+if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for this machine" \
+  && UV_HTTP_TIMEOUT=30 UV_HTTP_RETRIES=1 $(BIN)/uv pip install --quiet --python $(BIN)/python --torch-backend auto \
+    --no-deps -c constraints.txt torch; then :; else \
+  echo "== uv cannot reach it (above): torch from pip's own index, which may be the large build for GPUs"; \
+  $(PIP_INSTALL) --no-deps torch; fi
+endef
+
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-order planted-bugs shield-bugs mutation bench-peers
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
 	@echo "make test [ARGS=...]  the test suite, without the tests marked long"
-	@echo "make lint             ruff, ruff format --check, mypy --strict"
+	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry"
 	@echo "make check            lint and test"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
 	@echo "make test-hostile     6,000 files and command lines of strangers: each refused in one line, or in order"
+	@echo "make test-light       install the wheel alone: at most 650 MB, no torch, and its examples run"
 	@echo "make shield-bugs      plant 19 bugs in copies of the shield; each must turn a test red"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
 	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"
@@ -35,7 +46,7 @@ help:
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make clean            remove $(VENV), $(PEERS), caches and builds (runs/ stays)"
-	@echo "TORCH_INDEX=URL       take torch from this index (CPU builds: see README)"
+	@echo "TORCH_INDEX=URL       take torch from this index; else uv picks the build for this machine"
 
 venv: $(STAMP)
 
@@ -66,10 +77,11 @@ $(STAMP): pyproject.toml constraints.txt
 	  echo "error: $$found cannot make a virtual environment (on Debian: apt install python3-venv)" >&2; \
 	  exit 1; \
 	fi
-	@echo "== Installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX))"
-	@$(PIP_INSTALL) --no-deps $(if $(TORCH_INDEX),--index-url "$(TORCH_INDEX)") torch
-	@echo "== Installing ethbrake_marl and its dependencies, at the versions of constraints.txt"
-	@$(PIP_INSTALL) -e ".[dev]"
+	@$(if $(TORCH_INDEX),echo "== Installing torch from $(TORCH_INDEX)"; \
+	$(PIP_INSTALL) --no-deps --index-url "$(TORCH_INDEX)" torch,$(TORCH_FOR_THIS_MACHINE))
+	@echo "== Installing ethbrake_marl with what it needs to train and to be tested, at the versions of constraints.txt"
+	@$(PIP_INSTALL) -e ".[train,dev]"
+	@echo "== torch $$($(BIN)/python -c 'from importlib.metadata import version; print(version("torch"))')"
 	@echo "$(CURDIR)" > $@
 	@echo "== Environment ready"
 
@@ -88,6 +100,8 @@ lint: $(STAMP)
 	@$(BIN)/python -m ruff format --check .
 	@echo "== mypy --strict"
 	@$(BIN)/python -m mypy --strict ethbrake_marl tests/every_public_name.py
+	@echo "== deptry: every package that is imported is asked for, and the other way round"
+	@$(BIN)/deptry ethbrake_marl
 
 check: lint
 	@$(MAKE) --no-print-directory test
@@ -103,6 +117,10 @@ test-resume: $(STAMP)
 test-shield: $(STAMP)
 	@echo "== trying to break the step shield"
 	@$(BIN)/python -m tests.shield.programme $(ARGS)
+
+test-light: $(STAMP)
+	@echo "== the wheel alone in an empty environment: size, and what it must do without torch"
+	@$(BIN)/python -m tests.wheel $(ARGS)
 
 test-order: $(STAMP)
 	@echo "== the suite in random orders"

@@ -12,10 +12,12 @@ from __future__ import annotations
 import ast
 from difflib import get_close_matches
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ethbrake_marl.envs.registration import register_environments
+from ethbrake_marl.errors import naming_extras
 
 if TYPE_CHECKING:
     # Environments
@@ -102,6 +104,7 @@ if TYPE_CHECKING:
 
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError
+    from ethbrake_marl.errors import MissingExtra as MissingExtra
 
 __version__ = "0.1.0"
 
@@ -115,17 +118,25 @@ def _read_homes() -> dict[str, str]:
 
 
 _HOMES = _read_homes()
+_NEED_TRAIN = ("EthBrakeVecEnv", "ShieldedVecEnv", "TrainResult", "make_sb3_vec_env", "resume", "train")
+
+
+def _usable() -> list[str]:
+    """The public names that can be imported here; each of the others says which extra it needs when it is used."""
+    missing = _NEED_TRAIN if find_spec("stable_baselines3") is None else ()
+    return [name for name in _HOMES if name not in missing]
 
 
 def _import_public(name: str) -> Any:
     """Import a public name from the file it lives in, once."""
     if name == "__all__":
-        return ["__version__", *_HOMES]
+        return ["__version__", *_usable()]
     if name not in _HOMES:
         close = get_close_matches(name, _HOMES, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
-    value = getattr(import_module(_HOMES[name]), name)
+    with naming_extras():
+        value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value
     return value
 
@@ -135,7 +146,7 @@ if not TYPE_CHECKING:  # type checkers would take any name for a public one
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOMES, "__all__"})
+    return sorted({*globals(), *_usable(), "__all__"})
 
 
 register_environments()

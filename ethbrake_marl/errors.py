@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +75,42 @@ class AlreadyExists(EthBrakeError, FileExistsError):
 
 class CorruptBundle(EthBrakeError, ValueError):
     """A policy bundle is damaged, or is not one; nothing of it was used."""
+
+
+_EXTRA_OF = {
+    **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
+    **dict.fromkeys(("benchmarl", "torchrl", "tensordict"), "marl"),
+    "onnx": "export",
+    "pyarrow": "data",
+    **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
+}
+
+
+class MissingExtra(EthBrakeError, ImportError):
+    """Something needs a package that the plain install leaves out; the message holds the line that installs it."""
+
+
+@contextmanager
+def naming_extras() -> Iterator[None]:
+    """An import inside that lacks a package of an extra raises ``MissingExtra``; any other fails as it would."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in _EXTRA_OF:
+            raise
+        raise _missing(package) from None
+
+
+def need(package: str) -> None:
+    """Raise ``MissingExtra`` unless a package of an extra is installed; nothing is imported."""
+    if find_spec(package) is None:
+        raise _missing(package)
+
+
+def _missing(package: str) -> MissingExtra:
+    line = f"{sys.executable} -m pip install 'ethbrake-marl[{_EXTRA_OF[package]}]'"
+    return MissingExtra(f"needs the package {package}, which is not installed: {line}")
 
 
 class PhysicsError(EthBrakeError, ArithmeticError):

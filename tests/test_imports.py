@@ -35,7 +35,8 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("learning", "figures"),
     ("__init__",),
     ("studies",),
-    ("cli", "__main__"),
+    ("cli",),
+    ("__main__",),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 

@@ -10,11 +10,10 @@ line) without the extra, with checkpoints and measuring on the way; this file is
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
 from ethbrake_marl.learning.algorithms.ppo import PpoRecipe
 from ethbrake_marl.learning.recipe import load_recipe
 
@@ -24,10 +23,8 @@ def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> No
     line, plan = eb.load_scenario(scenario), load_recipe(recipe).replace(total_steps=steps, seed=seed)
     if not isinstance(plan, PpoRecipe):
         raise InvalidInput(f"recipe {plan.name!r}: is for {plan.algorithm.upper()}; MAPPO needs one for PPO")
-    try:
+    with naming_extras():
         from ethbrake_marl.learning.benchmarl import train_mappo  # only here: an extra
-    except ModuleNotFoundError as error:
-        raise InvalidInput(f"needs BenchMARL: {sys.executable} -m pip install benchmarl ({error})") from None
     train_mappo(plan, line, output)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -11,6 +12,7 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
+from ethbrake_marl import __version__
 from ethbrake_marl.cli.ablate import ablate_command, generalise_command
 from ethbrake_marl.cli.bench import bench_command
 from ethbrake_marl.cli.best_harm import best_harm_command
@@ -40,7 +42,9 @@ from ethbrake_marl.cli.terminal import (
     interruptible,
     progress_bars,
     say,
+    shell_asks,
     show,
+    tell_compilation,
     tell_old_spellings,
     tolerate_narrow_streams,
     write_json,
@@ -54,7 +58,7 @@ from ethbrake_marl.cli.train import (
     resume_command,
     train_command,
 )
-from ethbrake_marl.errors import EthBrakeError
+from ethbrake_marl.errors import EthBrakeError, naming_extras
 from ethbrake_marl.evaluation.inputs import (
     EPISODES,
     LIST_SEED,
@@ -74,12 +78,12 @@ from ethbrake_marl.scenario import (
 )
 
 BAD_INPUT = 2
-_NO_VARIABLE = ""  # no completion is offered, so no variable may ask for it
+_NO_VARIABLE = ""  # by which no shell can ask for completion
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
 GENERALISE = "Example: ethbrake generalise --runs runs/cooperation-4-all-cooperation-seed0 --vehicles 3,5,10"
 
 app = typer.Typer(
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     help="Ethical emergency braking: train, shield, evaluate. Every command has its own --help with an example.",
@@ -123,6 +127,7 @@ def main() -> None:
     """Entry point: run the command line and exit with its status."""
     tolerate_narrow_streams()
     tell_old_spellings()
+    tell_compilation()
     sys.exit(run_command(sys.argv[1:]))
 
 
@@ -133,7 +138,9 @@ def run_command(arguments: Sequence[str]) -> int:
     """
     try:
         arguments = rename_old_options(arguments)
-        status = app(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=_NO_VARIABLE)
+        variable = None if shell_asks(os.environ) else _NO_VARIABLE  # None: the usual one
+        with naming_extras():
+            status = app(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)
         sys.stdout.flush()
     except TyperException as error:
         context = getattr(error, "ctx", None)
@@ -147,6 +154,21 @@ def run_command(arguments: Sequence[str]) -> int:
     except MemoryError as error:
         return _refuse(f"not enough memory{f' ({error})' if str(error) else ''}; ask for fewer worlds at once")
     return status if isinstance(status, int) else 0
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        show(f"ethbrake {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _about(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Options of ``ethbrake`` itself."""
 
 
 @app.command(epilog="Example: ethbrake run --steps 200000 --seed 1")
@@ -257,12 +279,17 @@ def scenario_schema() -> None:
 
 
 @app.command(epilog="Example: ethbrake doctor")
-def doctor(as_json: JsonOption = False) -> None:
+def doctor(
+    warm_up: Annotated[
+        bool, typer.Option("--warm-up", help="Compile all of the physics now, so that no later command waits for it.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
     """Check this installation: versions, folders, physics.
 
     One line per check, OK or FAIL; exit status 1 when any failed.
     """
-    checks = diagnose()
+    checks = diagnose(warm_up=warm_up)
     if as_json:
         write_json([asdict(check) for check in checks])
     else:

@@ -14,6 +14,7 @@ from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import ForceOption, JsonOption
 from ethbrake_marl.cli.picture import picture_target
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
+from ethbrake_marl.errors import need
 from ethbrake_marl.studies.speed import BENCHMARKS, FULL, QUICK, WORLD_STEPS, Speed, measure
 
 Measured = TypeVar("Measured")
@@ -37,6 +38,7 @@ def bench_command(
     if scaling is not None:
         _bench_scaling(scaling, quick=quick, force=force, as_json=as_json)
         return
+    need("stable_baselines3")  # one of the figures does; before minutes are spent on the others
     machine = this_machine()
     with interruptible(_NOTHING):
         speeds = _watch(measure(QUICK if quick else FULL), len(BENCHMARKS))

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 from packaging.requirements import Requirement
@@ -17,11 +18,17 @@ from packaging.version import Version
 
 from ethbrake_marl import __version__
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.evaluation import evaluate, summarise
+from ethbrake_marl.evaluation.inputs import LIST_SEED, make_lineup, make_proposers
+from ethbrake_marl.evaluation.shield_modes import compare_modes
 from ethbrake_marl.physics import Worlds, advance, make_worlds
-from ethbrake_marl.physics.compiled import cache_folder
-from ethbrake_marl.scenario import list_scenarios, scenario_folder
+from ethbrake_marl.physics.compiled import cache_folder, is_temporary
+from ethbrake_marl.scenario import Task, list_scenarios, load_scenario, scenario_folder
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 DISTRIBUTION = "ethbrake-marl"
+EXTRAS = ("train", "marl", "export")
+_WARM_UP = ("ladder", "ppo@shipped", "ppo@shipped+refined+episode", "full_brake+step", "full_brake+robust")
 OLDEST_PYTHON = (3, 11)
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent  # or the folder of installed packages, where there is no pyproject.toml
@@ -36,8 +43,11 @@ class Check:
     detail: str
 
 
-def diagnose() -> list[Check]:
-    """All checks, in the order in which they should be repaired; none of them raises."""
+def diagnose(*, warm_up: bool = False) -> list[Check]:
+    """All checks, in the order in which they should be repaired; none of them raises.
+
+    ``warm_up``: run every kernel that the usual commands use first, so that all are compiled and kept.
+    """
     return [
         Check("ethbrake_marl", True, f"{__version__} in {_PACKAGE}"),
         _check("python", _python),
@@ -47,6 +57,7 @@ def diagnose() -> list[Check]:
         _check("scenarios", _scenarios),
         _check("physics", _golden_impact),
         _check("baseline", _golden_baseline),
+        *([_check("warm-up", _warm_up)] if warm_up else []),
     ]
 
 
@@ -65,15 +76,19 @@ def _python() -> tuple[bool, str]:
 
 
 def _dependencies() -> Iterator[Check]:
-    """One check per dependency of the package: installed, and not older than the oldest version that was tried."""
+    """One check per dependency of the package: installed, and not older than the oldest version that was tried.
+
+    What only an extra brings may be missing.
+    """
     pinned = _pinned_versions(_CHECKOUT / "constraints.txt")
-    for requirement in _requirements():
+    for extra, requirement in _requirements():
         name = requirement.name
         wanted = f"needs {requirement.specifier}"
         try:
             found = version(name)
         except PackageNotFoundError:
-            yield Check(name, False, f"is not installed; {wanted}")
+            what = f"is not installed; the extra {extra} brings it" if extra else f"is not installed; {wanted}"
+            yield Check(name, bool(extra), what)
             continue
         tested = pinned.get(name.lower())
         note = f" (tested with {tested})" if tested and Version(found).public != Version(tested).public else ""
@@ -81,15 +96,17 @@ def _dependencies() -> Iterator[Check]:
         yield Check(name, fits, f"{found}{note}" if fits else f"{found}; {wanted}{note}")
 
 
-def _requirements() -> list[Requirement]:
-    """What the package needs without its extras: from the checkout that it runs in, else from its metadata."""
+def _requirements() -> list[tuple[str, Requirement]]:
+    """(extra, or "" for what is always needed; requirement): from the checkout that it runs in, else its metadata."""
     project = _CHECKOUT / "pyproject.toml"
-    if project.is_file():
-        lines = tomllib.loads(project.read_text("utf-8"))["project"]["dependencies"]
-    else:
-        lines = requires(DISTRIBUTION) or []
-    requirements = [Requirement(line) for line in lines]
-    return [r for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
+    if not project.is_file():
+        lines = [Requirement(line) for line in requires(DISTRIBUTION) or []]
+        plain = [("", r) for r in lines if r.marker is None or r.marker.evaluate({"extra": ""})]
+        extra = [(e, r) for e in EXTRAS for r in lines if r.marker is not None and r.marker.evaluate({"extra": e})]
+        return plain + [(e, r) for e, r in extra if ("", r) not in plain]
+    table = tomllib.loads(project.read_text("utf-8"))["project"]
+    groups = {"": table["dependencies"], **{extra: table["optional-dependencies"][extra] for extra in EXTRAS}}
+    return [(extra, Requirement(line)) for extra, lines in groups.items() for line in lines]
 
 
 def _pinned_versions(constraints: Path) -> dict[str, str]:
@@ -108,9 +125,8 @@ def _processor() -> tuple[bool, str]:
 
 def _kernel_cache() -> tuple[bool, str]:
     folder = cache_folder()
-    temporary = folder.name.startswith("ethbrake_marl-")
     note = "temporary: kernels are compiled anew in every process; set NUMBA_CACHE_DIR to a writable folder"
-    return True, f"{folder} ({note})" if temporary else str(folder)
+    return True, f"{folder} ({note})" if is_temporary(folder) else str(folder)
 
 
 def _scenarios() -> tuple[bool, str]:
@@ -134,6 +150,21 @@ def _golden_baseline() -> tuple[bool, str]:
     found = f"{float(best.deceleration_mps2[0]):.6g} m/s2, harm {float(best.harm[0]):.6g}"
     wanted = "5.17021 m/s2, harm 4.03447"
     return found == wanted, f"E-V2X-BM at gaps 7 and 7 m: {found} (known: {wanted})"
+
+
+def _warm_up() -> tuple[bool, str]:
+    """A few worlds through what evaluations, shields and searches run; all other commands use parts of it."""
+    begun = perf_counter()
+    scenario = load_scenario("paper-random")
+    for n in (20, 1):  # some in which a shield steps in; and one alone, whose arrays lie differently in memory
+        sample = scenario.sample(n, LIST_SEED)
+        lineup = make_lineup(_WARM_UP, scenario, uncertainty=parse_uncertainty("latency_s=0.1"))
+        summarise(evaluate(sample, lineup, scenario=scenario))
+        compare_modes(
+            make_proposers(["full_brake"], scenario), sample.worlds, Task(scenario, scenario.learners, "first")
+        )
+    kernels = len(list(cache_folder().rglob("*.nbc")))
+    return True, f"{kernels} kernels ready after {perf_counter() - begun:.0f} s"
 
 
 def _world(

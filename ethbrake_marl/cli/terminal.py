@@ -9,6 +9,7 @@ import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -17,9 +18,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.segment import Segment
 
 from ethbrake_marl.errors import OldSpelling, one_line, plain_text
+from ethbrake_marl.physics.compiled import is_temporary, on_first_compilation
 from ethbrake_marl.progress import Progress as PartProgress
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
+COMPILE_S = 20  # processor seconds of a first `ethbrake evaluate`
 INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
 
@@ -55,6 +58,31 @@ def tell_old_spellings() -> None:
             shown(message, category, *place, **more)
 
     warnings.showwarning = show_warning
+
+
+def tell_compilation() -> None:
+    """Say in one line why the first command takes longer, when it begins to compile."""
+
+    def tell(folder: Path, empty: bool) -> None:
+        if is_temporary(folder):
+            say("compiling the physics; no folder can be written to keep it, so every command does (ethbrake doctor)")
+        elif empty:
+            say(f"compiling the physics, once, about {COMPILE_S} s")
+        else:
+            say("compiling a part of the physics that was not used before, once, some seconds")
+
+    on_first_compilation(tell)
+
+
+def shell_asks(environment: Mapping[str, str]) -> bool:
+    """Whether a shell's completion runs this command, as its script from ``--show-completion`` does.
+
+    The variable alone, or with what no such script sets, is ignored: a command must not fail because of it.
+    """
+    if environment.get("_ETHBRAKE_COMPLETE") == "complete_bash":
+        return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
+    others = ("complete_zsh", "complete_fish", "complete_powershell", "complete_pwsh")
+    return environment.get("_ETHBRAKE_COMPLETE") in others and "_TYPER_COMPLETE_ARGS" in environment
 
 
 def abandon_output() -> None:

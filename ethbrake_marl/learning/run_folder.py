@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -11,6 +10,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, get_args
+
+from filelock import FileLock, Timeout
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.durable import new_folder, write_file
@@ -173,15 +174,14 @@ def only_process(run: RunDirectory) -> Iterator[None]:
 
     Raises ``InvalidInput`` when another process trains in this folder.
     """
-    path = run.path / "run.lock"
+    lock = FileLock(run.path / "run.lock", blocking=False, mode=0o666)
     try:
-        # What stands there is neither emptied nor, where it is a link, followed, and a pipe keeps nobody waiting.
-        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+        lock.acquire()
+    except Timeout:
+        raise InvalidInput(f"{run.path}: another process is training here") from None
     except OSError as error:
-        raise InvalidInput(f"{path}: cannot be used as a lock ({error.strerror}); delete it") from None
-    with os.fdopen(lock, "rb+", buffering=0) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise InvalidInput(f"{run.path}: another process is training here") from None
+        raise InvalidInput(f"{lock.lock_file}: cannot be used as a lock ({error.strerror}); delete it") from None
+    try:
         yield
+    finally:
+        lock.release()

@@ -20,12 +20,14 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import config as numba_config
+from numba.core import event
 
 from ethbrake_marl.errors import check_whole_number
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).resolve().parents[1]
 _MARK = b"@compiled"
+_TEMPORARY = "ethbrake_marl-"
 
 
 @cache
@@ -43,9 +45,32 @@ def cache_folder() -> Path:
         with tempfile.TemporaryFile(dir=folder):
             return folder
     except OSError:
-        temporary = Path(tempfile.mkdtemp(prefix="ethbrake_marl-"))
+        temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY))
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
         return temporary
+
+
+def is_temporary(folder: Path) -> bool:
+    """Whether a ``cache_folder`` goes when this process ends."""
+    return folder.name.startswith(_TEMPORARY)
+
+
+def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
+    """Call ``tell`` once, when this process begins to compile: the folder of the kernels, and whether it was empty.
+
+    Kernels that are loaded from the folder are not compiled.
+    """
+    events: Any = event  # numba's own types end here
+
+    class Once(event.Listener):
+        def on_start(self, event_: event.Event) -> None:
+            events.unregister("numba:compile", self)
+            tell(cache_folder(), not any(cache_folder().rglob("*.nbi")))
+
+        def on_end(self, event_: event.Event) -> None:
+            """Nothing: it does not listen any more."""
+
+    events.register("numba:compile", Once())
 
 
 def compiled(function: Function) -> Function:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import naming_extras
 from ethbrake_marl.policies.policy import Policy
 
 OPSET = 17
@@ -22,12 +21,10 @@ def onnx_model(policy: Policy) -> bytes:
 
     The acceleration is the action times the own braking (below 0) or driving capacity (above 0), which the observation
     holds. Products are summed in another order than in our forward pass: results agree within rounding, not to the
-    bit. Raises ``InvalidInput`` when the package onnx is not installed.
+    bit. Raises ``MissingExtra`` where the package onnx is not installed.
     """
-    try:
+    with naming_extras():
         import onnx  # only here: an extra
-    except ImportError:
-        raise InvalidInput(f"ONNX export needs the package onnx: {sys.executable} -m pip install onnx") from None
     writer = _Writer(onnx)
     action = writer.actor(policy)
     features = {f.name: (k, f.scale) for k, f in enumerate(policy.observation.features)}

@@ -38,20 +38,22 @@ def test_doctor_json__is_pure(ethbrake):
 
 @pytest.mark.parametrize("form", [[], ["--json"]])
 def test_doctor__one_failure_gives_exit_status_1(ethbrake, monkeypatch, form):
-    monkeypatch.setattr("ethbrake_marl.cli.app.diagnose", lambda: [Check("a", True, "x"), Check("b", False, "y")])
+    checks = [Check("a", True, "x"), Check("b", False, "y")]
+    monkeypatch.setattr("ethbrake_marl.cli.app.diagnose", lambda warm_up: checks)
     answer = ethbrake("doctor", *form)
     assert answer.status == 1
     assert ("FAIL  b  y" in answer.out) == (not form)
 
 
 def test_dependencies__too_old_and_missing_ones_fail(monkeypatch):
-    wanted = [Requirement("numpy>=99"), Requirement("no-such-package>=1"), Requirement("scipy>=1")]
-    monkeypatch.setattr(doctor, "_requirements", lambda: wanted)
-    numpy, missing, scipy = found("numpy"), found("no-such-package"), found("scipy")
+    wanted = [("", "numpy>=99"), ("", "no-such-package>=1"), ("", "scipy>=1"), ("train", "no-such-extra>=1")]
+    monkeypatch.setattr(doctor, "_requirements", lambda: [(extra, Requirement(line)) for extra, line in wanted])
+    numpy, missing, scipy, optional = (found(name) for name in ("numpy", "no-such-package", "scipy", "no-such-extra"))
     assert not numpy.ok
     assert "needs >=99" in numpy.detail
     assert (missing.ok, missing.detail) == (False, "is not installed; needs >=1")
     assert scipy.ok
+    assert (optional.ok, optional.detail) == (True, "is not installed; the extra train brings it")
 
 
 def test_dependencies__another_version_than_the_tested_one_is_mentioned(monkeypatch):
@@ -60,10 +62,11 @@ def test_dependencies__another_version_than_the_tested_one_is_mentioned(monkeypa
     assert "(tested with 1.0)" in found("numpy").detail
 
 
-def test_dependencies__are_those_of_the_package_without_its_extras():
-    names = {requirement.name for requirement in doctor._requirements()}
-    assert {"numpy", "numba", "torch", "stable-baselines3"} <= names
-    assert not {"pytest", "ray", "optuna"} & names
+def test_dependencies__each_stands_with_the_extra_that_brings_it():
+    extra_of = {requirement.name: extra for extra, requirement in doctor._requirements()}
+    assert extra_of["numpy"] == extra_of["numba"] == ""
+    assert (extra_of["torch"], extra_of["benchmarl"], extra_of["onnx"]) == ("train", "marl", "export")
+    assert "pytest" not in extra_of
 
 
 def test_physics__a_kernel_that_gives_other_harm_fails(monkeypatch):

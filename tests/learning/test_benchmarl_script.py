@@ -15,7 +15,7 @@ TASK = "ethbrake_marl.learning.benchmarl"
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "-m pip install benchmarl"),
+        ([], "-m pip install 'ethbrake-marl[marl]'"),
         (["--scenario", "cooperation-3-pear"], "did you mean 'cooperation-3-pair'?"),
         (["--recipe", "sac"], "recipe 'sac': is for SAC; MAPPO needs one for PPO"),
         (["--steps", "-5"], "total_steps = -5: must be greater than or equal to 1"),
@@ -29,7 +29,7 @@ def test_script__refuses_what_cannot_be(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, TASK, None)  # cannot be imported, as where the extra is missing
+    monkeypatch.setitem(sys.modules, "benchmarl", None)  # cannot be imported, as where the extra is missing
     monkeypatch.setattr(sys, "argv", ["benchmarl_mappo.py", *arguments])
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(SCRIPT), run_name="__main__")

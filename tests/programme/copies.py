@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import itertools
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from tests.programme.suites import ROOT
 
@@ -34,11 +35,11 @@ def working_copy() -> Iterator[Path]:
     """
     _KEPT.mkdir(parents=True, exist_ok=True)
     for number in itertools.count():
-        with (_KEPT / f"{number}.lock").open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                continue
+        try:
+            lock = FileLock(_KEPT / f"{number}.lock").acquire(blocking=False)
+        except Timeout:
+            continue
+        with lock:
             folder = _KEPT / str(number)
             for name in PARTS:
                 shutil.rmtree(folder / name, ignore_errors=True)

@@ -1,0 +1,6 @@
+"""``python -m ethbrake_marl``: the command line, where its script is not on the path."""
+
+from ethbrake_marl.cli.app import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""What people type at any command line: -h, --version, python -m, Tab; and why the first call takes longer."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import pytest
+from typer.main import get_command
+
+from ethbrake_marl import __version__
+from ethbrake_marl.cli import doctor, terminal
+from ethbrake_marl.cli.app import app, run_command
+from ethbrake_marl.physics.compiled import cache_folder
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_version__is_told_by_the_command_and_by_python_m(ethbrake):
+    assert ethbrake("--version").out == f"ethbrake {__version__}\n"
+    result = subprocess.run(
+        [sys.executable, "-m", "ethbrake_marl", "--version"],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (0, f"ethbrake {__version__}\n", "")
+
+
+def test_short_help__is_the_long_one_for_every_command(ethbrake):
+    lines = [[]]
+    for name, command in get_command(app).commands.items():
+        lines += [[name], *([name, each] for each in getattr(command, "commands", ()))]
+    for line in lines:
+        short, long = ethbrake(*line, "-h"), ethbrake(*line, "--help")
+        assert (short.status, short.out) == (0, long.out)
+        assert "-h, --help" in short.out
+
+
+COMPLETION = [
+    ({"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake sce", "COMP_CWORD": "1"}, "scenario\n"),
+    ({"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake scenario val", "COMP_CWORD": "2"}, "validate\n"),
+    ({"_ETHBRAKE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --warm"}, '"--warm-up"'),
+]
+
+
+@pytest.mark.parametrize(("asked", "found"), COMPLETION)
+def test_completion__a_shell_that_asks_gets_what_can_follow(monkeypatch, capsys, asked, found):
+    for name, value in asked.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(SystemExit) as ended:
+        run_command([])
+    assert ended.value.code == 0
+    assert found in capsys.readouterr().out
+
+
+NOT_ASKED = [
+    {"_ETHBRAKE_COMPLETE": "bash_source"},
+    {"_ETHBRAKE_COMPLETE": "1"},
+    {"_ETHBRAKE_COMPLETE": "complete_bash"},
+    {"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake", "COMP_CWORD": "x"},
+    {"_ETHBRAKE_COMPLETE": "complete_tcsh", "_TYPER_COMPLETE_ARGS": "ethbrake"},
+]
+
+
+@pytest.mark.parametrize("asked", NOT_ASKED)
+def test_completion__a_variable_that_no_shell_set_changes_nothing(ethbrake, monkeypatch, asked):
+    for name, value in asked.items():
+        monkeypatch.setenv(name, value)
+    assert ethbrake("--version").out == f"ethbrake {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("kernels", "temporary", "told"),
+    [
+        ([], False, f"compiling the physics, once, about {terminal.COMPILE_S} s\n"),
+        (["one.nbi"], False, "compiling a part of the physics that was not used before, once, some seconds\n"),
+        ([], True, "no folder can be written"),
+    ],
+)
+def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, kernels, temporary, told):
+    folder = tmp_path / ("ethbrake_marl-x" if temporary else "kept")
+    folder.mkdir()
+    for name in kernels:
+        (folder / name).touch()
+    monkeypatch.setattr("ethbrake_marl.physics.compiled.cache_folder", lambda: folder)
+    terminal.tell_compilation()
+
+    @numba.njit
+    def next_number(x: int) -> int:
+        return x + 1
+
+    assert next_number(1) == 2
+    assert next_number(1.5) == 2.5
+    captured = capsys.readouterr()
+    assert captured.out == "" and told in captured.err and captured.err.count("\n") == 1
+
+
+def test_doctor__warms_up_only_when_asked(ethbrake, monkeypatch):
+    monkeypatch.setattr(doctor, "_warm_up", lambda: (True, "9 kernels ready"))
+    assert "warm-up" not in ethbrake("doctor").out
+    assert "9 kernels ready" in ethbrake("doctor", "--warm-up").out
+
+
+@pytest.mark.long
+def test_doctor_warm_up__leaves_nothing_to_compile(ethbrake):
+    answer = ethbrake("doctor", "--warm-up", "--json")
+    assert answer.status == 0 and '"name": "warm-up",\n    "ok": true' in answer.out
+    kernels = set(cache_folder().rglob("*.nbc"))
+    commands = [
+        ("evaluate", "--agents", "full_brake,e_v2x_bm,ppo@shipped,ppo@shipped+episode", "--episodes", "3"),
+        ("shield", "--agents", "full_brake", "--episodes", "3"),
+        ("evaluate", "--agents", "planner,full_brake+step", "--episodes", "3"),
+    ]
+    assert [ethbrake(*command).status for command in commands] == [0, 0, 0]
+    assert set(cache_folder().rglob("*.nbc")) == kernels
