@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
     # Agents, teams and policies
     from ethbrake_marl.agents.learned import LearnedAgent as LearnedAgent
+    from ethbrake_marl.agents.policy_agent import policy_agent as policy_agent
     from ethbrake_marl.agents.protocol import Agent as Agent
     from ethbrake_marl.agents.registry import AgentSettings as AgentSettings
     from ethbrake_marl.agents.registry import agent_names as agent_names
@@ -96,6 +97,7 @@ if TYPE_CHECKING:
 
     # Registration of your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent
+    from ethbrake_marl.files.plugins import load_plugin as load_plugin
     from ethbrake_marl.learning.registry import register_algorithm as register_algorithm
     from ethbrake_marl.objectives import register_objective as register_objective
     from ethbrake_marl.observations import register_feature as register_feature

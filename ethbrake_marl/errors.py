@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -42,6 +44,23 @@ def one_line(text: str) -> str:
 def count_of(n: int, thing: str) -> str:
     """A number and what it counts, as a message has it: ``1 world``, ``10,000 worlds``."""
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
+
+
+def describe_error(error: BaseException, path: str | None = None) -> str:
+    """An exception of somebody's code in a few words, and the last line that was run, of the file at ``path`` if given.
+
+    Ours speak for themselves.
+    """
+    text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
+    frames = traceback.extract_tb(error.__traceback__)
+    if isinstance(error, SyntaxError):
+        return f"line {error.lineno}: {type(error).__name__}: {error.msg}"
+    if path is not None:
+        lines = [frame.lineno for frame in frames if frame.filename == path]
+        return f"line {lines[-1]}: {text}" if lines else text
+    if isinstance(error, EthBrakeError) or not frames:
+        return text
+    return f"{text} ({os.path.basename(frames[-1].filename)}, line {frames[-1].lineno})"
 
 
 class EthBrakeError(Exception):
@@ -134,6 +153,25 @@ class PhysicsError(EthBrakeError, ArithmeticError):
         return PhysicsError({int(rows[row]): reason for row, reason in self.worlds.items()})
 
 
+class AgentFailed(InvalidInput):
+    """An agent that somebody gave us raised an exception, or gave no actions; the message names world and step.
+
+    ``row``: of the world in the batch that was given; None where it is not known.
+    """
+
+    def __init__(self, agent: str, row: int | None, reason: str) -> None:
+        super().__init__(agent, row, reason)
+        self.agent, self.row, self.reason = agent, row, reason
+
+    def __str__(self) -> str:
+        where = "" if self.row is None else f", world {self.row}"
+        return one_line(f"agent {self.agent!r}{where}, {self.reason}")
+
+    def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> AgentFailed:
+        """The same of the batch from which the worlds of this one were taken, as ``PhysicsError.renumbered``."""
+        return AgentFailed(self.agent, None if self.row is None else int(rows[self.row]), self.reason)
+
+
 class OldSpelling(FutureWarning):
     """Something is written as it was before this version; the message holds the new spelling. The next refuses it."""
 
@@ -147,7 +185,7 @@ def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
     """Worlds that fail inside are told by the rows of the batch from which they were taken."""
     try:
         yield
-    except PhysicsError as error:
+    except (PhysicsError, AgentFailed) as error:
         raise error.renumbered(rows) from error
 
 

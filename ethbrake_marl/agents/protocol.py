@@ -9,7 +9,7 @@ from typing import ClassVar, Protocol, Self, TypeGuard, runtime_checkable
 import numpy as np
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source, combine
-from ethbrake_marl.engine.stream import Script, is_state_free
+from ethbrake_marl.engine.stream import Script, ask_script, is_state_free
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics import Floats, Ints, Worlds
 
@@ -62,8 +62,8 @@ def check_agent(agent: object, where: str) -> None:
     """Raise ``InvalidInput`` for what is not an agent."""
     if not isinstance(agent, Agent):
         raise InvalidInput(
-            f"{where}: a {type(agent).__name__} is not an agent; make_agent(name) makes one, and"
-            " LearnedAgent(load_policy(path)) one of a policy"
+            f"{where}: a {type(agent).__name__} is not an agent; make_agent(name) makes one, policy_agent(policy) one"
+            " of a function or a model, and LearnedAgent(load_policy(path)) one of a policy bundle"
         )
 
 
@@ -152,7 +152,7 @@ class AgentAround:
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """As the policy, [n] m/s2."""
-        return self.policy.act(worlds, vehicle)
+        return ask_script(self.policy, worlds, vehicle)
 
     def take(self, rows: Ints) -> Self:
         """A copy that drives on in some rows of its batch only; raises ``InvalidInput`` if it or the policy cannot."""

@@ -10,7 +10,8 @@ from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place, recall
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, script_agents, set_others
-from ethbrake_marl.errors import check_whole_number
+from ethbrake_marl.engine.stream import ask_script
+from ethbrake_marl.errors import check_whole_number, renumbered
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
@@ -84,7 +85,9 @@ class Refined(AgentAround):
             step = max(1, _BLOCK // self.tries)
             for some in (open_rows[i : i + step] for i in range(0, len(open_rows), step)):
                 tried = best[some, np.newaxis] + change  # [worlds, tries, segments]
-                harm = self._harm(worlds.take(np.repeat(some, len(change))), vehicle, tried.reshape(-1, _SEGMENTS))
+                each = np.repeat(some, len(change))
+                with renumbered(each):
+                    harm = self._harm(worlds.take(each), vehicle, tried.reshape(-1, _SEGMENTS))
                 harm = harm.reshape(len(some), len(change))
                 chosen = harm.argmin(axis=1)
                 better = harm[np.arange(len(some)), chosen] < least[some]
@@ -98,7 +101,7 @@ class Refined(AgentAround):
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """Wanted signed acceleration, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
         deviation = recall(self._deviation, worlds.n, self.name)
-        return deviate(self.policy.act(worlds, vehicle), deviation, worlds, vehicle)
+        return deviate(ask_script(self.policy, worlds, vehicle), deviation, worlds, vehicle)
 
     def _harm(self, worlds: Worlds, vehicle: int, deviation: Floats) -> Floats:
         """Harm under one deviation per world, [n]."""
@@ -120,7 +123,7 @@ class _Deviating(AgentAround):
         self.deviation = deviation  # [n, segments]
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        return deviate(self.policy.act(worlds, vehicle), self.deviation, worlds, vehicle)
+        return deviate(ask_script(self.policy, worlds, vehicle), self.deviation, worlds, vehicle)
 
 
 def changes(number: int, tries: int) -> Floats:

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source
-from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.protocol import Agent, check_agent
 from ethbrake_marl.agents.spelling import AROUND, OLD_NAMES, OLD_SPELLINGS, AgentSpec, parse_spec
 from ethbrake_marl.agents.team import Driver, Team
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, OldSpelling, unknown_name
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, OldSpelling, describe_error, unknown_name
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.scenario import Scenario
 
@@ -78,6 +78,7 @@ class Entry:
 
 
 _SCRIPTS, _POLICIES = "agents.scripts", "learning.driving:make_policy_agent"
+_FROM_FILE = "agents.user_file:make_from_file"
 _ENTRIES: dict[str, Entry] = {
     "coast": Entry("coast", "nothing at all", (Source.SENSORS,), f"{_SCRIPTS}:make_state_free"),
     "full_brake": Entry(
@@ -164,7 +165,8 @@ def make_agent(
 
     Args:
         spec: ``name[:argument][@policy]`` and what is put around it, for instance ``constant:3.5``, ``planner:20ms``,
-            ``ppo@shipped+refined+step``; ``ethbrake agents`` lists all.
+            ``ppo@shipped+refined+step``; ``ethbrake agents`` lists all. ``my_file.py:make_agent`` runs that file, which
+            can do whatever you can: its function gets what a factory of ``register_agent`` gets, or nothing.
         scenario: needed by teams, by what is put around an agent, and to find the shipped policy of this scenario.
         harm_count: which harm an optimising agent minimises, ``first`` or ``total``.
         horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.
@@ -190,7 +192,7 @@ def make_agent(
     settings = AgentSettings(
         written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty
     )
-    driver: Driver = find_entry(written).load()(written.argument, settings)
+    driver = _make(find_entry(written), written.argument, settings)
     for each in written.around:
         settings = replace(settings, spec=f"{settings.spec}+{each}")
         driver = _put_around(driver, each, settings)
@@ -226,6 +228,8 @@ def find_entry(written: AgentSpec) -> Entry:
 
     Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for an argument or a policy that it does not take.
     """
+    if written.file is not None:
+        return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", (Source.UNSTATED,), _FROM_FILE)
     if written.name not in _ENTRIES:
         raise unknown_name("agent", written.name, {*_ENTRIES, "ladder"})
     entry = _ENTRIES[written.name]
@@ -266,6 +270,20 @@ def register_agent(
     entry = Entry(f"{name}[:ARGUMENT][@POLICY]", about, knows, factory)
     if name in OLD_NAMES or _ENTRIES.setdefault(name, entry).make is not factory:
         raise AlreadyExists(f"agent {name!r} is registered already")
+
+
+def _make(entry: Entry, argument: str | None, settings: AgentSettings) -> Driver:
+    """The driver of an entry; of one that is not ours, what it raises becomes ``InvalidInput``, and it is looked at."""
+    factory, ours = entry.load(), isinstance(entry.make, str) and entry.make != _FROM_FILE
+    try:
+        driver: Driver = factory(argument, settings)
+    except Exception as error:
+        if ours or isinstance(error, EthBrakeError):
+            raise
+        raise InvalidInput(f"agent {settings.spec!r}: {describe_error(error)}") from error
+    if not isinstance(driver, Team):
+        check_agent(driver, f"agent {settings.spec!r}")
+    return driver
 
 
 def _put_around(driver: Driver, around: str, settings: AgentSettings) -> Agent:

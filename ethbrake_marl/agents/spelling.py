@@ -1,11 +1,13 @@
 """The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
 
-``+refined`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``.
+``+refined`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``. A name may be
+a function of a Python file, ``my_file.py:make_agent``.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from difflib import get_close_matches
 
@@ -28,12 +30,15 @@ OLD_SPELLINGS = {  # of a policy; ``hybrid@PATH`` is ``ppo@PATH+episode`` now
 }
 OLD_NAMES = frozenset(old.partition(":")[0] for old in OLD_SPELLINGS)
 
+_IN_FILE = re.compile(r"(?P<name>[^:]+\.py:[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
+_BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
+
 
 @dataclass(frozen=True, slots=True)
 class AgentSpec:
     """An agent as it is written, in its parts."""
 
-    name: str
+    name: str  # or FILE.py:FUNCTION
     argument: str | None  # after the colon
     policy: str | None  # after the @: a path, or "shipped"
     around: tuple[str, ...]  # of AROUND, innermost first
@@ -43,6 +48,12 @@ class AgentSpec:
         """The agent without what is around it."""
         argument = "" if self.argument is None else f":{self.argument}"
         return f"{self.name}{argument}" + ("" if self.policy is None else f"@{self.policy}")
+
+    @property
+    def file(self) -> tuple[str, str] | None:
+        """The Python file and its function that makes the agent, where the name is one of those."""
+        file, _, function = self.name.rpartition(":")
+        return (file, function) if file else None
 
     @property
     def shield(self) -> str | None:
@@ -60,6 +71,14 @@ def parse_spec(spec: str) -> AgentSpec:
     something else behind a ``+``.
     """
     core, around = _split_around(spec)
+    if _BEGINS_WITH_FILE.fullmatch(core):
+        match = _IN_FILE.fullmatch(core)
+        if match is None:
+            raise InvalidInput(
+                f"agent {spec!r}: one from a file is FILE.py:FUNCTION, FILE.py:FUNCTION:ARGUMENT or"
+                " FILE.py:FUNCTION@POLICY, for instance my_file.py:make_agent"
+            )
+        return AgentSpec(match["name"], match["argument"], match["policy"], around)
     head, at, path = core.partition("@")
     name, argument = parse_agent_spec(head if at else core)
     if at and not path:
@@ -89,6 +108,8 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
     """Whether a word behind a ``+`` that is none of ``AROUND`` is no part of an argument or path either."""
+    if ".py" in last or _IN_FILE.fullmatch(core):
+        return False  # the + is part of a file's path, or of its argument
     if ":" not in before and "@" not in before:
         return True
     if "/" in last or "\\" in last:

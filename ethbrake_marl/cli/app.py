@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 from typer.exceptions import TyperException
+from typer.main import get_command
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli.ablate import ablate_command, generalise_command
@@ -34,6 +35,7 @@ from ethbrake_marl.cli.options import (
 )
 from ethbrake_marl.cli.parts import CommandWithParts
 from ethbrake_marl.cli.picture import picture_app
+from ethbrake_marl.cli.plugins import accept_plugins
 from ethbrake_marl.cli.recipe import recipe_app
 from ethbrake_marl.cli.record import record_command
 from ethbrake_marl.cli.settings import SetOption, read_settings
@@ -139,8 +141,9 @@ def run_command(arguments: Sequence[str]) -> int:
     try:
         arguments = rename_old_options(arguments)
         variable = None if shell_asks(os.environ) else _NO_VARIABLE  # None: the usual one
+        command = accept_plugins(get_command(app))
         with naming_extras():
-            status = app(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)
+            status = command(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)
         sys.stdout.flush()
     except TyperException as error:
         context = getattr(error, "ctx", None)

@@ -87,7 +87,10 @@ def train_command(
 def resume_command(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the run.")],
     other_versions: Annotated[
-        bool, typer.Option("--other-versions", help="Go on although other versions trained it; the numbers may differ.")
+        bool,
+        typer.Option(
+            "--other-versions", help="Go on although other versions or plug-ins trained it; numbers may differ."
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -21,6 +21,7 @@ from ethbrake_marl.engine.stream import (
     Start,
     Stream,
     Told,
+    ask_script,
     check_alert,
     is_state_free,
     moved,
@@ -326,7 +327,7 @@ class Engine:
         if self._remembering:
             worlds = self.worlds
             for vehicle, script in self._remembering.items():
-                self._wanted[:, vehicle] = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
+                self._wanted[:, vehicle] = within_capacity(ask_script(script, worlds, vehicle), worlds, vehicle)
         before = self._objective_harm() if self._objectives else None
         reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
         status = self._step_worlds(columns, reward, outcome)
@@ -451,7 +452,7 @@ class Engine:
         self._state[rows] = self._kept(pack(alert)).state
         worlds = self.worlds
         for vehicle, script in early.items():
-            wanted = within_capacity(script.act(worlds, vehicle), worlds, vehicle)
+            wanted = within_capacity(ask_script(script, worlds, vehicle), worlds, vehicle)
             self._wanted[rows, vehicle] = wanted[rows]
         with renumbered(rows):
             self._state[rows] = self._kept(moved(alert, self._wanted[rows], start_s)).state

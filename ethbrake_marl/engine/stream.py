@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from ethbrake_marl.engine.step import CLOCK_WIDTH, LAST_STEP, START
-from ethbrake_marl.errors import FailedWorld, InvalidInput, PhysicsError, count_of
+from ethbrake_marl.errors import EthBrakeError, FailedWorld, InvalidInput, PhysicsError, count_of, describe_error
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
 from ethbrake_marl.physics.episode import first_decision_s, number_of_decisions
 from ethbrake_marl.physics.failed import failure
@@ -166,7 +166,7 @@ class Stream:
         wanted = np.zeros(alert.speeds_mps.shape)
         for vehicle, script in self._state_free.items():
             script.begin(alert, vehicle, np.arange(alert.n))
-            wanted[:, vehicle] = within_capacity(script.act(alert, vehicle), alert, vehicle)
+            wanted[:, vehicle] = within_capacity(ask_script(script, alert, vehicle), alert, vehicle)
         return Start(alert, 0, moved(alert, wanted, clock[:, START]), clock, wanted)
 
 
@@ -199,6 +199,27 @@ def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
         obstacle = (impacts.obstacle_first_harm, impacts.obstacle_total_harm, impacts.obstacle_count)
         packed.state[:, state_width(alert.N) + 2 :] = np.column_stack(obstacle)
     return packed
+
+
+def ask_script(script: Script, worlds: Worlds, vehicle: int) -> Floats:
+    """The command of a script, [n] m/s2.
+
+    Raises ``InvalidInput`` naming it, and the world where there is one only, for a command of another shape and for
+    whatever a script that is not ours raises.
+    """
+    where = f"agent {getattr(script, 'name', type(script).__name__)!r} of vehicle_{vehicle + 1}"
+    try:
+        command = script.act(worlds, vehicle)
+    except Exception as error:
+        if isinstance(error, EthBrakeError) or type(script).__module__.startswith("ethbrake_marl."):
+            raise
+        moment = f"{count_of(worlds.n, 'world')} at {worlds.time_s.min(initial=np.inf):.2f} s"
+        raise InvalidInput(f"{where}: act on {moment}: {describe_error(error)}") from error
+    if np.shape(command) != (worlds.n,):
+        raise InvalidInput(
+            f"{where}: a command of shape {np.shape(command)}; one per world is needed, shape ({worlds.n},)"
+        )
+    return command
 
 
 def within_capacity(command_mps2: Floats, worlds: Worlds, vehicle: int) -> Floats:

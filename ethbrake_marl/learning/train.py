@@ -21,7 +21,7 @@ from ethbrake_marl.learning.registry import algorithm_named
 from ethbrake_marl.learning.run_folder import RunDirectory, create_run, has_finished, only_process, open_run
 from ethbrake_marl.learning.session import Ended, Session, stop_on_signal
 from ethbrake_marl.learning.team_file import team_content
-from ethbrake_marl.learning.training import Training, resolve, training_in
+from ethbrake_marl.learning.training import Training, check_run_plugins, resolve, training_in
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.team import Trained, drivers_of
@@ -141,13 +141,16 @@ def resume(
         directory: the run's folder.
         measure: as it was given to ``train``.
         on_progress: is told how far the training is.
-        other_versions: go on from a checkpoint that other versions wrote, although its numbers may differ.
+        other_versions: go on from a checkpoint that other versions, or other plug-ins, wrote, although its numbers may
+            differ.
 
     Raises ``InvalidInput`` for a folder without a training, one that has finished, one in which another process trains,
-    one whose ``config.json`` was edited since the checkpoint, and a checkpoint of other versions.
+    one whose ``config.json`` was edited since the checkpoint, a checkpoint of other versions, and other plug-ins.
 
     """
     run, config = open_run(Path(directory))
+    if not other_versions:
+        check_run_plugins(run.path, config, "or go on all the same with --other-versions")
     training = training_in(run.path, config)
     if has_finished(run):
         alone = len(training.drivers) == 1

@@ -18,6 +18,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.plugins import check_plugins, noted_plugins
 from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe, load_recipe, recipe_of
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
 from ethbrake_marl.learning.schemes import drivers, scheme_of
@@ -48,6 +49,7 @@ class Training:
             "scenario": self.scenario.model_dump(mode="json", exclude_unset=True),  # as in its file: defaults may clash
             "seeds": {"training": recipe.seed, "evaluation": recipe.evaluation.seed},
             "versions": installed_versions(),
+            "plugins": noted_plugins(),
             **recipe.facts,
         }
 
@@ -93,9 +95,19 @@ def training_in(folder: Path, config: Mapping[str, Any]) -> Training:
     return resolve(recipe, scenario)
 
 
+def check_run_plugins(folder: Path, config: Mapping[str, Any], advice: str) -> None:
+    """Raise ``InvalidInput``, ending in ``advice``, unless the plug-ins of this process are those of this run."""
+    check_plugins(config.get("plugins", []), str(RunDirectory(folder).config), advice)
+
+
 def check_same(folder: Path, training: Training) -> None:
-    """Raise ``InvalidInput`` unless the run in ``folder`` is this training, naming the keys in which they differ."""
-    found = training_in(folder, read_object(RunDirectory(folder).config))
+    """Raise ``InvalidInput`` unless the run in ``folder`` is this training, naming the keys in which they differ.
+
+    Its plug-ins must be those of this process.
+    """
+    config = read_object(RunDirectory(folder).config)
+    check_run_plugins(folder, config, "or give another folder (--output)")
+    found = training_in(folder, config)
     if found.identity == training.identity:
         return
     kept, wanted = (_content(each.recipe, each.scenario) for each in (found, training))

@@ -25,13 +25,19 @@ _SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
 def parse_agent_spec(spec: str) -> tuple[str, str | None]:
     """Split ``name[:argument]``, for instance ``constant:3.5``, into its name and its argument or None.
 
-    Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no blanks.
+    Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no blanks, and for a
+    Python file: a scenario that somebody else wrote must not run code.
     """
     match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None
     if match is None:
         raise InvalidInput(
             f"agent {spec!r}: must be name or name:argument, the name in lower case letters, digits and _ @ . -,"
             " for instance full_brake or constant:3.5"
+        )
+    if match["name"].endswith(".py"):
+        raise InvalidInput(
+            f"agent {spec!r}: is a function of a Python file, and those are loaded only where a person names them"
+            " (--agents, --plugin); no scenario does. A plug-in can register it under a name"
         )
     return match["name"], match["argument"]
 

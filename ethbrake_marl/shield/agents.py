@@ -20,6 +20,7 @@ from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place
 from ethbrake_marl.agents.refined import Refined
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, script_agents, set_others
+from ethbrake_marl.engine.stream import ask_script
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
@@ -91,7 +92,7 @@ class HybridAgent(AgentAround):
         """Wanted signed acceleration of the chosen strategy, [n] m/s2."""
         self.policy_harm = recall(self.policy_harm, worlds.n, self.name)  # of this batch; an earlier one may be larger
         self.bound_harm = recall(self.bound_harm, worlds.n, self.name)
-        return np.where(self.chosen_policy, self.policy.act(worlds, vehicle), self.backup.act(worlds, vehicle))
+        return np.where(self.chosen_policy, ask_script(self.policy, worlds, vehicle), self.backup.act(worlds, vehicle))
 
     def _harm(self, worlds: Worlds, agent: Agent, vehicle: int) -> Floats:
         return drive(worlds, agent, self.scenario, vehicle).ledger.world_harm(self.harm_count)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.actions import action_to_command, command_to_action
 from ethbrake_marl.agents.protocol import Agent, AgentAround, is_divisible
 from ethbrake_marl.agents.rollout import drive, script_agents, set_others
+from ethbrake_marl.engine.stream import ask_script
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.episode import HARM_IS_TOTAL, START, TIME_STEP, decision_at
@@ -94,7 +95,7 @@ def _later_plan(
 
 def proposed_action(policy: Agent, worlds: Worlds, vehicle: int) -> Floats:
     """What a policy proposes, as actions [n] in [-1, 1]; a command that is no number stays none."""
-    command = policy.act(worlds, vehicle)
+    command = ask_script(policy, worlds, vehicle)
     return np.where(np.isnan(command), np.nan, command_to_action(command, worlds.vehicles, vehicle))
 
 

@@ -196,7 +196,7 @@ def _show(
         "Seeds": f"training {config['seeds']['training']}, evaluation list {evaluation.seed}",
         "Reward": _reward(config["recipe"]["reward"]),
         "Whole run": f"{wall_s:.0f} s",
-        **({"Settings": ", ".join(config["settings"])} if "settings" in config else {}),
+        **_own_parts(config),
     }
     manifest = trained.policy.manifest
     which = f"{manifest.algorithm.upper()} after {manifest.steps:,} steps (least harm on its own list)"
@@ -208,6 +208,15 @@ def _show(
     return write_page(
         run.path, rows, figures, beside=beside, summary=summary, settings=told, versions=installed_versions()
     )
+
+
+def _own_parts(config: Mapping[str, Any]) -> dict[str, str]:
+    """What the command line changed or added: settings and plug-ins; nothing where there are none."""
+    told = {
+        "Settings": config.get("settings", ()),
+        "Plug-ins": [f"{each['name']} (SHA-256 {each['sha256']})" for each in config["plugins"]],
+    }
+    return {what: ", ".join(each) for what, each in told.items() if each}
 
 
 def _reward(given: dict[str, Any]) -> str:

@@ -8,6 +8,7 @@ import pytest
 
 from ethbrake_marl import objectives
 from ethbrake_marl.agents import registry as agents
+from ethbrake_marl.files import plugins
 from ethbrake_marl.learning import registry as algorithms
 from ethbrake_marl.rewards import registry as terms
 from ethbrake_marl.scenario import features, v2x
@@ -19,6 +20,8 @@ TABLES = (
     (agents, "_ENTRIES"),
     (algorithms, "_ENTRIES"),
     (terms, "TERMS"),
+    (plugins, "_RUN"),
+    (plugins, "_LOADED"),
 )
 
 

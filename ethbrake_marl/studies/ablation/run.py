@@ -17,6 +17,7 @@ from ethbrake_marl.agents.team import Team
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.learning.run_folder import RunDirectory
 from ethbrake_marl.learning.team_file import load_team
@@ -38,7 +39,9 @@ def train_all(trainings: Sequence[Training], jobs: int, tell: OnProgress | None 
     say = tell or (lambda progress: None)
     if jobs == 1 or len(left) < 2:
         return all(_train(training, partial(_tell, say, training.folder.name)) for training in left)
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin_worker) as pool:
+    plugins, spawn = loaded_plugins(), get_context("spawn")
+    load_the_same(plugins)  # a file that was changed since is told here, in one line
+    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_worker, initargs=(plugins,)) as pool:
         futures = [pool.submit(_train, training) for training in left]
         say(Progress("trainings", 0, len(left)))
         try:
@@ -64,12 +67,13 @@ def check_finished(trainings: Iterable[Training]) -> None:
             load_team(training.folder, training.level.scenario)
 
 
-def _begin_worker() -> None:
-    """Leave Ctrl-C to the parent, which passes it on once, and end with the parent however that ends."""
+def _begin_worker(plugins: Sequence[Plugin]) -> None:
+    """Leave Ctrl-C to the parent, which passes it on once, end with the parent however that ends; load its plug-ins."""
     os.setpgrp()
     parent = parent_process()
     assert parent is not None
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    load_the_same(plugins)
 
 
 def _end_with(parent: BaseProcess) -> None:

@@ -1,0 +1,44 @@
+"""The option ``--plugin`` of every command: loads a Python file, or an installed plug-in, before anything else."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+from typer.main import get_command
+
+from ethbrake_marl.files.plugins import load_plugin
+
+
+def _load_all(sources: list[str] | None) -> None:
+    for source in sources or ():
+        load_plugin(source)
+
+
+PluginOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--plugin",
+        metavar="FILE.py|NAME",
+        help="Load this file, or installed plug-in, first: it is code, and can do what you can. Repeatable.",
+        is_eager=True,  # before the values of other options are looked at
+        expose_value=False,
+        callback=_load_all,
+    ),
+]
+
+
+def accept_plugins(command: Any) -> Any:
+    """The command, or group of commands, with ``--plugin`` on it and on everything in it."""
+    only_option = typer.Typer(add_completion=False)
+
+    @only_option.command()
+    def takes_plugins(plugin: PluginOption = None) -> None:
+        """Nothing but the option, as Typer makes it."""
+
+    (option,) = get_command(only_option).params
+    waiting = [command]
+    for each in waiting:
+        each.params.append(option)
+        waiting += getattr(each, "commands", {}).values()
+    return command

@@ -1,0 +1,178 @@
+"""Python files of the user's own: run once when a person names them, and remembered with their SHA-256.
+
+Nothing here is found by itself: a file is run because it was named (``--plugin``, ``--agents my_file.py:make_agent``),
+a plug-in of an installed distribution because its name was. What a run's folder or a scenario names is never run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from ethbrake_marl.errors import InvalidInput, describe_error, unknown_name
+from ethbrake_marl.files.plain import read_plain
+
+GROUP = "ethbrake_marl.plugins"  # of entry points
+_LIMIT_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Plugin:
+    """A plug-in, as ``config.json`` of a run notes it."""
+
+    name: str  # of the file without its folder, or of the entry point
+    source: str  # as it was named
+    sha256: str  # of the file, or of the file of the entry point's module
+
+
+@dataclass(frozen=True, slots=True)
+class _RunFile:
+    """A Python file that was run in this process."""
+
+    sha256: str
+    module: ModuleType
+
+
+_RUN: dict[Path, _RunFile] = {}
+_LOADED: dict[str, Plugin] = {}  # by file, or by the entry point's name
+
+
+def load_plugin(source: str | os.PathLike[str]) -> None:
+    """Run a plug-in, once: a Python file that registers agents, reward terms, features, algorithms and so on.
+
+    It can do whatever you can do. ``source`` is a file ``my_file.py``, or the name of an entry point of the group
+    ``ethbrake_marl.plugins``. Runs that are trained from then on note it, with its SHA-256, in their ``config.json``.
+
+    Raises ``InvalidInput`` for a file that is missing, that raises (naming its line) or that was changed since it was
+    run, ``UnknownName`` for an entry point that no installed distribution has.
+    """
+    named = os.fspath(source)
+    if not named.endswith(".py") and os.sep not in named:
+        _load_entry_point(named)
+        return
+    path = Path(named)
+    run = _run_file(path, f"plug-in {named!r}")
+    _LOADED.setdefault(str(path.resolve()), Plugin(path.name, named, run.sha256))
+
+
+def load_function(path: str, function: str) -> Any:
+    """A function of a Python file, which is run, once, and can do whatever you can do.
+
+    Raises ``InvalidInput`` as ``load_plugin``, and if there is no such function.
+    """
+    found = getattr(_run_file(Path(path), f"file {path!r}").module, function, None)
+    if not callable(found):
+        raise InvalidInput(f"file {path!r}: has no function {function}; it is what makes the agent")
+    return found
+
+
+def loaded_plugins() -> tuple[Plugin, ...]:
+    """The plug-ins of this process, in the order in which they were loaded."""
+    return tuple(_LOADED.values())
+
+
+def noted_plugins() -> list[dict[str, str]]:
+    """The plug-ins of this process, for ``config.json``."""
+    return [asdict(plugin) for plugin in loaded_plugins()]
+
+
+def load_the_same(plugins: Sequence[Plugin]) -> None:
+    """Load, in a worker process, what its parent has loaded; raises ``InvalidInput`` where a file is another now."""
+    for plugin in plugins:
+        load_plugin(plugin.source)
+    check_plugins([asdict(plugin) for plugin in plugins], "the process that started this one", "start again")
+
+
+def check_plugins(noted: object, where: str, advice: str) -> None:
+    """Raise ``InvalidInput`` unless the plug-ins of this process are the ``noted`` ones, by their SHA-256.
+
+    ``where`` begins the message, ``advice`` ends it.
+    """
+    then = _read_noted(noted, where)
+    now = {plugin.sha256: plugin for plugin in loaded_plugins()}
+    for plugin in then:
+        if plugin.sha256 in now:
+            continue
+        other = next((one for one in now.values() if one.name == plugin.name), None)
+        if other is None:
+            raise InvalidInput(
+                f"{where}: needs the plug-in {plugin.name}, which is not loaded; name it: --plugin {plugin.source}"
+                " (in Python: load_plugin)"
+            )
+        raise InvalidInput(
+            f"{where}: the plug-in {plugin.name} was another file then (SHA-256 {plugin.sha256[:12]}..., now"
+            f" {other.sha256[:12]}...); put it back as it was, {advice}"
+        )
+    more = now.keys() - {plugin.sha256 for plugin in then}
+    if more:
+        names = ", ".join(sorted(now[sha256].source for sha256 in more))
+        raise InvalidInput(f"{where}: was made without the plug-in {names}; leave it out, {advice}")
+
+
+def _read_noted(noted: object, where: str) -> list[Plugin]:
+    try:
+        if not isinstance(noted, list):
+            raise TypeError
+        found = [Plugin(**each) for each in noted]
+        if not all(isinstance(value, str) for plugin in found for value in asdict(plugin).values()):
+            raise TypeError
+    except TypeError:
+        raise InvalidInput(f"{where}: plugins must be a list of name, source and sha256") from None
+    return found
+
+
+def _run_file(path: Path, what: str) -> _RunFile:
+    """The module of a file; run now unless it was run before."""
+    if not path.is_file():
+        raise InvalidInput(f"{what}: {'is not a plain file' if path.exists() else 'there is no such file'}")
+    content = read_plain(path, _LIMIT_BYTES)
+    sha256, resolved = hashlib.sha256(content).hexdigest(), path.resolve()
+    before = _RUN.get(resolved)
+    if before is None:
+        before = _RUN[resolved] = _RunFile(sha256, _run(content, resolved, sha256, what))
+    if before.sha256 != sha256:
+        raise InvalidInput(f"{what}: was changed since it was loaded; begin a new process")
+    return before
+
+
+def _run(content: bytes, path: Path, sha256: str, what: str) -> ModuleType:
+    """Run the content of a file as a module, which classes of it are pickled by."""
+    module = ModuleType(f"ethbrake_file_{path.stem}_{sha256[:12]}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module
+    try:
+        exec(compile(content, str(path), "exec"), module.__dict__)
+    except (Exception, SystemExit) as error:
+        del sys.modules[module.__name__]
+        raise InvalidInput(f"{what}, {describe_error(error, str(path))}") from error
+    return module
+
+
+def _load_entry_point(name: str) -> None:
+    if name in _LOADED:
+        return
+    found = {point.name: point for point in entry_points(group=GROUP)}
+    if name not in found:
+        if not found:
+            raise InvalidInput(
+                f"plug-in {name!r}: must be a Python file (my_file.py), or the name of an installed one; none is"
+            )
+        raise unknown_name("plug-in", name, found)
+    _LOADED[name] = Plugin(name, name, _import(found[name]))
+
+
+def _import(point: EntryPoint) -> str:
+    """Import the module of an entry point; gives the SHA-256 of its file."""
+    try:
+        point.load()
+        file = sys.modules[point.module].__file__
+        return hashlib.sha256(Path(file or "").read_bytes()).hexdigest()
+    except (Exception, SystemExit) as error:
+        raise InvalidInput(f"plug-in {point.name!r} ({point.value}): {describe_error(error)}") from error

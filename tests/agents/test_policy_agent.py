@@ -1,0 +1,293 @@
+"""Policies of other libraries drive as agents: alone, refined and behind every shield."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.errors import AgentFailed, InvalidInput
+from ethbrake_marl.policies.onnx import onnx_model
+
+SCENARIO = eb.load_scenario("paper-random")
+WORLDS = SCENARIO.sample(12, 7).worlds
+AROUND = ("+refined", "+episode", "+episode:pairwise", "+step", "+refined+step")
+
+
+def harms(agent, worlds=WORLDS):
+    return drive(worlds, agent, SCENARIO, 1).ledger.world_harm("first")
+
+
+def shielded(agent, around):
+    """The agent with this around it, through a name of its own."""
+    eb.register_agent(f"theirs_{id(agent)}", lambda argument, settings: agent)
+    return eb.make_agent(f"theirs_{id(agent)}{around}", scenario=SCENARIO)
+
+
+def brake(observation):
+    return np.full((len(observation), 1), -0.5, np.float32)
+
+
+@pytest.fixture(scope="module")
+def model():
+    stable = pytest.importorskip("stable_baselines3")
+    model = stable.PPO(
+        "MlpPolicy", eb.make_sb3_vec_env("paper-random", 4), n_steps=8, batch_size=16, n_epochs=1, seed=1
+    )
+    return model.learn(64)
+
+
+def test_function__drives_as_it_says_and_is_named_after_itself():
+    agent = eb.policy_agent(brake)
+    assert agent.name == "brake" and isinstance(agent, eb.Agent)
+    agent.begin(WORLDS, 1, np.arange(12))
+    assert agent.act(WORLDS, 1).tolist() == (-0.5 * WORLDS.vehicles.braking_capacity_mps2[:, 1]).tolist()
+
+
+def test_trained_model__drives_as_in_its_own_librarys_rollout(model):
+    agent = eb.policy_agent(model, name="sb3", scenario=SCENARIO)
+    for seed in (3, 4, 9):
+        env = eb.EthBrakeEnv()
+        observation, _ = env.reset(seed=seed)
+        over, reward = False, 0.0
+        while not over:
+            action, _ = model.predict(observation, deterministic=True)
+            observation, more, terminated, truncated, _ = env.step(action)
+            reward, over = reward + more, terminated or truncated
+        worlds = SCENARIO.sample(1, seed, channel="training").worlds
+        assert harms(agent, worlds)[0] == pytest.approx(-reward, rel=1e-5, abs=1e-5)
+
+
+def test_trained_model__is_shared_by_copies_and_driven_by_evaluate(model):
+    agent = eb.policy_agent(model, name="sb3")
+    copied = copy.deepcopy(agent)
+    copied.begin(WORLDS, 1, np.arange(12))
+    assert len(copied._steps) == 12 and len(agent._steps) == 0
+    found = eb.evaluate(SCENARIO.sample(12, 7), {"sb3": agent}, scenario=SCENARIO, chunk=5)
+    # Torch rounds products by the size of the batch, so a chunk changes the last digits.
+    assert found.outcome("sb3").first_impact_harm == pytest.approx(harms(agent), rel=1e-5)
+
+
+@pytest.mark.parametrize("around", AROUND)
+def test_trained_model__behind_every_shield_keeps_the_bound(model, around):
+    agent = shielded(eb.policy_agent(model, name="sb3"), around)
+    harm = harms(agent)
+    if around != "+episode:pairwise":
+        assert (harm <= agent.predicted_harm + 1e-5).all()
+
+
+def test_torch_module__drives_without_gradients_and_is_shared():
+    torch = pytest.importorskip("torch")
+    module = torch.nn.Sequential(torch.nn.Linear(27, 1), torch.nn.Tanh())
+    agent = eb.policy_agent(module, name="torch")
+
+    def by_hand(observation):
+        return module(torch.from_numpy(observation)).detach().numpy()
+
+    assert harms(copy.deepcopy(agent)).tolist() == harms(eb.policy_agent(by_hand)).tolist()
+
+
+def test_onnx__path_and_session_drive_as_the_policy_does(tmp_path: Path):
+    runtime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnx")
+    policy = eb.load_shipped("ppo")
+    path = tmp_path / "shipped.onnx"
+    path.write_bytes(onnx_model(policy))
+    expected = harms(eb.LearnedAgent(policy))
+    session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    for given in (path, session):
+        assert harms(eb.policy_agent(given)) == pytest.approx(expected, rel=1e-5, abs=1e-5)
+    assert eb.policy_agent(path).name == "shipped"
+    assert harms(eb.policy_agent(policy)).tolist() == expected.tolist()
+
+
+def ramp(observation, state):
+    """Brakes harder with every step: what it does depends on its memory alone."""
+    return -np.minimum(state["steps"], 10.0) / 10.0, {"steps": state["steps"] + 1.0}
+
+
+def no_memory(n):
+    return {"steps": np.zeros((n, 1), np.float32)}
+
+
+def test_memory__belongs_to_each_episode_and_goes_with_its_world():
+    agent = eb.policy_agent(ramp, initial_state=no_memory)
+    capacity = WORLDS.vehicles.braking_capacity_mps2[:, 1]
+    agent.begin(WORLDS, 1, np.arange(12))
+    for _ in range(3):
+        agent.act(WORLDS, 1)
+    agent.begin(WORLDS.take([4]), 1, np.array([4]))  # one episode is renewed
+    part = agent.take(np.array([3, 4]))
+    share = np.where(np.arange(12) == 4, 0.0, 0.3)
+    assert agent.act(WORLDS, 1) == pytest.approx(-share * capacity)
+    assert part.act(WORLDS.take([3, 4]), 1) == pytest.approx([-0.3 * capacity[3], 0.0])  # left as it was
+
+
+@pytest.mark.parametrize("around", AROUND)
+def test_memory__behind_every_shield_keeps_the_bound(around):
+    agent = shielded(eb.policy_agent(ramp, initial_state=no_memory), around)
+    harm = harms(agent)
+    if around != "+episode:pairwise":
+        assert (harm <= agent.predicted_harm + 1e-9).all()
+    if around == "+step":  # rolled out with a memory of its own, so it drives unhindered where it is good
+        alone = harms(eb.policy_agent(ramp, initial_state=no_memory))
+        assert (harm[agent.chosen_policy] == alone[agent.chosen_policy]).all() and agent.chosen_policy.any()
+
+
+def failing(observation):
+    if (observation[:, 0] == observation_of_world(7)).any():
+        raise RuntimeError("not this one")
+    return brake(observation)
+
+
+def observation_of_world(row):
+    from ethbrake_marl.observations import observe
+
+    return observe(WORLDS, 1, eb.ObservationSpec())[row, 0]
+
+
+@pytest.mark.parametrize("chunk", [5, 12])
+def test_exception__names_agent_world_of_the_list_and_step(chunk):
+    agent = eb.policy_agent(failing, name="mine")
+    told = r"agent 'mine', world 7, step 1 \(0\.\d\d s\): observations of shape \(\d+, 27\): RuntimeError: not this one"
+    with pytest.raises(AgentFailed, match=told + r" \(test_policy_agent.py, line \d+\)"):
+        eb.evaluate(SCENARIO.sample(12, 7), {"mine": agent}, scenario=SCENARIO, chunk=chunk)
+
+
+@pytest.mark.parametrize("around", AROUND)
+def test_exception__names_the_same_world_behind_every_shield(around):
+    agent = shielded(eb.policy_agent(failing, name="mine"), around)
+    with pytest.raises(AgentFailed, match=r"agent 'mine', world 7, step \d+ "):
+        eb.evaluate(SCENARIO.sample(12, 7), {"mine": agent}, scenario=SCENARIO, chunk=5)
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        (
+            lambda seen: brake(seen)[:, 0],
+            r"world 0, step 1 \(0\.00 s\): gave float32 of shape \(12,\) for",
+        ),
+        (lambda seen: brake(seen)[:5], r"world 5, .*gave float32 of shape \(5, 1\)"),
+        (lambda seen: np.where(np.arange(12) == 3, np.nan, -1.0)[:, None], r"world 3, .*in which stands nan; must be"),
+        (lambda seen: 1.5 * np.eye(12)[:, 2:3], r"world 2, .*stands 1.5; must be in \[-1, 1\]; with clip=True"),
+        (lambda seen: "brake", r"world 0, .*gave <U5 of shape \(\)"),
+    ],
+)
+def test_answer__that_is_no_action_names_agent_world_and_shape(answer, told):
+    agent = eb.policy_agent(answer, name="mine")
+    agent.begin(WORLDS, 1, np.arange(12))
+    with pytest.raises(InvalidInput, match="agent 'mine', " + told):
+        agent.act(WORLDS, 1)
+
+
+def test_clip__means_the_nearest_and_one_float32_step_beyond_is_always_1():
+    for beyond, clip in ((1.5, True), (float(np.nextafter(np.float32(1), np.float32(2))), False)):
+        agent = eb.policy_agent(lambda seen, beyond=beyond: np.full((len(seen), 1), -beyond), clip=clip)
+        agent.begin(WORLDS, 1, np.arange(12))
+        assert agent.act(WORLDS, 1).tolist() == (-WORLDS.vehicles.braking_capacity_mps2[:, 1]).tolist()
+
+
+def test_bad_policies__are_refused_at_once(tmp_path: Path, model):
+    with pytest.raises(InvalidInput, match=r"a int is no policy; must be a function of observations"):
+        eb.policy_agent(3)
+    with pytest.raises(InvalidInput, match="there is no such file"):
+        eb.policy_agent(tmp_path / "none.onnx")
+    with pytest.raises(InvalidInput, match=r"takes observations of shape \(27,\), here are \d+ features"):
+        eb.policy_agent(model, observation=eb.ObservationSpec(front=2))
+    with pytest.raises(InvalidInput, match="initial_state is for a function"):
+        eb.policy_agent(model, initial_state=no_memory)
+    agent = eb.policy_agent(ramp, initial_state=lambda n: {"steps": np.zeros(3)})
+    with pytest.raises(AgentFailed, match=r"initial_state\(12\): state: ndarray of shape \(3,\); its first"):
+        agent.begin(WORLDS, 1, np.arange(12))
+    with pytest.raises(InvalidInput, match="begin was not called for each"):
+        eb.policy_agent(brake).act(WORLDS, 1)
+
+
+class OwnAgent:
+    """An agent of one's own, which is no ``policy_agent``."""
+
+    def __init__(self, answer):
+        self.name, self.answer = "own", answer
+
+    def begin(self, worlds, vehicle, rows):
+        pass
+
+    def act(self, worlds, vehicle):
+        return self.answer(worlds)
+
+
+@pytest.mark.parametrize("around", ["", *AROUND])
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        (lambda worlds: 1 / 0, r"agent 'own' of vehicle_2: act on \d+ worlds at 0.\d\d s: ZeroDivisionError"),
+        (lambda worlds: np.zeros((worlds.n, 1)), r"agent 'own' of vehicle_2: a command of shape \(\d+, 1\); one per"),
+    ],
+)
+def test_own_agent__that_raises_or_gives_another_shape_is_named(around, answer, told):
+    agent = shielded(OwnAgent(answer), around)
+    with pytest.raises(InvalidInput, match=told):
+        eb.evaluate(SCENARIO.sample(12, 7), {"own": agent}, scenario=SCENARIO)
+
+
+FILE = """
+import numpy as np
+import ethbrake_marl as eb
+
+def make_agent():
+    return eb.policy_agent(lambda seen: np.full((len(seen), 1), -0.5), name="half")
+
+def harder(argument, settings):
+    return eb.policy_agent(lambda seen: np.full((len(seen), 1), -float(argument)), scenario=settings.scenario)
+
+def wrong():
+    return 3
+
+def raising():
+    raise KeyError("weights")
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "My+File.py"
+    path.write_text(FILE)
+    return path
+
+
+@pytest.mark.parametrize("around", ["", *AROUND])
+def test_file__makes_an_agent_alone_and_behind_every_shield(file, around):
+    agent = eb.make_agent(f"{file}:harder:0.5{around}", scenario=SCENARIO)
+    same = shielded(eb.policy_agent(brake), around)
+    assert harms(agent).tolist() == harms(same).tolist()
+    assert harms(eb.make_agent(f"{file}:make_agent")).tolist() == harms(eb.policy_agent(brake)).tolist()
+
+
+@pytest.mark.parametrize(
+    ("spec", "told"),
+    [
+        ("{file}", "one from a file is FILE.py:FUNCTION"),
+        ("{file}:", "one from a file is FILE.py:FUNCTION"),
+        ("{file}:make_agent+stpe", "did you mean 'step'"),
+        ("{file}:make_agent:3", "make_agent has no parameters, so it takes no argument"),
+        ("{file}:wrong", "a int is not an agent"),
+        ("{file}:raising", r"KeyError: 'weights' \(My\+File.py, line 15\)"),
+        ("{file}:nobody", "has no function nobody"),
+        ("nowhere/none.py:make_agent", "there is no such file"),
+    ],
+)
+def test_file__what_is_wrong_is_one_clear_error(file, spec, told):
+    with pytest.raises(InvalidInput, match=told):
+        eb.make_agent(spec.format(file=file), scenario=SCENARIO)
+
+
+def test_file__no_scenario_can_name_one(file):
+    (file.parent / "half.py").write_text(FILE + "raise SystemExit('this ran')")
+    for script in (f"{file}:make_agent", "half.py:make_agent"):
+        with pytest.raises(InvalidInput, match=r"agent '.*py:make_agent'"):
+            SCENARIO.replace(roles={"vehicle_1": script})

@@ -1,0 +1,264 @@
+"""Plug-ins in one file: named on the command line, used in training and evaluation, and held to on resume."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+import yaml
+
+from ethbrake_marl import objectives
+from ethbrake_marl.agents import registry as agents
+from ethbrake_marl.cli.app import app
+from ethbrake_marl.cli.plugins import accept_plugins
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files import plugins
+from ethbrake_marl.learning import registry as algorithms
+from ethbrake_marl.rewards import registry as terms
+from ethbrake_marl.scenario import features, new_scenario_text, v2x
+from ethbrake_marl.studies.ablation.run import train_all
+from tests.cli.conftest import TINY_RECIPE
+
+PLUGIN = '''
+import numpy as np
+import ethbrake_marl as eb
+
+
+def calm(step):
+    """Minus the square of the own command in force."""
+    return -(step.command_mps2**2)
+
+
+def time_gap(worlds, vehicle):
+    """Time to where the vehicle ahead is now, 1 m/s at the least."""
+    return worlds.gaps_m[:, vehicle - 1] / np.maximum(worlds.speeds_mps[:, vehicle], 1.0)
+
+
+def make_gentle(argument, settings):
+    share = float(argument or 0.5)
+    return eb.policy_agent(lambda seen: np.full((len(seen), 1), -share), name="gentle", scenario=settings.scenario)
+
+
+eb.register_term("calm", calm, unit="m2/s4")
+eb.register_feature("time_gap_s", time_gap, unit="s", scale=1.0, low=0.0, high=10.0)
+eb.register_preset("hilly", {"preset": "nominal", "lost": 0.3})
+eb.register_agent("gentle", make_gentle, about="brakes with a constant share")
+'''
+TABLES = (
+    (features, "FEATURES"),
+    (v2x, "CHANNELS"),
+    (objectives, "KINDS"),
+    (agents, "_ENTRIES"),
+    (algorithms, "_ENTRIES"),
+    (terms, "TERMS"),
+    (plugins, "_RUN"),
+    (plugins, "_LOADED"),
+)
+
+
+@pytest.fixture(autouse=True)
+def new_process() -> Iterator[None]:
+    """Each test begins as a process that has loaded nothing, and leaves nothing."""
+    before = [(getattr(module, name), dict(getattr(module, name))) for module, name in TABLES]
+    plugins._RUN.clear()
+    plugins._LOADED.clear()
+    yield
+    restore(before)
+
+
+def restore(before) -> None:
+    for table, entries in before:
+        table.clear()
+        table.update(entries)
+
+
+@pytest.fixture
+def again():
+    """Call it to go on as in a new process."""
+    before = [(getattr(module, name), dict(getattr(module, name))) for module, name in TABLES]
+    return lambda: restore(before)
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> Path:
+    path = tmp_path / "my_parts.py"
+    path.write_text(PLUGIN)
+    return path
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    """A scenario with the plug-in's preset."""
+    path = tmp_path / "hills.yaml"
+    content = yaml.safe_load(new_scenario_text("hills"))
+    path.write_text(yaml.safe_dump(content | {"v2x": "hilly", "early_impacts": "keep"}))
+    return path
+
+
+def write_recipe(folder: Path, **changes: object) -> Path:
+    path = folder / "calm.yaml"
+    path.write_text(yaml.safe_dump({**TINY_RECIPE, "name": "calm", **changes}))
+    return path
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Path:
+    """A recipe with the plug-in's term and feature."""
+    seen = ["own", "front_1", "rear_1", "time_gap_s"]
+    return write_recipe(tmp_path, reward={"harm": 1.0, "calm": 0.01}, observation=seen)
+
+
+def test_one_file__adds_agent_term_feature_and_preset_and_is_seen_in_the_report(
+    ethbrake, tmp_path, parts, scenario, recipe, again
+):
+    assert len(PLUGIN.strip().splitlines()) <= 40
+    run = tmp_path / "run"
+    named = ("--plugin", parts)
+    made = ethbrake("run", *named, "--scenario", scenario, "--recipe", recipe, "--episodes", "20", "--output", run)
+    assert made.status == 0, made.err
+    config = json.loads((run / "config.json").read_text())
+    sha256 = hashlib.sha256(parts.read_bytes()).hexdigest()
+    assert config["plugins"] == [{"name": "my_parts.py", "source": str(parts), "sha256": sha256}]
+    assert config["recipe"]["reward"]["terms"] == {"calm": 0.01} and config["scenario"]["v2x"] == {"preset": "hilly"}
+    page = (run / "report.html").read_text()
+    assert f"my_parts.py (SHA-256 {sha256})" in page and "calm" in page
+    again()
+    driven = ethbrake(
+        "evaluate", *named, "--scenario", scenario, "--episodes", "20", "--agents", f"gentle,gentle:0.2+step,ppo@{run}"
+    )
+    assert driven.status == 0 and "gentle:0.2+step" in driven.out
+    again()
+    refused = ethbrake("evaluate", "--episodes", "20", "--agents", "gentle")
+    assert (refused.status, refused.err.count("\n")) == (2, 1) and "unknown agent 'gentle'" in refused.err
+
+
+def test_agents_from_a_file__drive_on_the_command_line_behind_a_shield(ethbrake, parts):
+    spec = f"{parts}:make_gentle:0.3"
+    answer = ethbrake("evaluate", "--episodes", "10", "--agents", f"{spec},{spec}+step", "--json")
+    assert [row["agent"] for row in json.loads(answer.out)] == [spec, f"{spec}+step"]
+    assert ethbrake("shield", "--episodes", "10", "--agents", spec).status == 0
+
+
+@pytest.fixture
+def stopped(ethbrake, tmp_path, parts, again):
+    """A training with the plug-in, stopped before its end, and a new process."""
+    folder = tmp_path / "stopped"
+    recipe = write_recipe(tmp_path, reward={"harm": 1.0, "calm": 0.01}, checkpoint_every_updates=1)
+    assert ethbrake("train", "--plugin", parts, "--recipe", recipe, "--output", folder).status == 0
+    status = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(status | {"status": "interrupted"}))
+    again()
+    return folder
+
+
+def test_resume__needs_the_same_plugins_and_says_how_to_go_on(ethbrake, tmp_path, parts, stopped, again):
+    def refuse(*more):
+        answer = ethbrake("resume", stopped, *more)
+        again()
+        assert (answer.status, answer.err.count("\n")) == (2, 1)
+        return answer.err
+
+    assert f"needs the plug-in my_parts.py, which is not loaded; name it: --plugin {parts}" in refuse()
+    other = tmp_path / "other.py"
+    other.write_text("")
+    told = refuse("--plugin", parts, "--plugin", other)
+    assert f"was made without the plug-in {other}; leave it out, or go on all the same with --other-versions" in told
+    parts.write_text(PLUGIN + "# changed\n")
+    told = refuse("--plugin", parts)
+    assert "the plug-in my_parts.py was another file then (SHA-256 " in told
+    assert "put it back as it was, or go on all the same with --other-versions" in told
+    assert ethbrake("resume", stopped, "--plugin", parts, "--other-versions").status == 0
+    again()
+    parts.write_text(PLUGIN)
+    moved = parts.rename(tmp_path / "moved.py")  # the content counts, not the place
+    config = json.loads((stopped / "config.json").read_text())
+    (stopped / "config.json").write_text(json.dumps(config | {"plugins": [{"name": 3}]}))
+    assert "plugins must be a list of name, source and sha256" in refuse("--plugin", moved)
+    (stopped / "config.json").write_text(json.dumps(config))
+    assert "this training has finished" in refuse("--plugin", moved)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (None, "there is no such file"),
+        ("x = 1\nraise KeyError('secret')\n", "line 2: KeyError: 'secret'"),
+        ("import nothing_of_this_name\n", "line 1: ModuleNotFoundError: No module named 'nothing_of_this_name'"),
+        ("def f(:\n", "line 1: SyntaxError"),
+        ("import sys\n\nsys.exit(3)\n", "line 3: SystemExit: 3"),
+        (
+            "import ethbrake_marl as eb\neb.register_agent('planner', print)\n",
+            "line 2: agent 'planner' is registered already",
+        ),
+    ],
+)
+def test_bad_plugin__is_one_clear_error_on_every_command(ethbrake, tmp_path, content, told):
+    path = tmp_path / "bad.py"
+    if content is not None:
+        path.write_text(content)
+    for command in (("agents",), ("scenario", "list"), ("train", "--steps", "64")):
+        answer = ethbrake(*command, "--plugin", path)
+        assert (answer.status, answer.err.count("\n")) == (2, 1)
+        assert f"plug-in '{path}'" in answer.err and told in answer.err
+
+
+def test_collision__of_two_plugins_names_the_second(ethbrake, tmp_path, parts):
+    twin = tmp_path / "twin.py"
+    twin.write_text("import ethbrake_marl as eb\neb.register_agent('gentle', print)\n")
+    assert ethbrake("agents", "--plugin", parts, "--plugin", parts).status == 0  # the same again changes nothing
+    answer = ethbrake("agents", "--plugin", twin)
+    assert answer.status == 2 and f"plug-in '{twin}', line 2: agent 'gentle' is registered already" in answer.err
+
+
+def test_option__stands_on_every_command_and_before_it(ethbrake, parts):
+    from typer.main import get_command
+
+    waiting = [accept_plugins(get_command(app))]
+    for command in waiting:
+        waiting += getattr(command, "commands", {}).values()
+        assert [each.name for each in command.params].count("plugin") == 1, command.name
+    answer = ethbrake("--plugin", parts, "agents")
+    assert answer.status == 0 and "gentle[:ARGUMENT][@POLICY]" in answer.out
+
+
+def test_installed_plugin__is_loaded_only_when_it_is_named(ethbrake, tmp_path, monkeypatch):
+    (tmp_path / "installed_parts.py").write_text(PLUGIN)
+    monkeypatch.syspath_prepend(tmp_path)
+    point = EntryPoint("hills", "installed_parts", plugins.GROUP)
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [point] if group == plugins.GROUP else [])
+    assert "gentle[" not in ethbrake("agents").out and "installed_parts" not in sys.modules
+    assert "gentle[" in ethbrake("agents", "--plugin", "hills").out
+    (noted,) = plugins.noted_plugins()
+    assert noted["name"] == "hills" and noted["sha256"] == hashlib.sha256(PLUGIN.encode()).hexdigest()
+    assert "unknown plug-in 'hill'; did you mean 'hills'?" in ethbrake("agents", "--plugin", "hill").err
+    del sys.modules["installed_parts"]
+
+
+def test_changed_file__is_refused_in_the_same_process(ethbrake, parts):
+    assert ethbrake("agents", "--plugin", parts).status == 0
+    parts.write_text(PLUGIN + "# changed\n")
+    assert "was changed since it was loaded" in ethbrake("agents", "--plugin", parts).err
+    with pytest.raises(InvalidInput, match="was changed since it was loaded"):
+        plugins.load_the_same(plugins.loaded_plugins())
+
+
+def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, monkeypatch):
+    from ethbrake_marl.learning.recipe import load_recipe
+    from ethbrake_marl.scenario import load_scenario
+    from ethbrake_marl.studies.ablation.plan import Level, Training
+
+    monkeypatch.setenv("PYTHONPATH", os.getcwd())
+    plugins.load_plugin(parts)
+    recipe = load_recipe(str(write_recipe(tmp_path, reward={"harm": 1.0, "calm": 0.01})))
+    level = Level(load_scenario("paper-random"))
+    wanted = [Training(level, "ppo", recipe.replace(seed=seed), tmp_path / f"seed{seed}") for seed in (0, 1)]
+    assert train_all(wanted, jobs=2)
+    for training in wanted:
+        config = json.loads((training.folder / "config.json").read_text())
+        assert [each["name"] for each in config["plugins"]] == ["my_parts.py"]
