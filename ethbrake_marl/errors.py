@@ -99,14 +99,20 @@ class CorruptBundle(EthBrakeError, ValueError):
 _EXTRA_OF = {
     **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
     **dict.fromkeys(("benchmarl", "torchrl", "tensordict"), "marl"),
-    "onnx": "export",
+    **dict.fromkeys(("onnx", "onnxruntime"), "export"),
     "pyarrow": "data",
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
 }
 
 
 class MissingExtra(EthBrakeError, ImportError):
-    """Something needs a package that the plain install leaves out; the message holds the line that installs it."""
+    """Something needs a package that the plain install leaves out; the message holds the line that installs it.
+
+    >>> import ethbrake_marl as eb
+    >>> issubclass(eb.MissingExtra, ImportError)
+    True
+
+    """
 
 
 @contextmanager

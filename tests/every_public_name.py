@@ -117,4 +117,7 @@ def show(found: eb.Evaluation, folder: Path) -> list[Any]:
 
 
 def version() -> str:
-    return eb.__version__
+    try:
+        return eb.__version__
+    except eb.MissingExtra as missing:
+        return str(missing)

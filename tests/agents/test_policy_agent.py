@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agents import registry
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.policies.onnx import onnx_model
@@ -16,6 +17,11 @@ from ethbrake_marl.policies.onnx import onnx_model
 SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(12, 7).worlds
 AROUND = ("+refined", "+episode", "+episode:pairwise", "+step", "+refined+step")
+
+
+@pytest.fixture(autouse=True)
+def forget_what_is_registered(monkeypatch):
+    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
 
 
 def harms(agent, worlds=WORLDS):
