@@ -83,7 +83,7 @@ def vector(worlds: int, seed: int) -> Harms:
         over = terminated | truncated
         return over, infos["final_info"]["world_first_impact_harm"][over] if over.any() else []
 
-    return _batched(env.attached.shield, step, worlds, seed)
+    return _batched(env.attached, step, worlds, seed)
 
 
 def sb3(worlds: int, seed: int) -> Harms:
@@ -94,7 +94,7 @@ def sb3(worlds: int, seed: int) -> Harms:
         _, _, over, infos = env.step(actions)
         return over, [infos[k]["world_first_impact_harm"] for k in np.flatnonzero(over)]
 
-    return _batched(env.attached.shield, step, worlds, seed)
+    return _batched(env.attached, step, worlds, seed)
 
 
 class Proposing:
@@ -127,13 +127,13 @@ def _with(told: Harms, engine: Any, bound: float, steps: int) -> Harms:
     return [*told[0], float(engine.ledger.world_harm("first")[0])], [*told[1], float(bound)], told[2] + steps
 
 
-def _batched(shield: Any, step: Any, worlds: int, seed: int) -> Harms:
+def _batched(attached: Any, step: Any, worlds: int, seed: int) -> Harms:
     """An interface that renews its rows by itself: until so many episodes have ended."""
     realised: list[float] = []
     bounds: list[float] = []
     proposals, decisions = Proposals(seed, ROWS), 0
     while len(realised) < worlds:
-        before = shield.first_bound.copy()
+        before = attached.shield.first_bound.copy()  # of the shield as it is now: each step puts another one in place
         over, harm = step(proposals.next()[:, np.newaxis].astype(np.float32))
         decisions += ROWS
         realised += [float(h) for h in harm]

@@ -19,6 +19,7 @@ from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
+from tests.shield.interface_attack import INTERFACES
 
 KEYS = {
     "mode", "proposed_action", "chosen_action", "intervened", "reason", "bound_harm", "margin", "trusted", "settles",
@@ -249,3 +250,11 @@ def test_infos__hold_the_bound_after_a_reset_already_with_the_keys_of_a_step(opt
         assert start.keys() == step.keys()
         assert start["bound_harm"] == starts[0]["bound_harm"] > 0.0
         assert not start["intervened"] and start["proposed_action"] == 0.0
+
+
+@pytest.mark.parametrize("name", INTERFACES)
+@pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.engine_shield.MovingAtHorizon")
+def test_attack__through_every_interface_stays_within_the_bound_at_the_alert(name):
+    realised, bound, _ = INTERFACES[name](60, 5)  # make test-shield: 10,000
+    assert len(realised) == len(bound) >= 60
+    assert (np.array(realised) <= np.array(bound) + 1e-9).all() and max(bound) > 0.0
