@@ -13,7 +13,6 @@ import typer
 from typer.exceptions import TyperException
 from typer.main import get_command
 
-from ethbrake_marl import __version__
 from ethbrake_marl.cli.ablate import ablate_command, generalise_command
 from ethbrake_marl.cli.bench import bench_command
 from ethbrake_marl.cli.best_harm import best_harm_command
@@ -31,6 +30,7 @@ from ethbrake_marl.cli.options import (
     StepsOption,
     TrainingSeedOption,
     VehicleOption,
+    VersionOption,
     rename_old_options,
 )
 from ethbrake_marl.cli.parts import CommandWithParts
@@ -159,18 +159,8 @@ def run_command(arguments: Sequence[str]) -> int:
     return status if isinstance(status, int) else 0
 
 
-def _show_version(asked: bool) -> None:
-    if asked:
-        show(f"ethbrake {__version__}")
-        raise typer.Exit
-
-
 @app.callback()
-def _about(
-    version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
-    ] = False,
-) -> None:
+def _about(version: VersionOption = False) -> None:
     """Options of ``ethbrake`` itself."""
 
 

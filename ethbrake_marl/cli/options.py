@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+from ethbrake_marl import __version__
+from ethbrake_marl.cli.terminal import show
 from ethbrake_marl.errors import OldSpelling
 
 ScenarioOption = Annotated[
@@ -38,6 +40,17 @@ VehicleOption = Annotated[
     str | None, typer.Option(help="Who is driven; other learners brake fully.", show_default="the learner")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout.")]
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        show(f"ethbrake {__version__}")
+        raise typer.Exit
+
+
+VersionOption = Annotated[
+    bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
+]
 
 OLD_OPTIONS = {"--count": "--harm-count"}
 
