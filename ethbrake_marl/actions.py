@@ -22,10 +22,10 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Flo
     step beyond -1 or 1, which a network's last rounding can give, is -1 or 1.
     """
     try:
-        if np.iscomplexobj(action):
+        if np.asarray(action).dtype.kind not in "fiubO":  # neither complex, nor text, nor a date
             raise TypeError
         given = np.asarray(action, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InvalidInput(f"action of {names}: {action!r} is not a number; one in [-1, 1] is needed") from None
     if given.shape != shape and _longer_axes(given.shape) != _longer_axes(shape):
         raise InvalidInput(f"action of {names}: shape {given.shape}; {shape} is needed")

@@ -60,3 +60,9 @@ def test_action__without_the_capacity_is_coasting():
     worlds = make_worlds(5.0, np.full((2, 2), 20.0), braking_capacity_mps2=6.0, driving_capacity_mps2=0.0,
                          latency_s=0.0, mass_t=1.0, restitution=0.0)  # fmt: skip
     assert command_to_action(np.array([2.0, -3.0]), worlds.vehicles, 0).tolist() == [0.0, -0.5]
+
+
+@pytest.mark.parametrize("given", [10**400, "-1", b"-1", None, np.datetime64("1970-01-01"), [1j]])
+def test_action__that_is_no_number_is_refused(given):
+    with pytest.raises(InvalidInput, match="action of vehicle_2: "):
+        checked_action(given, (1,), "vehicle_2")

@@ -145,6 +145,10 @@ def run_command(arguments: Sequence[str]) -> int:
         with naming_extras():
             status = command(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)
         sys.stdout.flush()
+    except SystemExit as stop:
+        if shell_asks(os.environ):
+            raise
+        return _refuse(f"code of yours ended the process: SystemExit: {stop.code}")
     except TyperException as error:
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "ethbrake"

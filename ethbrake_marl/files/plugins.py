@@ -41,6 +41,7 @@ class _RunFile:
 
 
 _RUN: dict[Path, _RunFile] = {}
+_BEING_RUN: set[Path] = set()
 _LOADED: dict[str, Plugin] = {}  # by file, or by the entry point's name
 
 
@@ -146,12 +147,17 @@ def _run(content: bytes, path: Path, sha256: str, what: str) -> ModuleType:
     """Run the content of a file as a module, which classes of it are pickled by."""
     module = ModuleType(f"ethbrake_file_{path.stem}_{sha256[:12]}")
     module.__file__ = str(path)
+    if path in _BEING_RUN:
+        raise InvalidInput(f"{what}: loads itself")
+    _BEING_RUN.add(path)
     sys.modules[module.__name__] = module
     try:
         exec(compile(content, str(path), "exec"), module.__dict__)
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
         raise InvalidInput(f"{what}, {describe_error(error, str(path))}") from error
+    finally:
+        _BEING_RUN.discard(path)
     return module
 
 

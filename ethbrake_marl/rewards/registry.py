@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error, unknown_name
 from ethbrake_marl.physics import Bools, Floats, Ints
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
@@ -107,7 +107,10 @@ def checked_term(term: Term, step: StepOutcome, counts: Bools, steps: Ints) -> F
     world, vehicle and step of a number that is not finite, or the shape that does not fit.
     """
     assert term.function is not None
-    value = np.asarray(term.function(step))
+    try:
+        value = np.asarray(term.function(step))
+    except (Exception, SystemExit) as error:
+        raise InvalidInput(f"reward term {term.name!r}, at step {int(steps.max())}: {describe_error(error)}") from error
     n, vehicles = step.speeds_mps.shape
     own = (n, len(step.learners))
     if value.dtype.kind not in "fiub" or value.shape not in ((n,), own, (n, vehicles)):

@@ -68,6 +68,7 @@ class Attached(ABC):
         self.vehicle = only_shielded(engine, options.where)
         self.sent: Sent | None = None
         self._left = memory
+        self.closed = False
         engine.watch(self, memory)
 
     @property
@@ -93,6 +94,12 @@ class Attached(ABC):
         """Let go of the engine: this shield no longer follows it."""
         self._left = self.memory
         self.engine.unwatch(self)
+        self.closed = True
+
+    def check_open(self) -> None:
+        """Raise ``InvalidInput`` once this shield was closed: it follows nothing any more, and bounds nothing."""
+        if self.closed:
+            raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
 
     def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
         """The memory once the engine made the certified step. Raises ``UncertifiedStep`` for any other one."""

@@ -51,11 +51,13 @@ class ShieldedVecEnv(VecEnvWrapper):
 
     def reset(self) -> Observations:
         """As the environment's own reset."""
+        self.attached.check_open()
         observation: Observations = self.venv.reset()  # type: ignore[assignment]
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Certify or replace the actions [rows, 1], and pass them on."""
+        self.attached.check_open()
         if not self.attached.running:
             self.venv.step_async(actions)
             return

@@ -85,12 +85,14 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], dict[str, dict[str, Any]]]:
         """Start an episode; the bound stands in ``infos[agent]["shield"]`` already."""
+        self.attached.check_open()
         observations, infos = super().reset(seed=seed, options=options)
         infos[self.shielded]["shield"] = self.attached.start_info(0)
         return observations, infos
 
     def step(self, actions: Mapping[str, Any]) -> Told:
         """Advance by one step with the shielded agent's action replaced; it may also be left out."""
+        self.attached.check_open()
         agent = self.shielded
         if not isinstance(actions, Mapping):
             raise InvalidInput(
@@ -164,6 +166,7 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode; the bound stands in ``info["shield"]`` already."""
+        self.attached.check_open()
         observation, info = self.env.reset(seed=seed, options=options)
         info["shield"] = self.attached.start_info(0)
         return observation, info
@@ -171,6 +174,7 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
     def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Advance by one step with the action certified or replaced."""
         shield = self.attached
+        shield.check_open()
         if not shield.running or shield.engine.ended[0]:
             return self.env.step(action)  # type: ignore[return-value]  # says what is wrong
         proposed = checked_action(action, (1,), shield.engine.scenario.vehicle_names[shield.vehicle])
@@ -220,6 +224,7 @@ class ShieldedVectorEnv(VectorWrapper):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode in every row; the bounds stand in ``infos["shield"]`` already."""
+        self.attached.check_open()
         observations, infos = self.env.reset(seed=seed, options=options)
         infos |= {"shield": self.attached.start_infos(), "_shield": np.ones(self.num_envs, np.bool_)}
         return observations, infos
@@ -227,6 +232,7 @@ class ShieldedVectorEnv(VectorWrapper):
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with the actions [rows, 1] certified or replaced."""
         attached = self.attached
+        attached.check_open()
         if not attached.running:
             return self.env.step(actions)  # says that no episode is running
         before = attached.engine.ended

@@ -262,3 +262,20 @@ def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, mon
     for training in wanted:
         config = json.loads((training.folder / "config.json").read_text())
         assert [each["name"] for each in config["plugins"]] == ["my_parts.py"]
+
+
+def test_plugin__that_loads_itself_is_one_line(ethbrake, tmp_path):
+    file = tmp_path / "rec.py"
+    file.write_text(f"import ethbrake_marl as eb\neb.load_plugin({str(file)!r})\n")
+    answer = ethbrake("agents", "--plugin", file)
+    assert answer.status == 2
+    assert len(answer.err.splitlines()) == 1 and "loads itself" in answer.err
+
+
+def test_agent_file__that_ends_the_process_ends_in_one_line(ethbrake, tmp_path):
+    file = tmp_path / "ag.py"
+    file.write_text(
+        "import sys\nimport ethbrake_marl as eb\n\ndef slow():\n    return eb.policy_agent(lambda o: sys.exit(0))\n"
+    )
+    answer = ethbrake("evaluate", "--agents", f"{file}:slow", "--episodes", "3", "--json")
+    assert answer.status == 2 and "SystemExit: 0" in answer.err and answer.out == ""

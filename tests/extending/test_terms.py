@@ -215,3 +215,15 @@ def test_misspelt_term__gets_a_suggestion(mine: Any, tmp_path: Path) -> None:
         reward_params({"terms": {"hury": 1.0}})
     with pytest.raises(InvalidInput, match=r"reward: calm = -1.0: must be greater than or equal to 0"):
         reward_params({"calm": -1.0})
+
+
+def test_term__that_raises_is_one_error_with_its_name_and_step() -> None:
+    def broken(step: Any) -> Any:
+        """Something that cannot be told."""
+        return step.speed_mps  # there is no such quantity
+
+    eb.register_term("broken", broken)
+    env = eb.parallel_env(scenario=SCENARIO, reward={"harm": 1.0, "broken": 1.0})
+    env.reset(seed=1)
+    with pytest.raises(InvalidInput, match=r"reward term 'broken', at step \d+: AttributeError: .*test_terms.py, line"):
+        env.step({agent: np.zeros(1, np.float32) for agent in env.agents})

@@ -258,3 +258,21 @@ def test_attack__through_every_interface_stays_within_the_bound_at_the_alert(nam
     realised, bound, _ = INTERFACES[name](60, 5)  # make test-shield: 10,000
     assert len(realised) == len(bound) >= 60
     assert (np.array(realised) <= np.array(bound) + 1e-9).all() and max(bound) > 0.0
+
+
+def closed_shields():
+    yield HybridShield(parallel_env(), mode="step"), lambda env: env.step({"vehicle_2": [0.0]})
+    yield ShieldedEnv(EthBrakeEnv()), lambda env: env.step([0.0])
+    yield ShieldedVectorEnv(EthBrakeVectorEnv(2)), lambda env: env.step(np.zeros((2, 1)))
+    yield ShieldedVecEnv(make_sb3_vec_env("paper-random", 2)), lambda env: env.step(np.zeros((2, 1)))
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_closed__a_shield_says_so_and_bounds_nothing_more(begun):
+    for env, step in closed_shields():
+        if begun:
+            env.reset()
+        env.close()
+        for call in (lambda env=env: env.reset(), lambda env=env, step=step: step(env)):
+            with pytest.raises(InvalidInput, match="this shield was closed; put a new one around the environment"):
+                call()
