@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, naming_extras
 from ethbrake_marl.observations import Observations
 
 State = Any  # arrays whose first axis is the world, or tuples, lists and mappings of such
@@ -83,10 +83,8 @@ def _open_onnx(path: Path, name: str) -> Any:
             "there is no such file" if path.suffix == ".onnx" else f"a path must be that of an .onnx file, not {path}"
         )
         raise InvalidInput(f"agent {name!r}: policy {str(path)!r}: {what}")
-    try:
-        import onnxruntime  # only here: an extra
-    except ImportError:
-        raise InvalidInput(f"agent {name!r}: needs onnxruntime: {sys.executable} -m pip install onnxruntime") from None
+    with naming_extras():
+        import onnxruntime
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 

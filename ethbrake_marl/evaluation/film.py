@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -15,7 +14,7 @@ from ethbrake_marl.agents.rollout import episode_engine
 from ethbrake_marl.agents.team import Driver, team_of
 from ethbrake_marl.envs.drawing.scene import Scene
 from ethbrake_marl.envs.drawing.trace import Trace, kept_motions, scenes
-from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario
 
@@ -75,11 +74,8 @@ def check_ending(ending: str) -> None:
     """Refuse, before any work, a film that cannot be written; raises as ``film_bytes``."""
     if ending not in _WRITERS:
         raise InvalidInput(f"a film that ends in {ending!r}: films are written as {' or '.join(_WRITERS)}")
-    if ending == ".mp4" and find_spec("imageio_ffmpeg") is None:
-        raise InvalidInput(
-            "an MP4 needs imageio-ffmpeg, which is not installed: python -m pip install 'ethbrake-marl[render]'; a GIF"
-            " does without"
-        )
+    if ending == ".mp4":
+        need("imageio_ffmpeg")
 
 
 def _stacked(films: Mapping[str, Sequence[Scene]]) -> Iterator[Frame]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput, naming_extras, need, unknown_name
 from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.evaluation.per_world import per_world_columns, write_output, write_per_world_csv
 from ethbrake_marl.objectives import Declared
@@ -45,7 +45,11 @@ def make_frame(evaluation: Evaluation, library: str | None = None) -> Any:
         library = next((name for name in LIBRARIES if find_spec(name) is not None), COLUMNS)
     if library not in (*LIBRARIES, COLUMNS):
         raise unknown_name("library", library, (*LIBRARIES, COLUMNS))
-    return columns if library == COLUMNS else _needed(library).DataFrame(columns)
+    if library == COLUMNS:
+        return columns
+    if find_spec(library) is None:
+        raise InvalidInput(f"to_frame: {library} is not installed: {sys.executable} -m pip install {library}")
+    return import_module(library).DataFrame(columns)
 
 
 def write_per_world(
@@ -58,7 +62,7 @@ def write_per_world(
     if Path(path).suffix.lower() != PARQUET:
         write_per_world_csv(path, evaluation, objectives=objectives, force=force)
         return
-    arrow, parquet = _needed("pyarrow"), _needed("pyarrow.parquet")
+    arrow, parquet = _import_extra("pyarrow"), _import_extra("pyarrow.parquet")
     columns = typed_columns(evaluation, objectives)
     buffer = io.BytesIO()
     table = arrow.table({name: arrow.array(values, from_pandas=True) for name, values in columns.items()})
@@ -67,9 +71,9 @@ def write_per_world(
 
 
 def check_parquet(path: str | Path) -> None:
-    """Raise ``InvalidInput`` for a Parquet file where pyarrow is not installed; before work whose result goes there."""
+    """Raise ``MissingExtra`` for a Parquet file where pyarrow is not installed; before work whose result goes there."""
     if Path(path).suffix.lower() == PARQUET:
-        _needed("pyarrow")
+        need("pyarrow")
 
 
 def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]]]:
@@ -79,7 +83,7 @@ def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]
     """
     try:
         if path.suffix.lower() == PARQUET:
-            table = _needed("pyarrow.parquet").read_table(io.BytesIO(data), columns=list(_HARMS)).to_pydict()
+            table = _import_extra("pyarrow.parquet").read_table(io.BytesIO(data), columns=list(_HARMS)).to_pydict()
             rows = list(zip(*(table[name] for name in _HARMS), strict=True))
         else:
             lines = csv.DictReader(data.decode("utf-8").splitlines())
@@ -96,11 +100,7 @@ def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]
         raise InvalidInput(f"{path}: is no file of --per-world: {error}") from None
 
 
-def _needed(package: str) -> Any:
-    """A package that the plain install leaves out; raises ``InvalidInput`` with the line that installs it."""
-    try:
-        return import_module(package)
-    except ImportError:
-        name = package.partition(".")[0]
-        line = f"{sys.executable} -m pip install 'ethbrake-marl[data]'"
-        raise InvalidInput(f"needs the package {name}, which is not installed: {line}") from None
+def _import_extra(module: str) -> Any:
+    """A module of an extra; raises ``MissingExtra``."""
+    with naming_extras():
+        return import_module(module)

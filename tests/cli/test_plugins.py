@@ -13,17 +13,14 @@ from pathlib import Path
 import pytest
 import yaml
 
-from ethbrake_marl import objectives
-from ethbrake_marl.agents import registry as agents
 from ethbrake_marl.cli.app import app
 from ethbrake_marl.cli.plugins import accept_plugins
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files import plugins
-from ethbrake_marl.learning import registry as algorithms
-from ethbrake_marl.rewards import registry as terms
-from ethbrake_marl.scenario import features, new_scenario_text, v2x
+from ethbrake_marl.scenario import new_scenario_text
 from ethbrake_marl.studies.ablation.run import train_all
 from tests.cli.conftest import TINY_RECIPE
+from tests.extending.conftest import TABLES
 
 PLUGIN = '''
 import numpy as np
@@ -50,16 +47,6 @@ eb.register_feature("time_gap_s", time_gap, unit="s", scale=1.0, low=0.0, high=1
 eb.register_preset("hilly", {"preset": "nominal", "lost": 0.3})
 eb.register_agent("gentle", make_gentle, about="brakes with a constant share")
 '''
-TABLES = (
-    (features, "FEATURES"),
-    (v2x, "CHANNELS"),
-    (objectives, "KINDS"),
-    (agents, "_ENTRIES"),
-    (algorithms, "_ENTRIES"),
-    (terms, "TERMS"),
-    (plugins, "_RUN"),
-    (plugins, "_LOADED"),
-)
 
 
 @pytest.fixture(autouse=True)

@@ -21,7 +21,7 @@ from ethbrake_marl.envs.drawing.frame import HEIGHT, WIDTH
 from ethbrake_marl.envs.drawing.scene import BODY_M, View, follow
 from ethbrake_marl.envs.drawing.trace import Trace, kept_motions, scenes
 from ethbrake_marl.envs.parallel import env, parallel_env
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, MissingExtra
 from tests.envs.lines import CRASH, REST
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -226,7 +226,7 @@ def test_none__imports_no_drawing_library_and_nobody_watches() -> None:
 
 def test_human__without_its_library_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(InvalidInput, match=r"pip install 'ethbrake-marl\[render\]'") as raised:
+    with pytest.raises(MissingExtra, match=r"pip install 'ethbrake-marl\[render\]'") as raised:
         parallel_env(render_mode="human")
     assert "\n" not in str(raised.value)
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from PIL import Image
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.envs.drawing.frame import draw_frame
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, MissingExtra
 from ethbrake_marl.evaluation import film
 from ethbrake_marl.evaluation.film import film_bytes, film_scenes
 from tests.envs.lines import CRASH
@@ -70,8 +71,8 @@ def test_film__as_mp4_plays_in_real_time(tmp_path: Path) -> None:
 
 
 def test_film__as_mp4_without_its_library_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(film, "find_spec", lambda name: None)
-    with pytest.raises(InvalidInput, match=r"pip install 'ethbrake-marl\[render\]'"):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'ethbrake-marl\[render\]'"):
         film.check_ending(".mp4")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.errors import InvalidInput, MissingExtra, UnknownName
 from ethbrake_marl.evaluation.frame import check_parquet, read_harms, write_per_world
 
 SCENARIO = eb.load_scenario("paper-random")
@@ -68,7 +68,7 @@ def test_frame__of_the_library_itself_has_a_row_per_agent_and_world(evaluation: 
 
 def test_parquet__without_pyarrow_names_the_extra(evaluation: eb.Evaluation, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(InvalidInput, match=r"pyarrow, which is not installed: .*pip install 'ethbrake-marl\[data\]'"):
+    with pytest.raises(MissingExtra, match=r"pyarrow, which is not installed: .*pip install 'ethbrake-marl\[data\]'"):
         check_parquet("worlds.parquet")
     check_parquet("worlds.csv")
 

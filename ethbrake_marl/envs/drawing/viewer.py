@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.drawing.scene import Scene
 from ethbrake_marl.envs.drawing.trace import Trace, kept_motions, moments, scenes
-from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.errors import InvalidInput, check_whole_number, need
 
 if TYPE_CHECKING:
     from ethbrake_marl.envs.drawing.frame import Frame
@@ -118,14 +117,8 @@ def draw(scene: Scene) -> Frame:
 
 
 def import_window() -> type[Window]:
-    """The class of the window. Raises ``InvalidInput`` with the line that installs its library where it is missing."""
-    try:
-        import_module("pygame")
-    except ImportError:
-        raise InvalidInput(
-            "render_mode = 'human': needs pygame-ce, which is not installed: python -m pip install"
-            " 'ethbrake-marl[render]'; the other modes do without"
-        ) from None
+    """The class of the window. Raises ``MissingExtra`` where its library is missing."""
+    need("pygame")
     from ethbrake_marl.envs.drawing.window import Window
 
     return Window
