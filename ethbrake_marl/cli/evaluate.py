@@ -46,9 +46,9 @@ from ethbrake_marl.evaluation.inputs import (
 )
 from ethbrake_marl.evaluation.paper import TESTS
 from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table
+from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table, modes_to_json
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.scenario import Scenario, Task
+from ethbrake_marl.scenario import Sample, Task
 from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty
 
 
@@ -181,9 +181,10 @@ def shield_command(
     (the same), costly (lower).
     """
     chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
-    rows = measure_modes(agents, chosen, episodes, harm_count)
+    sample, task = chosen.sample(episodes, LIST_SEED), Task(chosen, chosen.learners, harm_count)
+    rows = measure_modes(agents, sample, task)
     if as_json:
-        write_json([row.to_json() for row in rows])
+        write_json(modes_to_json(rows, sample, task))
     else:
         result_console().print(modes_table(rows))
     tell_left_out(rows[0].left_out, episodes)
@@ -210,7 +211,7 @@ def picture_shield_modes(
     from ethbrake_marl.figures.style import write_picture
 
     chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
-    rows = measure_modes(agents, chosen, episodes, harm_count)
+    rows = measure_modes(agents, chosen.sample(episodes, LIST_SEED), Task(chosen, chosen.learners, harm_count))
     caption = (
         f"{chosen.name}, {count_of(episodes, 'world')} of the list of seed {LIST_SEED}, {harm_count} harm; mean and 95"
         " % interval of the difference, paired by world."
@@ -221,16 +222,15 @@ def picture_shield_modes(
     say(f"picture: {target}")
 
 
-def measure_modes(agents: str, scenario: Scenario, episodes: int, harm_count: HarmCount) -> list[ModeRow]:
+def measure_modes(agents: str, sample: Sample, task: Task) -> list[ModeRow]:
     """The rows of these agents, with progress on stderr."""
-    worlds = scenario.sample(episodes, LIST_SEED).worlds
-    lineup = make_proposers(agents.split(","), scenario, harm_count=harm_count)
+    lineup = make_proposers(agents.split(","), task.scenario, harm_count=task.harm_count)
     with interruptible("nothing was written"), progress_bars() as bars:
         return compare_modes(
             lineup,
-            worlds,
-            Task(scenario, scenario.learners, harm_count),
-            on_progress=lambda name, done: bars.show(name, done, episodes),
+            sample.worlds,
+            task,
+            on_progress=lambda name, done: bars.show(name, done, sample.worlds.n),
         )
 
 

@@ -13,7 +13,7 @@ from rich.text import Text
 from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_text, sees_through
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.conditions import parameters
-from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.identity import policies_by_name, result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.evaluation.paper import is_papers_test
 from ethbrake_marl.evaluation.regret import Distance, assess, distance
@@ -139,6 +139,7 @@ class SummaryRow:
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
         return {
+            "kind": "evaluate",
             "agent": self.agent,
             "knows": knowledge_text(self.knows),
             "sees_through_channel": self.sees_through,
@@ -227,7 +228,7 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
     beside, regrets, braking = is_papers_test(evaluation), assess(evaluation), evaluation.outcomes.get(BASELINE)
     hidden = float(evaluation.hidden.mean())
     worlds, scenario = worlds_sha256(evaluation.worlds, evaluation.index), scenario_sha256(evaluation.scenario)
-    names, versions = evaluation.scenario.vehicle_names, result_versions()
+    versions = result_versions()
     rows = [_row(agent, outcome, reference, conditions) for agent, outcome in evaluation.outcomes.items()]
     return SummaryTable(
         replace(
@@ -239,7 +240,7 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
             hidden_share=hidden,
             worlds_sha256=worlds,
             scenario_sha256=scenario,
-            policy_sha256={names[i]: sha for i, sha in evaluation.outcome(row.agent).policies.items()},
+            policy_sha256=policies_by_name(evaluation.outcome(row.agent).policies, evaluation.scenario),
             versions=versions,
         )
         for row in rows

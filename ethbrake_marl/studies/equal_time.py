@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from rich.text import Text
 from ethbrake_marl.agents.knowledge import Knowledge, knowledge_text
 from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.errors import check_whole_number, unknown_name
+from ethbrake_marl.evaluation.identity import policies_by_name
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
@@ -42,11 +43,13 @@ class TimedRow:
     first_impact_harm: Estimate
     total_harm: Estimate
     difference: Estimate  # of the harm that is compared, minus the reference agent's, paired by world
+    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> its policy's, where one drives
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; an interval is ``[low, high]`` or null."""
         found: dict[str, Any] = {"agent": self.agent, "knows": knowledge_text(self.knows)}
         found |= {"cpu_ms": self.median_ms, "cpu_ms_range": [self.lowest_ms, self.highest_ms]}
+        found["policy_sha256"] = dict(self.policy_sha256)
         harms = {"first_impact_harm": self.first_impact_harm, "total_harm": self.total_harm}
         return found | estimates_to_json({**harms, "difference": self.difference})
 
@@ -95,6 +98,7 @@ def equal_time(
             mean(outcome.first_impact_harm),
             mean(outcome.total_harm),
             paired_difference(outcome.ledger.world_harm(harm_count), reference),
+            policies_by_name(outcome.policies, scenario),
         )
         for name, outcome in outcomes.items()
     ]
