@@ -97,6 +97,7 @@ if TYPE_CHECKING:
 
     # Registration of your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent
+    from ethbrake_marl.evaluation.harm_metrics import register_harm_metric as register_harm_metric
     from ethbrake_marl.files.plugins import load_plugin as load_plugin
     from ethbrake_marl.learning.registry import register_algorithm as register_algorithm
     from ethbrake_marl.objectives import register_objective as register_objective

@@ -47,6 +47,7 @@ from ethbrake_marl.evaluation.inputs import (
 from ethbrake_marl.evaluation.paper import TESTS
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table, modes_to_json
+from ethbrake_marl.evaluation.text import metrics_table
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.scenario import Sample, Task
 from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty
@@ -145,6 +146,8 @@ def show_rows(
     """The rows as a table, or as a results file, see ``results_to_json``."""
     if not as_json:
         result_console().print(rich_table(rows))
+        if rows and rows[0].metrics:
+            result_console().print(metrics_table(rows))
         return
     write_json(results_to_json(rows, told=told, per_world=per_world))
 

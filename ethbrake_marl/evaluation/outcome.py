@@ -46,6 +46,7 @@ class Outcome:
     shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself, see ``travel``
     sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands, see ``sampled_harm``
     policies: Mapping[int, str] = field(default_factory=dict)  # vehicle (0 = front) -> SHA-256 of its policy's manifest
+    metrics: Mapping[str, Floats] = field(default_factory=dict)  # registered harm metrics by column, [n]
 
     def __repr__(self) -> str:
         return f"Outcome({count_of(len(self.collided), 'world')}, {int(self.collided.sum()):,} collided, {self._means})"
@@ -65,6 +66,7 @@ class Outcome:
             name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in names
         }
         columns |= {"knows": self.knows, "policies": self.policies}
+        columns |= {"metrics": {name: column[rows] for name, column in self.metrics.items()}}
         return Outcome(ledger, self.final.take(rows), self.at_rest[rows], **columns)
 
     @property

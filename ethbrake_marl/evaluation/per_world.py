@@ -14,6 +14,7 @@ import numpy as np
 from ethbrake_marl.agents.knowledge import knowledge_text
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.conditions import quantity, quantity_rules
+from ethbrake_marl.evaluation.harm_metrics import COLUMN
 from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
 from ethbrake_marl.evaluation.regret import Regrets, assess
 from ethbrake_marl.files.durable import check_writable, write_file
@@ -176,4 +177,5 @@ def outcome_columns(outcome: Outcome) -> Columns:
     predicted, chosen = outcome.predicted_harm, outcome.chosen_policy
     columns["predicted_harm"] = [None] * n if predicted is None else predicted.tolist()
     columns["chosen_policy"] = [None] * n if chosen is None else chosen.astype(int).tolist()
+    columns |= {f"{COLUMN}{name}": column.tolist() for name, column in outcome.metrics.items()}
     return columns

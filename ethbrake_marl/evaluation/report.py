@@ -9,7 +9,7 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from ethbrake_marl.evaluation.cells import COLUMNS, MEANINGS, Line, our_lines, paper_blocks
+from ethbrake_marl.evaluation.cells import Line, our_lines, paper_blocks, table_columns, table_meanings
 from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
 from ethbrake_marl.evaluation.per_world import write_output
@@ -79,8 +79,8 @@ def render_report(report: Report) -> str:
     blocks = paper_blocks(report.rows)
     return environment.get_template(_TEMPLATE).render(
         report=report,
-        columns=COLUMNS,
-        meanings=MEANINGS,
+        columns=table_columns(report.rows),
+        meanings=table_meanings(report.rows),
         ours=our_lines(report.rows),
         conditions=parameter_line(report.rows[0].parameters) if report.rows else "",
         left_out=left_out_lines(report.rows),

@@ -19,6 +19,7 @@ from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.engine.stream import check_alert
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_one_learner, check_whole_number, unknown_name
 from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
+from ethbrake_marl.evaluation.harm_metrics import ImpactWatch
 from ethbrake_marl.evaluation.identity import policy_sha256
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.harm import Ledger
@@ -55,7 +56,8 @@ def evaluate(
         seed: of the list; noted, not used.
         chunk: worlds advanced together.
         on_progress: is called with an agent's name and its worlds done so far.
-        aftermath: look how far Vehicle 1 is shoved, and what the paper's sum over samples is; costs time.
+        aftermath: look how far Vehicle 1 is shoved, what the paper's sum over samples is, and what registered harm
+            metrics are; costs time.
 
     Raises ``PhysicsError`` if no world is left; ``InvalidInput`` for worlds that do not fit the scenario or are not at
     the alert, no agents, no vehicle to drive, a team of other vehicles, or a learner that nobody drives.
@@ -181,7 +183,8 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     task = Task(scenario, tuple(team.drivers))
     shoved = ShovedFront.of(worlds, task) if aftermath else None
     sampled = SampledHarm.of(worlds, task) if aftermath else None
-    episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled) if w is not None])
+    impacts = ImpactWatch.of(worlds) if aftermath else None
+    episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled, impacts) if w is not None])
     alone = next(iter(team.drivers.values())) if len(team.drivers) == 1 else None
     predicted, chosen = (_read_column(alone, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
     return Outcome(
@@ -194,6 +197,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
         None if shoved is None else shoved.metres,
         None if sampled is None else sampled.finish(),
         {vehicle: sha for vehicle, agent in team.drivers.items() if (sha := policy_sha256(agent)) is not None},
+        {} if impacts is None else impacts.finish(),
     )
 
 
@@ -228,4 +232,5 @@ def _join(parts: list[Outcome]) -> Outcome:
         column("shoved_m"),
         column("sampled_harm"),
         parts[0].policies,
+        {name: np.concatenate([part.metrics[name] for part in parts]) for name in parts[0].metrics},
     )

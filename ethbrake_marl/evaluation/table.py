@@ -13,6 +13,7 @@ from rich.text import Text
 from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_text, sees_through
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.conditions import parameters
+from ethbrake_marl.evaluation.harm_metrics import COLUMN, metric_headings
 from ethbrake_marl.evaluation.identity import policies_by_name, result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.evaluation.paper import is_papers_test
@@ -130,6 +131,7 @@ class SummaryRow:
     scenario_sha256: str = ""  # of all that shapes an episode
     policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> its policy's, where one drives
     versions: Mapping[str, str] = field(default_factory=dict)  # of what computed it
+    metrics: Mapping[str, Estimate] = field(default_factory=dict)  # registered harm metrics, mean per world
 
     @property
     def sees_through(self) -> bool:
@@ -155,6 +157,7 @@ class SummaryRow:
             "scenario_sha256": self.scenario_sha256,
             "policy_sha256": dict(self.policy_sha256),
             "versions": dict(self.versions),
+            **({"metrics": metric_headings(self.metrics)} if self.metrics else {}),
             "parameters": self.parameters,
         }
 
@@ -172,6 +175,7 @@ class SummaryRow:
             "harm_decrease_first": self.first_decrease,
             "harm_decrease_total": self.total_decrease,
             **({"predicted_harm": self.predicted_harm} if self.predicted_harm else {}),
+            **{f"{COLUMN}{name}": estimate for name, estimate in self.metrics.items()},
         }
 
     def _distance_to_json(self) -> dict[str, Any]:
@@ -283,4 +287,5 @@ def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: di
         shoved_m=None if outcome.shoved_m is None else mean(outcome.shoved_m),
         shoved_far=None if outcome.shoved_m is None else rate(int((outcome.shoved_m > FAR_M).sum()), episodes),
         sampled_harm=None if outcome.sampled_harm is None else mean(outcome.sampled_harm),
+        metrics={name: mean(column) for name, column in outcome.metrics.items()},
     )

@@ -8,6 +8,7 @@ import pytest
 
 from ethbrake_marl import objectives
 from ethbrake_marl.agents import registry as agents
+from ethbrake_marl.evaluation import harm_metrics
 from ethbrake_marl.files import plugins
 from ethbrake_marl.learning import registry as algorithms
 from ethbrake_marl.rewards import registry as terms
@@ -20,6 +21,7 @@ TABLES = (
     (agents, "_ENTRIES"),
     (algorithms, "_ENTRIES"),
     (terms, "TERMS"),
+    (harm_metrics, "METRICS"),
     (plugins, "_RUN"),
     (plugins, "_LOADED"),
 )
