@@ -103,6 +103,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.objectives import register_objective as register_objective
     from ethbrake_marl.observations import register_feature as register_feature
     from ethbrake_marl.rewards import register_term as register_term
+    from ethbrake_marl.scenario.catalogue import register_scenarios as register_scenarios
     from ethbrake_marl.scenario.presets import register_preset as register_preset
 
     # Errors

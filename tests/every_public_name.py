@@ -37,6 +37,7 @@ def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str
     eb.register_preset("deaf", {"preset": "nominal", "lost": 0.5})
     eb.register_objective("front", lambda harm, vehicle: harm.borne[:, 0])
     eb.register_harm_metric("delta_v", lambda episodes: episodes.largest_speed_change_mps, unit="m/s")
+    eb.register_scenarios("my_scenarios")
     return eb.agent_names()
 
 

@@ -78,6 +78,7 @@ from ethbrake_marl.scenario import (
     scenario_json_schema,
     scenario_path,
 )
+from ethbrake_marl.scenario.catalogue import SHIPPED
 
 BAD_INPUT = 2
 _NO_VARIABLE = ""  # by which no shell can ask for completion
@@ -226,14 +227,14 @@ app.command(
 
 @scenario_app.command("list", epilog="Example: ethbrake scenario list")
 def scenario_list(as_json: JsonOption = False) -> None:
-    """List the shipped scenarios: name and title."""
+    """List the scenarios that have a name: that and the title, and the folder of those that a plug-in registers."""
     entries = list_scenarios()
     if as_json:
-        write_json([{"name": e.name, "title": e.title, "path": str(e.path)} for e in entries])
+        write_json([{"name": e.name, "title": e.title, "path": str(e.path), "origin": e.origin} for e in entries])
         return
     width = max(len(entry.name) for entry in entries)
     for entry in entries:
-        show(f"{entry.name:{width}}  {entry.title}")
+        show(f"{entry.name:{width}}  {entry.title}{'' if entry.origin == SHIPPED else f'  (from {entry.origin})'}")
 
 
 @scenario_app.command("show", epilog="Example: ethbrake scenario show paper-random")

@@ -14,7 +14,8 @@ from ethbrake_marl.cli.terminal import show
 from ethbrake_marl.errors import OldSpelling
 
 ScenarioOption = Annotated[
-    str, typer.Option("--scenario", metavar="NAME|PATH", help="A shipped scenario, or a path to a YAML file.")
+    str,
+    typer.Option("--scenario", metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file."),
 ]
 RecipeOption = Annotated[
     str, typer.Option("--recipe", metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file.")

@@ -1,4 +1,4 @@
-"""The catalogue of scenarios: those that ship, in a checkout or inside the installed package, and files by path."""
+"""The catalogue of scenarios: those that ship, those of registered folders, and files by path."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import flow_text, read_yaml
 from ethbrake_marl.scenario.fields import NAME_PATTERN
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
@@ -32,15 +32,40 @@ def shipped_folder(folder: str, meaning: str) -> Path:
 
 
 _SUFFIXES = (".yaml", ".yml")
+SHIPPED = "shipped"
+FOLDERS: dict[str, Path] = {}  # registered, by their path
 
 
 @dataclass(frozen=True, slots=True)
 class CatalogueEntry:
-    """One shipped scenario."""
+    """One shipped or registered scenario."""
 
     name: str
     title: str
     path: Path
+    origin: str = SHIPPED  # or the registered folder
+
+
+def register_scenarios(folder: str | os.PathLike[str]) -> None:
+    """Make the scenarios of a folder known by name, ``--scenario my-name``: every ``my-name.yaml`` directly in it.
+
+    Whether a file is in order is said when it is used. Registering the same folder again changes nothing. Raises
+    ``InvalidInput`` for a folder that is missing or has no such file, ``AlreadyExists`` for one that has a name which a
+    shipped scenario, or one of another registered folder, has.
+    """
+    path = Path(folder).resolve()
+    if not path.is_dir():
+        raise InvalidInput(f"scenarios {os.fspath(folder)!r}: there is no such folder")
+    if not _files_of(path):
+        raise InvalidInput(f"scenarios {os.fspath(folder)!r}: no file in it ends in .yaml")
+    known = str(path) in FOLDERS
+    FOLDERS[str(path)] = path
+    try:
+        _known_paths()
+    except AlreadyExists:
+        if not known:
+            del FOLDERS[str(path)]
+        raise
 
 
 def scenario_folder() -> Path:
@@ -52,7 +77,7 @@ def scenario_folder() -> Path:
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:
-    """Load a shipped scenario by name, or a file by path; see ``scenario_path``.
+    """Load a shipped or registered scenario by name, or a file by path; see ``scenario_path``.
 
     Raises ``UnknownName`` with a suggestion for an unknown name, and ``InvalidInput`` with file, line, path inside
     it and value for a file that does not describe a scenario, or whose name differs from the file's.
@@ -71,20 +96,45 @@ def scenario_path(name_or_path: str | Path) -> Path:
     path = Path(text)
     if path.suffix in _SUFFIXES or "\\" in text or ("/" in text and os.path.exists(path)):
         return path
-    paths = _shipped_paths()
     if "/" in text:
+        paths = _shipped_paths()
         return {f"{p.parent.name}/{p.stem.removeprefix(p.parent.name + '-')}": p for p in paths.values()}.get(
             text, path
         )
-    if text not in paths:
-        raise unknown_name("scenario", text, paths)
-    return paths[text]
+    known = _known_paths()
+    if text not in known:
+        raise unknown_name("scenario", text, known)
+    return known[text]
 
 
 def list_scenarios() -> list[CatalogueEntry]:
-    """Every shipped scenario, sorted by name."""
-    scenarios = [(_load(path), path) for path in _shipped_paths().values()]
-    return sorted((CatalogueEntry(s.name, s.title, path) for s, path in scenarios), key=lambda entry: entry.name)
+    """Every shipped and registered scenario, sorted by name."""
+    shipped = _shipped_paths()
+    scenarios = [(_load(path), path) for path in _known_paths().values()]
+    entries = [
+        CatalogueEntry(s.name, s.title, path, SHIPPED if s.name in shipped else str(path.parent))
+        for s, path in scenarios
+    ]
+    return sorted(entries, key=lambda entry: entry.name)
+
+
+def _known_paths() -> dict[str, Path]:
+    """Name -> file of every shipped and registered scenario; raises ``AlreadyExists`` for a name that two have."""
+    shipped = _shipped_paths()
+    known = dict(shipped)
+    for folder in FOLDERS.values():
+        for path in _files_of(folder):
+            if path.stem in known:
+                other = "a shipped scenario" if path.stem in shipped else f"{known[path.stem]}"
+                raise AlreadyExists(
+                    f"scenario {path}: {other} has the name {path.stem!r} already; give the file another one"
+                )
+            known[path.stem] = path
+    return known
+
+
+def _files_of(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("*.yaml") if path.is_file())
 
 
 def _shipped_paths() -> dict[str, Path]:

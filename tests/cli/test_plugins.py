@@ -20,7 +20,7 @@ from ethbrake_marl.files import plugins
 from ethbrake_marl.scenario import new_scenario_text
 from ethbrake_marl.studies.ablation.run import train_all
 from tests.cli.conftest import TINY_RECIPE
-from tests.extending.conftest import TABLES
+from tests.extending.conftest import restore, tables
 
 PLUGIN = '''
 import numpy as np
@@ -52,23 +52,17 @@ eb.register_agent("gentle", make_gentle, about="brakes with a constant share")
 @pytest.fixture(autouse=True)
 def new_process() -> Iterator[None]:
     """Each test begins as a process that has loaded nothing, and leaves nothing."""
-    before = [(getattr(module, name), dict(getattr(module, name))) for module, name in TABLES]
+    before = tables()
     plugins._RUN.clear()
     plugins._LOADED.clear()
     yield
     restore(before)
 
 
-def restore(before) -> None:
-    for table, entries in before:
-        table.clear()
-        table.update(entries)
-
-
 @pytest.fixture
 def again():
     """Call it to go on as in a new process."""
-    before = [(getattr(module, name), dict(getattr(module, name))) for module, name in TABLES]
+    before = tables()
     return lambda: restore(before)
 
 
