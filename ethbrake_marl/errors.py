@@ -60,6 +60,8 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
         return f"line {lines[-1]}: {text}" if lines else text
     if isinstance(error, EthBrakeError) or not frames:
         return text
+    if frames[-1].filename.startswith(os.path.dirname(__file__)):  # it was not even called: other parameters
+        return text
     return f"{text} ({os.path.basename(frames[-1].filename)}, line {frames[-1].lineno})"
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.knowledge import knowledge_of
-from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.protocol import Agent, check_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.engine.stream import check_alert
@@ -98,8 +98,8 @@ def _check_request(worlds: object, agents: object, scenario: object, chunk: obje
     if not agents:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
     for name, agent in agents.items():
-        if not isinstance(agent, Agent | Team):
-            raise InvalidInput(f"evaluate: agent {name!r} = {agent!r}: must be an agent, as make_agent(name) gives")
+        if not isinstance(agent, Team):
+            check_agent(agent, f"evaluate: agent {name!r}")
         knowledge_of(agent)  # refuses what is no statement
     check_whole_number("evaluate: chunk", chunk, 1)
 
