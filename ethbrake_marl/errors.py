@@ -54,7 +54,8 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
     if isinstance(error, SyntaxError):
-        return f"line {error.lineno}: {type(error).__name__}: {error.msg}"
+        where = "" if error.lineno is None else f"line {error.lineno}: "
+        return f"{where}{type(error).__name__}: {error.msg}"
     if path is not None:
         lines = [frame.lineno for frame in frames if frame.filename == path]
         return f"line {lines[-1]}: {text}" if lines else text

@@ -8,7 +8,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
-from pettingzoo.utils.conversions import parallel_to_aec
 
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.drawing.viewer import CLASS_METADATA, Viewer, render_metadata
@@ -23,6 +22,7 @@ from ethbrake_marl.envs.setup import (
     restart,
 )
 from ethbrake_marl.envs.state import full_state, state_features
+from ethbrake_marl.envs.turns import in_turns
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.observations import Observation, Observations
 from ethbrake_marl.physics import Ints
@@ -190,12 +190,13 @@ def raw_env(**settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
     'vehicle_1'
 
     """
-    return parallel_to_aec(parallel_env(**settings))
+    return in_turns(parallel_env(**settings))
 
 
 def env(**settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
     """The AEC environment with PettingZoo's usual wrapper, order enforcement, which ``raw_env`` already has.
 
-    Actions are not clipped and nothing ends an episode early: an unusable action is an ``InvalidInput``.
+    Actions are not clipped and nothing ends an episode early: an unusable action is an ``InvalidInput`` in its agent's
+    turn, which stays.
     """
     return raw_env(**settings)

@@ -260,3 +260,23 @@ def test_agent_file__that_ends_the_process_ends_in_one_line(ethbrake, tmp_path):
     )
     answer = ethbrake("evaluate", "--agents", f"{file}:slow", "--episodes", "3", "--json")
     assert answer.status == 2 and "SystemExit: 0" in answer.err and answer.out == ""
+
+
+def test_plugin__with_a_nul_byte_names_no_line_that_is_not_there(ethbrake, tmp_path):
+    file = tmp_path / "nul.py"
+    file.write_bytes(b"x = 1\n\0\n")
+    answer = ethbrake("agents", "--plugin", file)
+    assert (answer.status, answer.err.count("\n")) == (2, 1)
+    assert "null bytes" in answer.err and "None" not in answer.err
+
+
+def test_command__of_the_users_cannot_take_the_place_of_a_built_in_one(ethbrake, monkeypatch):
+    monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
+
+    @app.command()
+    def evaluate() -> None:
+        """Another one."""
+
+    answer = ethbrake("evaluate", "--episodes", "3")
+    assert (answer.status, answer.err.count("\n")) == (2, 1)
+    assert "command 'evaluate' is there already; give yours another name: app.command('my-evaluate')" in answer.err
