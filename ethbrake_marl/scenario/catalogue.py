@@ -163,17 +163,22 @@ _HEAD = """\
 """
 
 
+def check_file_name(kind: str, name: str) -> None:
+    """Raise ``InvalidInput`` for what cannot be the name of a scenario or recipe, which is that of its file."""
+    if re.fullmatch(NAME_PATTERN, name) is None:
+        raise InvalidInput(
+            f"{kind} name {name!r}: must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or"
+            " digit"
+        )
+
+
 def new_scenario_text(name: str, based_on: str = "paper-random") -> str:
     """Text of a commented YAML file for a new scenario ``name`` with the values of ``based_on``, all keys written out.
 
     A key that stands for another way to declare gaps or speeds is there as a comment with an example.
     Save it as ``<name>.yaml``. Raises ``InvalidInput`` for a name that cannot be one, or an unknown ``based_on``.
     """
-    if re.fullmatch(NAME_PATTERN, name) is None:
-        raise InvalidInput(
-            f"scenario name {name!r}: must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or"
-            " digit"
-        )
+    check_file_name("scenario", name)
     base = load_scenario(based_on)
     values = {
         **base.model_dump(mode="json", exclude_none=True),
