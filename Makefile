@@ -32,7 +32,7 @@ endef
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
 	@echo "make test [ARGS=...]  the test suite, without the tests marked long"
-	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry"
+	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make check            lint and test"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
@@ -102,6 +102,8 @@ lint: $(STAMP)
 	@$(BIN)/python -m mypy --strict ethbrake_marl tests/every_public_name.py
 	@echo "== deptry: every package that is imported is asked for, and the other way round"
 	@$(BIN)/deptry ethbrake_marl
+	@echo "== import-linter: imports point down, without a circle"
+	@$(BIN)/lint-imports --no-cache
 
 check: lint
 	@$(MAKE) --no-print-directory test
