@@ -35,7 +35,7 @@ from ethbrake_marl.cli.options import (
 )
 from ethbrake_marl.cli.parts import CommandWithParts
 from ethbrake_marl.cli.picture import picture_app
-from ethbrake_marl.cli.plugins import accept_plugins
+from ethbrake_marl.cli.plugins import accept_plugins, check_commands
 from ethbrake_marl.cli.recipe import recipe_app
 from ethbrake_marl.cli.record import record_command
 from ethbrake_marl.cli.settings import SetOption, read_settings
@@ -60,7 +60,7 @@ from ethbrake_marl.cli.train import (
     resume_command,
     train_command,
 )
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, naming_extras
+from ethbrake_marl.errors import EthBrakeError, naming_extras
 from ethbrake_marl.evaluation.inputs import (
     EPISODES,
     LIST_SEED,
@@ -140,7 +140,7 @@ def run_command(arguments: Sequence[str]) -> int:
     Other errors, which are defects, pass through.
     """
     try:
-        _check_commands()
+        check_commands(app)
         variable = None if shell_asks(os.environ) else _NO_VARIABLE  # None: the usual one
         command = accept_plugins(get_command(app))
         arguments = rename_old_options(arguments, command)
@@ -297,15 +297,6 @@ def doctor(
             show(f"{'OK' if check.ok else 'FAIL':4}  {check.name:{width}}  {check.detail}")
     if not all(check.ok for check in checks):
         raise typer.Exit(1)
-
-
-def _check_commands() -> None:
-    """Refuse a command of somebody's that would take the place of another one."""
-    names = [each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback]
-    names += [str(group.name) for group in app.registered_groups]
-    for k, name in enumerate(names):
-        if name in names[:k]:
-            raise AlreadyExists(f"command {name!r} is there already; give yours another name: app.command('my-{name}')")
 
 
 def _refuse(reason: str) -> int:
