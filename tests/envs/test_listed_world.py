@@ -44,7 +44,10 @@ def test_reset__of_a_batch_starts_in_the_worlds_that_follow() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"listed_world": 3}, r"listed_world = 3: must name a world of a list, for instance \{'seed': 7, 'number': 3\}"),
+        (
+            {"listed_world": 3},
+            r"listed_world = 3: must name a world of a list, for instance \{'seed': 7, 'number': 3\}",
+        ),
         ({"listed_world": {"seed": 7}}, "must name a world of a list"),
         (wanted(number=-1), "listed_world: number = -1: must be a whole number"),
         (wanted(seed=0.5), "listed_world: seed = 0.5: must be a whole number"),
