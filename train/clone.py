@@ -2,7 +2,7 @@
 
     ethbrake dataset --agents ppo@shipped --episodes 10000 --seed 1 --output runs/ppo.parquet
     python train/clone.py runs/ppo.parquet --output runs/clone
-    ethbrake evaluate --agents full_brake,ppo@shipped,ppo@runs/clone,best_harm --episodes 2000
+    ethbrake evaluate --agents full_brake,ppo@shipped,train/clone.py:make_agent:runs/clone,best_harm --episodes 2000
 
 The worlds of the list of seed 1 are others than those of seed 7, on which `ethbrake evaluate` measures. What a clone
 can reach depends on whom it watches: ppo@shipped sees what the clone sees; best_harm chose with hindsight.
@@ -72,8 +72,8 @@ def clone(seen: Tensor, done: Tensor, seed: int) -> nn.Sequential:
     return network
 
 
-# 3. The policy as a bundle, which `ethbrake evaluate` takes as ppo@FOLDER. In Python the network itself would do:
-#    eb.policy_agent(network, clip=True).
+# 3. The policy as a bundle: plain files, run without torch. (In Python the network itself drives, too:
+#    eb.policy_agent(network, clip=True).)
 
 
 def as_policy(network: nn.Sequential, told: dict[str, Any], seed: int) -> Policy:
@@ -113,6 +113,16 @@ def train(dataset: Path, seed: int, output: Path) -> None:
         save_policy(as_policy(clone(seen, done, seed), told, seed), folder / "policy")
 
 
+# 4. Who drives by it, on every command that takes agents.
+
+
+def make_agent(argument: str | None, settings: eb.AgentSettings) -> eb.Agent:
+    """The clone in the folder `argument`: `train/clone.py:make_agent:runs/clone` or `...:runs/clone+step`."""
+    if argument is None:
+        raise InvalidInput(f"agent {settings.spec!r}: say which clone drives: train/clone.py:make_agent:runs/clone")
+    return eb.LearnedAgent(eb.load_policy(argument), name=settings.spec)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", type=Path, help="a Parquet file of `ethbrake dataset`")
@@ -123,4 +133,4 @@ if __name__ == "__main__":
         train(given.dataset, given.seed, given.output)
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
-    print(f"cloned: {given.output}; ethbrake evaluate --agents full_brake,ppo@shipped,ppo@{given.output},best_harm")
+    print(f"cloned: {given.output}; ethbrake evaluate --agents ppo@shipped,{__file__}:make_agent:{given.output}")

@@ -33,8 +33,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
     Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity, 0
     coasts, +1 full driving capacity. Terminated: all at rest and no command that would move one. Truncated: the
     horizon. Infos: see ``envs.infos``. ``reset(seed=s)`` starts the stream of worlds of s, ``reset()`` goes on in it;
-    ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from there,
-    ``options={"listed_world": {"seed": 7, "number": 3}}`` in that world of an evaluated list. Raises
+    ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from there. Raises
     ``InvalidInput`` for more or fewer than one learner, an action outside [-1, 1], a step without an episode.
 
     Args:

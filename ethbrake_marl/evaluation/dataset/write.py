@@ -76,11 +76,11 @@ def write_dataset(
     left.
 
     """
-    chosen = check_dataset(path, scenario, format, force=force)
     check_whole_number("write_dataset: episodes", episodes, 1)
     check_whole_number("write_dataset: seed", seed, 0)
     if not agents:
         raise InvalidInput("write_dataset: no agents given; at least one is needed, for instance full_brake")
+    chosen = check_dataset(path, scenario, format, force=force)
     spec = observation_for(scenario) if observation is None else choose_observation(observation)
     task = Task(scenario, int(seed), reward_params(reward), spec)
     work = _Work(task, int(episodes), on_progress, tell(task, agents, episodes))
