@@ -63,7 +63,7 @@ def clone(seen: Tensor, done: Tensor, seed: int) -> nn.Sequential:
     optimiser = torch.optim.Adam(network.parameters(), LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, batches)
     for _ in range(EPOCHS):
-        for rows in torch.randperm(len(seen)).split(BATCH):
+        for rows in torch.split(torch.randperm(len(seen)), BATCH):
             loss = nn.functional.mse_loss(network(seen[rows]), done[rows])
             optimiser.zero_grad()
             loss.backward()
