@@ -19,6 +19,7 @@ from ethbrake_marl.evaluation.dataset.write import (
 )
 from ethbrake_marl.evaluation.inputs import LIST_SEED, check_agents, load_evaluated, make_lineup
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty
 
 
 def dataset_command(
@@ -36,6 +37,10 @@ def dataset_command(
     harm_count: Annotated[
         HarmCount, typer.Option(help="Harm that agents minimise, and the reward counts: first impacts only, or all.")
     ] = "first",
+    uncertainty: Annotated[
+        str | None,
+        typer.Option(metavar="QUANTITY=WIDTH,...", help=f"What the robust shield does not know, such as {EXAMPLE}."),
+    ] = None,
     settings: SetOption = None,
     force: ForceOption = False,
 ) -> None:
@@ -46,7 +51,8 @@ def dataset_command(
     """
     chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
     kind = check_dataset(output, chosen, format, force=force)
-    lineup = make_lineup(agents.split(","), chosen, harm_count=harm_count)
+    intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
+    lineup = make_lineup(agents.split(","), chosen, harm_count=harm_count, uncertainty=intervals)
     check_agents(lineup, chosen.sample(1, seed).worlds, chosen)
     with interruptible("nothing was written"), progress_bars() as bars:
         summary = write_dataset(
