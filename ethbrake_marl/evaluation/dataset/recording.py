@@ -2,12 +2,14 @@
 
 An agent drives as in an evaluation, where its commands (float64, m/s2) are applied as they are. A learner's action is a
 float32 in [-1, 1], of which most commands are no exact image. So each command is rounded to an action, and those
-actions are played from the alert on: what is recorded is that second episode, and so it replays to the same bits.
+actions are played from the alert on: what is recorded is that second episode, and so it replays to the same bits. On
+the edge of an impact a last bit decides about it: of the roundings to the nearest, downwards and upwards, each world
+gets the one whose harm is nearest to that of the commands.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +21,7 @@ from ethbrake_marl.agents.team import Driver, team_of
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.step import Step
 from ethbrake_marl.envs.infos import COLUMNS, Report, report
-from ethbrake_marl.errors import PhysicsError
+from ethbrake_marl.errors import PhysicsError, renumbered
 from ethbrake_marl.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance
@@ -28,6 +30,7 @@ from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import Sample, Scenario
 
 Float32s = NDArray[np.float32]
+SLACK = 1e-6  # m2/s2; a smaller difference of harm is not worth another rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,18 +94,9 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
 
     Raises ``PhysicsError`` naming worlds that could not be advanced, and what ``episode_engine`` raises.
     """
-    actions, evaluated = _choose_actions(sample.worlds, driver, task.scenario)
-    engine = Engine(
-        task.scenario,
-        sample.worlds.n,
-        learners=task.scenario.learners,
-        scripts=script_agents(task.scenario),
-        reward=task.reward,
-        observation=task.observation,
-        seed=task.seed,
-        worlds=sample.worlds,
-    )
-    engine.roster.warns = False
+    commanded, evaluated = _evaluated_actions(sample.worlds, driver, task.scenario)
+    actions, off_by = _rounded(commanded, sample.worlds, evaluated, task)
+    engine = _learners_engine(sample.worlds, task)
     learners = np.array(engine.learners, np.int64)
     road = _Road(sample.worlds, engine)
     observations, reports = [engine.observe_all(learners)], [report(engine)]
@@ -117,25 +111,67 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
         road.follow(engine)
     _refuse_failed(engine)
     played = np.stack([actions[min(t, len(actions) - 1)] for t in range(len(steps))])
-    ledger = engine.ledger
-    off_by = max(float(np.abs(ledger.world_harm(c) - evaluated.world_harm(c)).max()) for c in HARM_COUNTS)
     return Recording(
         name, task, sample.index, decisions, np.stack(observations), played, tuple(steps), tuple(reports),
-        np.stack(road.positions_m), np.stack(road.speeds_mps), ledger, off_by,
+        np.stack(road.positions_m), np.stack(road.speeds_mps), engine.ledger, float(off_by.max()),
     )  # fmt: skip
 
 
-def _choose_actions(worlds: Worlds, driver: Driver, scenario: Scenario) -> tuple[list[Float32s], Ledger]:
-    """The actions [n, L] of each step nearest to what the driver commands in an evaluation, and its harm there."""
+def _evaluated_actions(worlds: Worlds, driver: Driver, scenario: Scenario) -> tuple[Floats, Ledger]:
+    """What the driver commands in an evaluation, as actions before rounding [T, n, L], and its harm there."""
     learners = scenario.learners
     engine = episode_engine(worlds, team_of(driver, learners), scenario)
     actions = []
     while not engine.ended.all():
         engine.step({})
         columns = [command_to_action(engine.wanted_mps2[:, i], worlds.vehicles, i) for i in learners]
-        actions.append(np.stack(columns, axis=1).astype(np.float32))
+        actions.append(np.stack(columns, axis=1))
     _refuse_failed(engine)
-    return actions, engine.ledger
+    return np.stack(actions), engine.ledger
+
+
+def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -> tuple[Float32s, Floats]:
+    """The actions [T, n, L] to play, and by how much their harm differs from the evaluated one, [n] m2/s2."""
+    nearest = commanded.astype(np.float32)
+    best, off_by = nearest.copy(), _off_by(nearest, worlds, evaluated, task)
+    rows = np.flatnonzero(off_by > SLACK)
+    for end in (-1.0, 1.0) if len(rows) else ():
+        beyond = np.where((nearest - commanded) * end >= 0.0, nearest, np.nextafter(nearest, np.float32(end)))[:, rows]
+        part = Ledger(*(getattr(evaluated, field.name)[rows] for field in fields(Ledger)))
+        with renumbered(rows):
+            off = _off_by(beyond, worlds.take(rows), part, task)
+        better = off < off_by[rows]
+        best[:, rows[better]], off_by[rows[better]] = beyond[:, better], off[better]
+    return best, off_by
+
+
+def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) -> Floats:
+    """By how much the harm of these actions differs from the evaluated one, the larger of both counts, [n] m2/s2."""
+    engine = _learners_engine(worlds, task)
+    step = 0
+    while not engine.ended.all():
+        engine.step(actions[min(step, len(actions) - 1)])
+        step += 1
+    _refuse_failed(engine)
+    ledger = engine.ledger
+    off: Floats = np.max([np.abs(ledger.world_harm(c) - evaluated.world_harm(c)) for c in HARM_COUNTS], axis=0)
+    return off
+
+
+def _learners_engine(worlds: Worlds, task: Task) -> Engine:
+    """An engine over worlds at the alert, as an interface has it: the learners take actions."""
+    engine = Engine(
+        task.scenario,
+        worlds.n,
+        learners=task.scenario.learners,
+        scripts=script_agents(task.scenario),
+        reward=task.reward,
+        observation=task.observation,
+        seed=task.seed,
+        worlds=worlds,
+    )
+    engine.roster.warns = False
+    return engine
 
 
 def _refuse_failed(engine: Engine) -> None:
