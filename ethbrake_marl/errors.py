@@ -103,7 +103,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
     **dict.fromkeys(("benchmarl", "torchrl", "tensordict"), "marl"),
     **dict.fromkeys(("onnx", "onnxruntime"), "export"),
-    "pyarrow": "data",
+    **dict.fromkeys(("pyarrow", "minari", "h5py"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
 }
 

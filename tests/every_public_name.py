@@ -102,6 +102,7 @@ def measure(folder: Path) -> list[eb.SummaryRow]:
     outcome: eb.Outcome = found.outcome("learned")
     record: eb.EpisodeRecord = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=scenario)
     assert record.ledger.world_harm("first").shape == outcome.first_impact_harm[:1].shape
+    eb.write_dataset(folder / "brakes.parquet", agents, scenario=scenario, episodes=10, format="parquet")
     return eb.summarise(found)
 
 

@@ -17,6 +17,7 @@ from ethbrake_marl.cli.ablate import ablate_command, generalise_command
 from ethbrake_marl.cli.bench import bench_command
 from ethbrake_marl.cli.best_harm import best_harm_command
 from ethbrake_marl.cli.compare import compare_command
+from ethbrake_marl.cli.dataset import dataset_command
 from ethbrake_marl.cli.doctor import diagnose
 from ethbrake_marl.cli.equal_time import equal_time_command
 from ethbrake_marl.cli.evaluate import agents_command, evaluate_command, shield_command, show_beside, show_rows
@@ -121,6 +122,9 @@ app.command("agents", epilog="Example: ethbrake agents")(agents_command)
 app.command("shield", epilog="Example: ethbrake shield --agents ppo@shipped,full_brake --episodes 500")(shield_command)
 app.command("record", epilog="Example: ethbrake record --agents full_brake,e_v2x_bm --world 3 --output both.gif")(
     record_command
+)
+app.command("dataset", epilog="Example: ethbrake dataset --agents best_harm --episodes 1000 --output best.parquet")(
+    dataset_command
 )
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
 app.command("equal-time", epilog="Example: ethbrake equal-time --episodes 200 --repeats 1")(equal_time_command)

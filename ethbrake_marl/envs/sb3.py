@@ -258,7 +258,7 @@ class EthBrakeVecEnv(VecEnv):
         options = [row or {} for row in self._options]
         if len(options) != self.num_envs:
             raise InvalidInput(f"set_options: {len(options)} entries; one for each of {self.num_envs} rows is needed")
-        warn_of_unknown(name for row in options for name in row)
+        warn_of_unknown((name for row in options for name in row), (INITIAL_STATE,))
         if not any(INITIAL_STATE in row for row in options):
             return None
         width = len(self.engine.learners)
