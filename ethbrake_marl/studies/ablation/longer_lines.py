@@ -73,7 +73,7 @@ def lengthen(scenario: Scenario, vehicles: int) -> Scenario:
         raise InvalidInput(f"line of {vehicles} vehicles: at least 2 are needed")
     given = scenario.model_dump(mode="json", exclude_unset=True)
     changes: dict[str, Any] = {"vehicles": vehicles, "name": f"{scenario.name}-n{vehicles}"}
-    for field in (*DECLARED, "objective"):
+    for field in (*DECLARED, "objective", "types"):
         values = given.get(field)
         if isinstance(values, list):
             wanted = vehicles - (scenario.vehicles - len(values))
