@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ethbrake_marl.physics.worlds import Ints, Worlds, concatenate
+from ethbrake_marl.physics.worlds import Floats, Ints, Worlds, concatenate
+from ethbrake_marl.scenario.quantities import OPTIONAL, QUANTITIES, QuantityRule
 
 Texts = NDArray[np.str_]
 
@@ -39,6 +40,44 @@ class Sample:
         some = np.asarray(rows)
         types, scenarios = (None if each is None else each[some] for each in (self.types, self.scenarios))
         return Sample(self.worlds.take(some), self.index[some], 0, types, scenarios)
+
+
+def quantity(worlds: Worlds, field: str) -> Floats:
+    """A quantity of every world, [n, entries]: one entry per vehicle, pair or world (see ``QUANTITIES``)."""
+    holder = worlds if field in ("gaps_m", "speeds_mps", *OPTIONAL) else worlds.vehicles
+    values: Floats = getattr(holder, field)
+    return values.reshape(worlds.n, -1)
+
+
+def quantity_rules(worlds: Worlds) -> dict[str, QuantityRule]:
+    """The quantities that these worlds have: the distance to an obstacle only where there is one."""
+    return {**QUANTITIES, **OPTIONAL} if np.isfinite(worlds.obstacle_gap_m).all() else QUANTITIES
+
+
+def quantity_columns(worlds: Worlds) -> dict[str, Floats]:
+    """Every quantity of the worlds, each [n], named as in a table of initial states: ``gap_1_m``, ``mass_2_t``."""
+    return {
+        rule.column_of(i): values
+        for field, rule in quantity_rules(worlds).items()
+        for i, values in enumerate(quantity(worlds, field).T)
+    }
+
+
+def kind_columns(types: Texts | None, scenarios: Texts | None) -> dict[str, Texts]:
+    """``scenario`` of a mixture and ``vehicle_K_type``, each [n], where the worlds were drawn with such."""
+    columns = {} if scenarios is None else {"scenario": scenarios}
+    if types is not None:
+        columns |= {f"vehicle_{i + 1}_type": column for i, column in enumerate(types.T)}
+    return columns
+
+
+def count_kinds(sample: Sample) -> str:
+    """How often each scenario of a mixture, and each type of a vehicle, is in the sample; empty without such."""
+    told = ""
+    for kind, column in kind_columns(sample.types, sample.scenarios).items():
+        names, counts = np.unique(column, return_counts=True)
+        told += f"; {kind}: " + ", ".join(f"{n or 'none'} {c}" for n, c in zip(names, counts, strict=True))
+    return told
 
 
 def join_samples(parts: Sequence[Sample], rejected: int) -> Sample:
