@@ -1,4 +1,4 @@
-"""What the worlds of an environment were drawn as: every quantity at the alert, type and scenario, as flat columns.
+"""The draws behind the worlds of an environment: every quantity at the alert, type and scenario, as flat columns.
 
 Worlds are pure functions of scenario, seed and number, so nothing is kept while episodes run: it costs nothing until
 somebody asks, and then the worlds are drawn again.
