@@ -82,6 +82,10 @@ def _check_members(document: Document, members: Sequence[ScenarioFields]) -> Non
     line = document.line_of(("mixture",))
     where = f"{document.file}{'' if line is None else f', line {line}'}: mixture"
     first = members[0]
+    if (given := document.content.get("vehicles", first.vehicles)) != first.vehicles:
+        raise InvalidInput(
+            f"{where}: vehicles = {given}: its scenarios have {first.vehicles}, which nothing beside them can change"
+        )
     for k, member in enumerate(members):
         if member.members:
             raise InvalidInput(f"{where}[{k}]: {member.name} is a mixture itself; list its scenarios here")

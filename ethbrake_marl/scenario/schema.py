@@ -136,6 +136,8 @@ class Scenario(ScenarioFields):
     def _repr_html_(self) -> str:
         """What it declares, for a notebook."""
         told = {key: value for key, value in self.declared().items() if key not in ("name", "title")}
+        if self.mixture is not None:
+            told["mixture"] = ", ".join(f"{e.weight:g} x {e.scenario['name']}" for e in self.mixture)
         rows = [(key, value if isinstance(value, str) else flow_text(value)) for key, value in told.items()]
         return html_table(("Key", "Value"), rows, caption=f"Scenario {self.name}: {self.title or 'no title'}")
 

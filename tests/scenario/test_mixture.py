@@ -141,6 +141,10 @@ def test_file__may_name_a_file_beside_it(tmp_path: Path):
             "mixture: [{scenario: paper-random}, {scenario: paper-random-obstacle}]",
             "an obstacle ahead must be there in all or in none: paper-random has none, paper-random-obstacle has one",
         ),
+        (
+            "mixture: [{scenario: paper-random}]\nvehicles: 5",
+            "line 2: mixture: vehicles = 5: its scenarios have 3, which nothing beside them can change",
+        ),
         ("mixture: [{scenario: paper-random}]\nmass_tt: 3", "line 3: mass_tt: unknown key; did you mean mass_t"),
         ("mixture: [{scenario: paper-random}]\nhorizon_s: -8", "mixture[0] (paper-random), line 3: horizon_s = -8"),
         ("mixture: [{scenario: {name: x,\n   massx: 3}}]", "mixture[0] (x), line 3: massx: unknown key; did you mean"),
@@ -163,6 +167,10 @@ def test_given_worlds__belong_to_no_member():
     env = eb.parallel_env(scenario=DELAYS)
     with pytest.raises(InvalidInput, match="is a mixture, and nothing says which of its scenarios a world belongs to"):
         env.reset(options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}})
+
+
+def test_notebook__names_the_members():
+    assert "1 x paper-delay-low, 1 x paper-delay-middle, 1 x paper-delay-high" in DELAYS._repr_html_()
 
 
 def test_quantities__are_those_of_the_members():
