@@ -86,6 +86,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.evaluation.compare import compare_results as compare_results
     from ethbrake_marl.evaluation.compare import read_result as read_result
     from ethbrake_marl.evaluation.dataset.write import write_dataset as write_dataset
+    from ethbrake_marl.evaluation.groups import summarise_by as summarise_by
 
     # Figures: matplotlib's, which a notebook shows
     from ethbrake_marl.evaluation.criticality import criticality_map as criticality_map

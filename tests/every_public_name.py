@@ -116,6 +116,9 @@ def show(found: eb.Evaluation, folder: Path) -> list[Any]:
     curve = eb.deceleration_curve(found.worlds.take([0]), found.task)
     eb.compare_results(eb.read_result(folder / "a.json"), eb.read_result(folder / "b.json"))
     figures = [eb.criticality_figure(cells), eb.deceleration_figure(curve), eb.harm_against_total_gap(found)]
+    mixed = eb.load_scenario("mixture-delays")
+    parts = eb.summarise_by(eb.evaluate(mixed.sample(10, 7), {"mine": Cautious()}, scenario=mixed), "scenario")
+    assert_type(parts, dict[str, eb.SummaryTable])
     return [found.to_frame(), *figures]
 
 

@@ -80,6 +80,7 @@ from ethbrake_marl.scenario import (
     scenario_path,
 )
 from ethbrake_marl.scenario.catalogue import SHIPPED
+from ethbrake_marl.scenario.sample import count_kinds
 
 BAD_INPUT = 2
 _NO_VARIABLE = ""  # by which no shell can ask for completion
@@ -256,7 +257,7 @@ def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")])
     sample = scenario.sample(CHECKED_DRAWS, LIST_SEED)
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "none"
     counts = f"{CHECKED_DRAWS:,} worlds drawn, {sample.rejected:,} more refused for an early impact"
-    show(f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}")
+    show(f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}{count_kinds(sample)}")
 
 
 @scenario_app.command("new", epilog="Example: ethbrake scenario new my-scenario --based-on paper-distance")

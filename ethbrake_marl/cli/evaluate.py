@@ -32,6 +32,7 @@ from ethbrake_marl.evaluation import (
 )
 from ethbrake_marl.evaluation.compare import results_to_json
 from ethbrake_marl.evaluation.frame import check_parquet, write_per_world
+from ethbrake_marl.evaluation.groups import check_group, summarise_by
 from ethbrake_marl.evaluation.inputs import (
     EPISODES,
     LIST_SEED,
@@ -50,7 +51,10 @@ from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, 
 from ethbrake_marl.evaluation.text import metrics_table
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.scenario import Sample, Task
+from ethbrake_marl.scenario.sample import kind_columns
 from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty
+
+Groups = Mapping[str, Sequence[SummaryRow]]
 
 
 def evaluate_command(
@@ -87,6 +91,10 @@ def evaluate_command(
             help="Also tell the results under this objective; standard: under all usual ones. Repeatable.",
         ),
     ] = None,
+    by: Annotated[
+        str | None,
+        typer.Option(metavar="COLUMN", help="Also tell the results by group: scenario (a mixture), vehicle_2_type."),
+    ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -103,6 +111,8 @@ def evaluate_command(
     chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
     objectives = declared_objectives(objective or (), chosen.vehicles)
     sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
+    if by is not None:
+        check_group(kind_columns(sample.types, sample.scenarios), by)
     intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
     lineup = make_lineup(agents.split(","), chosen, harm_count=harm_count, shield=shield, uncertainty=intervals)
     check_agents(lineup, sample.worlds, chosen)
@@ -117,10 +127,13 @@ def evaluate_command(
         )
     told = rescore(evaluation, objectives)
     rows = summarise(evaluation)
+    groups = {} if by is None else summarise_by(evaluation, by)
     if per_world is not None:
         write_per_world(per_world, evaluation, objectives=objectives, force=force)
-        write_results_beside(per_world, rows, told, force=force)
-    show_rows(rows, as_json, told, per_world=per_world)
+        write_results_beside(per_world, rows, told, groups=groups, force=force)
+    show_rows(rows, as_json, told, groups=groups, per_world=per_world)
+    if not as_json:
+        show_groups(groups)
     moving = {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
     if note := horizon_note(moving, sample.worlds.n, chosen.horizon_s):
         say(note)
@@ -133,15 +146,25 @@ def results_beside(per_world: Path) -> Path:
     return per_world.with_name(f"{per_world.name}.json")
 
 
-def write_results_beside(per_world: Path, rows: Sequence[SummaryRow], told: Sequence[Rescored], *, force: bool) -> None:
+def write_results_beside(
+    per_world: Path, rows: Sequence[SummaryRow], told: Sequence[Rescored], *, groups: Groups, force: bool
+) -> None:
     """Write the results file of the file with one row per world that has just been written."""
-    content = json.dumps(results_to_json(rows, told=told, per_world=per_world), indent=2, allow_nan=False) + "\n"
+    content = (
+        json.dumps(results_to_json(rows, told=told, groups=groups, per_world=per_world), indent=2, allow_nan=False)
+        + "\n"
+    )
     write_output(results_beside(per_world), content.encode(), force=force)
     say(f"every world: {per_world}; the results: {results_beside(per_world)}")
 
 
 def show_rows(
-    rows: Sequence[SummaryRow], as_json: bool, told: Sequence[Rescored] = (), *, per_world: Path | None = None
+    rows: Sequence[SummaryRow],
+    as_json: bool,
+    told: Sequence[Rescored] = (),
+    *,
+    groups: Groups | None = None,
+    per_world: Path | None = None,
 ) -> None:
     """The rows as a table, or as a results file, see ``results_to_json``."""
     if not as_json:
@@ -149,7 +172,14 @@ def show_rows(
         if rows and rows[0].metrics:
             result_console().print(metrics_table(rows))
         return
-    write_json(results_to_json(rows, told=told, per_world=per_world))
+    write_json(results_to_json(rows, told=told, groups=groups, per_world=per_world))
+
+
+def show_groups(groups: Groups) -> None:
+    """The rows of each group of worlds, below its name."""
+    for name, rows in groups.items():
+        result_console().print(f"\n{name}: {count_of(rows[0].episodes, 'world')}\n", highlight=False, markup=False)
+        result_console().print(rich_table(rows))
 
 
 def show_beside(beside: Mapping[str, Sequence[SummaryRow]]) -> None:

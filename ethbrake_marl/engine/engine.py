@@ -243,9 +243,9 @@ class Engine:
         first = None if worlds is not None else stream.position
         start = stream.take(self.n) if worlds is None else stream.prepare(worlds)
         new = copy.copy(self)
-        new._stream, new.roster = stream, Roster(self.n, stream.seed, first)
+        new._stream, new.roster = stream, Roster(self.n, stream.seed, first, worlds)
         new._obstacle = self.scenario.has_obstacle or has_obstacle(start.packed.state, self.scenario.vehicles)
-        new._by_link = self.scenario.v2x.by_link or has_news(start.packed.params, self.scenario.vehicles)
+        new._by_link = self.scenario.by_link or has_news(start.packed.params, self.scenario.vehicles)
         new._state, new._params = (array.copy() for array in new._kept(start.packed))
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
         new._potential = np.zeros(start.wanted.shape)

@@ -81,10 +81,11 @@ class Roster:
     ``first`` is the number of row 0's world, the others follow; None: the worlds were given, and have no number.
     """
 
-    def __init__(self, n: int, seed: int, first: int | None) -> None:
+    def __init__(self, n: int, seed: int, first: int | None, given: Worlds | None = None) -> None:
         self.failed: dict[int, str] = {}  # by row, and why; until a new episode begins there
         self.warns = True  # with a ``FailedWorld`` that names the world; off: the caller looks at ``failed``
         self.seed = seed
+        self.given = given  # the worlds that were given, at the alert: where ``numbers`` are -1
         self.numbers = np.full(n, -1, np.int64) if first is None else first + np.arange(n)  # by row; -1: given
 
     def renew(self, rows: Ints, first: int) -> None:

@@ -11,6 +11,7 @@ from pettingzoo import AECEnv, ParallelEnv
 
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.drawing.viewer import CLASS_METADATA, Viewer, render_metadata
+from ethbrake_marl.envs.drawn import describe_world
 from ethbrake_marl.envs.infos import Report, plain_infos, report
 from ethbrake_marl.envs.setup import (
     AnyScenario,
@@ -133,6 +134,12 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
             dict.fromkeys(agents, truncated),
             infos,
         )
+
+    def describe_world(self) -> dict[str, Any]:
+        """What the running world was drawn as: flat numbers and texts by name; see ``envs.drawn``."""
+        if not self._started:
+            raise InvalidInput("describe_world: no episode was started; call reset first")
+        return describe_world(self.engine)
 
     def render(self) -> Any:
         """What the render mode says: a frame [H, W, 3] uint8, a list of new ones, a text, or None for ``human``."""

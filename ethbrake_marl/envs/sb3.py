@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.snapshot import Arrays, engine_snapshot, restore_engine
 from ethbrake_marl.engine.step import Step
+from ethbrake_marl.envs.drawn import describe_worlds
 from ethbrake_marl.envs.infos import plain_infos, report
 from ethbrake_marl.envs.setup import (
     INITIAL_STATE,
@@ -171,6 +172,12 @@ class EthBrakeVecEnv(VecEnv):
             engine.renew(ended)
             self._begun[ended] = report(engine, rows=ended).values
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
+
+    def describe_worlds(self) -> dict[str, NDArray[Any]]:
+        """What each running world was drawn as: columns by name, each [worlds]; see ``envs.drawn``."""
+        if not self._started:
+            raise InvalidInput("describe_worlds: no episode was started; call reset first")
+        return describe_worlds(self.engine)
 
     def close(self) -> None:
         """Nothing to release."""

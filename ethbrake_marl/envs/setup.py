@@ -17,7 +17,7 @@ from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_nu
 from ethbrake_marl.observations import Feature, Observation, ObservationSpec, choose_observation
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.rewards import Reward
-from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
+from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario, read_scenario
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping: what a file would say
 
@@ -49,7 +49,7 @@ def make_engine(
     """
     check_whole_number("number of worlds", n, 1)
     if isinstance(scenario, Mapping):
-        loaded = Scenario(**scenario)
+        loaded = read_scenario(scenario)
     else:
         loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     if not (observation is None or isinstance(observation, ObservationSpec | list | tuple)):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.engine.step import Step
 from ethbrake_marl.envs.drawing.viewer import BATCH_MODES, Viewer, render_metadata
+from ethbrake_marl.envs.drawn import describe_worlds
 from ethbrake_marl.envs.infos import batch_info, report
 from ethbrake_marl.envs.setup import (
     AnyScenario,
@@ -109,6 +110,12 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         infos |= batch_info(report(engine, step), self.learner, every, ~renewed)
         reward = step.reward[:, self.learner].copy()
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
+
+    def describe_worlds(self) -> dict[str, NDArray[Any]]:
+        """What each running world was drawn as: columns by name, each [worlds]; see ``envs.drawn``."""
+        if not self._started:
+            raise InvalidInput("describe_worlds: no episode was started; call reset first")
+        return describe_worlds(self.engine)
 
     def render(self) -> tuple[Any, ...]:
         """A frame [H, W, 3] uint8, or a text, of every world; of a world that has just been renewed, its start."""

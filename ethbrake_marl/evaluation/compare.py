@@ -28,15 +28,24 @@ _NEEDED = {"agent": str, "episodes": int, **dict.fromkeys(_HASHES, str), "policy
 
 
 def results_to_json(
-    rows: Sequence[SummaryRow], *, told: Sequence[Rescored] = (), per_world: Path | None = None
+    rows: Sequence[SummaryRow],
+    *,
+    told: Sequence[Rescored] = (),
+    groups: Mapping[str, Sequence[SummaryRow]] | None = None,
+    per_world: Path | None = None,
 ) -> list[dict[str, Any]]:
     """What a results file holds: one object per row, with what was ``told`` of it under other objectives.
 
+    ``groups``, by name, are rows of the same agents on parts of the worlds (``summarise_by``).
     ``per_world`` is the file with one row per world, written before; its name and hash go into every object.
     """
     found = [row.to_json() for row in rows]
     if told:
         found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
+    for row in found if groups else ():
+        row["groups"] = {
+            name: each.to_json() for name, part in (groups or {}).items() for each in part if each.agent == row["agent"]
+        }
     if per_world is None:
         return found
     beside = {"file": per_world.name, "sha256": hashlib.sha256(per_world.read_bytes()).hexdigest()}

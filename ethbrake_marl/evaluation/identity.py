@@ -50,7 +50,7 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 
 def scenario_sha256(scenario: Scenario) -> str:
     """SHA-256 of all that shapes an episode: every value of the scenario, defaults too, but neither name nor texts."""
-    content = scenario.model_dump(mode="json", exclude=_WORDS)
+    content = scenario.content(without=_WORDS)
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 

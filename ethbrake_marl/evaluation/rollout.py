@@ -25,6 +25,7 @@ from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Ints, Worlds, concatenate, leaving_out_failed
 from ethbrake_marl.scenario import Sample, Scenario, Task
+from ethbrake_marl.scenario.sample import kind_columns
 
 CHUNK = 10_000  # worlds advanced together: bounds memory, changes no result
 
@@ -159,9 +160,11 @@ class _Whole(NamedTuple):
         if self.left_out and not good.size:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         outcomes = {name: _join([part.among(good) for part in parts]) for name, parts in self.parts.items()}
+        kinds = kind_columns(self.sample.types, self.sample.scenarios)
         if self.left_out:
             worlds, index = worlds.take(good), index[good]
-        return Evaluation(scenario, driven, worlds, index, seed, outcomes, self.left_out)
+            kinds = {name: column[good] for name, column in kinds.items()}
+        return Evaluation(scenario, driven, worlds, index, seed, outcomes, self.left_out, kinds)
 
 
 class _Chunk(NamedTuple):

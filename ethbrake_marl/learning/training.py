@@ -126,5 +126,5 @@ def _content(recipe: TrainingRecipe, scenario: Scenario) -> Content:
     """Plain data with every default in it, without words."""
     return {
         "recipe": recipe.model_dump(mode="json", exclude=set(WORDS)),
-        "scenario": scenario.model_dump(mode="json", exclude=set(WORDS)),
+        "scenario": scenario.content(without=WORDS),
     }

@@ -7,10 +7,12 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
-from ethbrake_marl.files.yaml import flow_text, read_yaml
+from ethbrake_marl.files.yaml import Document, flow_text, read_yaml
 from ethbrake_marl.scenario.fields import NAME_PATTERN
+from ethbrake_marl.scenario.mixture import member_content
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
 from ethbrake_marl.scenario.schema import Scenario
 
@@ -143,7 +145,7 @@ def _shipped_paths() -> dict[str, Path]:
 
 def _load(path: Path) -> Scenario:
     document = read_yaml(path)
-    scenario = Scenario.from_document(document)
+    scenario = Scenario.from_document(_with_members(document, path.parent))
     if scenario.name != path.stem:
         line = document.line_of(("name",))
         raise InvalidInput(
@@ -151,6 +153,48 @@ def _load(path: Path) -> Scenario:
             f" (or rename the file to {scenario.name}{path.suffix})"
         )
     return scenario
+
+
+def read_scenario(content: Mapping[str, Any]) -> Scenario:
+    """A scenario from what its file would say; the members of a mixture may be named as there.
+
+    Raises ``InvalidInput`` as ``Scenario``, and what ``load_scenario`` raises for a name.
+    """
+    document = _with_members(Document("scenario", dict(content), {}), Path())
+    return Scenario(**document.content)
+
+
+def _with_members(document: Document, folder: Path) -> Document:
+    """The document of a mixture with the content of every member in place of its name, or of a path from ``folder``."""
+    content = document.content
+    listed = content.get("mixture") if isinstance(content, dict) else None
+    if not isinstance(listed, list | tuple):
+        return document
+    found = [
+        {**entry, "scenario": _member(entry["scenario"], _place(document, i), folder)}
+        if isinstance(entry, dict) and isinstance(entry.get("scenario"), str)
+        else entry
+        for i, entry in enumerate(listed)
+    ]
+    return Document(document.file, {**content, "mixture": found}, document.lines)
+
+
+def _place(document: Document, i: int) -> str:
+    line = document.line_of(("mixture", i, "scenario"))
+    return f"{document.file}{'' if line is None else f', line {line}'}: mixture[{i}].scenario"
+
+
+def _member(name: str, where: str, folder: Path) -> dict[str, Any]:
+    try:
+        path = Path(scenario_path(name))
+        if path not in _shipped_paths().values():
+            path = folder / path
+        document = read_yaml(path)
+        if isinstance(document.content, dict) and "mixture" in document.content:
+            raise InvalidInput(f"{name} is a mixture itself; list its scenarios here")
+        return _load(path).declared()
+    except InvalidInput as error:
+        raise InvalidInput(f"{where} = {name}: {error}") from None
 
 
 _HEAD = """\
@@ -180,24 +224,47 @@ def new_scenario_text(name: str, based_on: str = "paper-random") -> str:
     """
     check_file_name("scenario", name)
     base = load_scenario(based_on)
+    given = base.declared() if base.members else base.model_dump(mode="json", exclude_none=True)
     values = {
-        **base.model_dump(mode="json", exclude_none=True),
+        **{key: value for key, value in given.items() if not base.members or key == "mixture"},
         "name": name,
         "title": "One line for lists and figures",
         "description": "What this scenario is for.",
         "source": f"Values of {base.name}, to be changed.",
     }
     if base.line_speed_mps is None:
-        del values["speed_deviations_mps"]
+        values.pop("speed_deviations_mps", None)
+    if base.members:
+        values["mixture"] = [_short_member(entry) for entry in values["mixture"]]
     keys = [f"\n# {_comment(key)}\n{_line(key, values)}\n" for key in Scenario.model_fields]
     return _HEAD.format(name=name, based_on=base.name) + "".join(keys)
+
+
+_EXAMPLES = {
+    "observation": "[own, front_1, rear_1]",
+    "vehicle_types": "{car: {weight: 9, mass_t: 1.5}, truck: {mass_t: {with_load: [14, 40]}}}",
+    "types": "[car, any, truck]",
+    "mixture": "[{scenario: paper-random, weight: 2}, {scenario: paper-random-early}]",
+    "roles": "{vehicle_2: learner}",
+    "v2x": "nominal",
+}  # of keys that are no quantity and may be left out
 
 
 def _line(key: str, values: Mapping[str, object]) -> str:
     """``key: value``; a key that goes only with the other way to declare the same stands in a comment."""
     if key in values:
         return f"{key}:{_value(values[key])}"
-    return f"# {key}: {DECLARED[key].example if key in DECLARED else '[own, front_1, rear_1]'}"
+    if key in DECLARED:
+        return f"# {key}: {DECLARED[key].example}"
+    default = Scenario.model_fields[key].default
+    return f"# {key}: {_EXAMPLES[key] if key in _EXAMPLES else flow_text(default)}"
+
+
+def _short_member(entry: dict[str, Any]) -> dict[str, Any]:
+    """A member of a mixture by its name, where that is a shipped scenario that says the same."""
+    content, name = entry["scenario"], entry["scenario"]["name"]
+    as_shipped = name in _shipped_paths() and member_content(load_scenario(name)) == content
+    return {**entry, "scenario": name} if as_shipped else entry
 
 
 def _comment(key: str) -> str:

@@ -75,7 +75,7 @@ def equal_time(
     if against not in agents:
         raise unknown_name("agent to compare with", against, agents)
     n = sample.worlds.n
-    few = Sample(sample.worlds.take(np.arange(min(n, _WARM_UP))), sample.index[:_WARM_UP], 0)
+    few = sample.take(np.arange(min(n, _WARM_UP)))
     evaluate(few, agents, scenario=scenario, chunk=CHUNK)
     spent: dict[str, list[float]] = {name: [] for name in agents}
     outcomes: dict[str, Outcome] = {}

@@ -77,7 +77,7 @@ def lengthen(scenario: Scenario, vehicles: int) -> Scenario:
         raise InvalidInput(f"line of {vehicles} vehicles: at least 2 are needed")
     given = scenario.model_dump(mode="json", exclude_unset=True)
     changes: dict[str, Any] = {"vehicles": vehicles, "name": f"{scenario.name}-n{vehicles}"}
-    for key in (*DECLARED, "objective"):
+    for key in (*DECLARED, "objective", "types"):
         values = given.get(key)
         if isinstance(values, list):
             wanted = vehicles - (scenario.vehicles - len(values))
