@@ -50,10 +50,7 @@ def make_engine(
     and is not listed brakes fully. Scripts come from the scenario's roles.
     """
     check_whole_number("number of worlds", n, 1)
-    if isinstance(scenario, Mapping):
-        loaded = Scenario(**scenario)
-    else:
-        loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+    loaded = read_scenario(scenario)
     if not (observation is None or isinstance(observation, ObservationSpec | list | tuple | Mapping)):
         raise InvalidInput(
             f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields"
@@ -99,6 +96,13 @@ def learner_columns(learners: Sequence[str], actions: Mapping[str, Any]) -> Floa
             action = checked_action(actions[name], (1,), name)
         columns[0, c] = action.item()
     return columns
+
+
+def read_scenario(scenario: AnyScenario) -> Scenario:
+    """The scenario of a shipped name, of a YAML file, of what such a file would say, or itself."""
+    if isinstance(scenario, Mapping):
+        return Scenario(**scenario)
+    return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
 
 
 def plain_spec(spec: EnvSpec | None) -> EnvSpec | None:

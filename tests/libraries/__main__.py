@@ -79,6 +79,7 @@ def watch(command: list[str], limit: float) -> tuple[bool, int]:
     """Run the command in the folder of its last argument for at most ``limit`` seconds, and end all that it started."""
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     given = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", **threads}
+    given["MINARI_DATASETS_PATH"] = str(Path(command[-1]).parent)  # not among the data sets of whoever runs this
     begun = subprocess.Popen(command, cwd=Path(command[-1]).parent, env=given, start_new_session=True)
     try:
         return False, begun.wait(limit)

@@ -82,7 +82,16 @@ def shown_lines(function: Callable[..., Any]) -> str:
 
 
 # In the order of the page. Each is a file of this folder with one ``LIBRARY``.
-NAMES = ("stable_baselines3", "cleanrl")
+NAMES = (
+    "stable_baselines3",
+    "rl_zoo3",
+    "cleanrl",
+    "skrl",
+    "tianshou",
+    "agilerl",
+    "minari",
+    "supersuit",
+)
 
 
 def load(name: str) -> Library:
