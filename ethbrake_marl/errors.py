@@ -98,7 +98,7 @@ class CorruptBundle(EthBrakeError, ValueError):
 
 _EXTRA_OF = {
     **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
-    **dict.fromkeys(("benchmarl", "torchrl", "tensordict"), "marl"),
+    **dict.fromkeys(("benchmarl", "torchrl", "tensordict", "hydra"), "marl"),
     **dict.fromkeys(("onnx", "onnxruntime"), "export"),
     "pyarrow": "data",
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),

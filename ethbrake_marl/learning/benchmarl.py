@@ -101,7 +101,8 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
 class LineTask(TaskClass):  # type: ignore[misc]
     """A scenario as a task.
 
-    ``config``: ``scenario`` (a shipped name, a YAML file, a mapping, or a ``Scenario``), ``reward``, ``horizon_is_end``.
+    ``config``: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``), ``reward``,
+    ``horizon_is_end``.
     """
 
     def __init__(self, name: str, config: dict[str, Any]) -> None:

@@ -92,7 +92,8 @@ Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # or a list o
 def choose_observation(listed: Observation) -> ObservationSpec:
     """The observation of a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
 
-    A mapping names the fields of an ``ObservationSpec``, which is what JSON makes of one. Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no such list.
+    A mapping names the fields of an ``ObservationSpec``, which is what JSON makes of one.
+    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no such list.
     """
     if isinstance(listed, ObservationSpec):
         return listed

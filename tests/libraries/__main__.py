@@ -1,9 +1,10 @@
 """Other people's libraries on this environment: ``make test-libraries`` (``python -m tests.libraries [NAME ...]``).
 
-Each library gets an environment of its own in ``.venvs/``, kept for the next run, with this project as it stands. Its file
-of this folder is run there: every way in which its user trains. Prints the matrix and exits with status 1 where one
-failed; what cannot be installed is skipped, and the reason told. ``--write`` keeps the rows in ``matrix.json``, and
-writes docs/other-libraries.md from them and from the files. ``--ci`` takes the libraries that are cheap to install.
+Each library gets an environment of its own in ``.venvs/``, kept for the next run, with this project as it stands. Its
+file of this folder is run there: every way in which its user trains. Prints the matrix, then the policies that were
+kept in one table, and exits with status 1 where something failed; what cannot be installed is skipped, and the reason
+told. ``--write`` keeps the rows in ``matrix.json``, and writes docs/other-libraries.md from them and from the files.
+``--ci`` takes the libraries that are cheap to install.
 """
 
 from __future__ import annotations
@@ -16,12 +17,23 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from tests.libraries.environment import ENVIRONMENTS, NotInstalled, ready_python
 from tests.libraries.library import NAMES, ROOT, load
-from tests.libraries.page import COLUMNS, PAGE, cells, make_page, read_matrix, write_matrix
+from tests.libraries.one_table import FILES, make_table
+from tests.libraries.page import (
+    COLUMNS,
+    PAGE,
+    TABLE_HEADS,
+    cells,
+    make_page,
+    read_matrix,
+    table_cells,
+    write_matrix,
+)
 
 
 def main() -> None:
@@ -42,14 +54,34 @@ def main() -> None:
     names = [n for n in given.names or NAMES if load(n).in_ci or not given.ci]
     until = time.monotonic() + given.within
     rows = {name: run(name, min(given.limit, until - time.monotonic())) for name in names}
-    shown = [cells(row) for name in names for row in rows[name]]
-    widths = [max(len(row[c]) for row in [COLUMNS, *shown]) for c in range(len(COLUMNS))]
-    for row in [COLUMNS, *shown]:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    show(COLUMNS, [cells(row) for name in names for row in rows[name]])
+    table = policies_of_all() if set(FILES) & set(names) else []
     if given.write:
-        write_matrix({**read_matrix(), **rows})
+        write_matrix({**read_matrix(), **rows, **({"one_table": table} if table else {})})
         PAGE.write_text(make_page(), "utf-8")
     sys.exit(1 if any("FAILED" in row["verdict"] for name in names for row in rows[name]) else 0)
+
+
+def show(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table."""
+    widths = [max(len(row[c]) for row in [heads, *rows]) for c in range(len(heads))]
+    for row in [heads, *rows]:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip(), flush=True)
+
+
+def policies_of_all() -> list[dict[str, Any]]:
+    """The policies that four libraries left, in one table; none while one of them has not run yet."""
+    missing = [name for name, file in FILES.items() if not file.is_file()]
+    if missing:
+        print(f"no table of all policies yet: run {', '.join(missing)}", flush=True)
+        return []
+    try:
+        rows = make_table(ready_python("benchmarl", load("benchmarl")))
+    except NotInstalled as reason:
+        print(f"no table of all policies: {reason}", flush=True)
+        return []
+    show(TABLE_HEADS, [table_cells(row) for row in rows])
+    return rows
 
 
 def run(name: str, limit: float) -> list[dict[str, Any]]:

@@ -10,8 +10,11 @@ LIBRARY = Library(
     title="AgileRL",
     package="agilerl",
     requires=("agilerl==2.7.1",),
-    about="Its training loop takes the vector environment. (Without one, its loop for PPO in 2.7.1 goes on stepping after an episode "
-    "has ended, in any environment.) It gives a single environment actions without axes, which are taken as one action.",
+    about=(
+        "Its training loop takes the vector environment. (Without one, its loop for PPO in 2.7.1 goes on "
+        "stepping after an episode has ended, in any environment.) It gives a single environment actions "
+        "without axes, which are taken as one action."
+    ),
 )
 
 

@@ -75,4 +75,4 @@ def _call(command: list[str]) -> None:
     if any(word in told.lower() for word in NO_NETWORK):
         raise NotInstalled("the package index cannot be reached")
     _, _, reason = told.rpartition("we can conclude that your requirements")
-    raise NotInstalled(f"does not resolve: {(reason and told or told)[:300]}")
+    raise NotInstalled(f"does not resolve: {((reason and told) or told)[:300]}")

@@ -21,7 +21,7 @@ class Way:
     """One way to train with a library.
 
     ``function`` is what a user copies, but for a last ``return``. It gives nothing, or what ``eb.policy_agent`` takes
-    (or an agent), or that and a function ``n -> harm [n]``: the library's own rollout of the first n worlds of a stream.
+    (or an agent), or that and a function ``n -> harm [n]``: the library's own rollout of a stream's first n worlds.
     With a ``command`` the user copies that instead; the function is called after it.
     """
 
@@ -86,6 +86,9 @@ NAMES = (
     "stable_baselines3",
     "rl_zoo3",
     "cleanrl",
+    "torchrl",
+    "benchmarl",
+    "rllib",
     "skrl",
     "tianshou",
     "agilerl",

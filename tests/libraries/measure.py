@@ -1,7 +1,7 @@
 """Runs one library's file inside the library's own environment: ``python -m tests.libraries.measure NAME FILE``.
 
-For each way: train, measure first-impact harm on a fixed list of worlds beside full braking, and where the way brings the
-library's own rollout, compare it with ours world by world. Writes rows to FILE as JSON.
+For each way: train, measure first-impact harm on a fixed list of worlds beside full braking, and where the way brings
+the library's own rollout, compare it with ours world by world. Writes rows to FILE as JSON.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ LIBRARY = Library(
     title="Stable-Baselines3",
     package="stable-baselines3",
     requires=("stable-baselines3==2.9.2",),
-    about="The native `VecEnv` is the fast way: all worlds are advanced together, with no environment in between.",
+    about=("The native `VecEnv` is the fast way: all worlds are advanced together, with no environment in between."),
     in_ci=True,
 )
 
@@ -64,5 +64,6 @@ def native():
     worlds = eb.make_sb3_vec_env("paper-random", n_envs=64, reward=reward)
     model = PPO("MlpPolicy", worlds, n_steps=64, batch_size=512, learning_rate=1e-3, seed=0)
     model.learn(200_000)
+    model.save("sb3")
     agent = eb.policy_agent(model)
     return agent, lambda n: own_rollout(model, n)

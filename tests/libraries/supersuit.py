@@ -8,9 +8,11 @@ LIBRARY = Library(
     title="SuperSuit",
     package="supersuit",
     requires=("supersuit==3.11.0", "stable-baselines3==2.9.2"),
-    about="From PettingZoo to Stable-Baselines3; the learners share one policy. SuperSuit's copies are not seeded, and it does "
-    "not hand on truncation: `train/supersuit_ppo.py` closes these traps, and `eb.make_sb3_vec_env` has none of them and is "
-    "many times faster.",
+    about=(
+        "From PettingZoo to Stable-Baselines3; the learners share one policy. SuperSuit's copies are not "
+        "seeded, and it does not hand on truncation: `train/supersuit_ppo.py` closes these traps, and "
+        "`eb.make_sb3_vec_env` has none of them and is many times faster."
+    ),
     in_ci=True,
 )
 
