@@ -7,7 +7,7 @@ from tests.libraries.library import Library
 LIBRARY = Library(
     title="Minari",
     package="minari",
-    requires=("minari[hdf5]==0.5.4",),
+    requires=("minari[create,hdf5]==0.5.4",),
     about=(
         "Infos are recorded, too: harm, cost, and the world's number. Whatever the settings were, objects "
         "included, `recover_environment` makes the same environment again. `ethbrake_marl`'s own data sets "
