@@ -101,7 +101,7 @@ class CorruptBundle(EthBrakeError, ValueError):
 
 _EXTRA_OF = {
     **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
-    **dict.fromkeys(("benchmarl", "torchrl", "tensordict"), "marl"),
+    **dict.fromkeys(("benchmarl", "torchrl", "tensordict", "hydra"), "marl"),
     **dict.fromkeys(("onnx", "onnxruntime"), "export"),
     **dict.fromkeys(("pyarrow", "minari", "h5py"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),

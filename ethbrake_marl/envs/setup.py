@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 
 from ethbrake_marl.actions import checked_action
@@ -16,7 +18,7 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number
 from ethbrake_marl.observations import Feature, Observation, ObservationSpec, choose_observation
 from ethbrake_marl.physics import Floats, Worlds
-from ethbrake_marl.rewards import Reward
+from ethbrake_marl.rewards import Reward, RewardParams
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario, read_scenario
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping: what a file would say
@@ -48,14 +50,11 @@ def make_engine(
     and is not listed brakes fully. Scripts come from the scenario's roles.
     """
     check_whole_number("number of worlds", n, 1)
-    if isinstance(scenario, Mapping):
-        loaded = read_scenario(scenario)
-    else:
-        loaded = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-    if not (observation is None or isinstance(observation, ObservationSpec | list | tuple)):
+    loaded = resolve_scenario(scenario)
+    if not (observation is None or isinstance(observation, ObservationSpec | list | tuple | Mapping)):
         raise InvalidInput(
-            f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1), or a list"
-            " of groups and features, for instance ['own', 'front_1']"
+            f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields"
+            " as a mapping, or a list of groups and features, for instance ['own', 'front_1']"
         )
     chosen = None if observation is None else choose_observation(observation)
     if learners is not None and not isinstance(learners, Iterable):
@@ -97,6 +96,28 @@ def learner_columns(learners: Sequence[str], actions: Mapping[str, Any]) -> Floa
             action = checked_action(actions[name], (1,), name)
         columns[0, c] = action.item()
     return columns
+
+
+def resolve_scenario(scenario: AnyScenario) -> Scenario:
+    """The scenario of a shipped name, of a YAML file, of what such a file would say, or itself."""
+    if isinstance(scenario, Mapping):
+        return read_scenario(scenario)
+    return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+
+
+def plain_spec(spec: EnvSpec | None) -> EnvSpec | None:
+    """The specification with objects among its settings as plain mappings, so that JSON keeps it."""
+    if spec is None:
+        return None
+    kwargs = dict(spec.kwargs)
+    for name, value in kwargs.items():
+        if isinstance(value, Scenario):
+            kwargs[name] = value.declared()
+        elif isinstance(value, RewardParams):
+            kwargs[name] = value.model_dump(mode="json")
+        elif isinstance(value, ObservationSpec):
+            kwargs[name] = asdict(value)
+    return replace(spec, kwargs=kwargs)
 
 
 INITIAL_STATE = "initial_state"

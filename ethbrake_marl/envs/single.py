@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from ethbrake_marl.envs.drawing.viewer import CLASS_METADATA, Viewer, render_metadata
@@ -21,6 +22,7 @@ from ethbrake_marl.envs.setup import (
     learner_columns,
     make_engine,
     only_learner,
+    plain_spec,
     restart,
 )
 from ethbrake_marl.errors import InvalidInput
@@ -55,6 +57,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
     """
 
+    _spec: EnvSpec | None = None
     metadata: dict[str, Any] = dict(CLASS_METADATA)  # noqa: RUF012  # as Gymnasium declares it
 
     def __init__(
@@ -74,6 +77,15 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         self.observation_space = feature_box(self.engine.observation.features)
         self.action_space = action_box()
         self._running = self._started = False
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How it was made, in plain settings; None where no id was used."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = plain_spec(spec)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -45,9 +45,10 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what the learner observes; None: ``observation_for(scenario)``.
-        autoreset_mode: Gymnasium's. ``SameStep`` returns the first observation of the new episode, with the last one of
-            the old in ``infos["final_obs"]`` and its infos in ``infos["final_info"]``. ``NextStep`` returns the last
-            observation and spends the next step, whose action is ignored and whose reward is 0, on the reset.
+        autoreset_mode: Gymnasium's. ``NextStep``, its default and ours, returns the last observation and spends the
+            next step, whose action is ignored and whose reward is 0, on the reset. ``SameStep`` returns the first
+            observation of the new episode, with the last one of the old in ``infos["final_obs"]`` and its infos in
+            ``infos["final_info"]``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -67,7 +68,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         learners: Sequence[str | int] | None = None,
         reward: Reward = "harm",
         observation: Observation | None = None,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         self.autoreset_mode = _check_mode(autoreset_mode)
         self.engine = make_engine(scenario, num_envs, learners=learners, reward=reward, observation=observation)
