@@ -33,6 +33,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("shield", "policies"),
     ("evaluation",),
     ("learning", "figures"),
+    ("pages",),
     ("__init__",),
     ("studies",),
     ("cli",),
