@@ -68,18 +68,20 @@ def page(title: str, sections: Sequence[Section], *, lead: str = "") -> str:
         " base-uri 'none'; form-action 'none'"
     )
     names = _anchors([section.title for section in sections])
-    return (
-        _environment()
-        .get_template("page.html.j2")
-        .render(
-            title=title,
-            lead=lead,
-            sections=list(zip(names, sections, strict=True)),
-            policy=policy,
-            styles=Markup(styles),
-            script=Markup(script),
-        )
+    return render(
+        "page.html.j2",
+        title=title,
+        lead=lead,
+        sections=list(zip(names, sections, strict=True)),
+        policy=policy,
+        styles=Markup(styles),
+        script=Markup(script),
     )
+
+
+def render(template: str, **values: object) -> Markup:
+    """A template of this folder with these values; all of them are text but what is Markup already."""
+    return Markup(_environment().get_template(template).render(**values))
 
 
 def shown(value: object) -> str:
