@@ -13,6 +13,7 @@ from rich.table import Table
 
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.evaluation.rollout import OnWorlds
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
@@ -71,6 +72,19 @@ def compare_modes(
         lambda at: _compare(agents, worlds.take(at), task, on_progress), worlds.n
     )
     return [replace(row, left_out=left_out) for row in rows]
+
+
+def compare_behind_shields(agents: Mapping[str, Driver], worlds: Worlds, task: Task) -> list[ModeRow]:
+    """``compare_modes`` of what is behind a shield among these agents; nothing where nobody has one.
+
+    Agents whose shield does not know the world (``+robust``) are left out: their modes are another question.
+    """
+    proposers = {
+        agent.policy.name: agent.policy
+        for name, agent in agents.items()
+        if isinstance(agent, HybridAgent | StepShieldAgent) and not name.endswith("+robust")
+    }
+    return compare_modes(proposers, worlds, task) if proposers else []
 
 
 def _compare(agents: Mapping[str, Agent], worlds: Worlds, task: Task, on_progress: OnWorlds | None) -> list[ModeRow]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,8 +25,8 @@ class Played(NamedTuple):
     number: int  # in the list
     kind: str  # why it was chosen, as a heading
     why: str  # what is special about it, in a few words
-    motions: Mapping[str, EpisodeMotion]  # by agent
-    passports: Mapping[str, str]  # by agent
+    motions: dict[str, EpisodeMotion]  # by agent
+    passports: dict[str, str]  # by agent
 
 
 def player(worlds: Sequence[Played], driven: Sequence[int]) -> Part:
