@@ -38,6 +38,7 @@ from ethbrake_marl.cli.picture import picture_app
 from ethbrake_marl.cli.plugins import accept_plugins
 from ethbrake_marl.cli.recipe import recipe_app
 from ethbrake_marl.cli.record import record_command
+from ethbrake_marl.cli.replay import replay_command
 from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import (
     abandon_output,
@@ -121,6 +122,7 @@ app.command("shield", epilog="Example: ethbrake shield --agents ppo@shipped,full
 app.command("record", epilog="Example: ethbrake record --agents full_brake,e_v2x_bm --world 3 --output both.gif")(
     record_command
 )
+app.command("replay", epilog="Example: ethbrake replay PASSPORT --output again.html")(replay_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
 app.command("equal-time", epilog="Example: ethbrake equal-time --episodes 200 --repeats 1")(equal_time_command)
 

@@ -7,22 +7,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.cli.terminal import Bars, say
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, check_target
-from ethbrake_marl.evaluation.shield_modes import compare_behind_shields
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.scenario import Task
 
 ReportOption = Annotated[
     Path | None,
     typer.Option("--report", metavar="FILE.html", help="Also write a page with tables, figures and episodes to watch."),
 ]
-SHIELD_WORLDS = 200  # in which what a shield replaced is simulated again
 
 
 def check_page(path: Path, *, force: bool = False) -> Path:
@@ -55,6 +51,7 @@ def write_evaluation_report(
 
     """
     # Here: matplotlib takes a second to load, and most evaluations draw nothing.
+    from ethbrake_marl.pages.evidence import shield_evidence
     from ethbrake_marl.pages.report import Report, focus_of, play_for_report, write_report
 
     done: list[str] = []
@@ -65,16 +62,14 @@ def write_evaluation_report(
 
     focus = focus_of(rows)
     played = play_for_report(evaluation, agents, focus, harm_count=harm_count, on_agent=tell)
-    task = Task(evaluation.scenario, evaluation.vehicles, harm_count)
-    first = evaluation.worlds.take(np.arange(min(evaluation.worlds.n, SHIELD_WORLDS)))
     scenario = evaluation.scenario
     names = ", ".join(row.agent for row in rows)
     report = Report(
-        f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(rows)} agents",
+        f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(rows)} agents compared",
         rows,
         evaluation,
         played,
-        compare_behind_shields(agents, first, task),
+        shield_evidence(agents, evaluation, harm_count),
         focus,
         summary=scenario.title or "Agents on the same worlds.",
         settings={

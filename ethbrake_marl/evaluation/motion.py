@@ -8,9 +8,10 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import Episodes, drive
-from ethbrake_marl.agents.team import Driver, team_of
+from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
+from ethbrake_marl.physics.episode import first_decision_s
 from ethbrake_marl.physics.pieces import segment_pieces
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
@@ -51,7 +52,7 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 
     """
     team = team_of(agent, scenario.learners)
-    follower = _Follower(worlds, list(team.drivers.values()))
+    follower = _Follower(worlds, team)
     episodes = drive(worlds, team, scenario, watched_by=[follower])
     return [follower.motion(k, episodes) for k in range(worlds.n)]
 
@@ -59,8 +60,9 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 class _Follower:
     """Watches a batch of episodes."""
 
-    def __init__(self, worlds: Worlds, drivers: list[Agent]) -> None:
-        self._worlds, self._drivers = worlds, drivers
+    def __init__(self, worlds: Worlds, team: Team) -> None:
+        self._worlds, self._drivers = worlds, list(team.drivers.values())
+        self._first_s = first_decision_s(worlds, list(team.drivers))
         self._way_m = np.zeros(worlds.n)
         self._pieces: list[list[Floats]] = [[] for _ in range(worlds.n)]
         self._impacts: list[list[ImpactRows]] = [[] for _ in range(worlds.n)]
@@ -96,7 +98,7 @@ class _Follower:
         final = episodes.final.take([k])
         taken_over = list(self._stepped_in[k])
         if any(isinstance(d, HybridAgent) and not d.chosen_policy[k] for d in self._drivers):
-            taken_over.append(float(pieces[pieces[:, 0] > 0.0, 0].min(initial=0.0)))
+            taken_over.append(float(self._first_s[k]))
         return EpisodeMotion(
             self._worlds.take([k]), join_pieces(pieces, N), float(final.time_s[0]), impacts,
             np.array(sorted(taken_over)), ledger, final, bool(episodes.at_rest[k]),

@@ -27,6 +27,7 @@ from ethbrake_marl.scenario import Scenario
 MOST_CHARACTERS = 160
 LEFT_OUT = "..."  # in the place of what would make a passport too long
 _MARK, _KIND = "EB", "1"
+_NAME = 30  # characters of a scenario's name
 _NONE = "-"
 _SCENARIO, _WORLD, _EPISODE, _POLICY, _CHECK = 10, 6, 10, 8, 6  # hexadecimal digits of each hash
 _PACKAGES = ("ethbrake-marl", "numba", "numpy")  # and Python, second
@@ -54,11 +55,12 @@ class Passport:
     agent: str  # as it is written; LEFT_OUT stands for what did not fit
 
     def __str__(self) -> str:
+        name = self.scenario if len(self.scenario) <= _NAME else self.scenario[:_NAME] + LEFT_OUT
         for agent in _shorter(self.agent):
-            text = replace(self, agent=agent)._written(self.scenario)
+            text = replace(self, agent=agent)._written(name)
             if len(text) <= MOST_CHARACTERS:
                 return text
-        return replace(self, agent=LEFT_OUT)._written(self.scenario[:20] + LEFT_OUT)
+        return replace(self, agent=LEFT_OUT)._written(name[:20] + LEFT_OUT)
 
     def _written(self, scenario: str) -> str:
         parts = (

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import FuncFormatter, PercentFormatter
 
-from ethbrake_marl.errors import InvalidInput, plain_text
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import parameter_line, parameters
 from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.evaluation.regret import assess
 from ethbrake_marl.evaluation.table import SummaryRow
-from ethbrake_marl.figures.style import COLOURS, add_caption, new_figure, series_style, style_axes
+from ethbrake_marl.figures.style import COLOURS, add_caption, label_text, new_figure, series_style, style_axes
 from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.physics import Floats
 
@@ -54,7 +54,7 @@ def harm_by_agent(rows: Sequence[SummaryRow]) -> Figure:
         axes.set_xlabel(_TITLES[count], fontsize=9)
         axes.margins(x=0.14)
         axes.set_xlim(left=0.0)
-    panels[0].set_yticks(range(len(rows)), [_name(row.agent) for row in rows])
+    panels[0].set_yticks(range(len(rows)), [label_text(row.agent) for row in rows])
     panels[0].invert_yaxis()
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", frameon=False, fontsize=9)
@@ -75,8 +75,9 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
         for number, (agent, outcome) in enumerate(evaluation.outcomes.items()):
             values = outcome.ledger.world_harm(count) if regrets is None else regrets.regret(outcome, count)
             style = {**series_style(number), "markevery": 40}
-            axes.plot(*_exceeded(values), label=_name(agent), **style)
+            axes.plot(*_exceeded(values), label=label_text(agent), **style)
         axes.set_xscale("symlog", linthresh=1.0, linscale=0.4)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.set_xlim(left=0.0)
         axes.set_ylim(0.0, 1.0)
         axes.set_xlabel(
@@ -107,7 +108,7 @@ def harm_in_parts(evaluation: Evaluation) -> Figure:
             parts = (regrets.best(count).mean(), (regret * ~avoidable).mean(), (regret * avoidable).mean())
             _stack(axes, k, [float(part) for part in parts])
         axes.set_xlabel(_TITLES[count], fontsize=9)
-    panels[0].set_yticks(range(len(evaluation.outcomes)), [_name(agent) for agent in evaluation.outcomes])
+    panels[0].set_yticks(range(len(evaluation.outcomes)), [label_text(agent) for agent in evaluation.outcomes])
     panels[0].invert_yaxis()
     _legend(figure, panels[0])
     add_caption(figure, f"Mean per world. {parameter_line(parameters(evaluation))}.")
@@ -130,12 +131,6 @@ def _exceeded(values: Floats) -> tuple[Floats, Floats]:
     chosen = np.unique(np.linspace(0, len(ordered) - 1, min(_POINTS, len(ordered))).astype(np.int64))
     share = np.array([float((ordered > value).mean()) for value in ordered[chosen]])
     return np.concatenate([[0.0], ordered[chosen]]), np.concatenate([[float((ordered > 0.0).mean())], share])
-
-
-def _name(agent: str) -> str:
-    """An agent's name as text of a figure: no formula, no control character, not too long."""
-    text = plain_text(agent).replace("$", r"\$")
-    return text if len(text) <= 40 else f"{text[:24]}…{text[-14:]}"
 
 
 def _legend(figure: Figure, axes: Axes) -> None:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import io
 import textwrap
+from functools import cache
 from pathlib import Path
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Figure  # the type that every figure has, for modules outside this folder
+from matplotlib.font_manager import findfont, get_font
 
 from ethbrake_marl.envs.drawing.scene import COLOURS as COLOURS  # one palette for figures and frames
+from ethbrake_marl.errors import plain_text
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.figures import picture_ending
 
@@ -39,6 +42,20 @@ def series_style(number: int) -> dict[str, object]:
     """Colour, marker and dashes of the series with this number (from 0); they repeat after seven."""
     k = number % len(COLOURS)
     return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
+
+
+def label_text(text: str, most: int = 40) -> str:
+    """Text as a figure may have it, whoever wrote it: no formula, no sign that the font lacks, not too long."""
+    signs = font_signs()
+    told = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
+    short = told if len(told) <= most else f"{told[: most - 16]}…{told[-15:]}"
+    return short.replace("$", r"\$")
+
+
+@cache
+def font_signs() -> frozenset[int]:
+    """Code points that the font of figures has."""
+    return frozenset(get_font(findfont("DejaVu Sans")).get_charmap())
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
 
+import numpy as np
 from markupsafe import Markup
 
+from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.errors import count_of
+from ethbrake_marl.evaluation.conditions import parameter_line, parameters
 from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
 from ethbrake_marl.evaluation.regret import Regrets, assess
-from ethbrake_marl.evaluation.shield_modes import ModeRow
+from ethbrake_marl.evaluation.shield_modes import ModeRow, compare_behind_shields
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate
 from ethbrake_marl.figures.report import harm_in_parts, regret_distribution
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.pages.chosen import worst_rows
 from ethbrake_marl.pages.frame import Part, Section, paragraph
 from ethbrake_marl.pages.parts import Cell, Row, table
 from ethbrake_marl.pages.vector import drawing
 from ethbrake_marl.physics import Bools
+from ethbrake_marl.scenario import Task
 from ethbrake_marl.shield.review import VERDICTS
 
+SHIELD_WORLDS = 200  # in which what a shield replaced is simulated again
 _NONE = "–"
 
 
@@ -61,7 +69,7 @@ def avoidable_section(evaluation: Evaluation) -> Section:
     body: list[str | Part] = []
     if regrets is None:
         told = "Nothing is proven of these worlds, so what was avoidable is not told apart."
-        body.append(f"{told} Reason: {evaluation.limits.because}." if hasattr(evaluation.limits, "because") else told)
+        body.append(f"{told} Reason: {evaluation.limits.because}." if isinstance(evaluation.limits, Unproven) else told)
         title, words = "Harm world by world", "For each harm x, the share of the worlds in which an agent did more."
     else:
         avoidable = regrets.limits.proof.avoidable
@@ -103,8 +111,34 @@ def _split_cells(outcome: Outcome, regrets: Regrets, among: Bools) -> list[Cell]
     return [_cell(collided, 100.0, 1, " %"), *(_cell(each) for each in means)]
 
 
-def shield_section(rows: Sequence[ModeRow]) -> Section:
+class ShieldEvidence(NamedTuple):
+    """The modes of the shield around some agents, measured."""
+
+    rows: Sequence[ModeRow]
+    conditions: str  # of the measurement
+
+
+def shield_evidence(
+    agents: Mapping[str, Driver], evaluation: Evaluation, harm_count: HarmCount = "first"
+) -> ShieldEvidence | None:
+    """What is behind a shield among these agents, alone and behind every mode, in the first worlds of an evaluation.
+
+    None where nobody has a shield, or more than one vehicle is driven.
+    """
+    if len(evaluation.vehicles) != 1:
+        return None
+    worlds = evaluation.worlds.take(np.arange(min(evaluation.worlds.n, SHIELD_WORLDS)))
+    rows = compare_behind_shields(agents, worlds, Task(evaluation.scenario, evaluation.vehicles, harm_count))
+    if not rows:
+        return None
+    count = "first-impact" if harm_count == "first" else "total"
+    line = parameter_line({**parameters(evaluation), "count": worlds.n})
+    return ShieldEvidence(rows, f"{count.capitalize()} harm, which the shield bounds, in m²/s². {line}.")
+
+
+def shield_section(evidence: ShieldEvidence) -> Section:
     """The modes of the shield on the same worlds, and what each intervention of step mode was good for."""
+    rows = evidence.rows
     head = ["Agent, mode", "Harm", "Minus episode mode", "Decisions replaced", *VERDICTS, "Worlds above the bound"]
     lines: list[Row] = []
     for row in rows:
@@ -114,19 +148,20 @@ def shield_section(rows: Sequence[ModeRow]) -> Section:
         against = _NONE if row.against_episode is None else _cell(row.against_episode)
         lines.append([f"{row.agent}, {row.mode}", _cell(row.harm), against, *replaced, above])
     told = (
-        "Each agent alone and behind both modes of the shield. Each decision that step mode replaced was simulated again"
-        " without it: needed (harm would have been higher), harmless (the same), costly (lower)."
+        "Each agent alone and behind every mode of the shield. Each decision that step mode replaced was simulated"
+        " again without it: needed (harm would have been higher), harmless (the same), costly (lower)."
     )
     left_out = rows[0].left_out
-    notes = [paragraph(f"Left out: {count_of(len(left_out), 'world')}, which the physics could not advance.", "note")]
-    return Section(
-        "Shield", [told, table(head, lines, caption="First worlds of the list"), *(notes if left_out else [])]
-    )
+    notes = [paragraph(evidence.conditions, "quiet")]
+    if left_out:
+        told_of = count_of(len(left_out), "world")
+        notes.append(paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
+    return Section("Shield", [told, table(head, lines, caption="Modes of the shield"), *notes])
 
 
 def _cell(estimate: Estimate, scale: float = 1.0, digits: int = 2, unit: str = "") -> Cell:
-    value = f"{scale * estimate.value:.{digits}f}{unit}"
+    value = f"{scale * estimate.value:.{digits}f}{unit}".replace("-", "−")
     if estimate.interval is None:
         return Cell(value)
-    low, high = (f"{scale * end:.{digits}f}" for end in estimate.interval)
+    low, high = (f"{scale * end:.{digits}f}".replace("-", "−") for end in estimate.interval)
     return Cell(value, f"{low}, {high}")

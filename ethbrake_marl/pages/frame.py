@@ -68,7 +68,7 @@ def page(title: str, sections: Sequence[Section], *, lead: str = "") -> str:
         " base-uri 'none'; form-action 'none'"
     )
     names = _anchors([section.title for section in sections])
-    return render(
+    whole = render(
         "page.html.j2",
         title=title,
         lead=lead,
@@ -77,6 +77,7 @@ def page(title: str, sections: Sequence[Section], *, lead: str = "") -> str:
         styles=Markup(styles),
         script=Markup(script),
     )
+    return str(whole)
 
 
 def render(template: str, **values: object) -> Markup:

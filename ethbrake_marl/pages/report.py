@@ -12,14 +12,13 @@ from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
 from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.evaluation.shield_modes import ModeRow
 from ethbrake_marl.evaluation.table import SummaryRow
 from ethbrake_marl.evaluation.text import identity_lines, knowledge_lines, left_out_lines, limit_lines
 from ethbrake_marl.figures.report import harm_by_agent
 from ethbrake_marl.figures.style import Figure
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.pages.chosen import choose_shown, play_chosen
-from ethbrake_marl.pages.evidence import avoidable_section, shield_section, worst_section
+from ethbrake_marl.pages.evidence import ShieldEvidence, avoidable_section, shield_section, worst_section
 from ethbrake_marl.pages.frame import Part, Section, page, paragraph
 from ethbrake_marl.pages.parts import Block, Cell, Row, facts, table
 from ethbrake_marl.pages.player import Played, player
@@ -55,7 +54,7 @@ class Report:
     rows: Sequence[SummaryRow]
     evaluation: Evaluation | None = None  # that the rows sum up
     played: Sequence[Played] = ()  # episodes to watch
-    shield: Sequence[ModeRow] = ()  # of policies behind a shield
+    shield: ShieldEvidence | None = None  # of what is behind a shield
     focus: str = ""  # the agent whose worst worlds are shown
     figures: Sequence[ReportFigure] = ()
     tests: Sequence[ReportTest] = ()  # the same agents elsewhere
@@ -91,7 +90,7 @@ def render_report(report: Report) -> str:
         sections.append(worst_section(report.evaluation, report.focus, {one.number for one in report.played}))
     if report.evaluation is not None:
         sections.append(avoidable_section(report.evaluation))
-    if report.shield:
+    if report.shield is not None:
         sections.append(shield_section(report.shield))
     if report.figures:
         drawn = [drawing(each.figure, each.title, each.description) for each in report.figures]
@@ -151,11 +150,8 @@ def _episodes(report: Report) -> list[Section]:
 
 
 def _other_test(test: ReportTest) -> Section:
-    lines = [_row(line, _HEADLINE) for line in our_lines(test.rows)]
-    body: list[str | Part] = [
-        test.description,
-        table(["Agent", *(COLUMNS[k] for k in _HEADLINE)], lines, caption=test.title),
-    ]
+    lines = [_row(line, range(len(COLUMNS))) for line in our_lines(test.rows)]
+    body: list[str | Part] = [test.description, table(["Agent", *COLUMNS], lines, caption=test.title)]
     if test.rows:
         told = [f"{parameter_line(test.rows[0].parameters)}.", *limit_lines(test.rows), *identity_lines(test.rows)]
         body += [paragraph(text, "quiet") for text in told]

@@ -16,19 +16,16 @@ from ethbrake_marl.evaluation import Evaluation, SummaryRow, record_episode, wri
 from ethbrake_marl.evaluation.compare import results_to_json
 from ethbrake_marl.evaluation.paper import MAIN_TEST, TESTS
 from ethbrake_marl.evaluation.per_world import PER_WORLD, write_output
-from ethbrake_marl.evaluation.shield_modes import compare_modes
 from ethbrake_marl.evaluation.table import BASELINE
 from ethbrake_marl.figures.episode import trajectories
 from ethbrake_marl.figures.run import harm_against_total_gap, learning_curve
 from ethbrake_marl.figures.style import picture_bytes
 from ethbrake_marl.learning.registry import algorithm_names
+from ethbrake_marl.pages.evidence import shield_evidence
 from ethbrake_marl.pages.report import Report, ReportFigure, ReportTest, play_for_report, write_report
-from ethbrake_marl.physics import Ints
 
 REFERENCES = ("full_brake", "e_v2x_bm")  # level lines beside the learning curve
 SHOWN = ("full_brake", "e_v2x_bm")  # columns of the figure of one episode, and the policy
-
-SHIELD_WORLDS = 200  # in which what the shield replaced is simulated again
 
 LEARNING_CURVE = "learning_curve.png"
 HARM_AGAINST_GAP = "harm_against_gap.png"
@@ -155,13 +152,12 @@ def write_page(
     name, learned = evaluation.scenario.name, learned_name(evaluation)
     title = f"ethbrake run: {name}{' (the main test of three)' if beside and name == MAIN_TEST else ''}"
     spellings = {learned: f"{learned}@{folder}", "hybrid": f"{learned}@{folder}+episode"}
-    behind = compare_modes({learned: agents[learned]}, evaluation.worlds.take(_first(evaluation)), evaluation.task)
     report = Report(
         title,
         rows,
         evaluation,
         play_for_report(evaluation, agents, learned, spellings=spellings),
-        behind,
+        shield_evidence(agents, evaluation),
         learned,
         figures,
         [ReportTest(name, TESTS[name], other) for name, other in beside.items()],
@@ -171,8 +167,3 @@ def write_page(
     )
     write_report(path, report, force=True)
     return path
-
-
-def _first(evaluation: Evaluation) -> Ints:
-    """Rows of the first worlds, in which the modes of the shield are compared."""
-    return np.arange(min(evaluation.worlds.n, SHIELD_WORLDS))
