@@ -36,6 +36,7 @@ class Part:
 class Section:
     """A section of a page.
 
+    >>> from ethbrake_marl.pages.frame import Section, page, paragraph
     >>> section = Section("Results", ["Text with <b> stays text.", paragraph("small print")])
     >>> "Text with &lt;b&gt; stays text." in page("A page", [section])
     True
