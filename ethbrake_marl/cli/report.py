@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -13,6 +13,7 @@ from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.cli.terminal import Bars, say
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, check_target
+from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.harm import HarmCount
 
 ReportOption = Annotated[
@@ -72,13 +73,23 @@ def write_evaluation_report(
         shield_evidence(agents, evaluation, harm_count),
         focus,
         summary=scenario.title or "Agents on the same worlds.",
-        settings={
-            "Command": "ethbrake " + " ".join(sys.argv[1:]),
-            "Agents": names,
-            "Harm that agents minimise": harm_count,
-            **{name: value for name, value in rows[0].parameters.items() if value not in (None, {}, [])},
-        },
+        settings=_settings(rows[0].parameters, names, harm_count),
         versions=rows[0].versions,
     )
     write_report(path, report, force=force)
     say(f"report: {path}")
+
+
+def _settings(found: Mapping[str, Any], agents: str, harm_count: HarmCount) -> dict[str, object]:
+    """What was asked for, in words."""
+    driven = found.get("controlled_vehicle") or ", ".join(found["controlled_vehicles"])
+    scripts = ", ".join(f"{vehicle} by {script}" for vehicle, script in found["scripts"].items())
+    return {
+        "Command": "ethbrake " + " ".join(sys.argv[1:]),
+        "Agents": agents,
+        "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
+        "Worlds": parameter_line(found),
+        "Driven by the agents": driven,
+        "Driven by scripts": scripts or "none",
+        "Time step, horizon": f"{found['time_step_s']:g} s, {found['horizon_s']:g} s",
+    }

@@ -11,7 +11,7 @@ class Player {
     this.time = 0;
     this.playing = false;
     this.speed = 1;
-    this.shown = data.agents.map((_, k) => k).slice(root.clientWidth < 500 ? -2 : -MOST_AGENTS);
+    this.shown = root.clientWidth < 500 ? data.shown.slice(-2) : data.shown;
     this.find = (name) => root.querySelector(`[data-part="${name}"]`);
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
     this.fillChoices();

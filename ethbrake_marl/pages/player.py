@@ -29,12 +29,13 @@ class Played(NamedTuple):
     passports: dict[str, str]  # by agent
 
 
-def player(worlds: Sequence[Played], driven: Sequence[int]) -> Part:
+def player(worlds: Sequence[Played], driven: Sequence[int], *, focus: str = "") -> Part:
     """The player of these worlds, all driven by the same agents.
 
     Args:
         worlds: at least one.
         driven: indices (0 = front) of the vehicles that the agents drive.
+        focus: the agent that is shown from the beginning, between the first and the last.
 
     """
     first = worlds[0]
@@ -44,6 +45,7 @@ def player(worlds: Sequence[Played], driven: Sequence[int]) -> Part:
         "vehicles": vehicles,
         "driven": list(driven),
         "agents": [shown(agent) for agent in first.motions],
+        "shown": _shown_first(list(first.motions), focus),
         "worlds": [_world(world) for world in worlds],
     }
     name = "episode_data"  # no section is called so
@@ -56,6 +58,13 @@ def player(worlds: Sequence[Played], driven: Sequence[int]) -> Part:
         episodes=data(name, content),
     )
     return Part(html, _STYLES, _SCRIPTS)
+
+
+def _shown_first(agents: Sequence[str], focus: str) -> list[int]:
+    """Up to three agents: the first, the focus, and as many of the last as there is room for."""
+    middle = [agents.index(focus)] if focus in agents else []
+    order = dict.fromkeys([*middle, 0, *reversed(range(len(agents)))])
+    return sorted(list(order)[:3])
 
 
 def _world(world: Played) -> dict[str, Any]:

@@ -145,7 +145,10 @@ def _episodes(report: Report) -> list[Section]:
         else f"All {worlds} worlds"
     )
     return [
-        Section("Episodes", [f"{told}, from the alert to rest.", player(report.played, report.evaluation.vehicles)])
+        Section(
+            "Episodes",
+            [f"{told}, from the alert to rest.", player(report.played, report.evaluation.vehicles, focus=report.focus)],
+        )
     ]
 
 

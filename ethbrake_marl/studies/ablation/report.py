@@ -52,7 +52,9 @@ def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure]) -
     ]
     sections = [Section("Figures", [*drawn, paragraph(conditions, "quiet")])] if drawn else []
     for title, tables in _blocks(found):
-        parts = [table(t.head, [[cell.replace("`", "") for cell in row] for row in t.rows]) for t in map(_alone, tables)]
+        parts = [
+            table(t.head, [[cell.replace("`", "") for cell in row] for row in t.rows]) for t in map(_alone, tables)
+        ]
         sections.append(Section(title, [*parts, paragraph(conditions, "quiet")]))
     settings = {name: value for name, value in found["settings"].items() if name != "recipes"}
     sections.append(Section("Settings", [facts(settings)]))
