@@ -84,7 +84,10 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
     """
     ending = picture_ending(path)
     buffer = io.BytesIO()
-    with matplotlib.rc_context({"savefig.facecolor": "white", "svg.hashsalt": "ethbrake"}):
+    # Fonts travel with the file: as outlines in SVG, as TrueType in PDF.
+    with matplotlib.rc_context(
+        {"savefig.facecolor": "white", "svg.hashsalt": "ethbrake", "svg.fonttype": "path", "pdf.fonttype": 42}
+    ):
         figure.savefig(buffer, format=ending[1:], dpi=DPI, metadata=_NO_DATES[ending])
     return buffer.getvalue()
 
