@@ -56,7 +56,7 @@ def ablate_command(
     """Train levels of cooperation, compare them on common worlds.
 
     Says first what it will take. The same command goes on after an interruption: finished trainings are kept, begun
-    ones go on. Writes ablation.json, ablation.csv, ablation.md and three figures.
+    ones go on. Writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures.
     """
     with interruptible(KEPT):
         # torch takes seconds to load, and no other command needs it
@@ -172,7 +172,7 @@ def _plan(
 
 
 def _run(plan: Plan, jobs: int, as_json: bool) -> None:
-    from ethbrake_marl.studies.ablation.report import FIGURES, PAGE, write_ablation
+    from ethbrake_marl.studies.ablation.report import FIGURES, PAGE, TEXT, write_ablation
     from ethbrake_marl.studies.ablation.run import measure, train_all
 
     with progress_bars() as bars:
@@ -184,5 +184,5 @@ def _run(plan: Plan, jobs: int, as_json: bool) -> None:
     if as_json:
         write_json(found)
     else:
-        show((plan.folder / PAGE).read_text("utf-8"), end="")
-    say(f"tables: {plan.folder / PAGE}; figures: {', '.join(FIGURES)}")
+        show((plan.folder / TEXT).read_text("utf-8"), end="")
+    say(f"page: {plan.folder / PAGE}; tables: {plan.folder / TEXT}; figures: {', '.join(FIGURES)}")

@@ -39,6 +39,7 @@ from ethbrake_marl.cli.picture import picture_app
 from ethbrake_marl.cli.plugins import accept_plugins, check_commands
 from ethbrake_marl.cli.recipe import recipe_app
 from ethbrake_marl.cli.record import record_command
+from ethbrake_marl.cli.replay import replay_command
 from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import (
     abandon_output,
@@ -127,6 +128,7 @@ app.command("record", epilog="Example: ethbrake record --agents full_brake,e_v2x
 app.command("dataset", epilog="Example: ethbrake dataset --agents best_harm --episodes 1000 --output best.parquet")(
     dataset_command
 )
+app.command("replay", epilog="Example: ethbrake replay PASSPORT --output again.html")(replay_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
 app.command("equal-time", epilog="Example: ethbrake equal-time --episodes 200 --repeats 1")(equal_time_command)
 

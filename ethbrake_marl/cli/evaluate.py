@@ -15,6 +15,7 @@ from ethbrake_marl.agents.knowledge import knowledge_text
 from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, VehicleOption
 from ethbrake_marl.cli.picture import PictureOption, counted_without, picture_app, picture_target, tell_left_out
+from ethbrake_marl.cli.report import ReportOption, check_page, write_evaluation_report
 from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
 from ethbrake_marl.errors import count_of
@@ -84,6 +85,7 @@ def evaluate_command(
         Path | None,
         typer.Option(metavar="FILE", help="Also write one row per world and agent (.csv, .parquet), and FILE.json."),
     ] = None,
+    report: ReportOption = None,
     objective: Annotated[
         list[str] | None,
         typer.Option(
@@ -108,6 +110,8 @@ def evaluate_command(
         check_parquet(per_world)
         for file in (per_world, results_beside(per_world)):
             check_target(file, force=force)
+    if report is not None:
+        check_page(report, force=force)
     chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
     objectives = declared_objectives(objective or (), chosen.vehicles)
     sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
@@ -125,8 +129,10 @@ def evaluate_command(
             chunk=PROGRESS_EVERY,
             on_progress=lambda agent, done: bars.show(agent, done, sample.worlds.n),
         )
+        rows = summarise(evaluation)
+        if report is not None:
+            write_evaluation_report(report, evaluation, rows, lineup, bars, harm_count=harm_count, force=force)
     told = rescore(evaluation, objectives)
-    rows = summarise(evaluation)
     groups = {} if by is None else summarise_by(evaluation, by)
     if per_world is not None:
         write_per_world(per_world, evaluation, objectives=objectives, force=force)

@@ -30,8 +30,19 @@ _BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that tak
 
 def worlds_sha256(worlds: Worlds, index: Ints) -> str:
     """SHA-256 of a list of worlds: of every array (little-endian, by name) and the worlds' numbers in the list."""
+    return _arrays_sha256({"index": index, **_arrays(worlds)})
+
+
+def content_sha256(*parts: Any) -> str:
+    """SHA-256 of every array of some dataclasses, one after the other."""
+    return _arrays_sha256(
+        {f"{k} {name}": array for k, part in enumerate(parts) for name, array in _arrays(part).items()}
+    )
+
+
+def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
     digest = hashlib.sha256()
-    for name, array in {"index": index, **_arrays(worlds)}.items():
+    for name, array in arrays.items():
         digest.update(f"{name} {array.dtype.kind} {array.shape}\n".encode())
         for first in range(0, len(array), _BLOCK):
             part = array[first : first + _BLOCK]

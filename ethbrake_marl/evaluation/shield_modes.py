@@ -13,6 +13,7 @@ from rich.table import Table
 
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.evaluation.identity import policies_by_name, policy_sha256, result_identity
 from ethbrake_marl.evaluation.rollout import OnWorlds
@@ -87,6 +88,19 @@ def modes_to_json(rows: list[ModeRow], sample: Sample, task: Task) -> list[dict[
     about = result_identity("shield", task.scenario, sample, left_out)
     about |= {"harm_count": task.harm_count, "episodes": sample.worlds.n - len(left_out)}
     return [about | row.to_json() for row in rows]
+
+
+def compare_behind_shields(agents: Mapping[str, Driver], worlds: Worlds, task: Task) -> list[ModeRow]:
+    """``compare_modes`` of what is behind a shield among these agents; nothing where nobody has one.
+
+    Agents whose shield does not know the world (``+robust``) are left out: their modes are another question.
+    """
+    proposers = {
+        agent.policy.name: agent.policy
+        for name, agent in agents.items()
+        if isinstance(agent, HybridAgent | StepShieldAgent) and not name.endswith("+robust")
+    }
+    return compare_modes(proposers, worlds, task) if proposers else []
 
 
 def _compare(agents: Mapping[str, Agent], worlds: Worlds, task: Task, on_progress: OnWorlds | None) -> list[ModeRow]:

@@ -10,7 +10,7 @@ from matplotlib.patheffects import Normal, Stroke
 
 from ethbrake_marl.evaluation.conditions import parameter_line, parameters
 from ethbrake_marl.evaluation.criticality import CriticalityMap
-from ethbrake_marl.figures.style import COLOURS, GREY, add_caption, new_figure
+from ethbrake_marl.figures.style import COLOURS, GREY, add_caption, label_text, new_figure
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics import Floats
 
@@ -28,7 +28,7 @@ def criticality_figure(found: CriticalityMap) -> Figure:
     for axes, (harm_count, label) in zip(panels, _TITLES.items(), strict=True):
         mesh = _draw_harm(axes, found, found.harm(harm_count), largest)
         _draw_boundary(axes, found)
-        axes.set_title(f"{label} of {agent}", loc="left", fontsize=10)
+        axes.set_title(f"{label} of {label_text(agent)}", loc="left", fontsize=10)
         axes.set_xlabel("Gap 1, Vehicle 1 to Vehicle 2 (m)", fontsize=9)
     panels[0].set_ylabel("Gap 2, Vehicle 2 to Vehicle 3 (m)", fontsize=9)
     bar = figure.colorbar(mesh, ax=panels, label="Harm (m²/s²)", pad=0.015)

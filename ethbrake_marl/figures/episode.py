@@ -13,7 +13,7 @@ from ethbrake_marl.envs.drawing.scene import vehicle_colour
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import quantities, quantity_line
 from ethbrake_marl.evaluation.record import EpisodeRecord
-from ethbrake_marl.figures.style import DASHES, GREY, add_caption, new_figure, style_axes
+from ethbrake_marl.figures.style import DASHES, GREY, add_caption, label_text, new_figure, style_axes
 from ethbrake_marl.physics import Floats
 
 
@@ -34,7 +34,7 @@ def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> 
             draw(axes, record)
         harms = (float(record.ledger.world_harm(count)[0]) for count in ("first", "total"))
         column[0].set_title(
-            "{}\nharm {:.2f} first-impact, {:.2f} total".format(title, *harms), loc="left", fontsize=9.5
+            "{}\nharm {:.2f} first-impact, {:.2f} total".format(label_text(title), *harms), loc="left", fontsize=9.5
         )
         column[-1].set_xlabel("Time since Vehicle 1 began to brake (s)", fontsize=9)
     panels[0, 0].set_xlim(0.0, 1.1 * max(_standstill_s(record) for record in records.values()))

@@ -17,6 +17,7 @@ from ethbrake_marl.evaluation.table import SummaryRow
 from ethbrake_marl.figures.style import (
     COLOURS,
     add_caption,
+    label_text,
     new_figure,
     series_style,
     style_axes,
@@ -52,7 +53,7 @@ def learning_curve(
             style = series_style(number if number < _POLICY_NUMBER else number + 1)
             axes.axhline(
                 getattr(row, name).value, color=style["color"], linestyle=style["linestyle"], linewidth=1.2,
-                label=row.agent,
+                label=label_text(row.agent),
             )  # fmt: skip
         axes.set_title(label, loc="left", fontsize=10)
         axes.set_xlabel("Training steps", fontsize=9)
@@ -80,7 +81,7 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
         style_axes(axes)
         for number, agent in enumerate(evaluation.outcomes if agents is None else agents):
             harm = getattr(evaluation.outcome(agent), name)
-            _band(axes, gap, harm, groups, series_style(number), agent)
+            _band(axes, gap, harm, groups, series_style(number), label_text(agent))
         axes.set_title(label, loc="left", fontsize=10)
         axes.set_xlabel(f"Total gap at the alert, {_gap_sum(evaluation.worlds.N)} (m)", fontsize=9)
         axes.set_ylim(bottom=0.0)

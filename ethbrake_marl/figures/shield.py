@@ -11,7 +11,7 @@ from rich.table import Table
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.shield_modes import NONE, STEP, STEP_ALERT, ModeRow
-from ethbrake_marl.figures.style import GREY, add_caption, new_figure, series_style, style_axes
+from ethbrake_marl.figures.style import GREY, add_caption, label_text, new_figure, series_style, style_axes
 from ethbrake_marl.shield.review import OperatingPoint
 from ethbrake_marl.shield.robustness import RobustnessPoint
 
@@ -30,7 +30,7 @@ def operating_figure(curves: Sequence[tuple[str, Sequence[OperatingPoint]]], *, 
     style_axes(axes)
     for number, (name, points) in enumerate(curves):
         rates, harms = [p.intervention_rate for p in points], [p.harm for p in points]
-        axes.plot(rates, harms, label=name, **series_style(number))  # type: ignore[arg-type]  # a style's values
+        axes.plot(rates, harms, label=label_text(name), **series_style(number))  # type: ignore[arg-type]  # a style's values
         for point in (p for p in points if p.intervention_rate >= LABELLED):
             axes.annotate(
                 f"{point.allowance:g}", (point.intervention_rate, point.harm), fontsize=7.5, xytext=(4, 4),

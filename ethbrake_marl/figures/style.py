@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import io
 import textwrap
+from functools import cache
 from pathlib import Path
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Figure  # the type that every figure has, for modules outside this folder
+from matplotlib.font_manager import findfont, get_font
 
 from ethbrake_marl.envs.drawing.scene import COLOURS as COLOURS  # one palette for figures and frames
+from ethbrake_marl.errors import plain_text
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.figures import picture_ending
 
@@ -41,6 +44,20 @@ def series_style(number: int) -> dict[str, object]:
     return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
 
 
+def label_text(text: str, most: int = 40) -> str:
+    """Text as a figure may have it, whoever wrote it: no formula, no sign that the font lacks, not too long."""
+    signs = font_signs()
+    told = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
+    short = told if len(told) <= most else f"{told[: most - 16]}…{told[-15:]}"
+    return short.replace("$", r"\$")
+
+
+@cache
+def font_signs() -> frozenset[int]:
+    """Code points that the font of figures has."""
+    return frozenset(get_font(findfont("DejaVu Sans")).get_charmap())
+
+
 def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure that lays itself out; it belongs to no window."""
     return ShownFigure(figsize=(width_in, height_in), layout="constrained")
@@ -67,7 +84,10 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
     """
     ending = picture_ending(path)
     buffer = io.BytesIO()
-    with matplotlib.rc_context({"savefig.facecolor": "white", "svg.hashsalt": "ethbrake"}):
+    # Fonts travel with the file: as outlines in SVG, as TrueType in PDF.
+    with matplotlib.rc_context(
+        {"savefig.facecolor": "white", "svg.hashsalt": "ethbrake", "svg.fonttype": "path", "pdf.fonttype": 42}
+    ):
         figure.savefig(buffer, format=ending[1:], dpi=DPI, metadata=_NO_DATES[ending])
     return buffer.getvalue()
 

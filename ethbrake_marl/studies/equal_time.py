@@ -7,9 +7,9 @@ each is measured with its whole episode: what it does at the alert, every decisi
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich import box
@@ -26,6 +26,9 @@ from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mea
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Sample, Scenario
+
+if TYPE_CHECKING:
+    from ethbrake_marl.figures.style import Figure
 
 CHUNK = 500  # worlds driven together, for every agent alike
 _WARM_UP = 2  # worlds that are driven first and not counted: kernels are compiled, tables are read
@@ -126,3 +129,12 @@ def timed_table(rows: list[TimedRow], against: str) -> Table:
             "" if row.agent == against else f"{row.difference.value:+.3f}{within}",
         )
     return table
+
+
+def equal_time_figure(rows: Sequence[TimedRow], *, caption: str = "") -> Figure:
+    """Both harms of each agent against its processor time."""
+    # Here: matplotlib takes a second to load, and the command draws nothing.
+    from ethbrake_marl.figures.report import harm_against_time
+
+    points = {row.agent: (row.median_ms, row.first_impact_harm, row.total_harm) for row in rows}
+    return harm_against_time(points, caption=caption)

@@ -206,7 +206,15 @@ def _show(
     if trained.status == "interrupted":
         summary += " The training was interrupted; this is the policy it had by then."
     return write_page(
-        run.path, rows, figures, beside=beside, summary=summary, settings=told, versions=installed_versions()
+        run.path,
+        evaluation,
+        rows,
+        figures,
+        agents,
+        beside=beside,
+        summary=summary,
+        settings=told,
+        versions=installed_versions(),
     )
 
 

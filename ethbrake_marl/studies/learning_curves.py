@@ -17,7 +17,7 @@ from ethbrake_marl.evaluation.identity import result_identity, worlds_sha256
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
 from ethbrake_marl.figures.curves import SeedCurve, at_common_steps, seed_curves
-from ethbrake_marl.figures.style import write_picture
+from ethbrake_marl.figures.style import Figure, write_picture
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
@@ -30,6 +30,7 @@ from ethbrake_marl.scenario import Scenario
 FIGURE, TABLE, SUMMARY = "learning_curves.png", "learning_curves.csv", "learning_curves.json"
 
 _RETURN = "rollout/ep_rew_mean"  # mean over the last episodes, exploration included
+_RETURNED = "return"  # what it is called here
 _LABELS = {
     "first_impact_harm": "First-impact harm on the fixed list (m²/s²)",
     "total_harm": "Total harm on the fixed list (m²/s²)",
@@ -95,35 +96,49 @@ def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) ->
     For each recipe: interquartile mean over seeds, with its stratified bootstrap interval, of the harm of the policy
     that each training kept, and of the last one. Raises ``InvalidInput`` when they have no evaluation in common.
     """
-    counts = {trainings.recipe.reward.harm_count for trainings in plan}
-    metrics = [HARM_METRIC[count] for count in ("first", "total") if count in counts]
-    curves: dict[str, dict[str, SeedCurve]] = {metric: {} for metric in (*metrics, "return")}
+    curves = _read_curves(plan, folder)
     about = result_identity("learning-curves", scenario, None)
     summary: dict[str, Any] = {**about, "scenario": scenario.name, "recipes": {}}
     for trainings in plan:
         name = trainings.recipe.name
-        tables = [_table(folder / f"{name}-seed{seed}") for seed in range(trainings.seeds)]
-        for metric in curves:
-            values = [_column(table, _RETURN if metric == "return" else f"eval/{metric}") for table in tables]
-            if metric != "return" or all(values):  # no episode may have ended in a very short training
-                curves[metric][name] = at_common_steps(values)
-        own = curves.get(HARM_METRIC[trainings.recipe.reward.harm_count])
-        assert own is not None
-        kept, last = own[name].values.min(axis=1), own[name].values[:, -1]
+        values = curves[HARM_METRIC[trainings.recipe.reward.harm_count]][name].values
+        kept, last = _estimate(values.min(axis=1)), _estimate(values[:, -1])
         summary["recipes"][name] = {
             **_identity(scenario, trainings, folder),
             "seeds": trainings.seeds,
-            "kept": _estimate(kept),
-            "last": _estimate(last),
+            "kept": kept,
+            "last": last,
         }
-    curves = {metric: lines for metric, lines in curves.items() if lines}
-    caption = f"{scenario.name}: mean over seeds, bands: one standard deviation. {_conditions(plan)}"
-    panels = {_LABELS[metric]: lines for metric, lines in curves.items()}
-    figure = seed_curves(panels, logarithmic=[_LABELS[metric] for metric in metrics], caption=caption)
-    write_picture(folder / FIGURE, figure, force=True)
+    write_picture(folder / FIGURE, curves_figure(scenario, plan, folder), force=True)
     write_output(folder / TABLE, _csv(curves).encode(), force=True)
     write_output(folder / SUMMARY, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode(), force=True)
     return summary
+
+
+def curves_figure(scenario: Scenario, plan: Sequence[Trainings], folder: Path) -> Figure:
+    """The figure of the finished trainings of ``folder``: harm and return over steps, mean over seeds.
+
+    Raises ``InvalidInput`` when they have no evaluation in common.
+    """
+    curves = _read_curves(plan, folder)
+    caption = f"{scenario.name}: mean over seeds, bands: one standard deviation. {_conditions(plan)}"
+    panels = {_LABELS[metric]: lines for metric, lines in curves.items()}
+    return seed_curves(panels, logarithmic=[_LABELS[m] for m in curves if m != _RETURNED], caption=caption)
+
+
+def _read_curves(plan: Sequence[Trainings], folder: Path) -> dict[str, dict[str, SeedCurve]]:
+    """What the trainings of ``folder`` reached, by metric and recipe; without what no episode told."""
+    counts = {trainings.recipe.reward.harm_count for trainings in plan}
+    metrics = [HARM_METRIC[count] for count in ("first", "total") if count in counts]
+    curves: dict[str, dict[str, SeedCurve]] = {metric: {} for metric in (*metrics, _RETURNED)}
+    for trainings in plan:
+        name = trainings.recipe.name
+        tables = [_table(folder / f"{name}-seed{seed}") for seed in range(trainings.seeds)]
+        for metric in curves:
+            values = [_column(table, _RETURN if metric == _RETURNED else f"eval/{metric}") for table in tables]
+            if metric != _RETURNED or all(values):  # no episode may have ended in a very short training
+                curves[metric][name] = at_common_steps(values)
+    return {metric: lines for metric, lines in curves.items() if lines}
 
 
 def _train_one(training: Training, path: Path, settings: Sequence[str], tell: OnProgress | None) -> bool:

@@ -16,12 +16,13 @@ from ethbrake_marl.evaluation import Evaluation, SummaryRow, record_episode, wri
 from ethbrake_marl.evaluation.compare import results_to_json
 from ethbrake_marl.evaluation.paper import MAIN_TEST, TESTS
 from ethbrake_marl.evaluation.per_world import PER_WORLD, write_output
-from ethbrake_marl.evaluation.report import Report, ReportFigure, ReportTest, write_report
 from ethbrake_marl.evaluation.table import BASELINE
 from ethbrake_marl.figures.episode import trajectories
 from ethbrake_marl.figures.run import harm_against_total_gap, learning_curve
 from ethbrake_marl.figures.style import picture_bytes
 from ethbrake_marl.learning.registry import algorithm_names
+from ethbrake_marl.pages.evidence import shield_evidence
+from ethbrake_marl.pages.report import Report, ReportFigure, ReportTest, play_for_report, write_report
 
 REFERENCES = ("full_brake", "e_v2x_bm")  # level lines beside the learning curve
 SHOWN = ("full_brake", "e_v2x_bm")  # columns of the figure of one episode, and the policy
@@ -96,9 +97,8 @@ def write_figures(
     figures = []
     for name, figure in drawn.items():
         title, description = FIGURE_TEXTS[name]
-        png = picture_bytes(figure, name)
-        write_output(folder / name, png, force=True)
-        figures.append(ReportFigure(title, description.format(world=int(evaluation.index[shown])), png))
+        write_output(folder / name, picture_bytes(figure, name), force=True)
+        figures.append(ReportFigure(title, description.format(world=int(evaluation.index[shown])), figure))
     return figures
 
 
@@ -137,19 +137,33 @@ def telling_world(evaluation: Evaluation) -> int:
 
 def write_page(
     folder: Path,
+    evaluation: Evaluation,
     rows: Sequence[SummaryRow],
     figures: Sequence[ReportFigure],
+    agents: Mapping[str, Agent],
     *,
     beside: Mapping[str, Sequence[SummaryRow]],
     summary: str,
     settings: Mapping[str, object],
     versions: Mapping[str, str],
 ) -> Path:
-    """Write ``report.html``, which holds the figures inside it; gives its path."""
+    """Write ``report.html``, which holds the figures and some episodes inside it; gives its path."""
     path = folder / "report.html"
-    scenario = rows[0].parameters["scenario"]
-    title = f"ethbrake run: {scenario}{' (the main test of three)' if beside and scenario == MAIN_TEST else ''}"
-    tests = [ReportTest(name, TESTS[name], other) for name, other in beside.items()]
-    report = Report(title, rows, figures, tests, summary=summary, settings=settings, versions=versions)
+    name, learned = evaluation.scenario.name, learned_name(evaluation)
+    title = f"ethbrake run: {name}{' (the main test of three)' if beside and name == MAIN_TEST else ''}"
+    spellings = {learned: f"{learned}@{folder}", "hybrid": f"{learned}@{folder}+episode"}
+    report = Report(
+        title,
+        rows,
+        evaluation,
+        play_for_report(evaluation, agents, learned, spellings=spellings),
+        shield_evidence(agents, evaluation),
+        learned,
+        figures,
+        [ReportTest(name, TESTS[name], other) for name, other in beside.items()],
+        summary=summary,
+        settings=settings,
+        versions=versions,
+    )
     write_report(path, report, force=True)
     return path

@@ -13,7 +13,7 @@ from rich.console import Console
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, rich_table, summarise, write_per_world_csv
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.report import Report, render_report
+from ethbrake_marl.pages.report import Report, render_report
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.results import results_csv
 
@@ -96,7 +96,7 @@ def test_knowledge__where_nothing_is_hidden_nobody_is_marked(v2x: object) -> Non
 
 
 def hidden_words(result: Evaluation) -> list[str]:
-    page = render_report(Report("Mine", summarise(result))).partition("<h2>How to read")[0]
+    page = render_report(Report("Mine", summarise(result))).partition(">How to read the tables</h2>")[0]
     texts = (terminal(result), markdown_table(summarise(result)), page)
     return [word for text in texts for word in ("†", "hides", "Not stated") if word in text]
 

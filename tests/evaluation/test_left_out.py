@@ -12,7 +12,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, summarise, write_per_world_csv
 from ethbrake_marl.evaluation.inputs import make_agents
-from ethbrake_marl.evaluation.report import Report, render_report
+from ethbrake_marl.pages.report import Report, render_report
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 from tests.failing_worlds import planted_list, without

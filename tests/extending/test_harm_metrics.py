@@ -15,8 +15,8 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import markdown_table
 from ethbrake_marl.evaluation.harm_metrics import METRICS
-from ethbrake_marl.evaluation.report import Report, render_report
 from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.pages.report import Report, render_report
 
 SCENARIO = eb.load_scenario("paper-random")
 SAMPLE = SCENARIO.sample(40, 7)

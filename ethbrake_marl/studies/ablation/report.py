@@ -1,20 +1,23 @@
-"""The figures of an ablation as text: Markdown tables, and one CSV row per level, algorithm and seed."""
+"""The findings of an ablation: Markdown tables, a page, and one CSV row per level, algorithm and seed."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.ablation import change_figure, harm_curve, who_pays
-from ethbrake_marl.figures.style import write_picture
+from ethbrake_marl.figures.style import Figure, write_picture
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.pages.frame import Section, page, paragraph
+from ethbrake_marl.pages.parts import facts, table
+from ethbrake_marl.pages.vector import drawing
 from ethbrake_marl.studies.ablation.comparison import compare
 from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, LineResult
 from ethbrake_marl.studies.ablation.plan import Plan
@@ -28,21 +31,49 @@ _HARM = {"first": "first-impact harm", "total": "total harm"}
 Json = dict[str, Any]
 
 
+class _Table(NamedTuple):
+    """A table whose first ``left`` columns are texts."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    left: int
+
+
 def markdown(found: Json, conditions: str) -> str:
     """All tables, with their conditions below."""
-    blocks = ["## Levels", *[_levels(found["levels"], harm_count) for harm_count in HARM_COUNTS]]
+    blocks = [each for title, tables in _blocks(found) for each in (f"## {title}", *map(_write_table, tables))]
+    return "\n\n".join([*blocks, conditions]) + "\n"
+
+
+def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure]) -> str:
+    """The figures by name and all tables as one HTML page, with their conditions."""
+    drawn = [
+        drawing(figure, *FIGURE_TEXTS[name], alone=name == "ablation-who-pays.png") for name, figure in figures.items()
+    ]
+    sections = [Section("Figures", [*drawn, paragraph(conditions, "quiet")])] if drawn else []
+    for title, tables in _blocks(found):
+        parts = [
+            table(t.head, [[cell.replace("`", "") for cell in row] for row in t.rows]) for t in map(_alone, tables)
+        ]
+        sections.append(Section(title, [*parts, paragraph(conditions, "quiet")]))
+    settings = {name: value for name, value in found["settings"].items() if name != "recipes"}
+    sections.append(Section("Settings", [facts(settings)]))
+    return page("What cooperation is worth", sections, lead="Who learns, who knows, whose harm counts: step by step.")
+
+
+def _blocks(found: Json) -> list[tuple[str, list[_Table]]]:
+    """The tables below their titles."""
     worlds = found["levels"][0]["first"]["searched"]["worlds"]
-    blocks += [f"## How near the joint optimum, in the first {count_of(worlds, 'world')}"]
-    blocks += [_optima(found["levels"], harm_count) for harm_count in HARM_COUNTS]
+    blocks = [("Levels", [_levels(found["levels"], harm_count) for harm_count in HARM_COUNTS])]
+    optima = [_optima(found["levels"], harm_count) for harm_count in HARM_COUNTS]
+    blocks.append((f"How near the joint optimum, in the first {count_of(worlds, 'world')}", optima))
     for title, key in (("What each step is worth", "steps"), ("Price of lost messages", "channels")):
         if found[key]:
-            blocks += [f"## {title}", _changes(found[key])]
+            blocks.append((title, [_changes(found[key])]))
     if found["steps"] or found["channels"]:
-        blocks += [
-            "## Who pays",
-            *[_who_pays(found["steps"] + found["channels"], harm_count) for harm_count in HARM_COUNTS],
-        ]
-    return "\n\n".join([*blocks, conditions]) + "\n"
+        changes = found["steps"] + found["channels"]
+        blocks.append(("Who pays", [_who_pays(changes, harm_count) for harm_count in HARM_COUNTS]))
+    return blocks
 
 
 def levels_csv(measured: Sequence[Measured], searched: int) -> str:
@@ -99,24 +130,24 @@ def lines_markdown(found: Sequence[LineResult], question: LineQuestion, runs: in
             f" Best known and share: the first {count_of(question.search_episodes, 'world')},"
             f" {question.budget:,} candidates each."
         )
-    return f"{_table(head, rows, left=1)}\n\n{conditions}\n"
+    return f"{_write_table(_Table(head, rows, left=1))}\n\n{conditions}\n"
 
 
 def _of(estimate: Estimate | None, scale: float = 1.0, digits: int = 2, unit: str = "") -> str:
     return _cell(None if estimate is None else estimate.to_json(), scale, digits, unit)
 
 
-def _levels(levels: Sequence[Json], harm_count: HarmCount) -> str:
+def _levels(levels: Sequence[Json], harm_count: HarmCount) -> _Table:
     head = ["Level", _ALGORITHM, "Collisions", "All brake fully", f"Reached, {_HARM[harm_count]}"]
     rows = []
     for level in levels:
         own = level[harm_count]
         row = [f"`{level['level']}`", level["algorithm"] or NONE, _cell(level["collision_rate"], 100.0, 1, " %")]
         rows.append([*row, _value(own["full_brake"]), _cell(own["harm"])])
-    return _table(head, rows, left=2)
+    return _Table(head, rows, left=2)
 
 
-def _optima(levels: Sequence[Json], harm_count: HarmCount) -> str:
+def _optima(levels: Sequence[Json], harm_count: HarmCount) -> _Table:
     head = ["Level", _ALGORITHM, "All brake fully", f"Reached, {_HARM[harm_count]}"]
     head += ["Joint optimum", "Share of its reduction"]
     rows = []
@@ -125,10 +156,10 @@ def _optima(levels: Sequence[Json], harm_count: HarmCount) -> str:
         if own["best_known"] is not None:
             row = [f"`{level['level']}`", level["algorithm"], _value(own["full_brake"]), _cell(own["harm"])]
             rows.append([*row, _value(own["best_known"]), _cell(own["realised_share"], 100.0, 1, " %")])
-    return _table(head, rows, left=2)
+    return _Table(head, rows, left=2)
 
 
-def _changes(changes: Sequence[Json]) -> str:
+def _changes(changes: Sequence[Json]) -> _Table:
     head = ["From", "To", _ALGORITHM]
     for harm_count in HARM_COUNTS:
         head += [f"Change of {_HARM[harm_count]}", f"Somebody worse off, {_HARM[harm_count]}"]
@@ -141,10 +172,10 @@ def _changes(changes: Sequence[Json]) -> str:
                 _cell(change[harm_count]["worse_off"], 100.0, 1, " %"),
             ]
         rows.append(row)
-    return _table(head, rows, left=3)
+    return _Table(head, rows, left=3)
 
 
-def _who_pays(changes: Sequence[Json], harm_count: HarmCount) -> str:
+def _who_pays(changes: Sequence[Json], harm_count: HarmCount) -> _Table:
     vehicles = len(changes[0][harm_count]["vehicles"])
     head = [f"Change of {_HARM[harm_count]}", _ALGORITHM, *(f"Vehicle {i + 1}" for i in range(vehicles))]
     head += [f"Vehicle {i + 1} worse off" for i in range(vehicles)]
@@ -154,16 +185,24 @@ def _who_pays(changes: Sequence[Json], harm_count: HarmCount) -> str:
         row = [f"`{change['from']}` to `{change['to']}`", change["algorithm"]]
         row += [_cell(estimate, sign=True) for estimate in own["vehicles"]]
         rows.append(row + [f"{100.0 * share:.1f} %" for share in own["worse_off_vehicles"]])
-    return _table(head, rows, left=2)
+    return _Table(head, rows, left=2)
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
-    """A table whose first ``left`` columns are texts; without the algorithm's where there is only one."""
-    if _ALGORITHM in head:
-        column = head.index(_ALGORITHM)
-        if len({row[column] for row in rows} - {NONE}) == 1:
-            head, *rows = ([*row[:column], *row[column + 1 :]] for row in (head, *rows))
-            left -= 1
+def _alone(given: _Table) -> _Table:
+    """The table without the algorithm's column where there is only one."""
+    head, rows, left = given
+    if _ALGORITHM not in head:
+        return given
+    column = head.index(_ALGORITHM)
+    if len({row[column] for row in rows} - {NONE}) != 1:
+        return given
+    head, *rows = ([*row[:column], *row[column + 1 :]] for row in (head, *rows))
+    return _Table(head, rows, left - 1)
+
+
+def _write_table(given: _Table) -> str:
+    """A table in Markdown."""
+    head, rows, left = _alone(given)
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * left + " ---: |" * (len(head) - left)]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
@@ -188,8 +227,17 @@ def _column(harm_count: HarmCount) -> str:
     return "first_impact_harm" if harm_count == "first" else "total_harm"
 
 
-SUMMARY, TABLE, PAGE = "ablation.json", "ablation.csv", "ablation.md"
+SUMMARY, TABLE, TEXT, PAGE = "ablation.json", "ablation.csv", "ablation.md", "ablation.html"
 FIGURES = {"ablation.png": harm_curve, "ablation-changes.png": change_figure, "ablation-who-pays.png": who_pays}
+
+FIGURE_TEXTS = {
+    "ablation.png": (
+        "Harm against cooperation",
+        "Both harms at each level, between full braking and the joint optimum.",
+    ),
+    "ablation-changes.png": ("What each step is worth", "Change of both harms from one level to the next."),
+    "ablation-who-pays.png": ("Who pays", "Change of the harm of each vehicle, under both counts."),
+}
 
 
 def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> dict[str, Any]:
@@ -198,10 +246,12 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> di
     conditions = _conditions(plan, machine)
     write_output(plan.folder / SUMMARY, (json.dumps(found, indent=2, allow_nan=False) + "\n").encode(), force=True)
     write_output(plan.folder / TABLE, levels_csv(measured, plan.search_episodes).encode(), force=True)
-    write_output(plan.folder / PAGE, markdown(found, conditions).encode(), force=True)
-    for name, draw in FIGURES.items():
-        if found["steps"] or found["channels"]:
-            write_picture(plan.folder / name, draw(found, conditions), force=True)
+    write_output(plan.folder / TEXT, markdown(found, conditions).encode(), force=True)
+    drawn = found["steps"] or found["channels"]
+    figures = {name: draw(found, conditions) for name, draw in FIGURES.items() if drawn}
+    for name, figure in figures.items():
+        write_picture(plan.folder / name, figure, force=True)
+    write_output(plan.folder / PAGE, ablation_page(found, conditions, figures).encode(), force=True)
     return found
 
 

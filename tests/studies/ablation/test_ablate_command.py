@@ -47,7 +47,7 @@ def content(folder: Path) -> dict:
 
 def test_ablate__writes_tables_and_figures(ablation):
     names = {"ablation.json", "ablation.csv", "ablation.md", "ablation.png", "ablation-changes.png",
-             "ablation-who-pays.png"}  # fmt: skip
+             "ablation-who-pays.png", "ablation.html"}  # fmt: skip
     assert names <= {path.name for path in ablation.iterdir()}
     found = content(ablation)
     assert [level["level"] for level in found["levels"]] == LEVELS.split(",")

@@ -13,8 +13,9 @@ from ethbrake_marl.figures.ablation import change_figure, harm_curve, who_pays
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.ablation.comparison import compare
 from ethbrake_marl.studies.ablation.plan import Level
-from ethbrake_marl.studies.ablation.report import interval_words, levels_csv, markdown
+from ethbrake_marl.studies.ablation.report import FIGURES, ablation_page, interval_words, levels_csv, markdown
 from ethbrake_marl.studies.ablation.run import Harms, Measured
+from tests.pages.hostile import Page
 
 WORLDS, SEARCHED = 40, 10
 
@@ -106,6 +107,15 @@ def test_tables__hold_the_same_figures(ablation, found):
     ]  # fmt: skip
     assert float(rows[2]["first_impact_harm"]) == 12.0 and float(rows[2]["total_harm_2"]) == 10.0
     assert float(rows[1]["searched_best_known_total_harm"]) == 12.0 and rows[0]["searched_best_known_total_harm"] == ""
+
+
+def test_page__holds_the_tables_and_figures(found):
+    figures = {name: draw(found, "40 worlds") for name, draw in FIGURES.items()}
+    html = ablation_page({**found, "settings": {"seeds": 2, "machine": "</script><b>"}}, "40 worlds.", figures)
+    shown = Page(html)
+    assert shown.open == [] and not {"script", "b", "img"} & {tag for tag, _ in shown.tags}
+    assert "cooperation-2-paper 100.0 % [100.0, 100.0] 20.00 11.00 [10.00, 12.00]" in shown.text
+    assert "`" not in shown.text and html.count("<figure>") == 3 and "</script><b>" in shown.text
 
 
 def test_tables__name_the_algorithm_where_there_are_two(ablation):

@@ -1,0 +1,125 @@
+"use strict";
+// Exact motion: an episode is a list of pieces of constant acceleration, 1 + 3 N numbers each: the time at which it
+// begins, the place of Vehicle 1, the gaps, the speeds and the accelerations. Nothing here touches the page.
+
+const BODY_M = 4.5; // drawn length; the physics knows none
+const FLASH_S = 0.3; // how long an impact is shown
+
+function decodePieces(text, vehicles) {
+  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const view = new DataView(bytes.buffer);
+  const width = 1 + 3 * vehicles;
+  const pieces = [];
+  for (let at = 0; at < bytes.length; at += 8 * width) {
+    const n = (k) => view.getFloat64(at + 8 * k, true);
+    const some = (first, count) => Array.from({ length: count }, (_, k) => n(first + k));
+    pieces.push({
+      time: n(0),
+      front: n(1),
+      gaps: some(2, vehicles - 1),
+      speeds: some(1 + vehicles, vehicles),
+      accelerations: some(1 + 2 * vehicles, vehicles),
+    });
+  }
+  return pieces;
+}
+
+// The last entry that has begun by then, by halving.
+function lastBegun(list, time, timeOf) {
+  let low = 0;
+  let high = list.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (timeOf(list[middle]) <= time) low = middle + 1;
+    else high = middle;
+  }
+  return low - 1;
+}
+
+function moveOn(piece, time) {
+  const t = time - piece.time;
+  const ways = piece.speeds.map((v, i) => (v + 0.5 * piece.accelerations[i] * t) * t);
+  return {
+    front: piece.front + ways[0],
+    gaps: piece.gaps.map((gap, p) => Math.max(gap + ways[p] - ways[p + 1], 0)),
+    speeds: piece.speeds.map((v, i) => v + piece.accelerations[i] * t),
+    accelerations: piece.accelerations,
+  };
+}
+
+// Where the line is at a time; at its end and after it stands as the episode left it.
+function stateAt(episode, time) {
+  const until = Math.min(time, episode.end);
+  const k = Math.max(lastBegun(episode.pieces, until, (piece) => piece.time), 0);
+  return moveOn(episode.pieces[k], until);
+}
+
+// Front bumpers of vehicles drawn with bodies, apart by the true gaps.
+function frontsOf(state) {
+  const fronts = [state.front];
+  for (const gap of state.gaps) fronts.push(fronts[fronts.length - 1] - gap - BODY_M);
+  return fronts;
+}
+
+// Impacts are [time, pair, closing speed, first, number so far, first-impact harm so far, total harm so far].
+function countedBy(episode, time) {
+  const k = lastBegun(episode.impacts, time, (impact) => impact[0]);
+  if (k < 0) return { impacts: 0, first: 0, total: 0 };
+  const [, , , , impacts, first, total] = episode.impacts[k];
+  return { impacts, first, total };
+}
+
+function struckAround(episode, time) {
+  return episode.impacts.filter((impact) => impact[0] <= time && time < impact[0] + FLASH_S);
+}
+
+function steppedInAt(episode, time) {
+  return episode.stepped.some((start) => start <= time && time < start + FLASH_S);
+}
+
+// The stretch of road that holds these episodes from the alert to their ends.
+function roadOf(episodes, obstacle) {
+  let left = Infinity;
+  let right = -Infinity;
+  for (const episode of episodes) {
+    for (const time of [...episode.pieces.map((piece) => piece.time), episode.end]) {
+      const fronts = frontsOf(stateAt(episode, time));
+      left = Math.min(left, fronts[fronts.length - 1] - BODY_M);
+      right = Math.max(right, fronts[0]);
+    }
+  }
+  if (obstacle !== null) right = Math.max(right, obstacle + 1);
+  return { left: left - 3, right: right + 3 };
+}
+
+// When the last vehicle of an episode has come to rest, or its end.
+function restOf(episode) {
+  const last = episode.pieces[episode.pieces.length - 1];
+  return last.speeds.every((v) => v === 0) ? last.time : episode.end;
+}
+
+// Curves as SVG paths, exact: gaps are quadratics, speeds straight lines, accelerations steps.
+function curves(episode, until, x, y, vehicles) {
+  const gaps = Array.from({ length: vehicles - 1 }, () => "");
+  const speeds = Array.from({ length: vehicles }, () => "");
+  const accelerations = Array.from({ length: vehicles }, () => "");
+  const pair = (t, v, scale) => `${x(t).toFixed(2)} ${scale(v).toFixed(2)}`;
+  episode.pieces.forEach((piece, k) => {
+    const next = k + 1 < episode.pieces.length ? episode.pieces[k + 1].time : episode.end;
+    const end = Math.min(next, until);
+    const t = end - piece.time;
+    if (t < 0 || (t === 0 && k > 0)) return;
+    const after = moveOn(piece, end);
+    const go = k === 0 ? "M" : "L";
+    gaps.forEach((_, p) => {
+      const middle = piece.gaps[p] + ((piece.speeds[p] - piece.speeds[p + 1]) * t) / 2;
+      gaps[p] += `${go}${pair(piece.time, piece.gaps[p], y.gap)}Q${pair(piece.time + t / 2, middle, y.gap)} ${pair(end, after.gaps[p], y.gap)}`;
+    });
+    speeds.forEach((_, i) => {
+      speeds[i] += `${go}${pair(piece.time, piece.speeds[i], y.speed)}L${pair(end, after.speeds[i], y.speed)}`;
+      const a = piece.accelerations[i];
+      accelerations[i] += `${go}${pair(piece.time, a, y.acceleration)}L${pair(end, a, y.acceleration)}`;
+    });
+  });
+  return { gap: gaps, speed: speeds, acceleration: accelerations };
+}

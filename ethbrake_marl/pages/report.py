@@ -1,0 +1,184 @@
+"""The report of an evaluation as one page: results, episodes to watch, what was avoidable, shield, figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ethbrake_marl.agents.team import Driver
+from ethbrake_marl.evaluation.cells import Line, our_lines, paper_blocks, table_columns, table_meanings
+from ethbrake_marl.evaluation.conditions import parameter_line
+from ethbrake_marl.evaluation.outcome import Evaluation
+from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
+from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.evaluation.table import SummaryRow
+from ethbrake_marl.evaluation.text import identity_lines, knowledge_lines, left_out_lines, limit_lines
+from ethbrake_marl.figures.report import harm_by_agent
+from ethbrake_marl.figures.style import Figure
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.pages.chosen import choose_shown, play_chosen
+from ethbrake_marl.pages.evidence import ShieldEvidence, avoidable_section, shield_section, worst_section
+from ethbrake_marl.pages.frame import Part, Section, page, paragraph
+from ethbrake_marl.pages.parts import Block, Cell, Row, facts, table
+from ethbrake_marl.pages.player import Played, player
+from ethbrake_marl.pages.vector import drawing
+
+_HEADLINE = (0, 1, 2, 6, 7, 9, 10)  # of the table's columns; those of registered harm metrics follow
+_OTHERS = (3, 4, 5, 8)
+
+
+@dataclass(frozen=True, slots=True)
+class ReportFigure:
+    """A figure of the report; ``description`` says in words what it shows (and is read to those who cannot see it)."""
+
+    title: str
+    description: str
+    figure: Figure
+
+
+@dataclass(frozen=True, slots=True)
+class ReportTest:
+    """Results on another test, to stand below the main table."""
+
+    title: str
+    description: str  # what differs from the main table's test
+    rows: Sequence[SummaryRow]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Everything on the page. ``settings`` and ``versions`` are printed as they are given, name and value."""
+
+    title: str
+    rows: Sequence[SummaryRow]
+    evaluation: Evaluation | None = None  # that the rows sum up
+    played: Sequence[Played] = ()  # episodes to watch
+    shield: ShieldEvidence | None = None  # of what is behind a shield
+    focus: str = ""  # the agent whose worst worlds are shown
+    figures: Sequence[ReportFigure] = ()
+    tests: Sequence[ReportTest] = ()  # the same agents elsewhere
+    summary: str = ""  # a sentence or two below the title
+    settings: Mapping[str, object] = field(default_factory=dict)  # command, seeds, training set-up
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+def focus_of(rows: Sequence[SummaryRow]) -> str:
+    """The agent whose worst worlds a report shows: the last that drives by a trained policy, or the last."""
+    learned = [row.agent for row in rows if row.policy_sha256]
+    return learned[-1] if learned else rows[-1].agent
+
+
+def play_for_report(
+    evaluation: Evaluation,
+    agents: Mapping[str, Driver],
+    focus: str,
+    *,
+    spellings: Mapping[str, str] | None = None,
+    harm_count: HarmCount = "first",
+    on_agent: Callable[[str], None] | None = None,
+) -> list[Played]:
+    """The episodes of a report: see ``choose_shown`` and ``play_chosen``, whose arguments these are."""
+    chosen = choose_shown(evaluation, focus)
+    return play_chosen(evaluation, chosen, agents, spellings=spellings, harm_count=harm_count, on_agent=on_agent)
+
+
+def render_report(report: Report) -> str:
+    """The page as HTML; it loads nothing from anywhere."""
+    sections = [_results(report), *_episodes(report)]
+    if report.evaluation is not None and report.focus:
+        sections.append(worst_section(report.evaluation, report.focus, {one.number for one in report.played}))
+    if report.evaluation is not None:
+        sections.append(avoidable_section(report.evaluation))
+    if report.shield is not None:
+        sections.append(shield_section(report.shield))
+    if report.figures:
+        drawn = [drawing(each.figure, each.title, each.description) for each in report.figures]
+        sections.append(Section("Figures", drawn))
+    sections += [_other_test(test) for test in report.tests]
+    sections += [_measures(report), _reading(report), *_settings(report)]
+    return page(report.title, sections, lead=report.summary)
+
+
+def write_report(path: str | Path, report: Report, *, force: bool = False) -> None:
+    """Write the page; raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` without a folder."""
+    write_output(path, render_report(report).encode("utf-8"), force=force)
+
+
+def _results(report: Report) -> Section:
+    rows = report.rows
+    body: list[str | Part] = []
+    if rows:
+        body.append(
+            drawing(
+                harm_by_agent(rows),
+                "Harm of each agent",
+                "Mean per world of the squared closing speed of impacts: each pair's first one, and every one.",
+            )
+        )
+    columns = table_columns(rows)
+    shown = (*_HEADLINE, *range(len(table_columns(())), len(columns)))
+    lines: list[Row] = [_row(line, shown) for line in our_lines(rows)]
+    blocks = paper_blocks(rows)
+    for name, paper in blocks:
+        lines += [Block(f"The paper's {name}, as printed"), *(_row(line, shown) for line in paper)]
+    body.append(table(["Agent", *(columns[k] for k in shown)], lines, caption="Means with 95 % intervals"))
+    if rows:
+        body.append(paragraph(f"{parameter_line(rows[0].parameters)}. Harm in m²/s².", "quiet"))
+    body += [paragraph(text, "note") for text in left_out_lines(rows)]
+    body += [paragraph(f"The limit: {text}", "quiet") for text in limit_lines(rows)]
+    body += [paragraph(f"Who knows what: {text}", "note") for text in knowledge_lines(rows)]
+    body += [paragraph(f"The paper's {name}: {PAPER_PARAMETERS[name]}.", "quiet") for name, _ in blocks]
+    body += [paragraph(PAPER_NOTE, "note")] if blocks else []
+    return Section("Results", body)
+
+
+def _row(line: Line, columns: Sequence[int]) -> Row:
+    return [line.agent, *(Cell(line.cells[k].value, line.cells[k].interval) for k in columns)]
+
+
+def _episodes(report: Report) -> list[Section]:
+    if not report.played or report.evaluation is None:
+        return []
+    worlds = len(report.played)
+    told = (
+        f"{worlds} of the {report.evaluation.worlds.n:,} worlds"
+        if worlds < report.evaluation.worlds.n
+        else f"All {worlds} worlds"
+    )
+    return [
+        Section(
+            "Episodes",
+            [f"{told}, from the alert to rest.", player(report.played, report.evaluation.vehicles, focus=report.focus)],
+        )
+    ]
+
+
+def _other_test(test: ReportTest) -> Section:
+    columns = table_columns(test.rows)
+    lines = [_row(line, range(len(columns))) for line in our_lines(test.rows)]
+    body: list[str | Part] = [test.description, table(["Agent", *columns], lines, caption=test.title)]
+    if test.rows:
+        told = [f"{parameter_line(test.rows[0].parameters)}.", *limit_lines(test.rows), *identity_lines(test.rows)]
+        body += [paragraph(text, "quiet") for text in told]
+    return Section(test.title, body)
+
+
+def _measures(report: Report) -> Section:
+    lines = [[line.agent, Cell(line.knows, words=True), *_row(line, _OTHERS)[1:]] for line in our_lines(report.rows)]
+    head = ["Agent", "Knows", *(table_columns(())[k] for k in _OTHERS)]
+    return Section("Other measures", [table(head, lines, caption="In the same worlds")])
+
+
+def _reading(report: Report) -> Section:
+    return Section("How to read the tables", [facts(table_meanings(report.rows))])
+
+
+def _settings(report: Report) -> list[Section]:
+    found = []
+    if report.settings:
+        found.append(Section("Settings and seeds", [facts(report.settings)]))
+    identity = [paragraph(text, "quiet") for text in identity_lines(report.rows)]
+    if report.versions or identity:
+        found.append(Section("Versions", [*([facts(report.versions)] if report.versions else []), *identity]))
+    return found

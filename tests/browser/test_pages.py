@@ -1,0 +1,132 @@
+"""Pages in a real browser: no sideways scroll, light and dark, print, no script, size and time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.evaluation import evaluate, summarise
+from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.figures.run import harm_against_total_gap
+from ethbrake_marl.pages.report import Report, ReportFigure, focus_of, play_for_report, write_report
+from ethbrake_marl.scenario import load_scenario
+from tests.browser.conftest import AGENTS
+from tests.pages.hostile import HOSTILE
+from tests.pages.test_frame import whole_page
+
+Open = Callable[..., Any]
+MOST_BYTES = 5 << 20
+MOST_MS = 2_000
+
+
+@pytest.mark.parametrize("width", [360, 500, 768, 1440])
+def test_report__never_scrolls_sideways(open_page: Open, report_file: Path, width: int) -> None:
+    page = open_page(report_file, width=width)
+    page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    outside = page.evaluate(
+        "[...document.querySelectorAll('body *')].filter((e) => e.getBoundingClientRect().right > innerWidth + 1 &&"
+        " !e.closest('.wide, .drawing, svg, .skip')).map((e) => e.outerHTML.slice(0, 80))"
+    )
+    assert outside == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_report__can_be_read_in_light_and_dark(open_page: Open, report_file: Path, scheme: str) -> None:
+    page = open_page(report_file, color_scheme=scheme)
+    script = (
+        "(names) => names.map((name) => { const e = document.createElement('i'); e.style.color = `var(--${name})`;"
+        " document.body.append(e); return getComputedStyle(e).color.match(/\\d+/g).map(Number); })"
+    )
+    paper, *inks = (np.array(c) for c in page.evaluate(script, ["paper", "ink", "quiet", "accent", "warn"]))
+    assert (paper.mean() < 128) == (scheme == "dark")
+    assert all(contrast(ink, paper) >= 4.5 for ink in inks)
+    series = (np.array(c) for c in page.evaluate(script, [f"series-{k}" for k in range(5)]))
+    assert all(contrast(colour, paper) >= 2.7 for colour in series)
+
+
+def contrast(first: np.ndarray, second: np.ndarray) -> float:
+    """Ratio of luminances, as WCAG defines it."""
+    lights = []
+    for colour in (first, second):
+        c = colour / 255.0
+        linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+        lights.append(float(linear @ [0.2126, 0.7152, 0.0722]) + 0.05)
+    return max(lights) / min(lights)
+
+
+def test_report__prints_light_and_without_controls(open_page: Open, report_file: Path) -> None:
+    page = open_page(report_file, color_scheme="dark")
+    page.emulate_media(media="print")
+    assert page.evaluate("getComputedStyle(document.querySelector('section')).backgroundColor") == "rgb(255, 255, 255)"
+    assert page.locator(".controls").is_hidden()
+    assert page.locator(".lane").first.is_visible()
+    assert page.pdf().startswith(b"%PDF")
+
+
+def test_report__without_scripts_says_what_is_missing(open_page: Open, report_file: Path) -> None:
+    page = open_page(report_file, java_script_enabled=False)
+    assert page.get_by_text("scripts are switched off here").is_visible()
+    assert page.get_by_text("Means with 95 % intervals").is_visible()
+    assert page.locator(".controls").is_hidden()
+
+
+def test_report__every_control_has_a_name(open_page: Open, report_file: Path) -> None:
+    page = open_page(report_file)
+    nameless = page.evaluate(
+        "[...document.querySelectorAll('button, input, select, [role=img], [role=region], [tabindex=\"0\"]')]"
+        ".filter((e) => !(e.getAttribute('aria-label') || e.textContent.trim() || e.labels?.length))"
+        ".map((e) => e.outerHTML)"
+    )
+    assert nameless == []
+    assert page.locator("h1").count() == 1
+
+
+def test_pages__hostile_texts_run_nothing_and_load_nothing(open_page: Open, tmp_path: Path) -> None:
+    for k, text in enumerate(HOSTILE):
+        path = tmp_path / f"{k}.html"
+        path.write_text(whole_page(text), "utf-8")
+        page = open_page(path)
+        page.on("dialog", lambda dialog: pytest.fail(dialog.message))
+        assert page.locator("script, iframe, img, form, a[href^=javascript]").count() == 0
+        page.context.close()
+
+
+def test_report__hostile_agent_is_text_in_the_player(open_page: Open, tmp_path: Path) -> None:
+    scenario = load_scenario("paper-random")
+    agents = dict(
+        zip(HOSTILE[:5], make_lineup([f"constant:{k}.5" for k in range(1, 6)], scenario).values(), strict=True)
+    )
+    found = evaluate(scenario.sample(12, 7), agents, scenario=scenario, seed=7)
+    rows = summarise(found)
+    path = tmp_path / "report.html"
+    write_report(path, Report("t", rows, found, play_for_report(found, agents, rows[0].agent), None, rows[0].agent))
+    page = open_page(path)
+    page.on("dialog", lambda dialog: pytest.fail(dialog.message))
+    for key in "123456789":
+        page.locator(".player").press(key)
+    assert page.locator(".player img, .player script, .player iframe").count() == 0
+    assert page.locator(".head strong").first.inner_text() in HOSTILE
+
+
+@pytest.mark.long
+def test_report__of_ten_thousand_worlds_is_small_and_soon_ready(open_page: Open, tmp_path: Path) -> None:
+    scenario = load_scenario("paper-random")
+    names = (*AGENTS[:2], "e_v2x_bm:pairwise", *AGENTS[3:], "best_harm")
+    agents = make_lineup(names, scenario)
+    found = evaluate(scenario.sample(10_000, 7), agents, scenario=scenario, seed=7)
+    rows = summarise(found)
+    focus = focus_of(rows)
+    figure = ReportFigure("Harm against the gap", "Mean harm by gap.", harm_against_total_gap(found))
+    path = tmp_path / "report.html"
+    write_report(path, Report("t", rows, found, play_for_report(found, agents, focus), None, focus, [figure]))
+    page = open_page(path)
+    ready = page.evaluate("performance.now()")
+    assert page.evaluate("document.querySelector('.player').classList.contains('ready')")
+    print(f"{path.stat().st_size / 1e6:.2f} MB, ready after {ready:.0f} ms")
+    assert path.stat().st_size <= MOST_BYTES
+    assert ready <= MOST_MS

@@ -1,0 +1,233 @@
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.errors import AlreadyExists
+from ethbrake_marl.evaluation import Evaluation, evaluate, summarise
+from ethbrake_marl.figures.style import new_figure
+from ethbrake_marl.pages.chosen import choose_shown, worst_rows
+from ethbrake_marl.pages.report import (
+    Report,
+    ReportFigure,
+    ReportTest,
+    focus_of,
+    play_for_report,
+    render_report,
+    write_report,
+)
+from ethbrake_marl.scenario import Scenario
+from tests.pages.hostile import HOSTILE, UNSEEN, Page
+
+EXTERNAL = re.compile(r"""(https?:)?//|@import|<(link|iframe|object|embed|base)\b""", re.IGNORECASE)
+PAIR_AGENTS = ("full_brake", "constant:4")
+
+
+@pytest.fixture(scope="module")
+def report(evaluation: Evaluation) -> Report:
+    agents = {name: make_agent(name) for name in ("full_brake", "constant:4.5")}
+    part = Evaluation(
+        evaluation.scenario, evaluation.vehicles, evaluation.worlds, evaluation.index, evaluation.seed,
+        {name: evaluation.outcome(name) for name in agents},
+    )  # fmt: skip
+    return Report(
+        title="PPO on paper-random",
+        rows=summarise(part),
+        evaluation=part,
+        played=play_for_report(part, agents, "constant:4.5"),
+        focus="constant:4.5",
+        figures=[ReportFigure("Learning curve", "Harm over steps.", new_figure(4.0, 3.0))],
+        tests=[ReportTest("paper-other", "Another test.", summarise(evaluation))],
+        summary="One million steps.",
+        settings={"Training seed": 5, "Command": "ethbrake run"},
+        versions={"numpy": "2.4.6"},
+    )
+
+
+@pytest.fixture(scope="module")
+def html(report: Report) -> str:
+    return render_report(report)
+
+
+def test_report__loads_nothing_from_anywhere(html: str) -> None:
+    assert EXTERNAL.search(re.sub(r'xmlns(:\w+)?="[^"]*"|"http://www.w3.org/2000/svg"', "", no_comments(html))) is None
+    for _, attributes in Page(html).tags:
+        assert (attributes.get("href") or "#").startswith("#")
+        assert "src" not in attributes
+
+
+def no_comments(html: str) -> str:
+    """Without the comments of our scripts and the numbers of the episodes."""
+    return re.sub(r"(?m)//.*$|<script type=.*</script>", "", html)
+
+
+def test_report__is_well_formed_and_says_everything(html: str, report: Report) -> None:
+    page = Page(html)
+    assert page.open == []
+    text = page.text.replace("\u00a0", " ")
+    for row in report.rows:
+        for estimate in (row.first_impact_harm, row.total_harm):
+            assert f"{estimate.value:.2f}" in text
+            assert f"{estimate.interval[0]:.2f}, {estimate.interval[1]:.2f}" in text
+        assert row.agent in text
+    assert "paper-random: 200 worlds, seed 7; d = " in text
+    assert "Training seed 5 Command ethbrake run" in text
+    assert "numpy 2.4.6" in text
+    assert "Hybrid PPO 59.74 % 5.6202" in text
+    assert "62.6 %" in text
+    assert report.rows[0].worlds_sha256 in text
+
+
+def test_report__embeds_fifty_worlds_whose_counts_are_the_ledgers(html: str, report: Report) -> None:
+    content = episode_data(html)
+    assert content["agents"] == ["full_brake", "constant:4.5"]
+    assert len(content["worlds"]) == 50
+    numbers = [world["number"] for world in content["worlds"]]
+    assert len(set(numbers)) == 50
+    assert report.evaluation is not None
+    row_of = {int(number): k for k, number in enumerate(report.evaluation.index)}
+    for world in content["worlds"]:
+        for agent, episode in zip(content["agents"], world["episodes"], strict=True):
+            outcome, k = report.evaluation.outcome(agent), row_of[world["number"]]
+            impacts, first, total = episode["impacts"][-1][4:] if episode["impacts"] else (0, 0.0, 0.0)
+            assert (impacts, first, total) == (
+                outcome.impacts[k], outcome.first_impact_harm[k], outcome.total_harm[k],
+            )  # fmt: skip
+
+
+def episode_data(html: str) -> dict:
+    found = re.search(r'<script type="application/json" id="episode_data">(.*?)</script>', html)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def test_chosen__begin_with_the_worst_and_are_the_same_each_time(report: Report) -> None:
+    assert report.evaluation is not None
+    chosen = choose_shown(report.evaluation, "constant:4.5")
+    worst = worst_rows(report.evaluation, "constant:4.5")
+    assert [each.row for each in chosen[:10]] == worst.tolist()
+    assert chosen == choose_shown(report.evaluation, "constant:4.5")
+    assert len({each.kind for each in chosen}) >= 4
+    assert focus_of(report.rows) == "constant:4.5"
+
+
+def test_worst__are_those_of_the_largest_regret(pair: Scenario) -> None:
+    worlds = pair.replace(gaps_m={"uniform": [0.5, 9.0]}).sample(40, 0)
+    result = evaluate(worlds, {"coast": make_agent("coast")}, scenario=pair)
+    rows = worst_rows(result, "coast")
+    harm = result.outcome("coast").total_harm
+    assert harm[rows].tolist() == sorted(harm, reverse=True)[:10]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_report__hostile_names_are_text_everywhere(pair: Scenario, text: str) -> None:
+    name = text if len(text) < 200 else text[:200]
+    result = evaluate(pair.sample(3, 0), {name: make_agent("constant:4")}, scenario=pair)
+    rows = summarise(result)
+    played = play_for_report(result, {name: make_agent("constant:4")}, name)
+    given = Report(name, rows, result, played, None, name, summary=name, settings={name: name}, versions={name: name})
+    html = render_report(given)
+    found = Page(html)
+    assert found.open == []
+    assert not set(html) & UNSEEN
+    assert {tag for tag, _ in found.tags} <= ALLOWED
+    assert not any(key.startswith("on") for _, attributes in found.tags for key in attributes)
+    assert [len(world["episodes"]) for world in episode_data(html)["worlds"]] == [1, 1, 1]
+    assert html.count("<script") == 2
+
+
+ALLOWED = set(
+    [
+        "html",
+        "head",
+        "meta",
+        "title",
+        "style",
+        "body",
+        "a",
+        "header",
+        "h1",
+        "h2",
+        "h3",
+        "p",
+        "nav",
+        "main",
+        "section",
+        "figure",
+        "figcaption",
+        "strong",
+        "span",
+        "div",
+        "table",
+        "caption",
+        "thead",
+        "tbody",
+        "tr",
+        "th",
+        "td",
+        "dl",
+        "dt",
+        "dd",
+        "details",
+        "summary",
+        "code",
+        "footer",
+        "script",
+        "noscript",
+        "svg",
+        "g",
+        "path",
+        "defs",
+        "use",
+        "clippath",
+        "rect",
+        "text",
+        "select",
+        "option",
+        "optgroup",
+        "label",
+        "input",
+        "button",
+        "fieldset",
+        "legend",
+        "output",
+        "pattern",
+        "line",
+        "image",
+    ]
+)
+
+
+def test_report__of_another_scenario_leaves_the_papers_rows_out(pair: Scenario) -> None:
+    result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
+    text = Page(render_report(Report(title="Pair", rows=summarise(result)))).text
+    assert "9.00" in text
+    assert "as printed" not in text
+    assert "5.6202" not in text
+
+
+def test_write_report__overwrites_only_by_force(tmp_path: Path, pair: Scenario) -> None:
+    rows = summarise(evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair))
+    path = tmp_path / "report.html"
+    write_report(path, Report("Mine", rows))
+    assert path.read_text("utf-8") == render_report(Report("Mine", rows))
+    with pytest.raises(AlreadyExists):
+        write_report(path, Report("Mine", rows))
+    write_report(path, Report(title="Other", rows=[]), force=True)
+    assert "<h1>Other</h1>" in path.read_text("utf-8")
+
+
+def test_report__counts_a_cascade_whole_but_draws_its_last_impact(pair: Scenario) -> None:
+    bouncy = pair.replace(restitution=0.8)
+    result = evaluate(bouncy.sample(1, 0), {"coast": make_agent("coast")}, scenario=bouncy)
+    played = play_for_report(result, {"coast": make_agent("coast")}, "coast")
+    (episode,) = episode_data(render_report(Report("t", summarise(result), result, played, focus="coast")))["worlds"][
+        0
+    ]["episodes"]
+    assert episode["impacts"][-1][4] == result.outcome("coast").impacts[0] > len(episode["impacts"]) - 1
+    assert np.diff([impact[4] for impact in episode["impacts"]]).min() > 0
