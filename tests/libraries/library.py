@@ -51,6 +51,7 @@ class Library:
     about: str  # what is to know, Markdown
     in_ci: bool = False
     overrides: tuple[str, ...] = ()
+    version: str = "{}"  # how it is told
     ways: list[Way] = field(default_factory=list)
 
     def way(

@@ -74,7 +74,7 @@ def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 
 def _section(library: Library) -> str:
-    lines = [f"## {library.title}\n", f"{library.about}\n", f"`pip install ethbrake-marl {library.install}`\n"]
+    lines = [f"## {library.title}\n", f"{library.about}\n", f"`pip install . {library.install}`\n"]
     for way in library.ways:
         lines.append(f"{way.title[0].upper()}{way.title[1:]} ({way.ran}):\n")
         lines.append(f"```{'sh' if way.command else 'python'}\n{way.code}\n```\n")
