@@ -34,7 +34,7 @@ ONE_TABLE = """\
 
 Policies that the blocks of Stable-Baselines3 (native), CleanRL, TorchRL and BenchMARL have left, each by a function
 of `tests/libraries/one_table.py`, in one environment and on the same 500 worlds: `ethbrake evaluate --episodes 500
---agents full_brake,e_v2x_bm,one_table.py:cleanrl,...,ppo@shipped`. They were trained for a minute or less.
+--agents full_brake,e_v2x_bm,one_table.py:cleanrl,...,ppo@shipped`. They were trained for about a minute of processor time.
 """
 
 
@@ -77,6 +77,8 @@ def _section(library: Library) -> str:
     lines = [f"## {library.title}\n", f"{library.about}\n", f"`pip install . {library.install}`\n"]
     for way in library.ways:
         lines.append(f"{way.title[0].upper()}{way.title[1:]} ({way.ran}):\n")
+        if way.needed:
+            lines.append(f"With these networks or settings:\n\n```python\n{way.needed.strip()}\n```\n")
         lines.append(f"```{'sh' if way.command else 'python'}\n{way.code}\n```\n")
     return "\n".join(lines)
 
