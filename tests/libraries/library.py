@@ -43,7 +43,7 @@ class Way:
             return ""
         names = {node.id for node in ast.walk(ast.parse(self.code)) if isinstance(node, ast.Name)}
         found = [value for name, value in self.function.__globals__.items() if name in names and callable(value)]
-        return "\n\n".join(["from typing import Any", *map(inspect.getsource, found)]) if found else ""
+        return "\n\n\n".join(["from typing import Any", *map(inspect.getsource, found)]) if found else ""
 
 
 @dataclass
