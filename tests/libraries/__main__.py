@@ -35,6 +35,8 @@ from tests.libraries.page import (
     write_matrix,
 )
 
+NO_TIME = "skipped: no time left"
+
 
 def main() -> None:
     """Run what is asked for, print, write."""
@@ -53,7 +55,7 @@ def main() -> None:
         parser.error(f"{unknown}: no such library; there are {', '.join(NAMES)}")
     names = [n for n in given.names or NAMES if load(n).in_ci or not given.ci]
     until = time.monotonic() + given.within
-    rows = {name: run(name, min(given.limit, until - time.monotonic())) for name in names}
+    rows = {name: run(name, given.limit, until) for name in names}
     show(COLUMNS, [cells(row) for name in names for row in rows[name]])
     table = policies_of_all() if set(FILES) & set(names) else []
     if given.write:
@@ -84,12 +86,12 @@ def policies_of_all() -> list[dict[str, Any]]:
     return rows
 
 
-def run(name: str, limit: float) -> list[dict[str, Any]]:
-    """The rows of one library."""
+def run(name: str, limit: float, until: float) -> list[dict[str, Any]]:
+    """The rows of one library, for at most ``limit`` seconds, and not beyond ``until`` on the monotonic clock."""
     library = load(name)
     row: dict[str, Any] = {"library": library.title, "version": "", "way": "", "ran": ""}
-    if limit <= 0:
-        return [row | {"verdict": "skipped: no time left"}]
+    if time.monotonic() >= until:
+        return [row | {"verdict": NO_TIME}]
     try:
         python = ready_python(name, library)
     except NotInstalled as reason:
@@ -99,11 +101,14 @@ def run(name: str, limit: float) -> list[dict[str, Any]]:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     file = folder / "rows.json"
-    timed_out, status = watch([str(python), "-W", "ignore", "-m", "tests.libraries.measure", name, str(file)], limit)
+    left = until - time.monotonic()
+    command = [str(python), "-W", "ignore", "-m", "tests.libraries.measure", name, str(file)]
+    timed_out, status = watch(command, max(min(limit, left), 0.0))
     rows: list[dict[str, Any]] = json.loads(file.read_text("utf-8")) if file.is_file() else []
     if len(rows) < len(library.ways):
-        why = f"not done after {limit:.0f} s" if timed_out else f"ended with status {status}"
-        rows.append(row | {"way": library.ways[len(rows)].title, "verdict": f"FAILED: {why}"})
+        why = f"FAILED: not done after {limit:.0f} s" if timed_out else f"FAILED: ended with status {status}"
+        verdict = NO_TIME if timed_out and left < limit else why
+        rows.append(row | {"way": library.ways[len(rows)].title, "verdict": verdict})
     return rows
 
 

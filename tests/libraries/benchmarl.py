@@ -12,7 +12,7 @@ LIBRARY = Library(
     package="benchmarl",
     requires=("benchmarl==1.5.2", "torchrl<0.12", "tensordict<0.12", "stable-baselines3==2.9.2"),
     about=(
-        "The extra is `ethbrake-marl[marl,train]`. Every shipped scenario in which somebody learns is a task "
+        "Every shipped scenario in which somebody learns is a task "
         "(`ethbrake/cooperation_3_pair` and so on; `task.scenario=my.yaml`, `task.reward=...`). BenchMARL "
         "finds tasks in its own folder only, so its command line is called through ours, which enters them "
         "into its registry first."

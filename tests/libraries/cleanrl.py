@@ -11,6 +11,7 @@ from tests.libraries.library import Library
 LIBRARY = Library(
     title="CleanRL",
     package="gymnasium",
+    version="Gymnasium {}",
     requires=("moviepy==2.2.1",),
     about=(
         "CleanRL is a folder of files to copy, not a package: `python cleanrl/ppo_continuous_action.py --env- "

@@ -36,6 +36,15 @@ class Way:
         """What a user copies."""
         return textwrap.dedent(self.command).strip() if self.command else shown_lines(self.function)
 
+    @property
+    def needed(self) -> str:
+        """Functions of the same file that the code calls: networks and settings, which a user has anyway."""
+        if self.command:
+            return ""
+        names = {node.id for node in ast.walk(ast.parse(self.code)) if isinstance(node, ast.Name)}
+        found = [value for name, value in self.function.__globals__.items() if name in names and callable(value)]
+        return "\n\n\n".join(["from typing import Any", *map(inspect.getsource, found)]) if found else ""
+
 
 @dataclass
 class Library:
@@ -51,6 +60,7 @@ class Library:
     about: str  # what is to know, Markdown
     in_ci: bool = False
     overrides: tuple[str, ...] = ()
+    version: str = "{}"  # how it is told
     ways: list[Way] = field(default_factory=list)
 
     def way(

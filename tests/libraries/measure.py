@@ -28,7 +28,8 @@ OWN_EPISODES, CLOSE = 50, 1e-5  # of the library's own rollout; m2/s2
 
 def measure(library: Library, way: Way) -> dict[str, Any]:
     """One row: what was run, how long it took, what it came to."""
-    row: dict[str, Any] = {"library": library.title, "version": version(library.package), "way": way.title}
+    told = library.version.format(version(library.package))
+    row: dict[str, Any] = {"library": library.title, "version": told, "way": way.title}
     begun = cpu_seconds()
     try:
         print(f"== {library.title}, {way.title}: {way.ran}", flush=True)

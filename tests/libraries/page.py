@@ -14,10 +14,11 @@ COLUMNS = ("library", "version", "way", "what was run", "harm", "full braking", 
 HEAD = """\
 # Other libraries
 
-Each block below is all that a user of that library writes: copy it, and it trains. (What a loop of one's own does
-with the environment, in CleanRL, TorchRL and skrl, stands in the file.) The page is made from `tests/libraries/`, one
-file per library; a test compares the two. What comes out drives in this project's tables and under its shields:
-`eb.policy_agent(model)` in Python, `--agents full_brake,my_file.py:make_agent` on the [command line](cli.md).
+Each block below is at most ten lines: copy it, and it trains. Where a library leaves networks or settings to its
+user, those of the run stand before it; the loops that follow in CleanRL and TorchRL, and what turns each model into a
+policy, stand in its file. The page is made from `tests/libraries/`, one file per library; a test compares the two.
+What comes out drives in this project's tables and under its shields: `eb.policy_agent(model)` in Python, `--agents
+full_brake,my_file.py:make_agent` on the [command line](cli.md).
 
 `make test-libraries` makes an environment for each library below `.venvs/`, runs every block there, and prints this
 table; `ARGS="skrl --write"` runs one of them and writes the page anew. *Harm* is first-impact harm, mean of 500
@@ -34,7 +35,8 @@ ONE_TABLE = """\
 
 Policies that the blocks of Stable-Baselines3 (native), CleanRL, TorchRL and BenchMARL have left, each by a function
 of `tests/libraries/one_table.py`, in one environment and on the same 500 worlds: `ethbrake evaluate --episodes 500
---agents full_brake,e_v2x_bm,one_table.py:cleanrl,...,ppo@shipped`. They were trained for a minute or less.
+--agents full_brake,e_v2x_bm,one_table.py:cleanrl,...,ppo@shipped`. They were trained for about a minute of processor
+time.
 """
 
 
@@ -74,9 +76,11 @@ def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 
 def _section(library: Library) -> str:
-    lines = [f"## {library.title}\n", f"{library.about}\n", f"`pip install ethbrake-marl {library.install}`\n"]
+    lines = [f"## {library.title}\n", f"{library.about}\n", f"`pip install . {library.install}`\n"]
     for way in library.ways:
         lines.append(f"{way.title[0].upper()}{way.title[1:]} ({way.ran}):\n")
+        if way.needed:
+            lines.append(f"With these networks or settings:\n\n```python\n{way.needed.strip()}\n```\n")
         lines.append(f"```{'sh' if way.command else 'python'}\n{way.code}\n```\n")
     return "\n".join(lines)
 

@@ -20,9 +20,8 @@ def high_level():
     from tianshou.highlevel.env import EnvFactoryRegistered, VectorEnvType
     from tianshou.highlevel.experiment import PPOExperimentBuilder
 
-    worlds = EnvFactoryRegistered(
-        task="ethbrake_marl:EthBrake-v0", venv_type=VectorEnvType.DUMMY, render_mode_watch=None
-    )
+    task, kind = "ethbrake_marl:EthBrake-v0", VectorEnvType.DUMMY
+    worlds = EnvFactoryRegistered(task=task, venv_type=kind, render_mode_watch=None)
     steps = {"max_epochs": 2, "epoch_num_steps": 2_048, "collection_step_num_env_steps": 2_048}
     config = OnPolicyTrainingConfig(**steps, num_training_envs=8, num_test_envs=2, update_step_num_repetitions=4)
     result = PPOExperimentBuilder(worlds, training_config=config).build().run()
