@@ -1,12 +1,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+
+import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation.motion import follow_episodes
-from ethbrake_marl.evaluation.passport import issue_passport
+from ethbrake_marl.evaluation.passport import Passport, issue_passport
 from ethbrake_marl.scenario import load_scenario, new_scenario_text
+from tests.pages.hostile import HOSTILE, UNSEEN
 
 
 def passport_of(spec: str, scenario_name: str | Path = "paper-random", *, seed: int | None = 7, world: int = 3) -> str:
@@ -79,6 +83,35 @@ def test_replay__says_what_is_missing(ethbrake, tmp_path):
         assert answer.status == 2 and words in answer.err and answer.err.count("\n") == 1
     answer = ethbrake("replay", passport_of("full_brake"), "--initial-states", path)
     assert answer.status == 2 and "leave --initial-states out" in answer.err
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_replay__of_anything_else_is_refused_in_one_line(ethbrake, tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    passport = str(EXAMPLE)
+    for given in (text, "EB1:" + text, passport.replace("paper-random", text), f"{passport[:-6]}{text}"):
+        answer = ethbrake("replay", "--", given)
+        assert answer.status == 2 and answer.err.count("\n") == 1
+        assert not set(answer.err[:-1]) & UNSEEN
+    made = str(replace(EXAMPLE, agent=text))
+    answer = ethbrake("replay", made)
+    assert answer.status == 2 and answer.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+EXAMPLE = Passport(
+    "paper-random",
+    "0" * 10,
+    7,
+    3,
+    "first",
+    (1,),
+    ("0.1.0", "3.11.7", "0.68.1", "2.4.6"),
+    "0" * 6,
+    "0" * 10,
+    None,
+    "coast",
+)
 
 
 def test_evaluate_report__its_passports_can_be_replayed(ethbrake, tmp_path):
