@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +28,14 @@ def test_replay__is_the_same_episode_bit_for_bit(ethbrake):
         assert answer.status == 0, answer.err
         assert "The same episode, bit for bit." in answer.out
         assert "Differs" not in answer.out
+
+
+def test_cli_page__shows_a_passport_that_can_be_replayed(ethbrake):
+    page = (Path(__file__).parents[2] / "docs" / "cli.md").read_text("utf-8")
+    found = re.search(r"\$ ethbrake replay (EB1:\S+)\n(.+)\n", page)
+    assert found is not None
+    answer = ethbrake("replay", found[1])
+    assert answer.status == 0 and answer.out.startswith(found[2])
 
 
 def test_replay__writes_a_page_and_a_film(ethbrake, tmp_path):
