@@ -33,28 +33,16 @@ _NONE = "–"
 def worst_section(evaluation: Evaluation, focus: str, watched: Collection[int]) -> Section:
     """The ten worlds in which an agent did worst; those that the page plays have a button."""
     regrets, outcome = assess(evaluation), evaluation.outcome(focus)
-    head = [
-        "World",
-        "First-impact harm",
-        "Total harm",
-        "Best known, first",
-        "Best known, total",
-        "Contact",
-        "Impacts",
-        "",
-    ]
+    head = ["World", "First-impact harm", "Total harm", "Best known, first", "Best known, total", "Contact", "Impacts"]
     rows: list[Row] = []
     for k in worst_rows(evaluation, focus).tolist():
         number = int(evaluation.index[k])
         best = (_NONE,) * 2 if regrets is None else (f"{regrets.best(c)[k]:.2f}" for c in ("first", "total"))
         contact = _NONE if regrets is None else "avoidable" if regrets.limits.proof.avoidable[k] else "unavoidable"
-        button = Markup('<button type="button" data-watch="{}">Watch</button>').format(number)
-        rows.append(
-            [
-                number, f"{outcome.first_impact_harm[k]:.2f}", f"{outcome.total_harm[k]:.2f}", *best, contact,
-                int(outcome.impacts[k]), button if number in watched else "",
-            ]
-        )  # fmt: skip
+        button = Markup('{} <button type="button" data-watch="{}">Watch</button>').format(number, number)
+        harms = (f"{outcome.first_impact_harm[k]:.2f}", f"{outcome.total_harm[k]:.2f}")
+        world = button if number in watched else number
+        rows.append([world, *harms, *best, contact, int(outcome.impacts[k])])
     why = "by total harm" if regrets is None else "by total harm above the best known"
     if not rows:
         return Section("Worst ten worlds", [f"{focus} did no harm above the best known in any of these worlds."])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ethbrake_marl.agents.team import Driver
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.cells import Line, our_lines, paper_blocks, table_columns, table_meanings
 from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.evaluation.outcome import Evaluation
@@ -140,17 +141,27 @@ def _row(line: Line, columns: Sequence[int]) -> Row:
 def _episodes(report: Report) -> list[Section]:
     if not report.played or report.evaluation is None:
         return []
-    worlds = len(report.played)
-    told = (
-        f"{worlds} of the {report.evaluation.worlds.n:,} worlds"
-        if worlds < report.evaluation.worlds.n
-        else f"All {worlds} worlds"
-    )
+    shown, every = len(report.played), report.evaluation.worlds.n
+    told = f"{shown} of the {every:,} worlds" if shown < every else f"All {shown} worlds"
+    notes = [paragraph(text, "note") for text in _unrepeated(report.played, report.evaluation)]
+    played = player(report.played, report.evaluation.vehicles, focus=report.focus)
+    return [Section("Episodes", [f"{told}, from the alert to rest.", *notes, played])]
+
+
+def _unrepeated(played: Sequence[Played], evaluation: Evaluation) -> list[str]:
+    """Which agents drove otherwise when they drove once more, as sentences; none where all did the same to the bit."""
+    rows = {int(number): row for row, number in enumerate(evaluation.index)}
+    found: dict[str, int] = {}
+    for world in played:
+        for agent, motion in world.motions.items():
+            outcome, row = evaluation.outcome(agent), rows[world.number]
+            counted = (float(outcome.first_impact_harm[row]), float(outcome.total_harm[row]))
+            found[agent] = found.get(agent, 0) + (motion.harm != counted)
     return [
-        Section(
-            "Episodes",
-            [f"{told}, from the alert to rest.", player(report.played, report.evaluation.vehicles, focus=report.focus)],
-        )
+        f"{agent} did not repeat itself in {count_of(count, 'world')} of these: what is played there is another episode"
+        " than the one that the tables count."
+        for agent, count in found.items()
+        if count
     ]
 
 
