@@ -111,7 +111,7 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
     last_of_many[0] = True
     kept: list[Floats] = []
     for row in pieces[last_of_many]:
-        if not kept or not np.allclose(state_at(kept[-1], row[0], vehicles), row[1:], rtol=0.0, atol=_SAME):
+        if not kept or not (np.abs(state_at(kept[-1], row[0], vehicles) - row[1:]) <= _SAME).all():
             kept.append(row)
     return np.array(kept)
 
