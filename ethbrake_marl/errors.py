@@ -102,6 +102,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("onnx", "onnxruntime"), "export"),
     "pyarrow": "data",
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
+    **dict.fromkeys(("starlette", "uvicorn"), "explore"),
 }
 
 
