@@ -13,7 +13,15 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, PhysicsError, check_whole_number, describe_error, need
+from ethbrake_marl.errors import (
+    EthBrakeError,
+    InvalidInput,
+    PhysicsError,
+    check_whole_number,
+    describe_error,
+    need,
+    one_line,
+)
 from ethbrake_marl.files.durable import check_writable
 from ethbrake_marl.files.plain import parse_strict_json
 from ethbrake_marl.pages.explorer.answer import Explored
@@ -49,8 +57,11 @@ class Setting:
     world: int  # of that list, shown first
 
 
-def explorer_app(setting: Setting, token: str, port: int) -> App:
-    """The ASGI application, behind its ``Guard``; raises ``MissingExtra`` where its library is not installed."""
+def explorer_app(setting: Setting, token: str, port: int, *, warm_up: bool = False) -> App:
+    """The ASGI application, behind its ``Guard``; raises ``MissingExtra`` where its library is not installed.
+
+    With ``warm_up`` the physics is compiled at once, not at the first question.
+    """
     need("starlette")
     from starlette.applications import Starlette
     from starlette.exceptions import HTTPException
@@ -68,6 +79,8 @@ def explorer_app(setting: Setting, token: str, port: int) -> App:
         return _reply({"error": f"{request.method} here: {error.detail.lower()}"}, error.status_code)
 
     answers = _Answers(setting)
+    if warm_up:
+        answers.warm_up()
     routes = [Route("/{token}/", show_page, methods=["GET"])]
     routes += [Route(f"/{{token}}/{name}", _asked(each), methods=["POST"]) for name, each in answers.by_name.items()]
     app = Starlette(routes=routes, exception_handlers={HTTPException: refuse})
@@ -80,11 +93,7 @@ class _Answers:
 
     def __init__(self, setting: Setting) -> None:
         self._setting, self._explored = setting, setting.explored
-        world = _worlds(setting, setting.world)
-        profile = read_profile([0.0])
-        self._drive = Worker("agents", lambda: self._explored.answer(world, profile))
-        self._search = Worker("search", lambda: self._explored.search(world, profile, 0.0, lambda: True))
-        self._repeat = Worker("profile", lambda: None)
+        self._drive, self._search, self._repeat = Worker("agents"), Worker("search"), Worker("profile")
         self.by_name: dict[str, Answer] = {
             "answer": self.answer, "best": self.best, "profile": self.profile, "world": self.world, "save": self.save,
         }  # fmt: skip
@@ -92,6 +101,12 @@ class _Answers:
     @property
     def scenario(self) -> Scenario:
         return self._explored.scenario
+
+    def warm_up(self) -> None:
+        """Begin with the first world, before anybody asks."""
+        world, profile = _worlds(self._setting, self._setting.world), read_profile([0.0])
+        self._drive.start(lambda: self._explored.answer(world, profile))
+        self._search.start(lambda: self._explored.search(world, profile, 0.0, lambda: True))
 
     async def answer(self, asked: Asked) -> Any:
         """Every agent in this world."""
@@ -152,7 +167,7 @@ def _asked(answer: Answer) -> Callable[[Request], Awaitable[Response]]:
         except OSError as error:
             return _reply({"error": f"cannot be written: {error.strerror or error}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
         except Exception as error:  # a defect of ours: told, and the server lives on
-            return _reply({"error": f"a defect: {describe_error(error)}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
+            return _reply({"error": f"a defect: {one_line(describe_error(error))}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
 
     return reply
 
@@ -228,7 +243,7 @@ def serve_explorer(setting: Setting, port: int, ready: Callable[[str], None]) ->
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind(("127.0.0.1", port))
         chosen = listening.getsockname()[1]
-        app = explorer_app(setting, token, chosen)
+        app = explorer_app(setting, token, chosen, warm_up=True)
         config = uvicorn.Config(
             app, http="h11", ws="none", lifespan="off", access_log=False, log_level="error", server_header=False,
             proxy_headers=False, timeout_keep_alive=30, timeout_graceful_shutdown=_STOPS, limit_concurrency=64,

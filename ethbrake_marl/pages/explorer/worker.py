@@ -22,15 +22,21 @@ class Superseded(Exception):  # not an error: nobody needs the answer any more
 class Worker:
     """The thread, and the one piece of work that waits for it."""
 
-    def __init__(self, name: str, first: Work) -> None:
-        """``first`` is done before anything is asked: it warms up what all work needs. What it raises is dropped."""
+    def __init__(self, name: str) -> None:
+        self._name = name
         self._arrived = Condition()
         self._waiting: tuple[Work, asyncio.Future[Any]] | None = None
-        self._first = first
-        Thread(target=self._run, name=name, daemon=True).start()
+        self._thread: Thread | None = None
+
+    def start(self, first: Work | None = None) -> None:
+        """Start the thread; ``first`` warms up what all work needs, and what it raises is dropped."""
+        if self._thread is None:
+            self._thread = Thread(target=self._run, args=(first,), name=self._name, daemon=True)
+            self._thread.start()
 
     async def newest(self, work: Work) -> Any:
         """The result of ``work``, or what it raises; raises ``Superseded`` if newer work came before it was begun."""
+        self.start()
         future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         with self._arrived:
             older, self._waiting = self._waiting, (work, future)
@@ -43,9 +49,10 @@ class Worker:
         """Whether newer work waits, so that what is done now may end."""
         return self._waiting is not None
 
-    def _run(self) -> None:
+    def _run(self, first: Work | None) -> None:
         with suppress(Exception):  # whoever asks next meets it again, and is told
-            self._first()
+            if first is not None:
+                first()
         while True:
             with self._arrived:
                 self._arrived.wait_for(lambda: self._waiting is not None)
