@@ -85,7 +85,7 @@ def explorer_app(setting: Setting, token: str, port: int, *, warm_up: bool = Fal
     routes += [Route(f"/{{token}}/{name}", _asked(each), methods=["POST"]) for name, each in answers.by_name.items()]
     app = Starlette(routes=routes, exception_handlers={HTTPException: refuse})
     app.router.redirect_slashes = False
-    return Guard(app, token, port)  # type: ignore[arg-type]  # its scopes are mappings too
+    return Guard(app, token, port)
 
 
 class _Answers:
