@@ -2,7 +2,7 @@
 # TORCH_INDEX: index to take torch from, e.g. make run TORCH_INDEX=ADDRESS; without it uv picks the build (see below)
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # PEERS:       the environment of `make bench-peers`, apart from the project's own.
-# ARGS:        passed on by `make run` (to `ethbrake run`) and `make test` (to pytest).
+# ARGS:        passed on by `make run` (to `ethbrake run`), `make test` (to pytest) and the long programmes.
 # WORKERS:     processes of `make test`; each compiles the kernels for itself, once. 0: one process, as a debugger needs.
 
 SHELL := /bin/sh
@@ -27,25 +27,26 @@ if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for th
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
 	@echo "make test [ARGS=...]  the test suite, without the tests marked long"
-	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry"
+	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make check            lint and test"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
 	@echo "make test-hostile     6,000 files and command lines of strangers: each refused in one line, or in order"
 	@echo "make test-light       install the wheel alone: at most 650 MB, no torch, and its examples run"
+	@echo "make test-libraries   train with other people's libraries, each in its own environment below .venvs/, and print the matrix"
 	@echo "make shield-bugs      plant 19 bugs in copies of the shield; each must turn a test red"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
 	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of the physics (ARGS='--modules rewards,v2x --sample 40': of others)"
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
 	@echo "make venv             the environment alone: $(VENV)"
-	@echo "make clean            remove $(VENV), $(PEERS), caches and builds (runs/ stays)"
+	@echo "make clean            remove $(VENV), $(PEERS), .venvs, caches and builds (runs/ stays)"
 	@echo "TORCH_INDEX=URL       take torch from this index; else uv picks the build for this machine"
 
 venv: $(STAMP)
@@ -102,6 +103,8 @@ lint: $(STAMP)
 	@$(BIN)/python -m mypy --strict ethbrake_marl tests/every_public_name.py
 	@echo "== deptry: every package that is imported is asked for, and the other way round"
 	@$(BIN)/deptry ethbrake_marl
+	@echo "== import-linter: imports point down, without a circle"
+	@$(BIN)/lint-imports --no-cache
 
 check: lint
 	@$(MAKE) --no-print-directory test
@@ -130,6 +133,10 @@ test-hostile: $(STAMP)
 	@echo "== files that a stranger wrote or a disk damaged"
 	@$(BIN)/python -m tests.hostile $(ARGS)
 
+test-libraries: $(STAMP)
+	@echo "== other people's libraries"
+	@$(BIN)/python -m tests.libraries $(ARGS)
+
 shield-bugs: $(STAMP)
 	@echo "== planted shield bugs"
 	@$(BIN)/python -m tests.shield.planted_bugs $(ARGS)
@@ -147,5 +154,5 @@ bench-peers: $(STAMP)
 	@$(BIN)/python -m tests.benchmarks.peers --environment $(PEERS) --torch-index "$(TORCH_INDEX)" $(ARGS)
 
 clean:
-	rm -rf $(VENV) $(PEERS) .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist
+	rm -rf $(VENV) $(PEERS) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist
 	find ethbrake_marl tests train -name __pycache__ -type d -prune -exec rm -rf {} +

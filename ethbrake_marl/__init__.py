@@ -85,6 +85,8 @@ if TYPE_CHECKING:
     from ethbrake_marl.evaluation import summarise as summarise
     from ethbrake_marl.evaluation.compare import compare_results as compare_results
     from ethbrake_marl.evaluation.compare import read_result as read_result
+    from ethbrake_marl.evaluation.dataset.write import write_dataset as write_dataset
+    from ethbrake_marl.evaluation.groups import summarise_by as summarise_by
 
     # Figures: matplotlib's, which a notebook shows
     from ethbrake_marl.evaluation.criticality import criticality_map as criticality_map
@@ -97,11 +99,13 @@ if TYPE_CHECKING:
 
     # Registration of your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent
+    from ethbrake_marl.evaluation.harm_metrics import register_harm_metric as register_harm_metric
     from ethbrake_marl.files.plugins import load_plugin as load_plugin
     from ethbrake_marl.learning.registry import register_algorithm as register_algorithm
     from ethbrake_marl.objectives import register_objective as register_objective
     from ethbrake_marl.observations import register_feature as register_feature
     from ethbrake_marl.rewards import register_term as register_term
+    from ethbrake_marl.scenario.catalogue import register_scenarios as register_scenarios
     from ethbrake_marl.scenario.presets import register_preset as register_preset
 
     # Errors

@@ -54,11 +54,14 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
     if isinstance(error, SyntaxError):
-        return f"line {error.lineno}: {type(error).__name__}: {error.msg}"
+        where = "" if error.lineno is None else f"line {error.lineno}: "
+        return f"{where}{type(error).__name__}: {error.msg}"
     if path is not None:
         lines = [frame.lineno for frame in frames if frame.filename == path]
         return f"line {lines[-1]}: {text}" if lines else text
     if isinstance(error, EthBrakeError) or not frames:
+        return text
+    if frames[-1].filename.startswith(os.path.dirname(__file__)):  # it was not even called: other parameters
         return text
     return f"{text} ({os.path.basename(frames[-1].filename)}, line {frames[-1].lineno})"
 
@@ -98,9 +101,9 @@ class CorruptBundle(EthBrakeError, ValueError):
 
 _EXTRA_OF = {
     **dict.fromkeys(("torch", "stable_baselines3", "supersuit", "tensorboard"), "train"),
-    **dict.fromkeys(("benchmarl", "torchrl", "tensordict"), "marl"),
+    **dict.fromkeys(("benchmarl", "torchrl", "tensordict", "hydra"), "marl"),
     **dict.fromkeys(("onnx", "onnxruntime"), "export"),
-    "pyarrow": "data",
+    **dict.fromkeys(("pyarrow", "minari", "h5py"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("starlette", "uvicorn"), "explore"),
 }

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,3 +30,32 @@ class Progress:
 
 
 OnProgress = Callable[[Progress], None]
+
+Told = OnProgress | Literal["show"] | None
+"""Who is told how far a training is: a function, stderr (``show``), or nobody."""
+
+
+class ShownProgress:
+    """Shows on stderr how far a training is: on a terminal in one line, else one for each tenth and evaluation."""
+
+    def __init__(self) -> None:
+        self._terminal = sys.stderr.isatty()
+        self._last: tuple[float | None, int] | None = None  # harm and tenth of the last line
+
+    def __call__(self, progress: Progress) -> None:
+        """Show it, if it is news."""
+        ended, harm = progress.done >= progress.total, progress.metrics.get("first_impact_harm")
+        news = (harm, 10 * progress.done // max(progress.total, 1))
+        if not (self._terminal or progress.note or news != self._last):
+            return
+        self._last = news
+        text = f"{progress.name}: {progress.done:,} of {progress.total:,}"
+        text += "" if harm is None else f", first-impact harm {harm:.2f}"
+        text += f"; {progress.note}" if progress.note else ""
+        sys.stderr.write(f"\r{text}\x1b[K{chr(10) if ended else ''}" if self._terminal else f"{text}\n")
+        sys.stderr.flush()
+
+
+def listener(told: Told) -> OnProgress | None:
+    """The function to tell; for ``show`` one that writes on stderr."""
+    return ShownProgress() if told == "show" else told

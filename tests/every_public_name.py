@@ -36,6 +36,8 @@ def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str
     eb.register_feature("load", lambda worlds, i: worlds.vehicles.mass_t[:, i], unit="t", scale=10.0, low=0.0, high=6.0)
     eb.register_preset("deaf", {"preset": "nominal", "lost": 0.5})
     eb.register_objective("front", lambda harm, vehicle: harm.borne[:, 0])
+    eb.register_harm_metric("delta_v", lambda episodes: episodes.largest_speed_change_mps, unit="m/s")
+    eb.register_scenarios("my_scenarios")
     return eb.agent_names()
 
 
@@ -100,6 +102,7 @@ def measure(folder: Path) -> list[eb.SummaryRow]:
     outcome: eb.Outcome = found.outcome("learned")
     record: eb.EpisodeRecord = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=scenario)
     assert record.ledger.world_harm("first").shape == outcome.first_impact_harm[:1].shape
+    eb.write_dataset(folder / "brakes.parquet", agents, scenario=scenario, episodes=10, format="parquet")
     return eb.summarise(found)
 
 
@@ -113,6 +116,9 @@ def show(found: eb.Evaluation, folder: Path) -> list[Any]:
     curve = eb.deceleration_curve(found.worlds.take([0]), found.task)
     eb.compare_results(eb.read_result(folder / "a.json"), eb.read_result(folder / "b.json"))
     figures = [eb.criticality_figure(cells), eb.deceleration_figure(curve), eb.harm_against_total_gap(found)]
+    mixed = eb.load_scenario("mixture-delays")
+    parts = eb.summarise_by(eb.evaluate(mixed.sample(10, 7), {"mine": Cautious()}, scenario=mixed), "scenario")
+    assert_type(parts, dict[str, eb.SummaryTable])
     return [found.to_frame(), *figures]
 
 

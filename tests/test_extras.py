@@ -81,7 +81,12 @@ def test_naming_extras__leaves_other_missing_modules_alone() -> None:
 
 def test_extras__are_those_of_the_table_and_all_is_their_sum() -> None:
     assert {"dev", "all", *_EXTRA_OF.values()} == set(EXTRAS)
-    distribution = {"stable_baselines3": "stable-baselines3", "pygame": "pygame-ce", "imageio_ffmpeg": "imageio-ffmpeg"}
+    distribution = {
+        "stable_baselines3": "stable-baselines3",
+        "pygame": "pygame-ce",
+        "imageio_ffmpeg": "imageio-ffmpeg",
+        "hydra": "hydra-core",
+    }
     for package, extra in _EXTRA_OF.items():
         names = [re.split(r"[<>=\[]", line)[0] for line in EXTRAS[extra]]
         assert distribution.get(package, package) in names

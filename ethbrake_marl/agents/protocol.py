@@ -9,7 +9,7 @@ from typing import ClassVar, Protocol, Self, TypeGuard, runtime_checkable
 import numpy as np
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source, combine
-from ethbrake_marl.engine.stream import Script, ask_script, is_state_free
+from ethbrake_marl.engine.stream import Script, ask_script, begin_script, is_state_free
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics import Floats, Ints, Worlds
 
@@ -61,9 +61,11 @@ class Divisible(Protocol):
 def check_agent(agent: object, where: str) -> None:
     """Raise ``InvalidInput`` for what is not an agent."""
     if not isinstance(agent, Agent):
+        missing = [what for what in ("name", "begin", "act") if not hasattr(agent, what)]
         raise InvalidInput(
-            f"{where}: a {type(agent).__name__} is not an agent; make_agent(name) makes one, policy_agent(policy) one"
-            " of a function or a model, and LearnedAgent(load_policy(path)) one of a policy bundle"
+            f"{where}: a {type(agent).__name__} is not an agent, it has no {' and no '.join(missing)};"
+            " make_agent(name) makes one, policy_agent(policy) one of a function or a model, and"
+            " LearnedAgent(load_policy(path)) one of a policy bundle"
         )
 
 
@@ -112,7 +114,7 @@ def fixed_commands(
                 f"{who}: vehicle_{i + 1} is driven by {name!r}, whose command is not fixed at the alert{advice}"
             )
         asked = copy.deepcopy(script)  # what it remembers of running episodes is not disturbed
-        asked.begin(worlds, i, np.arange(worlds.n))
+        begin_script(asked, worlds, i, np.arange(worlds.n))
         command[:, i] = asked.act(worlds, i)
     return command
 
@@ -148,7 +150,7 @@ class AgentAround:
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """As the policy."""
-        self.policy.begin(worlds, vehicle, rows)
+        begin_script(self.policy, worlds, vehicle, rows)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """As the policy, [n] m/s2."""

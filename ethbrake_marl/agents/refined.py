@@ -10,7 +10,7 @@ from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place, recall
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, script_agents, set_others
-from ethbrake_marl.engine.stream import ask_script
+from ethbrake_marl.engine.stream import ask_script, begin_script
 from ethbrake_marl.errors import check_whole_number, renumbered
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
@@ -94,7 +94,7 @@ class Refined(AgentAround):
                 best[some[better]] = tried[better, chosen[better]]
                 least[some[better]] = harm[better, chosen[better]]
         set_others(self.policy, vehicle, script_agents(self.scenario, except_for=vehicle))
-        self.policy.begin(worlds, vehicle, rows)
+        begin_script(self.policy, worlds, vehicle, rows)
         self._deviation = place(self._deviation, rows, best)
         self.predicted_harm = place(self.predicted_harm, rows, least)
 

@@ -17,6 +17,7 @@ from ethbrake_marl.cli.ablate import ablate_command, generalise_command
 from ethbrake_marl.cli.bench import bench_command
 from ethbrake_marl.cli.best_harm import best_harm_command
 from ethbrake_marl.cli.compare import compare_command
+from ethbrake_marl.cli.dataset import dataset_command
 from ethbrake_marl.cli.doctor import diagnose
 from ethbrake_marl.cli.equal_time import equal_time_command
 from ethbrake_marl.cli.evaluate import agents_command, evaluate_command, shield_command, show_beside, show_rows
@@ -36,7 +37,7 @@ from ethbrake_marl.cli.options import (
 )
 from ethbrake_marl.cli.parts import CommandWithParts
 from ethbrake_marl.cli.picture import picture_app
-from ethbrake_marl.cli.plugins import accept_plugins
+from ethbrake_marl.cli.plugins import accept_plugins, check_commands
 from ethbrake_marl.cli.recipe import recipe_app
 from ethbrake_marl.cli.record import record_command
 from ethbrake_marl.cli.replay import replay_command
@@ -80,6 +81,8 @@ from ethbrake_marl.scenario import (
     scenario_json_schema,
     scenario_path,
 )
+from ethbrake_marl.scenario.catalogue import SHIPPED
+from ethbrake_marl.scenario.sample import count_kinds
 
 BAD_INPUT = 2
 _NO_VARIABLE = ""  # by which no shell can ask for completion
@@ -123,6 +126,9 @@ app.command("shield", epilog="Example: ethbrake shield --agents ppo@shipped,full
 app.command("record", epilog="Example: ethbrake record --agents full_brake,e_v2x_bm --world 3 --output both.gif")(
     record_command
 )
+app.command("dataset", epilog="Example: ethbrake dataset --agents best_harm --episodes 1000 --output best.parquet")(
+    dataset_command
+)
 app.command("replay", epilog="Example: ethbrake replay PASSPORT --output again.html")(replay_command)
 app.command("explore", epilog="Example: ethbrake explore --agents full_brake,ppo@shipped")(explore_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
@@ -143,9 +149,10 @@ def run_command(arguments: Sequence[str]) -> int:
     Other errors, which are defects, pass through.
     """
     try:
-        arguments = rename_old_options(arguments)
+        check_commands(app)
         variable = None if shell_asks(os.environ) else _NO_VARIABLE  # None: the usual one
         command = accept_plugins(get_command(app))
+        arguments = rename_old_options(arguments, command)
         with naming_extras():
             status = command(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)
         sys.stdout.flush()
@@ -230,14 +237,14 @@ app.command(
 
 @scenario_app.command("list", epilog="Example: ethbrake scenario list")
 def scenario_list(as_json: JsonOption = False) -> None:
-    """List the shipped scenarios: name and title."""
+    """List the scenarios that have a name: that and the title, and the folder of those that a plug-in registers."""
     entries = list_scenarios()
     if as_json:
-        write_json([{"name": e.name, "title": e.title, "path": str(e.path)} for e in entries])
+        write_json([{"name": e.name, "title": e.title, "path": str(e.path), "origin": e.origin} for e in entries])
         return
     width = max(len(entry.name) for entry in entries)
     for entry in entries:
-        show(f"{entry.name:{width}}  {entry.title}")
+        show(f"{entry.name:{width}}  {entry.title}{'' if entry.origin == SHIPPED else f'  (from {entry.origin})'}")
 
 
 @scenario_app.command("show", epilog="Example: ethbrake scenario show paper-random")
@@ -254,7 +261,7 @@ def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")])
     sample = scenario.sample(CHECKED_DRAWS, LIST_SEED)
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "none"
     counts = f"{CHECKED_DRAWS:,} worlds drawn, {sample.rejected:,} more refused for an early impact"
-    show(f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}")
+    show(f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}{count_kinds(sample)}")
 
 
 @scenario_app.command("new", epilog="Example: ethbrake scenario new my-scenario --based-on paper-distance")

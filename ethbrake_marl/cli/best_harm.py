@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from ethbrake_marl.agents.protocol import Agent
@@ -18,9 +19,10 @@ from ethbrake_marl.cli.terminal import interruptible, progress_bars, say, show, 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.bounds import proven_of_table, shipped_bounds, shipped_lines
+from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, load_runnable, make_agents
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.limits.best_harm import BUDGET, search_list
+from ethbrake_marl.limits.best_harm import BUDGET, LEFT_OUT, search_list
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table, save_table
 from ethbrake_marl.limits.driven_profiles import fold_agent
 from ethbrake_marl.physics import Worlds
@@ -94,10 +96,14 @@ def best_harm_command(
         save_table(output, table)
         shutil.rmtree(parts)
         say(f"every world: {output}")
-    _show(
-        {**best_harm_figures(table), **_prove(sample.worlds, Task(chosen, controlled or chosen.learners), table)},
-        as_json=as_json,
-    )
+    figures = {**best_harm_figures(table), **_prove(sample.worlds, Task(chosen, controlled or chosen.learners), table)}
+    _show(figures | (_identity(chosen, sample, table) if as_json else {}), as_json=as_json)
+
+
+def _identity(scenario: Scenario, sample: Sample, table: BestHarmTable) -> dict[str, object]:
+    """What the figures are about; worlds that were left out are in no hash."""
+    left_out = np.flatnonzero(np.isin(sample.index, [int(world) for world in table.header.get(LEFT_OUT, ())]))
+    return result_identity("best-harm", scenario, sample, left_out.tolist())
 
 
 def _search(

@@ -14,7 +14,8 @@ from ethbrake_marl.cli.options import JsonOption
 from ethbrake_marl.cli.terminal import result_console, say, write_json
 from ethbrake_marl.evaluation.compare import Comparison, compare_results, read_result
 
-_FILE = typer.Argument(metavar="RESULTS.json", help="What `ethbrake evaluate --json` or `ethbrake run` wrote.")
+_FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield, equal-time (--json) or run.")
+_HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", "harm": "Harm"}
 _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
 
@@ -25,8 +26,8 @@ def compare_command(
 ) -> None:
     """Difference of harm between two results, the second minus the first, for agents of the same name.
 
-    Both must be about the same worlds of the same scenario. Intervals are paired by world where the files of
-    --per-world lie beside both results.
+    Both must be of one command, and about the same worlds of the same scenario. Intervals are paired by world where the
+    files of --per-world lie beside both results.
     """
     found = compare_results(read_result(first), read_result(second))
     if as_json:
@@ -41,10 +42,10 @@ def comparison_table(found: Comparison) -> Table:
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, title_justify="left")
     table.add_column("Agent", overflow="fold")
     table.add_column("Policy")
-    table.add_column("First-impact harm", justify="right", no_wrap=True)
-    table.add_column("Total harm", justify="right", no_wrap=True)
+    for name in found.differences[0].harms:
+        table.add_column(_HARMS[name], justify="right", no_wrap=True)
     for each in found.differences:
-        harms = (each.first_impact_harm.in_words(), each.total_harm.in_words())
+        harms = (estimate.in_words() for estimate in each.harms.values())
         table.add_row(Text(each.agent), _POLICIES[each.policy], *map(Text, harms))
     return table
 

@@ -24,6 +24,7 @@ from ethbrake_marl.evaluation.shield_modes import compare_modes
 from ethbrake_marl.physics import Worlds, advance, make_worlds
 from ethbrake_marl.physics.compiled import cache_folder, is_temporary
 from ethbrake_marl.scenario import Task, list_scenarios, load_scenario, scenario_folder
+from ethbrake_marl.scenario.catalogue import SHIPPED
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 DISTRIBUTION = "ethbrake-marl"
@@ -130,7 +131,7 @@ def _kernel_cache() -> tuple[bool, str]:
 
 
 def _scenarios() -> tuple[bool, str]:
-    found = list_scenarios()
+    found = [entry for entry in list_scenarios() if entry.origin == SHIPPED]
     return len(found) > 0, f"{len(found)} in {scenario_folder()}"
 
 

@@ -13,6 +13,7 @@ from ethbrake_marl.cli.options import JsonOption, ScenarioOption
 from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, write_json
 from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.inputs import check_agents, load_driven, make_lineup
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.shipped import best_known
@@ -72,6 +73,7 @@ def equal_time_command(
             "episodes": episodes,
             "harm_count": harm_count,
             "against": against,
+            **result_identity("equal-time", chosen, worlds),
         }
         write_json({"machine": asdict(machine), **conditions, "agents": [row.to_json() for row in rows]})
         return

@@ -33,6 +33,7 @@ from ethbrake_marl.evaluation import (
 )
 from ethbrake_marl.evaluation.compare import results_to_json
 from ethbrake_marl.evaluation.frame import check_parquet, write_per_world
+from ethbrake_marl.evaluation.groups import check_group, summarise_by
 from ethbrake_marl.evaluation.inputs import (
     EPISODES,
     LIST_SEED,
@@ -47,10 +48,14 @@ from ethbrake_marl.evaluation.inputs import (
 )
 from ethbrake_marl.evaluation.paper import TESTS
 from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table
+from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table, modes_to_json
+from ethbrake_marl.evaluation.text import metrics_table
 from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.scenario import Scenario, Task
+from ethbrake_marl.scenario import Sample, Task
+from ethbrake_marl.scenario.sample import kind_columns
 from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty
+
+Groups = Mapping[str, Sequence[SummaryRow]]
 
 
 def evaluate_command(
@@ -88,6 +93,10 @@ def evaluate_command(
             help="Also tell the results under this objective; standard: under all usual ones. Repeatable.",
         ),
     ] = None,
+    by: Annotated[
+        str | None,
+        typer.Option(metavar="COLUMN", help="Also tell the results by group: scenario (a mixture), vehicle_2_type."),
+    ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -106,6 +115,8 @@ def evaluate_command(
     chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
     objectives = declared_objectives(objective or (), chosen.vehicles)
     sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
+    if by is not None:
+        check_group(kind_columns(sample.types, sample.scenarios), by)
     intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
     lineup = make_lineup(agents.split(","), chosen, harm_count=harm_count, shield=shield, uncertainty=intervals)
     check_agents(lineup, sample.worlds, chosen)
@@ -122,10 +133,13 @@ def evaluate_command(
         if report is not None:
             write_evaluation_report(report, evaluation, rows, lineup, bars, harm_count=harm_count, force=force)
     told = rescore(evaluation, objectives)
+    groups = {} if by is None else summarise_by(evaluation, by)
     if per_world is not None:
         write_per_world(per_world, evaluation, objectives=objectives, force=force)
-        write_results_beside(per_world, rows, told, force=force)
-    show_rows(rows, as_json, told, per_world=per_world)
+        write_results_beside(per_world, rows, told, groups=groups, force=force)
+    show_rows(rows, as_json, told, groups=groups, per_world=per_world)
+    if not as_json:
+        show_groups(groups)
     moving = {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
     if note := horizon_note(moving, sample.worlds.n, chosen.horizon_s):
         say(note)
@@ -138,21 +152,40 @@ def results_beside(per_world: Path) -> Path:
     return per_world.with_name(f"{per_world.name}.json")
 
 
-def write_results_beside(per_world: Path, rows: Sequence[SummaryRow], told: Sequence[Rescored], *, force: bool) -> None:
+def write_results_beside(
+    per_world: Path, rows: Sequence[SummaryRow], told: Sequence[Rescored], *, groups: Groups, force: bool
+) -> None:
     """Write the results file of the file with one row per world that has just been written."""
-    content = json.dumps(results_to_json(rows, told=told, per_world=per_world), indent=2, allow_nan=False) + "\n"
+    content = (
+        json.dumps(results_to_json(rows, told=told, groups=groups, per_world=per_world), indent=2, allow_nan=False)
+        + "\n"
+    )
     write_output(results_beside(per_world), content.encode(), force=force)
     say(f"every world: {per_world}; the results: {results_beside(per_world)}")
 
 
 def show_rows(
-    rows: Sequence[SummaryRow], as_json: bool, told: Sequence[Rescored] = (), *, per_world: Path | None = None
+    rows: Sequence[SummaryRow],
+    as_json: bool,
+    told: Sequence[Rescored] = (),
+    *,
+    groups: Groups | None = None,
+    per_world: Path | None = None,
 ) -> None:
     """The rows as a table, or as a results file, see ``results_to_json``."""
     if not as_json:
         result_console().print(rich_table(rows))
+        if rows and rows[0].metrics:
+            result_console().print(metrics_table(rows))
         return
-    write_json(results_to_json(rows, told=told, per_world=per_world))
+    write_json(results_to_json(rows, told=told, groups=groups, per_world=per_world))
+
+
+def show_groups(groups: Groups) -> None:
+    """The rows of each group of worlds, below its name."""
+    for name, rows in groups.items():
+        result_console().print(f"\n{name}: {count_of(rows[0].episodes, 'world')}\n", highlight=False, markup=False)
+        result_console().print(rich_table(rows))
 
 
 def show_beside(beside: Mapping[str, Sequence[SummaryRow]]) -> None:
@@ -187,9 +220,10 @@ def shield_command(
     (the same), costly (lower).
     """
     chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
-    rows = measure_modes(agents, chosen, episodes, harm_count)
+    sample, task = chosen.sample(episodes, LIST_SEED), Task(chosen, chosen.learners, harm_count)
+    rows = measure_modes(agents, sample, task)
     if as_json:
-        write_json([row.to_json() for row in rows])
+        write_json(modes_to_json(rows, sample, task))
     else:
         result_console().print(modes_table(rows))
     tell_left_out(rows[0].left_out, episodes)
@@ -216,7 +250,7 @@ def picture_shield_modes(
     from ethbrake_marl.figures.style import write_picture
 
     chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
-    rows = measure_modes(agents, chosen, episodes, harm_count)
+    rows = measure_modes(agents, chosen.sample(episodes, LIST_SEED), Task(chosen, chosen.learners, harm_count))
     caption = (
         f"{chosen.name}, {count_of(episodes, 'world')} of the list of seed {LIST_SEED}, {harm_count} harm; mean and 95"
         " % interval of the difference, paired by world."
@@ -227,16 +261,15 @@ def picture_shield_modes(
     say(f"picture: {target}")
 
 
-def measure_modes(agents: str, scenario: Scenario, episodes: int, harm_count: HarmCount) -> list[ModeRow]:
+def measure_modes(agents: str, sample: Sample, task: Task) -> list[ModeRow]:
     """The rows of these agents, with progress on stderr."""
-    worlds = scenario.sample(episodes, LIST_SEED).worlds
-    lineup = make_proposers(agents.split(","), scenario, harm_count=harm_count)
+    lineup = make_proposers(agents.split(","), task.scenario, harm_count=task.harm_count)
     with interruptible("nothing was written"), progress_bars() as bars:
         return compare_modes(
             lineup,
-            worlds,
-            Task(scenario, scenario.learners, harm_count),
-            on_progress=lambda name, done: bars.show(name, done, episodes),
+            sample.worlds,
+            task,
+            on_progress=lambda name, done: bars.show(name, done, sample.worlds.n),
         )
 
 

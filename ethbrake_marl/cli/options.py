@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -14,7 +14,8 @@ from ethbrake_marl.cli.terminal import show
 from ethbrake_marl.errors import OldSpelling
 
 ScenarioOption = Annotated[
-    str, typer.Option("--scenario", metavar="NAME|PATH", help="A shipped scenario, or a path to a YAML file.")
+    str,
+    typer.Option("--scenario", metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file."),
 ]
 RecipeOption = Annotated[
     str, typer.Option("--recipe", metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file.")
@@ -55,12 +56,19 @@ VersionOption = Annotated[
 OLD_OPTIONS = {"--count": "--harm-count"}
 
 
-def rename_old_options(arguments: Sequence[str]) -> list[str]:
-    """The same command line with every option of the version before as it is written today, and a warning."""
+def rename_old_options(arguments: Sequence[str], command: Any) -> list[str]:
+    """The same line with every option of the version before as it is written today, and a warning.
+
+    ``command`` is the whole command line; one of its commands that has no such option today never had the old one.
+    """
+    for argument in arguments:
+        command = getattr(command, "commands", {}).get(argument, command)
+    options = {option for parameter in command.params for option in parameter.opts}
     renamed = []
     for argument in arguments:
         option, equals, value = argument.partition("=")
         new = OLD_OPTIONS.get(option, option)
+        new = new if new in options else option
         if new != option:
             warnings.warn(OldSpelling(f"{option} is written {new} now"), stacklevel=2)
         renamed.append(f"{new}{equals}{value}")

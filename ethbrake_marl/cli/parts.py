@@ -6,6 +6,7 @@ from typing import Any
 
 from typer.core import TyperCommand
 
+from ethbrake_marl.evaluation.harm_metrics import METRICS
 from ethbrake_marl.learning.registry import algorithm_names
 from ethbrake_marl.objectives import KINDS
 from ethbrake_marl.rewards import TERMS
@@ -22,6 +23,7 @@ def part_names() -> list[tuple[str, str]]:
         ("V2X presets", ", ".join(CHANNELS)),
         ("Objectives", ", ".join(kind.form for kind in KINDS.values())),
         ("Algorithms", ", ".join(algorithm_names())),
+        *([("Harm metrics", ", ".join(METRICS))] if METRICS else []),
     ]
 
 

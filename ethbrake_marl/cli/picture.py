@@ -14,6 +14,7 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.criticality import CELLS, criticality_map
 from ethbrake_marl.evaluation.deceleration import deceleration_curve
+from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.inputs import LIST_SEED, load_driven, make_agents, make_proposers
 from ethbrake_marl.evaluation.text import left_out_line
 from ethbrake_marl.figures import picture_ending
@@ -166,11 +167,11 @@ def picture_robustness(
     from ethbrake_marl.shield.robustness import robustness
 
     chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
-    worlds = chosen.sample(episodes, LIST_SEED).worlds
+    sample = chosen.sample(episodes, LIST_SEED)
     (policy,) = make_proposers([agent], chosen, harm_count=harm_count).values()
     with interruptible("nothing was written"), progress_bars() as bars:
         points = robustness(
-            worlds, policy, Task(chosen, chosen.learners, harm_count), intervals,
+            sample.worlds, policy, Task(chosen, chosen.learners, harm_count), intervals,
             on_progress=lambda what, done: bars.show(what, done, episodes),
         )  # fmt: skip
     caption = (
@@ -180,7 +181,8 @@ def picture_robustness(
     caption += counted_without(points[0].left_out)
     write_picture(target, robustness_figure(points, caption=caption), force=force)
     if as_json:
-        write_json([point._asdict() for point in points])
+        about = result_identity("robustness", chosen, sample, [world for world, _ in points[0].left_out])
+        write_json([about | point._asdict() for point in points])
     else:
         result_console().print(robustness_table(points))
     tell_left_out(points[0].left_out, episodes)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer.main import get_command
 
+from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.files.plugins import load_plugin
 
 
@@ -42,3 +43,12 @@ def accept_plugins(command: Any) -> Any:
         each.params.append(option)
         waiting += getattr(each, "commands", {}).values()
     return command
+
+
+def check_commands(app: typer.Typer) -> None:
+    """Raise ``AlreadyExists`` for a command of somebody's that would take the place of another one."""
+    names = [each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback]
+    names += [str(group.name) for group in app.registered_groups]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise AlreadyExists(f"command {name!r} is there already; give yours another name: app.command('my-{name}')")

@@ -10,7 +10,7 @@ import typer
 from ethbrake_marl.cli.options import ForceOption, ScenarioOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, say
 from ethbrake_marl.evaluation import check_target
-from ethbrake_marl.evaluation.film import check_ending, film_bytes, film_scenes
+from ethbrake_marl.evaluation.film import check_ending, check_number_of_films, film_bytes, film_scenes
 from ethbrake_marl.evaluation.inputs import LIST_SEED, load_evaluated, make_lineup
 from ethbrake_marl.evaluation.per_world import write_output
 
@@ -30,6 +30,7 @@ def record_command(
     ending = output.suffix.lower()
     check_ending(ending)
     target = check_target(output, force=force)
+    check_number_of_films(len(agents.split(",")))
     chosen = load_evaluated(scenario, vehicle)
     lineup = make_lineup(agents.split(","), chosen)
     worlds = chosen.sample(1, seed, first=world).worlds

@@ -53,6 +53,8 @@ def read_settings(texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe]
     }
     found: dict[str, list[Override]] = {"scenario": [], "recipe": []}
     for override in parse_overrides(texts or ()):
+        if override.top == "recipe" and len(override.path) > 1 and not recipes:
+            raise InvalidInput(f"--set {override.key}: this command takes no recipe, so nothing of one can be set")
         whose = [override.top] if override.top in known and len(override.path) > 1 else [*known]
         inside = override.inside() if whose == [override.top] else override
         owners = [each for each in whose if inside.top in known[each]]

@@ -22,6 +22,7 @@ from ethbrake_marl.engine.stream import (
     Stream,
     Told,
     ask_script,
+    begin_script,
     check_alert,
     is_state_free,
     moved,
@@ -242,9 +243,9 @@ class Engine:
         first = None if worlds is not None else stream.position
         start = stream.take(self.n) if worlds is None else stream.prepare(worlds)
         new = copy.copy(self)
-        new._stream, new.roster = stream, Roster(self.n, stream.seed, first)
+        new._stream, new.roster = stream, Roster(self.n, stream.seed, first, worlds)
         new._obstacle = self.scenario.has_obstacle or has_obstacle(start.packed.state, self.scenario.vehicles)
-        new._by_link = self.scenario.v2x.by_link or has_news(start.packed.params, self.scenario.vehicles)
+        new._by_link = self.scenario.by_link or has_news(start.packed.params, self.scenario.vehicles)
         new._state, new._params = (array.copy() for array in new._kept(start.packed))
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
         new._potential = np.zeros(start.wanted.shape)
@@ -327,7 +328,7 @@ class Engine:
         if self._remembering:
             worlds = self.worlds
             for vehicle, script in self._remembering.items():
-                self._wanted[:, vehicle] = within_capacity(ask_script(script, worlds, vehicle), worlds, vehicle)
+                self._wanted[:, vehicle] = within_capacity(ask_script(script, worlds, vehicle), worlds, vehicle, script)
         before = self._objective_harm() if self._objectives else None
         reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
         status = self._step_worlds(columns, reward, outcome)
@@ -435,7 +436,7 @@ class Engine:
             with renumbered(rows):
                 self._memories = {w: w.begun(memory, alert, rows) for w, memory in self._memories.items()}
                 for vehicle, script in self._remembering.items():
-                    script.begin(alert, vehicle, rows)
+                    begin_script(script, alert, vehicle, rows)
             if self._remembering:
                 self._begin_with_memory(rows, alert, start.clock[:, START])
         if self.reward.shaping > 0.0:
@@ -452,7 +453,7 @@ class Engine:
         self._state[rows] = self._kept(pack(alert)).state
         worlds = self.worlds
         for vehicle, script in early.items():
-            wanted = within_capacity(ask_script(script, worlds, vehicle), worlds, vehicle)
+            wanted = within_capacity(ask_script(script, worlds, vehicle), worlds, vehicle, script)
             self._wanted[rows, vehicle] = wanted[rows]
         with renumbered(rows):
             self._state[rows] = self._kept(moved(alert, self._wanted[rows], start_s)).state

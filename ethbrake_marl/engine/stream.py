@@ -9,7 +9,15 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from ethbrake_marl.engine.step import CLOCK_WIDTH, LAST_STEP, START
-from ethbrake_marl.errors import EthBrakeError, FailedWorld, InvalidInput, PhysicsError, count_of, describe_error
+from ethbrake_marl.errors import (
+    AgentFailed,
+    EthBrakeError,
+    FailedWorld,
+    InvalidInput,
+    PhysicsError,
+    count_of,
+    describe_error,
+)
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
 from ethbrake_marl.physics.episode import first_decision_s, number_of_decisions
 from ethbrake_marl.physics.failed import failure
@@ -73,10 +81,11 @@ class Roster:
     ``first`` is the number of row 0's world, the others follow; None: the worlds were given, and have no number.
     """
 
-    def __init__(self, n: int, seed: int, first: int | None) -> None:
+    def __init__(self, n: int, seed: int, first: int | None, given: Worlds | None = None) -> None:
         self.failed: dict[int, str] = {}  # by row, and why; until a new episode begins there
         self.warns = True  # with a ``FailedWorld`` that names the world; off: the caller looks at ``failed``
         self.seed = seed
+        self.given = given  # the worlds that were given, at the alert: where ``numbers`` are -1
         self.numbers = np.full(n, -1, np.int64) if first is None else first + np.arange(n)  # by row; -1: given
 
     def renew(self, rows: Ints, first: int) -> None:
@@ -165,8 +174,8 @@ class Stream:
         clock[:, LAST_STEP] = number_of_decisions(clock[:, START], step, horizon)
         wanted = np.zeros(alert.speeds_mps.shape)
         for vehicle, script in self._state_free.items():
-            script.begin(alert, vehicle, np.arange(alert.n))
-            wanted[:, vehicle] = within_capacity(ask_script(script, alert, vehicle), alert, vehicle)
+            begin_script(script, alert, vehicle, np.arange(alert.n))
+            wanted[:, vehicle] = within_capacity(ask_script(script, alert, vehicle), alert, vehicle, script)
         return Start(alert, 0, moved(alert, wanted, clock[:, START]), clock, wanted)
 
 
@@ -201,35 +210,56 @@ def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
     return packed
 
 
+def begin_script(script: Script, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+    """Tell a script that episodes begin; what one that is not ours raises becomes ``InvalidInput`` naming it."""
+    try:
+        script.begin(worlds, vehicle, rows)
+    except Exception as error:
+        raise _named(error, script, "begin", worlds, vehicle) from error
+
+
 def ask_script(script: Script, worlds: Worlds, vehicle: int) -> Floats:
     """The command of a script, [n] m/s2.
 
-    Raises ``InvalidInput`` naming it, and the world where there is one only, for a command of another shape and for
-    whatever a script that is not ours raises.
+    Raises ``AgentFailed`` naming it, world, moment and shape for a command of another shape, or of no numbers, and
+    ``InvalidInput`` naming it for whatever a script that is not ours raises.
     """
-    where = f"agent {getattr(script, 'name', type(script).__name__)!r} of vehicle_{vehicle + 1}"
     try:
         command = script.act(worlds, vehicle)
     except Exception as error:
-        if isinstance(error, EthBrakeError) or type(script).__module__.startswith("ethbrake_marl."):
-            raise
-        moment = f"{count_of(worlds.n, 'world')} at {worlds.time_s.min(initial=np.inf):.2f} s"
-        raise InvalidInput(f"{where}: act on {moment}: {describe_error(error)}") from error
-    if np.shape(command) != (worlds.n,):
-        raise InvalidInput(
-            f"{where}: a command of shape {np.shape(command)}; one per world is needed, shape ({worlds.n},)"
+        raise _named(error, script, "act", worlds, vehicle) from error
+    given = np.asarray(command)
+    if given.shape != (worlds.n,) or given.dtype.kind not in "fiub":
+        short = given.ndim > 0 and len(given) < worlds.n
+        row = len(given) if short else 0
+        raise AgentFailed(
+            getattr(script, "name", type(script).__name__),
+            row if worlds.n else None,
+            f"vehicle_{vehicle + 1} at {worlds.time_s[row : row + 1].min(initial=np.inf):.2f} s: gave {given.dtype} of"
+            f" shape {given.shape}; one number per world is needed, shape ({worlds.n},)",
         )
     return command
 
 
-def within_capacity(command_mps2: Floats, worlds: Worlds, vehicle: int) -> Floats:
-    """A script's command [n], refused with ``InvalidInput`` where it is not within the vehicle's capacities."""
+def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
+    """The error to raise for what a script raised: its own, where it speaks for itself."""
+    if isinstance(error, EthBrakeError) or type(script).__module__.startswith("ethbrake_marl."):
+        return error
+    who = f"agent {getattr(script, 'name', type(script).__name__)!r} of vehicle_{vehicle + 1}"
+    moment = f"{count_of(worlds.n, 'world')} at {worlds.time_s.min(initial=np.inf):.2f} s"
+    return InvalidInput(f"{who}: {what} on {moment}: {describe_error(error)}")
+
+
+def within_capacity(command_mps2: Floats, worlds: Worlds, vehicle: int, script: Script) -> Floats:
+    """A script's command [n], refused with ``AgentFailed`` where it is not within the vehicle's capacities."""
     low, high = -worlds.vehicles.braking_capacity_mps2[:, vehicle], worlds.vehicles.driving_capacity_mps2[:, vehicle]
     good = (command_mps2 >= low) & (command_mps2 <= high)
     if not good.all():
         k = int(np.argmin(good))
-        raise InvalidInput(
-            f"script of vehicle_{vehicle + 1}, world {k}: command {command_mps2[k]:g} m/s2; must be in"
-            f" [{low[k]:g}, {high[k]:g}]"
+        raise AgentFailed(
+            getattr(script, "name", type(script).__name__),
+            k,
+            f"vehicle_{vehicle + 1} at {worlds.time_s[k]:.2f} s: command {command_mps2[k]:g} m/s2; must be in"
+            f" [{low[k]:g}, {high[k]:g}]",
         )
     return command_mps2

@@ -8,10 +8,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
-from pettingzoo.utils.conversions import parallel_to_aec
 
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.drawing.viewer import CLASS_METADATA, Viewer, render_metadata
+from ethbrake_marl.envs.drawn import describe_world
 from ethbrake_marl.envs.infos import Report, plain_infos, report
 from ethbrake_marl.envs.setup import (
     AnyScenario,
@@ -23,6 +23,7 @@ from ethbrake_marl.envs.setup import (
     restart,
 )
 from ethbrake_marl.envs.state import full_state, state_features
+from ethbrake_marl.envs.turns import in_turns
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.observations import Observation, Observations
 from ethbrake_marl.physics import Ints
@@ -134,6 +135,12 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
             infos,
         )
 
+    def describe_world(self) -> dict[str, Any]:
+        """What the running world was drawn as: flat numbers and texts by name; see ``envs.drawn``."""
+        if not self._started:
+            raise InvalidInput("describe_world: no episode was started; call reset first")
+        return describe_world(self.engine)
+
     def render(self) -> Any:
         """What the render mode says: a frame [H, W, 3] uint8, a list of new ones, a text, or None for ``human``."""
         return self.viewer.render()
@@ -190,12 +197,13 @@ def raw_env(**settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
     'vehicle_1'
 
     """
-    return parallel_to_aec(parallel_env(**settings))
+    return in_turns(parallel_env(**settings))
 
 
 def env(**settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
     """The AEC environment with PettingZoo's usual wrapper, order enforcement, which ``raw_env`` already has.
 
-    Actions are not clipped and nothing ends an episode early: an unusable action is an ``InvalidInput``.
+    Actions are not clipped and nothing ends an episode early: an unusable action is an ``InvalidInput`` in its agent's
+    turn, which stays.
     """
     return raw_env(**settings)

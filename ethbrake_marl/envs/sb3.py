@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.snapshot import Arrays, engine_snapshot, restore_engine
 from ethbrake_marl.engine.step import Step
+from ethbrake_marl.envs.drawn import describe_worlds
 from ethbrake_marl.envs.infos import plain_infos, report
 from ethbrake_marl.envs.setup import (
     INITIAL_STATE,
@@ -172,6 +173,12 @@ class EthBrakeVecEnv(VecEnv):
             self._begun[ended] = report(engine, rows=ended).values
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
 
+    def describe_worlds(self) -> dict[str, NDArray[Any]]:
+        """What each running world was drawn as: columns by name, each [worlds]; see ``envs.drawn``."""
+        if not self._started:
+            raise InvalidInput("describe_worlds: no episode was started; call reset first")
+        return describe_worlds(self.engine)
+
     def close(self) -> None:
         """Nothing to release."""
 
@@ -258,7 +265,7 @@ class EthBrakeVecEnv(VecEnv):
         options = [row or {} for row in self._options]
         if len(options) != self.num_envs:
             raise InvalidInput(f"set_options: {len(options)} entries; one for each of {self.num_envs} rows is needed")
-        warn_of_unknown(name for row in options for name in row)
+        warn_of_unknown((name for row in options for name in row), (INITIAL_STATE,))
         if not any(INITIAL_STATE in row for row in options):
             return None
         width = len(self.engine.learners)

@@ -7,9 +7,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from ethbrake_marl.envs.drawing.viewer import CLASS_METADATA, Viewer, render_metadata
+from ethbrake_marl.envs.drawn import describe_world
 from ethbrake_marl.envs.infos import plain_infos, report
 from ethbrake_marl.envs.setup import (
     AnyScenario,
@@ -20,6 +22,7 @@ from ethbrake_marl.envs.setup import (
     learner_columns,
     make_engine,
     only_learner,
+    plain_spec,
     restart,
 )
 from ethbrake_marl.errors import InvalidInput
@@ -54,6 +57,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
     """
 
+    _spec: EnvSpec | None = None
     metadata: dict[str, Any] = dict(CLASS_METADATA)  # noqa: RUF012  # as Gymnasium declares it
 
     def __init__(
@@ -72,7 +76,16 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         self._name = self.engine.scenario.vehicle_names[self.learner]
         self.observation_space = feature_box(self.engine.observation.features)
         self.action_space = action_box()
-        self._running = False
+        self._running = self._started = False
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How it was made, in plain settings; None where no id was used."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = plain_spec(spec)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -83,7 +96,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
             seed = fresh_seed()  # kept by Gymnasium: reset(seed=env.np_random_seed) repeats it
         restart(self.engine, seed, options)
         super().reset(seed=seed)
-        self._running = True
+        self._running = self._started = True
         self.viewer.began()
         return self._observe(), plain_infos(report(self.engine), self._column)[0]
 
@@ -98,6 +111,12 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         info = plain_infos(report(self.engine, step), self._column)[0]
         reward = float(step.reward[0, self.learner])
         return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info
+
+    def describe_world(self) -> dict[str, Any]:
+        """What the running world was drawn as: flat numbers and texts by name; see ``envs.drawn``."""
+        if not self._started:
+            raise InvalidInput("describe_world: no episode was started; call reset first")
+        return describe_world(self.engine)
 
     def render(self) -> Any:
         """What the render mode says: a frame [H, W, 3] uint8, a list of new ones, a text, or None for ``human``."""

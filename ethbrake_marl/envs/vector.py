@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.engine.step import Step
 from ethbrake_marl.envs.drawing.viewer import BATCH_MODES, Viewer, render_metadata
+from ethbrake_marl.envs.drawn import describe_worlds
 from ethbrake_marl.envs.infos import batch_info, report
 from ethbrake_marl.envs.setup import (
     AnyScenario,
@@ -44,9 +45,10 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what the learner observes; None: ``observation_for(scenario)``.
-        autoreset_mode: Gymnasium's. ``SameStep`` returns the first observation of the new episode, with the last one of
-            the old in ``infos["final_obs"]`` and its infos in ``infos["final_info"]``. ``NextStep`` returns the last
-            observation and spends the next step, whose action is ignored and whose reward is 0, on the reset.
+        autoreset_mode: Gymnasium's. ``NextStep``, its default and ours, returns the last observation and spends the
+            next step, whose action is ignored and whose reward is 0, on the reset. ``SameStep`` returns the first
+            observation of the new episode, with the last one of the old in ``infos["final_obs"]`` and its infos in
+            ``infos["final_info"]``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -66,7 +68,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         learners: Sequence[str | int] | None = None,
         reward: Reward = "harm",
         observation: Observation | None = None,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         self.autoreset_mode = _check_mode(autoreset_mode)
         self.engine = make_engine(scenario, num_envs, learners=learners, reward=reward, observation=observation)
@@ -109,6 +111,12 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         infos |= batch_info(report(engine, step), self.learner, every, ~renewed)
         reward = step.reward[:, self.learner].copy()
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
+
+    def describe_worlds(self) -> dict[str, NDArray[Any]]:
+        """What each running world was drawn as: columns by name, each [worlds]; see ``envs.drawn``."""
+        if not self._started:
+            raise InvalidInput("describe_worlds: no episode was started; call reset first")
+        return describe_worlds(self.engine)
 
     def render(self) -> tuple[Any, ...]:
         """A frame [H, W, 3] uint8, or a text, of every world; of a world that has just been renewed, its start."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ethbrake_marl.agents.knowledge import knowledge_text
+from ethbrake_marl.evaluation.harm_metrics import metric_headings, metric_meanings
 from ethbrake_marl.evaluation.paper import PAPER_ROWS, PaperRow
 from ethbrake_marl.evaluation.regret import Distance
 from ethbrake_marl.evaluation.statistics import Estimate
@@ -78,6 +79,16 @@ MEANINGS = {
 }
 
 
+def table_columns(rows: Sequence[SummaryRow]) -> tuple[str, ...]:
+    """The columns, those of registered harm metrics last."""
+    return (*COLUMNS, *(metric_headings(rows[0].metrics).values() if rows else ()))
+
+
+def table_meanings(rows: Sequence[SummaryRow]) -> dict[str, str]:
+    """What the columns mean, those of registered harm metrics last."""
+    return MEANINGS | (metric_meanings(rows[0].metrics) if rows else {})
+
+
 def our_lines(rows: Sequence[SummaryRow]) -> list[Line]:
     """Our results, one line per agent."""
     return [
@@ -95,6 +106,7 @@ def our_lines(rows: Sequence[SummaryRow]) -> list[Line]:
                 _number_cell(row.predicted_harm),
                 _regret(row.distance),
                 percent_cell(row.distance.realised_first, 1),
+                *(_number_cell(estimate) for estimate in row.metrics.values()),
             ),
             SEES_THROUGH * row.sees_through + knowledge_text(row.knows),
         )
@@ -106,14 +118,20 @@ def paper_blocks(rows: Sequence[SummaryRow]) -> list[tuple[str, list[Line]]]:
     """The paper's tables that belong beside these rows, as (table, lines)."""
     blocks: dict[str, list[Line]] = {}
     for paper in PAPER_ROWS if rows and rows[0].beside_paper else ():
-        blocks.setdefault(paper.table, []).append(_paper_line(paper))
+        blocks.setdefault(paper.table, []).append(_paper_line(paper, len(rows[0].metrics)))
     return list(blocks.items())
 
 
-def _paper_line(row: PaperRow) -> Line:
-    """The paper's figures with the digits that it prints."""
+def _paper_line(row: PaperRow, metrics: int) -> Line:
+    """The paper's figures with the digits that it prints; nothing under the ``metrics`` that somebody registered."""
     decrease = NONE if row.harm_decrease is None else f"{100 * row.harm_decrease:.4g} %"
-    cells = (f"{100 * row.collision_rate:.4g} %", f"{row.average_harm:.6g}", *[NONE] * 4, decrease, *[NONE] * 4)
+    cells = (
+        f"{100 * row.collision_rate:.4g} %",
+        f"{row.average_harm:.6g}",
+        *[NONE] * 4,
+        decrease,
+        *[NONE] * (4 + metrics),
+    )
     return Line(row.agent, tuple(Cell(cell) for cell in cells))
 
 

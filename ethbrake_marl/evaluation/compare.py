@@ -6,34 +6,46 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, count_of
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, count_of, unknown_name
 from ethbrake_marl.evaluation.frame import read_harms
+from ethbrake_marl.evaluation.identity import Kind
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, paired_difference, unpaired_difference
 from ethbrake_marl.evaluation.table import Rescored, SummaryRow
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.physics import Floats
 
 HARMS = ("first_impact_harm", "total_harm")
+_COMPARED: dict[Kind, tuple[str, ...]] = {"evaluate": HARMS, "equal-time": HARMS, "shield": ("harm",)}  # harms of each
 _LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one with every world
 _MOST_HARM = 1e100  # m2/s2; a number that can be squared
 _HASHES = {"worlds_sha256": "another list of worlds", "scenario_sha256": "another scenario"}
+_SAME = {"kind": "another kind of results", **_HASHES, "harm_count": "another harm"}  # the last: where it is told
 _NEEDED = {"agent": str, "episodes": int, **dict.fromkeys(_HASHES, str), "policy_sha256": dict, "versions": dict}
 
 
 def results_to_json(
-    rows: Sequence[SummaryRow], *, told: Sequence[Rescored] = (), per_world: Path | None = None
+    rows: Sequence[SummaryRow],
+    *,
+    told: Sequence[Rescored] = (),
+    groups: Mapping[str, Sequence[SummaryRow]] | None = None,
+    per_world: Path | None = None,
 ) -> list[dict[str, Any]]:
     """What a results file holds: one object per row, with what was ``told`` of it under other objectives.
 
+    ``groups``, by name, are rows of the same agents on parts of the worlds (``summarise_by``).
     ``per_world`` is the file with one row per world, written before; its name and hash go into every object.
     """
     found = [row.to_json() for row in rows]
     if told:
         found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
+    for row in found if groups else ():
+        row["groups"] = {
+            name: each.to_json() for name, part in (groups or {}).items() for each in part if each.agent == row["agent"]
+        }
     if per_world is None:
         return found
     beside = {"file": per_world.name, "sha256": hashlib.sha256(per_world.read_bytes()).hexdigest()}
@@ -45,7 +57,12 @@ class Result:
     """One results file."""
 
     path: Path
-    rows: Mapping[str, Mapping[str, Any]]  # by agent
+    rows: Mapping[str, Mapping[str, Any]]  # by agent; of ``ethbrake shield`` by agent and mode
+
+    @property
+    def harm_names(self) -> tuple[str, ...]:
+        """The harms that its rows tell."""
+        return _COMPARED[self.about["kind"]]
 
     @property
     def about(self) -> Mapping[str, Any]:
@@ -83,12 +100,11 @@ class Difference:
 
     agent: str
     policy: Literal["same", "other", "none"]  # whether both drove by the same one
-    first_impact_harm: Estimate
-    total_harm: Estimate
+    harms: Mapping[str, Estimate]  # by the name of the harm
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        harms = {f"{harm}_difference": getattr(self, harm) for harm in HARMS}
+        harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
         return {"agent": self.agent, "policy": self.policy, **estimates_to_json(harms)}
 
 
@@ -114,41 +130,72 @@ class Comparison:
 
 
 def read_result(path: Path) -> Result:
-    """Read what ``ethbrake evaluate --json`` printed or ``ethbrake run`` wrote.
+    """Read what ``evaluate``, ``shield`` or ``equal-time`` printed with ``--json``, or ``ethbrake run`` wrote.
 
-    Raises ``InvalidInput`` for anything else, and for a result without hashes, as earlier versions wrote them.
+    Raises ``InvalidInput`` for anything else, also for other kinds of results, in which no agents stand beside each
+    other, and for a result without hashes, as earlier versions wrote them.
     """
     try:
         content = parse_strict_json(read_plain(path, _LIMIT_BYTES))
     except ValueError as error:
         if isinstance(error, EthBrakeError):
             raise
-        raise InvalidInput(f"{path}: is no JSON: {error}") from None
-    if not isinstance(content, list) or not content or not all(isinstance(row, dict) for row in content):
-        raise InvalidInput(f"{path}: is no results file, as ethbrake evaluate --json prints one")
-    for row in content:
+        raise InvalidInput(f"{path}: is no JSON, or was not written to its end: {error}") from None
+    rows = _rows_of(path, content)
+    for row in rows:
         for key, kind in _NEEDED.items():
             if not isinstance(row.get(key), kind):
                 raise InvalidInput(
                     f"{path}: {key} is missing or no {kind.__name__}; a results file of an earlier version has no"
                     " hashes: evaluate again"
                 )
-    if len({tuple(row[key] for key in _HASHES) for row in content}) > 1:
+    if len({tuple(row.get(key) for key in _SAME) for row in rows}) > 1:
         raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
-    return Result(path, {row["agent"]: row for row in content})
+    return Result(path, {_name_of(row): row for row in rows})
+
+
+def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
+    """The objects of a results file, one for each agent; ``InvalidInput`` where it is none, or of a kind without."""
+    several = [content] if isinstance(content, dict) else content
+    if not isinstance(several, list) or not several or not all(isinstance(row, dict) for row in several):
+        raise InvalidInput(f"{path}: is no results file, as ethbrake evaluate --json prints one")
+    for row in several:
+        kind = row.get("kind")
+        if not isinstance(kind, str):
+            raise InvalidInput(
+                f"{path}: is no results file, as ethbrake evaluate --json prints one, or of an earlier version (kind is"
+                " missing): evaluate again"
+            )
+        if kind not in get_args(Kind):
+            raise InvalidInput(f"{path}: {unknown_name('kind of results', kind, get_args(Kind))}")
+        if kind not in _COMPARED:
+            raise InvalidInput(
+                f"{path}: results of ethbrake {kind} cannot be compared; those of {', '.join(_COMPARED)} can"
+            )
+    if not isinstance(content, dict):
+        return several
+    about = {key: value for key, value in content.items() if key != "agents"}
+    agents = content.get("agents")
+    if not isinstance(agents, list) or not agents or not all(isinstance(row, dict) for row in agents):
+        raise InvalidInput(f"{path}: agents is missing or no list of objects: it is not whole")
+    return [row | about for row in agents]
+
+
+def _name_of(row: Mapping[str, Any]) -> str:
+    return f"{row['agent']} ({row['mode']})" if row["kind"] == "shield" and "mode" in row else str(row["agent"])
 
 
 def compare_results(first: Result, second: Result) -> Comparison:
     """What agents of the same name did in both, the second minus the first.
 
-    Paired by world where both have every world beside them. Raises ``InvalidInput`` for results on different worlds or
-    scenarios, or without a common agent.
+    Paired by world where both have every world beside them. Raises ``InvalidInput`` for results of different kinds, on
+    different worlds or scenarios, or without a common agent.
     """
-    for key, what in _HASHES.items():
-        one, other = first.about[key], second.about[key]
+    for key, what in _SAME.items():
+        one, other = first.about.get(key), second.about.get(key)
         if one != other:
             raise InvalidInput(
-                f"{second.path}: is about {what} than {first.path} ({key} {other:.12} and {one:.12}): no comparison"
+                f"{second.path}: is about {what} than {first.path} ({key} {other!s:.12} and {one!s:.12}): no comparison"
             )
     common = [agent for agent in first.rows if agent in second.rows]
     left_over = [tuple(agent for agent in one.rows if agent not in common) for one in (first, second)]
@@ -157,7 +204,7 @@ def compare_results(first: Result, second: Result) -> Comparison:
         raise InvalidInput(f"{first.path} and {second.path} have no agent in common: {agents}")
     worlds, because = _worlds_of_both(first, second, common)
     differences = tuple(
-        Difference(agent, _policies(first, second, agent), *_differences(first, second, agent, worlds))
+        Difference(agent, _policies(first, second, agent), _differences(first, second, agent, worlds))
         for agent in common
     )
     return Comparison(differences, because, (left_over[0], left_over[1]), _other_versions(first, second))
@@ -181,16 +228,16 @@ def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tup
     return found, None  # type: ignore[return-value]  # two of them each
 
 
-def _differences(first: Result, second: Result, agent: str, worlds: Worlds | None) -> list[Estimate]:
-    """The second minus the first, under both counts."""
+def _differences(first: Result, second: Result, agent: str, worlds: Worlds | None) -> dict[str, Estimate]:
+    """The second minus the first, by the name of the harm."""
     if worlds is not None:
         before, after = worlds[agent]
-        return [paired_difference(after[:, k], before[:, k]) for k in range(len(HARMS))]
+        return {name: paired_difference(after[:, k], before[:, k]) for k, name in enumerate(HARMS)}
     sizes = second.rows[agent]["episodes"], first.rows[agent]["episodes"]
-    return [
-        unpaired_difference(second.estimate(agent, harm), sizes[0], first.estimate(agent, harm), sizes[1])
-        for harm in HARMS
-    ]
+    return {
+        harm: unpaired_difference(second.estimate(agent, harm), sizes[0], first.estimate(agent, harm), sizes[1])
+        for harm in first.harm_names
+    }
 
 
 def _policies(first: Result, second: Result, agent: str) -> Literal["same", "other", "none"]:

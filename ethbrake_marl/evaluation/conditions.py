@@ -11,7 +11,8 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.physics import Floats, Worlds
-from ethbrake_marl.scenario.quantities import DECLARED, OPTIONAL, QUANTITIES, QuantityRule
+from ethbrake_marl.scenario.quantities import DECLARED
+from ethbrake_marl.scenario.sample import quantity, quantity_rules
 
 _SYMBOLS = {
     "gaps_m": ("d", "m"),
@@ -24,18 +25,6 @@ _SYMBOLS = {
     "obstacle_gap_m": ("obstacle at", "m"),
 }
 _STAY = "\u00a0"  # a blank at which no line is broken
-
-
-def quantity(worlds: Worlds, field: str) -> Floats:
-    """A quantity of every world, [n, entries]: one entry per vehicle, pair or world (see ``QUANTITIES``)."""
-    holder = worlds if field in ("gaps_m", "speeds_mps", *OPTIONAL) else worlds.vehicles
-    values: Floats = getattr(holder, field)
-    return values.reshape(worlds.n, -1)
-
-
-def quantity_rules(worlds: Worlds) -> dict[str, QuantityRule]:
-    """The quantities that these worlds have: the distance to an obstacle only where there is one."""
-    return {**QUANTITIES, **OPTIONAL} if np.isfinite(worlds.obstacle_gap_m).all() else QUANTITIES
 
 
 def quantities(worlds: Worlds) -> dict[str, Any]:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from ethbrake_marl.envs.drawing.frame import Frame
 
 FILM_FPS = 25
+MOST_FILMS = 12  # one below the other
+MOST_PICTURES = 2_500  # of all films together: 1.8 GB in memory
 _COLOURS = 64
 
 
@@ -58,7 +60,8 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
 def film_bytes(films: Mapping[str, Sequence[Scene]], ending: str, *, fps: int = FILM_FPS) -> bytes:
     """Films of one world, titled and one below the other, in real time: an endless GIF, or an MP4.
 
-    A film that ends before the others shows its end. Raises ``InvalidInput`` without films, for an ``ending`` that is
+    A film that ends before the others shows its end. Raises ``InvalidInput`` without films, for more than
+    ``MOST_FILMS`` or ``MOST_PICTURES``, for an ``ending`` that is
     neither ``.gif`` nor ``.mp4``, for an ``fps`` whose frames do not last whole hundredths of a second, as a GIF needs,
     and for an MP4 where the library that writes it is missing.
     """
@@ -67,7 +70,20 @@ def film_bytes(films: Mapping[str, Sequence[Scene]], ending: str, *, fps: int = 
         raise InvalidInput("film_bytes: no films given")
     if not fps > 0 or 100 % fps:
         raise InvalidInput(f"film_bytes: fps = {fps}: must divide 100, for instance 10, 20, 25 or 50")
+    check_number_of_films(len(films))
+    pictures = len(films) * max(map(len, films.values()))
+    if pictures > MOST_PICTURES:
+        raise InvalidInput(
+            f"film of {len(films)} agents for {pictures // len(films) / fps:g} s: needs {pictures:,} pictures,"
+            f" and at most {MOST_PICTURES:,} are kept; give fewer agents, or a scenario with a shorter horizon_s"
+        )
     return _WRITERS[ending](list(_stacked(films)), fps)
+
+
+def check_number_of_films(films: int) -> None:
+    """Refuse more than ``MOST_FILMS`` with ``InvalidInput``."""
+    if films > MOST_FILMS:
+        raise InvalidInput(f"film: {films} agents, one below the other; at most {MOST_FILMS} are shown")
 
 
 def check_ending(ending: str) -> None:

@@ -24,7 +24,7 @@ COLUMNS = "columns"
 LIBRARIES = ("pandas", "polars")  # in the order of preference
 _MOST_HARM = 1e100  # m2/s2; a number that can be squared
 _HARMS = ("agent", "world", "first_impact_harm", "total_harm")
-_TEXTS = {"agent", "unavoidable_reason", "best_known_source", "ended", "knows"}
+_TEXTS = {"agent", "scenario", "unavoidable_reason", "best_known_source", "ended", "knows"}
 
 
 def typed_columns(evaluation: Evaluation, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
@@ -33,7 +33,7 @@ def typed_columns(evaluation: Evaluation, objectives: Sequence[Declared] = ()) -
 
 
 def _typed(name: str, values: list[Any]) -> NDArray[Any]:
-    if name in _TEXTS:
+    if name in _TEXTS or (name.startswith("vehicle_") and name.endswith("_type")):
         return np.array([value or "" for value in values])
     return np.array([np.nan if value is None else value for value in values])
 

@@ -8,18 +8,21 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+from collections.abc import Collection, Mapping
 from dataclasses import fields, is_dataclass
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import AgentAround
+from ethbrake_marl.files.plugins import files_run
 from ethbrake_marl.physics import Ints, Worlds
 from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Sample, Scenario
 
+Kind = Literal["evaluate", "shield", "equal-time", "best-harm", "ablate", "generalise", "learning-curves", "robustness"]
 _PACKAGES = ("ethbrake-marl", "numba", "numpy")
 _WORDS = {"name", "title", "description", "source"}  # what a scenario is called changes nothing
 _BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that takes no memory
@@ -58,7 +61,7 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 
 def scenario_sha256(scenario: Scenario) -> str:
     """SHA-256 of all that shapes an episode: every value of the scenario, defaults too, but neither name nor texts."""
-    content = scenario.model_dump(mode="json", exclude=_WORDS)
+    content = scenario.content(without=_WORDS)
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
@@ -73,5 +76,39 @@ def policy_sha256(agent: object) -> str | None:
 
 
 def result_versions() -> dict[str, str]:
-    """Name -> version of Python and of every package that a result's numbers depend on."""
-    return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
+    """Name -> version of Python and of every package that a result's numbers depend on.
+
+    Of the user's own files that this process ran (plug-ins, agents) the SHA-256 is told in its place.
+    """
+    versions = {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
+    return versions | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
+
+
+def identity_line(scenario: Scenario, sample: Sample) -> str:
+    """One line for results that are a text: the hashes of worlds and scenario, and versions."""
+    worlds, versions = worlds_sha256(sample.worlds, sample.index), result_versions()
+    told = ", ".join(f"{name} {number}" for name, number in versions.items())
+    return f"Worlds: SHA-256 {worlds}; scenario: SHA-256 {scenario_sha256(scenario)}; {told}."
+
+
+def policies_by_name(policies: Mapping[int, str], scenario: Scenario) -> dict[str, str]:
+    """Vehicle's name -> SHA-256 of its policy, from that by index."""
+    return {scenario.vehicle_names[vehicle]: sha256 for vehicle, sha256 in policies.items()}
+
+
+def result_identity(
+    kind: Kind, scenario: Scenario, sample: Sample | None, left_out: Collection[int] = ()
+) -> dict[str, Any]:
+    """What a results file of this kind says of itself: ``kind``, hashes of worlds and scenario, ``versions``.
+
+    ``left_out`` are rows of the sample that no figure counts. Without a sample nothing is said of worlds: they differ
+    inside the file, which says it there.
+    """
+    found: dict[str, Any] = {"kind": kind, "scenario_sha256": scenario_sha256(scenario), "versions": result_versions()}
+    if sample is not None:
+        worlds, index = sample.worlds, sample.index
+        if left_out:
+            rows = np.setdiff1d(np.arange(worlds.n), list(left_out))
+            worlds, index = worlds.take(rows), index[rows]
+        found["worlds_sha256"] = worlds_sha256(worlds, index)
+    return found

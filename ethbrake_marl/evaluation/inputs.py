@@ -15,6 +15,7 @@ from ethbrake_marl.agents.registry import current_spelling, make_agent, make_sin
 from ethbrake_marl.agents.rollout import script_agents, set_others
 from ethbrake_marl.agents.spelling import AgentSpec, parse_spec
 from ethbrake_marl.agents.team import Driver, Team, team_of
+from ethbrake_marl.engine.stream import ask_script, begin_script
 from ethbrake_marl.errors import InvalidInput, OldSpelling, check_one_learner, unknown_name
 from ethbrake_marl.files.overrides import Override, changed_parts
 from ethbrake_marl.harm import HarmCount
@@ -179,8 +180,8 @@ def choose_worlds(
 def _try_out(agent: Agent, worlds: Worlds, vehicle: int) -> None:
     """Let a copy of the agent begin and act once."""
     driver = copy.deepcopy(agent)
-    driver.begin(worlds, vehicle, np.arange(worlds.n))
-    driver.act(worlds, vehicle)
+    begin_script(driver, worlds, vehicle, np.arange(worlds.n))
+    ask_script(driver, worlds, vehicle)
 
 
 def _place_of_role(name_or_path: str, role: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ from ethbrake_marl.harm import HarmCount, Ledger
 from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario, Task
+from ethbrake_marl.scenario.sample import Texts
 from ethbrake_marl.scenario.v2x import hidden_from
 
 _SHOWN_AGENTS = 5  # by name, in ``repr``
@@ -46,6 +47,7 @@ class Outcome:
     shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself, see ``travel``
     sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands, see ``sampled_harm``
     policies: Mapping[int, str] = field(default_factory=dict)  # vehicle (0 = front) -> SHA-256 of its policy's manifest
+    metrics: Mapping[str, Floats] = field(default_factory=dict)  # registered harm metrics by column, [n]
 
     def __repr__(self) -> str:
         return f"Outcome({count_of(len(self.collided), 'world')}, {int(self.collided.sum()):,} collided, {self._means})"
@@ -65,6 +67,7 @@ class Outcome:
             name: None if getattr(self, name) is None else getattr(self, name)[rows] for name in names
         }
         columns |= {"knows": self.knows, "policies": self.policies}
+        columns |= {"metrics": {name: column[rows] for name, column in self.metrics.items()}}
         return Outcome(ledger, self.final.take(rows), self.at_rest[rows], **columns)
 
     @property
@@ -134,6 +137,7 @@ class Evaluation:
     seed: int | None  # of the list; None for worlds that were given
     outcomes: dict[str, Outcome]  # by the agent's name
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
+    kinds: Mapping[str, Texts] = field(default_factory=dict)  # ``scenario`` of a mixture, ``vehicle_2_type``, ...: [n]
 
     def __repr__(self) -> str:
         drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
@@ -159,6 +163,14 @@ class Evaluation:
     def limits(self) -> Limits | Unproven:
         """What is known of each world whoever drives: found once, for everything that tells of this evaluation."""
         return known_limits(self.worlds, self.task)
+
+    def take(self, rows: Ints | Bools) -> Evaluation:
+        """That of some of the worlds; nobody is left out of them."""
+        outcomes = {name: outcome.take(rows) for name, outcome in self.outcomes.items()}
+        kinds = {name: column[rows] for name, column in self.kinds.items()}
+        return replace(
+            self, worlds=self.worlds.take(rows), index=self.index[rows], outcomes=outcomes, left_out=(), kinds=kinds
+        )
 
     @property
     def hidden(self) -> Bools:

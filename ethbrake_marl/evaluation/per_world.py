@@ -13,12 +13,13 @@ import numpy as np
 
 from ethbrake_marl.agents.knowledge import knowledge_text
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation.conditions import quantity, quantity_rules
+from ethbrake_marl.evaluation.harm_metrics import COLUMN
 from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
 from ethbrake_marl.evaluation.regret import Regrets, assess
 from ethbrake_marl.files.durable import check_writable, write_file
 from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.objectives import Declared, scored
+from ethbrake_marl.scenario.sample import quantity, quantity_rules
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
@@ -113,9 +114,11 @@ def per_world_columns(evaluation: Evaluation, objectives: Sequence[Declared] = (
 def initial_columns(evaluation: Evaluation) -> Columns:
     """World number and its initial state: gaps, speeds, and any other quantity that differs between worlds.
 
-    Named as in a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``.
+    Where there is such, also the scenario of a mixture, and each vehicle's type. Quantities are named
+    as in a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``.
     """
     columns: Columns = {"world": evaluation.index.tolist()}
+    columns |= {name: column.tolist() for name, column in evaluation.kinds.items()}
     for field, rule in quantity_rules(evaluation.worlds).items():
         values = quantity(evaluation.worlds, field)
         if field in _ALWAYS or np.ptp(values, axis=0).any():
@@ -176,4 +179,5 @@ def outcome_columns(outcome: Outcome) -> Columns:
     predicted, chosen = outcome.predicted_harm, outcome.chosen_policy
     columns["predicted_harm"] = [None] * n if predicted is None else predicted.tolist()
     columns["chosen_policy"] = [None] * n if chosen is None else chosen.astype(int).tolist()
+    columns |= {f"{COLUMN}{name}": column.tolist() for name, column in outcome.metrics.items()}
     return columns

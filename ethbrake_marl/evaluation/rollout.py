@@ -13,17 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.knowledge import knowledge_of
-from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.protocol import Agent, check_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.engine.stream import check_alert
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_one_learner, check_whole_number, unknown_name
 from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
+from ethbrake_marl.evaluation.harm_metrics import ImpactWatch
 from ethbrake_marl.evaluation.identity import policy_sha256
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Ints, Worlds, concatenate, leaving_out_failed
 from ethbrake_marl.scenario import Sample, Scenario, Task
+from ethbrake_marl.scenario.sample import kind_columns
 
 CHUNK = 10_000  # worlds advanced together: bounds memory, changes no result
 
@@ -55,7 +57,8 @@ def evaluate(
         seed: of the list; noted, not used.
         chunk: worlds advanced together.
         on_progress: is called with an agent's name and its worlds done so far.
-        aftermath: look how far Vehicle 1 is shoved, and what the paper's sum over samples is; costs time.
+        aftermath: look how far Vehicle 1 is shoved, what the paper's sum over samples is, and what registered harm
+            metrics are; costs time.
 
     Raises ``PhysicsError`` if no world is left; ``InvalidInput`` for worlds that do not fit the scenario or are not at
     the alert, no agents, no vehicle to drive, a team of other vehicles, or a learner that nobody drives.
@@ -96,8 +99,8 @@ def _check_request(worlds: object, agents: object, scenario: object, chunk: obje
     if not agents:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
     for name, agent in agents.items():
-        if not isinstance(agent, Agent | Team):
-            raise InvalidInput(f"evaluate: agent {name!r} = {agent!r}: must be an agent, as make_agent(name) gives")
+        if not isinstance(agent, Team):
+            check_agent(agent, f"evaluate: agent {name!r}")
         knowledge_of(agent)  # refuses what is no statement
     check_whole_number("evaluate: chunk", chunk, 1)
 
@@ -157,9 +160,11 @@ class _Whole(NamedTuple):
         if self.left_out and not good.size:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         outcomes = {name: _join([part.among(good) for part in parts]) for name, parts in self.parts.items()}
+        kinds = kind_columns(self.sample.types, self.sample.scenarios)
         if self.left_out:
             worlds, index = worlds.take(good), index[good]
-        return Evaluation(scenario, driven, worlds, index, seed, outcomes, self.left_out)
+            kinds = {name: column[good] for name, column in kinds.items()}
+        return Evaluation(scenario, driven, worlds, index, seed, outcomes, self.left_out, kinds)
 
 
 class _Chunk(NamedTuple):
@@ -181,7 +186,8 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     task = Task(scenario, tuple(team.drivers))
     shoved = ShovedFront.of(worlds, task) if aftermath else None
     sampled = SampledHarm.of(worlds, task) if aftermath else None
-    episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled) if w is not None])
+    impacts = ImpactWatch.of(worlds) if aftermath else None
+    episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled, impacts) if w is not None])
     alone = next(iter(team.drivers.values())) if len(team.drivers) == 1 else None
     predicted, chosen = (_read_column(alone, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
     return Outcome(
@@ -194,6 +200,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
         None if shoved is None else shoved.metres,
         None if sampled is None else sampled.finish(),
         {vehicle: sha for vehicle, agent in team.drivers.items() if (sha := policy_sha256(agent)) is not None},
+        {} if impacts is None else impacts.finish(),
     )
 
 
@@ -228,4 +235,5 @@ def _join(parts: list[Outcome]) -> Outcome:
         column("shoved_m"),
         column("sampled_harm"),
         parts[0].policies,
+        {name: np.concatenate([part.metrics[name] for part in parts]) for name in parts[0].metrics},
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,11 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.errors import renumbered
+from ethbrake_marl.evaluation.identity import policies_by_name, policy_sha256, result_identity
 from ethbrake_marl.evaluation.rollout import OnWorlds
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
 from ethbrake_marl.physics import Floats, LeftOutRows, Worlds, measured_without_failed
-from ethbrake_marl.scenario import Task
+from ethbrake_marl.scenario import Sample, Task
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
 from ethbrake_marl.shield.review import VERDICTS, review
 
@@ -39,6 +40,7 @@ class ModeRow:
     verdicts: tuple[float, ...] | None = None  # shares of the replaced decisions, in the order of VERDICTS
     above_bound: int | None = None  # worlds whose realised harm is above the bound told at the alert
     left_out: LeftOutRows = ()  # worlds that could not be advanced: in no row, whichever agent and mode met them
+    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> the policy's that proposes, if one does
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
@@ -52,6 +54,7 @@ class ModeRow:
         }
         shares = (None,) * len(VERDICTS) if self.verdicts is None else self.verdicts
         told |= {**dict(zip(VERDICTS, shares, strict=True)), "above_bound": self.above_bound}
+        told["policy_sha256"] = dict(self.policy_sha256)
         return {**told, "left_out": [{"world": world, "reason": reason} for world, reason in self.left_out]}
 
 
@@ -71,7 +74,20 @@ def compare_modes(
     rows, _, left_out = measured_without_failed(
         lambda at: _compare(agents, worlds.take(at), task, on_progress), worlds.n
     )
-    return [replace(row, left_out=left_out) for row in rows]
+    policies = {name: policy_sha256(agent) for name, agent in agents.items()}
+    named = {
+        name: {} if sha256 is None else policies_by_name({task.vehicle: sha256}, task.scenario)
+        for name, sha256 in policies.items()
+    }
+    return [replace(row, left_out=left_out, policy_sha256=named[row.agent]) for row in rows]
+
+
+def modes_to_json(rows: list[ModeRow], sample: Sample, task: Task) -> list[dict[str, Any]]:
+    """What a results file of ``ethbrake shield`` holds: one object per row, of the worlds of ``sample``."""
+    left_out = [world for world, _ in rows[0].left_out]
+    about = result_identity("shield", task.scenario, sample, left_out)
+    about |= {"harm_count": task.harm_count, "episodes": sample.worlds.n - len(left_out)}
+    return [about | row.to_json() for row in rows]
 
 
 def compare_behind_shields(agents: Mapping[str, Driver], worlds: Worlds, task: Task) -> list[ModeRow]:

@@ -13,7 +13,8 @@ from rich.text import Text
 from ethbrake_marl.agents.knowledge import Knowledge, Source, knowledge_text, sees_through
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.conditions import parameters
-from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.harm_metrics import COLUMN, metric_headings
+from ethbrake_marl.evaluation.identity import policies_by_name, result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.evaluation.paper import is_papers_test
 from ethbrake_marl.evaluation.regret import Distance, assess, distance
@@ -130,6 +131,7 @@ class SummaryRow:
     scenario_sha256: str = ""  # of all that shapes an episode
     policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> its policy's, where one drives
     versions: Mapping[str, str] = field(default_factory=dict)  # of what computed it
+    metrics: Mapping[str, Estimate] = field(default_factory=dict)  # registered harm metrics, mean per world
 
     @property
     def sees_through(self) -> bool:
@@ -139,6 +141,7 @@ class SummaryRow:
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
         return {
+            "kind": "evaluate",
             "agent": self.agent,
             "knows": knowledge_text(self.knows),
             "sees_through_channel": self.sees_through,
@@ -154,6 +157,7 @@ class SummaryRow:
             "scenario_sha256": self.scenario_sha256,
             "policy_sha256": dict(self.policy_sha256),
             "versions": dict(self.versions),
+            **({"metrics": metric_headings(self.metrics)} if self.metrics else {}),
             "parameters": self.parameters,
         }
 
@@ -171,6 +175,7 @@ class SummaryRow:
             "harm_decrease_first": self.first_decrease,
             "harm_decrease_total": self.total_decrease,
             **({"predicted_harm": self.predicted_harm} if self.predicted_harm else {}),
+            **{f"{COLUMN}{name}": estimate for name, estimate in self.metrics.items()},
         }
 
     def _distance_to_json(self) -> dict[str, Any]:
@@ -227,7 +232,7 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
     beside, regrets, braking = is_papers_test(evaluation), assess(evaluation), evaluation.outcomes.get(BASELINE)
     hidden = float(evaluation.hidden.mean())
     worlds, scenario = worlds_sha256(evaluation.worlds, evaluation.index), scenario_sha256(evaluation.scenario)
-    names, versions = evaluation.scenario.vehicle_names, result_versions()
+    versions = result_versions()
     rows = [_row(agent, outcome, reference, conditions) for agent, outcome in evaluation.outcomes.items()]
     return SummaryTable(
         replace(
@@ -239,7 +244,7 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
             hidden_share=hidden,
             worlds_sha256=worlds,
             scenario_sha256=scenario,
-            policy_sha256={names[i]: sha for i, sha in evaluation.outcome(row.agent).policies.items()},
+            policy_sha256=policies_by_name(evaluation.outcome(row.agent).policies, evaluation.scenario),
             versions=versions,
         )
         for row in rows
@@ -282,4 +287,5 @@ def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: di
         shoved_m=None if outcome.shoved_m is None else mean(outcome.shoved_m),
         shoved_far=None if outcome.shoved_m is None else rate(int((outcome.shoved_m > FAR_M).sum()), episodes),
         sampled_harm=None if outcome.sampled_harm is None else mean(outcome.sampled_harm),
+        metrics={name: mean(column) for name, column in outcome.metrics.items()},
     )

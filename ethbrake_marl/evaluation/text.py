@@ -13,7 +13,6 @@ from rich.text import Text
 from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.cells import (
-    COLUMNS,
     NONE,
     SEES_THROUGH,
     Cell,
@@ -21,8 +20,10 @@ from ethbrake_marl.evaluation.cells import (
     our_lines,
     paper_blocks,
     percent_cell,
+    table_columns,
 )
 from ethbrake_marl.evaluation.conditions import parameter_line
+from ethbrake_marl.evaluation.harm_metrics import metric_headings
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
 from ethbrake_marl.evaluation.regret import Between
 from ethbrake_marl.evaluation.table import SummaryRow
@@ -49,6 +50,17 @@ _WIDE = 120  # terminal columns that all of them need
 def rich_table(rows: Sequence[SummaryRow]) -> RenderableType:
     """The table for a terminal of 80 columns or more: ours, then the paper's rows, then the conditions of each."""
     return Group(_TerminalTable(rows), Text(), Text(_conditions(rows), style="dim"))
+
+
+def metrics_table(rows: Sequence[SummaryRow]) -> Table:
+    """The registered harm metrics for a terminal: one line per agent, the mean per world with its interval."""
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, title="Harm metrics", title_justify="left")
+    table.add_column("Agent", overflow="fold")
+    for heading in metric_headings(rows[0].metrics).values() if rows else ():
+        table.add_column(Text(heading), justify="right", overflow="fold")
+    for row in rows:
+        table.add_row(Text(row.agent), *(Text(estimate.in_words()) for estimate in row.metrics.values()))
+    return table
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +99,9 @@ def _terminal_cell(column: int, cell: Cell) -> Text:
 
 def markdown_table(rows: Sequence[SummaryRow]) -> str:
     """The table for a document, with the conditions of ours and of the paper's below it."""
-    head = ["Agent", "Knows", *COLUMNS]
-    lines = ["| " + " | ".join(head) + " |", "|" + 2 * " --- |" + " ---: |" * len(COLUMNS)]
+    columns = table_columns(rows)
+    head = ["Agent", "Knows", *columns]
+    lines = ["| " + " | ".join(head) + " |", "|" + 2 * " --- |" + " ---: |" * len(columns)]
     lines += [_markdown_line(line) for line in our_lines(rows)]
     for name, block in paper_blocks(rows):
         lines += [_markdown_line(Line(f"paper, {name}: {line.agent}", line.cells)) for line in block]

@@ -17,15 +17,24 @@ _HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"  # short whatever the target is 
 
 def write_file(path: Path, data: bytes) -> None:
     """Write ``data`` to ``path``, replacing it in one step; a reader sees the old or the new content, whole."""
+    with new_file(path) as partial:
+        partial.write_bytes(data)
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Give a temporary file beside ``path`` that takes its place when the block ends well, and vanishes otherwise."""
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED)
+    os.close(descriptor)
+    partial = Path(name)
     try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
+        yield partial
+        with partial.open("rb") as file:
             _to_disk(file.fileno())
-        os.chmod(name, 0o666 & ~_umask())
-        os.replace(name, path)
+        partial.chmod(0o666 & ~_umask())
+        os.replace(partial, path)
     except BaseException:
-        Path(name).unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
         raise
     _folder_to_disk(path.parent)
 

@@ -1,9 +1,10 @@
-"""One clear message for whatever pydantic found in a YAML file: where, value, what would be right."""
+"""One clear message for whatever pydantic found: where, value, what would be right. No other file words its errors."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -69,6 +70,26 @@ def explain(error: ValidationError, document: Document, wording: Wording) -> Inv
     line = None if absent else document.line_of(path)
     where = document.file if line is None else f"{document.file}, line {line}"
     return InvalidInput(f"{where}: {_describe(shown, path, wording)}{f' (and {more} more)' if more else ''}")
+
+
+class Mistake(NamedTuple):
+    """The first defect that pydantic found in what no person wrote: as text ``place: right``."""
+
+    place: str  # keys with dots between them; empty for the whole
+    given: Any
+    right: str
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.right}" if self.place else self.right
+
+
+def first_mistake(error: ValidationError) -> Mistake:
+    """Where the first mistake is, and what would be right: for files that programs write, and for settings in code."""
+    detail = error.errors(include_url=False)[0]
+    right = {"missing": "is missing", "extra_forbidden": "unknown key"}.get(detail["type"])
+    if detail["type"] == "string_pattern_mismatch":  # not always that of a name, as in files that people write
+        right = f"must match {detail['ctx']['pattern']}"
+    return Mistake(".".join(str(key) for key in _path(detail)), detail["input"], right or _right(detail))
 
 
 def _path(detail: ErrorDetails) -> YamlPath:

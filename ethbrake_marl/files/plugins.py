@@ -79,6 +79,16 @@ def loaded_plugins() -> tuple[Plugin, ...]:
     return tuple(_LOADED.values())
 
 
+def files_run() -> dict[str, str]:
+    """Name -> SHA-256 of every plug-in and agent file of this process; of all of that name, where there are several."""
+    found: dict[str, set[str]] = {}
+    for path, file in _RUN.items():
+        found.setdefault(path.name, set()).add(file.sha256)
+    for plugin in loaded_plugins():
+        found.setdefault(plugin.name, set()).add(plugin.sha256)
+    return {name: ", ".join(sorted(sha256)) for name, sha256 in found.items()}
+
+
 def noted_plugins() -> list[dict[str, str]]:
     """The plug-ins of this process, for ``config.json``."""
     return [asdict(plugin) for plugin in loaded_plugins()]

@@ -22,7 +22,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.modules import MultiAgentMLP
 
-from ethbrake_marl.envs.setup import feature_box, make_engine
+from ethbrake_marl.envs.setup import feature_box, make_engine, resolve_scenario
 from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.learning.algorithms.ppo import PpoRecipe
 from ethbrake_marl.learning.model_state import own_random_state
@@ -99,7 +99,14 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
 
 
 class LineTask(TaskClass):  # type: ignore[misc]
-    """A scenario as a task; ``config``: ``scenario``, ``reward``, ``horizon_is_end``."""
+    """A scenario as a task.
+
+    ``config``: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``), ``reward``,
+    ``horizon_is_end``.
+    """
+
+    def __init__(self, name: str, config: dict[str, Any]) -> None:
+        super().__init__(name, {**config, "scenario": resolve_scenario(config["scenario"])})
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
         """How to make the worlds."""

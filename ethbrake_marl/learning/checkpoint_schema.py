@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from typing_extensions import TypedDict
 
+from ethbrake_marl.files.messages import first_mistake
 from ethbrake_marl.files.plain import parse_strict_json
 from ethbrake_marl.learning.loop import EPISODE_COLUMNS
 from ethbrake_marl.policies.manifest import Sha256
-from ethbrake_marl.policies.policy import first_line
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Number = Annotated[int | float, Field(ge=-1e300, le=1e300)]
@@ -117,5 +117,5 @@ def check_json(schema: type[Listing | Numbers], data: bytes) -> dict[str, Any]:
     try:
         schema.model_validate_json(data)
     except ValidationError as error:
-        raise ValueError(first_line(error)) from None
+        raise ValueError(str(first_mistake(error))) from None
     return content

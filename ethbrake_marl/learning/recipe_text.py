@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.scenario.fields import NAME_PATTERN
+from ethbrake_marl.scenario.catalogue import check_file_name
 
 _MEANINGS = {
     "name": "equal to the file's name without .yaml",
@@ -57,11 +55,7 @@ def new_recipe_text(name: str, based_on: str = "ppo") -> str:
     A key that ``based_on`` leaves out stands in a comment. Save it as ``<name>.yaml``. Raises ``InvalidInput`` for a
     name that cannot be one, and what ``load_recipe`` raises for ``based_on``.
     """
-    if re.fullmatch(NAME_PATTERN, name) is None:
-        raise InvalidInput(
-            f"recipe name {name!r}: must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or"
-            " digit"
-        )
+    check_file_name("recipe", name)
     base = load_recipe(based_on)
     values = {
         **base.model_dump(mode="json"),

@@ -25,7 +25,7 @@ from ethbrake_marl.learning.training import Training, check_run_plugins, resolve
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.team import Trained, drivers_of
-from ethbrake_marl.progress import OnProgress
+from ethbrake_marl.progress import OnProgress, Told, listener
 from ethbrake_marl.scenario import Scenario
 
 _APPENDED: dict[Scheme, Appended] = {"independent": "number", "centralised": "state"}
@@ -87,7 +87,7 @@ def train(
     force: bool = False,
     settings: Sequence[str] = (),
     measure: Measure | None = measure_on_list,
-    on_progress: OnProgress | None = None,
+    on_progress: Told = "show",
 ) -> TrainResult:
     """Train the learners of ``scenario`` into the new ``directory``.
 
@@ -108,7 +108,7 @@ def train(
         settings: by which recipe and scenario differ from their files, ``KEY=VALUE`` each: noted in ``config.json``.
         measure: makes of the training what measures its policies before the first update, then as the recipe says, and
             at the end: by default on the recipe's fixed list. None: nothing is measured.
-        on_progress: is told how far the training is.
+        on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.
 
     Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` where recipe and scenario do
     not fit each other, ``TrainingDiverged`` for numbers that are not finite.
@@ -122,14 +122,14 @@ def train(
         config = {**training.config(), **({"settings": list(settings)} if settings else {})}
         return create_run(Path(directory), config, team=team, force=force), None
 
-    return _run(begin, training, measure, on_progress)
+    return _run(begin, training, measure, listener(on_progress))
 
 
 def resume(
     directory: str | Path,
     *,
     measure: Measure | None = measure_on_list,
-    on_progress: OnProgress | None = None,
+    on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
     """Go on with a training that was stopped or killed, to the policies that it would have come to: the same bits.
@@ -140,7 +140,7 @@ def resume(
     Args:
         directory: the run's folder.
         measure: as it was given to ``train``.
-        on_progress: is told how far the training is.
+        on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.
         other_versions: go on from a checkpoint that other versions, or other plug-ins, wrote, although its numbers may
             differ.
 
@@ -164,7 +164,7 @@ def resume(
         run.write_json(run.team, team_content(training.scheme, training.scenario))  # a damaged one would stay
         return run, other_versions
 
-    return _run(begin, training, measure, on_progress)
+    return _run(begin, training, measure, listener(on_progress))
 
 
 def _run(

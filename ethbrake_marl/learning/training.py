@@ -18,13 +18,13 @@ from typing import Any
 from pydantic import ValidationError
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.messages import first_mistake
 from ethbrake_marl.files.plugins import check_plugins, noted_plugins
 from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe, load_recipe, recipe_of
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
 from ethbrake_marl.learning.schemes import drivers, scheme_of
 from ethbrake_marl.observations import ObservationSpec, choose_observation, observation_for
 from ethbrake_marl.policies.manifest import installed_versions
-from ethbrake_marl.policies.policy import first_line
 from ethbrake_marl.scenario import Scenario, load_scenario
 
 Content = dict[str, dict[str, Any]]
@@ -89,7 +89,7 @@ def training_in(folder: Path, config: Mapping[str, Any]) -> Training:
     except KeyError as error:
         raise InvalidInput(f"{file}: is not the configuration of a training: {error} is missing") from None
     except ValidationError as error:
-        raise InvalidInput(f"{file}: scenario: {first_line(error)}") from None
+        raise InvalidInput(f"{file}: scenario: {first_mistake(error)}") from None
     except InvalidInput as error:
         raise InvalidInput(f"{file}: {error}") from None
     return resolve(recipe, scenario)
@@ -126,5 +126,5 @@ def _content(recipe: TrainingRecipe, scenario: Scenario) -> Content:
     """Plain data with every default in it, without words."""
     return {
         "recipe": recipe.model_dump(mode="json", exclude=set(WORDS)),
-        "scenario": scenario.model_dump(mode="json", exclude=set(WORDS)),
+        "scenario": scenario.content(without=WORDS),
     }

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
 from ethbrake_marl.files.durable import write_file
+from ethbrake_marl.files.messages import first_mistake
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, UInt64s
@@ -207,8 +208,7 @@ def _header(data: bytes) -> dict[str, Any]:
     try:
         _Header.model_validate(content)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise ValueError(f"header: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise ValueError(f"header: {first_mistake(error)}") from None
     del content["format"]
     return dict(content)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.scenario.features import (
     MOST_NEIGHBOURS,
@@ -85,22 +86,36 @@ class ObservationSpec:
         return len(self.chosen) or len(OWN_FEATURES) + (self.front + self.rear) * len(NEIGHBOUR_FEATURES) + further
 
 
-Observation = ObservationSpec | Sequence[str]  # or a list of groups and features
+Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # or a list of groups and features, or the fields
 
 
 def choose_observation(listed: Observation) -> ObservationSpec:
     """The observation of a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
 
+    A mapping names the fields of an ``ObservationSpec``, which is what JSON makes of one.
     Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no such list.
     """
     if isinstance(listed, ObservationSpec):
         return listed
+    if isinstance(listed, Mapping):
+        return _spec_of_fields(listed)
     names = listed_features(listed)
     front, rear, role, obstacle = _reach(names)
     usual = ObservationSpec(front, rear, role, obstacle)
     if tuple(feature.name for feature in usual.features) == names:
         return usual
     return ObservationSpec(front, rear, role, obstacle, names)
+
+
+def _spec_of_fields(given: Mapping[str, Any]) -> ObservationSpec:
+    known = [field.name for field in fields(ObservationSpec)]
+    for name in given:
+        if name not in known:
+            raise unknown_name("observation", name, known)
+    chosen = given.get("chosen", ())
+    if not isinstance(chosen, list | tuple):
+        raise InvalidInput(f"observation: chosen = {chosen!r}; must be a list of features")
+    return ObservationSpec(**{**given, "chosen": listed_features(chosen) if chosen else ()})
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool]:

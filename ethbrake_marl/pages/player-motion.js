@@ -113,10 +113,12 @@ function curves(episode, until, x, y, vehicles) {
     const go = k === 0 ? "M" : "L";
     gaps.forEach((_, p) => {
       const middle = piece.gaps[p] + ((piece.speeds[p] - piece.speeds[p + 1]) * t) / 2;
-      gaps[p] += `${go}${pair(piece.time, piece.gaps[p], y.gap)}Q${pair(piece.time + t / 2, middle, y.gap)} ${pair(end, after.gaps[p], y.gap)}`;
+      gaps[p] += `${go}${pair(piece.time, piece.gaps[p], y.gap)}`;
+      gaps[p] += `Q${pair(piece.time + t / 2, middle, y.gap)} ${pair(end, after.gaps[p], y.gap)}`;
     });
     speeds.forEach((_, i) => {
-      speeds[i] += `${go}${pair(piece.time, piece.speeds[i], y.speed)}L${pair(end, after.speeds[i], y.speed)}`;
+      const v = piece.speeds[i];
+      speeds[i] += `${go}${pair(piece.time, v, y.speed)}L${pair(end, after.speeds[i], y.speed)}`;
       const a = piece.accelerations[i];
       accelerations[i] += `${go}${pair(piece.time, a, y.acceleration)}L${pair(end, a, y.acceleration)}`;
     });

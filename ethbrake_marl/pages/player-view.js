@@ -22,7 +22,8 @@ function ticks(low, high, most) {
   const power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map((k) => k * power).find((each) => each >= rough);
   const found = [];
-  for (let at = Math.ceil(low / step - 1e-9) * step; at <= high + 1e-9 * step; at += step) found.push(Math.abs(at) < step / 1e6 ? 0 : at);
+  for (let at = Math.ceil(low / step - 1e-9) * step; at <= high + 1e-9 * step; at += step)
+    found.push(Math.abs(at) < step / 1e6 ? 0 : at);
   return found;
 }
 
@@ -40,12 +41,16 @@ class Lane {
     const bottom = this.middle + this.half + 9;
     const height = bottom + (scaleBelow ? 18 : 2);
     this.svg = draw("svg", { class: "lane", width, height, viewBox: `0 0 ${width} ${height}`, role: "img" });
-    this.svg.append(draw("rect", { class: "asphalt", x: 0, y: this.middle - this.half - 9, width, height: 2 * this.half + 18, rx: 3 }));
+    const band = { y: this.middle - this.half - 9, height: 2 * this.half + 18 };
+    this.svg.append(draw("rect", { class: "asphalt", x: 0, width, rx: 3, ...band }));
     const dashes = `${3 * this.scale} ${6 * this.scale}`;
     for (const y of [this.middle - this.half - 5, this.middle + this.half + 5])
       this.svg.append(draw("line", { class: "dash", x1: 0, x2: width, y1: y, y2: y, "stroke-dasharray": dashes }));
     if (scaleBelow) this.drawScale(view, bottom, width);
-    if (world.obstacle !== null) this.svg.append(draw("rect", { class: "obstacle", x: this.x(world.obstacle), y: this.middle - this.half - 6, width: Math.max(this.scale, 4), height: 2 * this.half + 12 }));
+    if (world.obstacle !== null) {
+      const block = { x: this.x(world.obstacle), width: Math.max(this.scale, 4), ...band };
+      this.svg.append(draw("rect", { class: "obstacle", ...block }));
+    }
     this.cars = Array.from({ length: data.vehicles }, (_, i) => this.makeCar(i));
     this.flashes = draw("g");
     this.svg.append(this.flashes);
@@ -63,12 +68,16 @@ class Lane {
   makeCar(i) {
     const length = BODY_M * this.scale;
     const h = this.half;
-    const body = draw("rect", { class: `body s${(i + 1) % 7}`, x: -length, y: -h, width: length, height: 2 * h, rx: Math.min(4, h / 2) });
+    const box = { x: -length, y: -h, height: 2 * h };
+    const body = draw("rect", { class: `body s${(i + 1) % 7}`, ...box, width: length, rx: Math.min(4, h / 2) });
     const driven = this.data.driven.includes(i);
-    const brake = draw("rect", { class: "brake", x: -length, y: -h, width: Math.max(2.5, length / 12), height: 2 * h });
+    const brake = draw("rect", { class: "brake", ...box, width: Math.max(2.5, length / 12) });
     const drive = draw("path", { class: "drive", d: `M${-length * 0.12} ${-h * 0.6}L0 0L${-length * 0.12} ${h * 0.6}Z` });
-    const guard = draw("rect", { class: "guard", x: -length - 4, y: -h - 4, width: length + 8, height: 2 * h + 8, rx: 6 });
-    const label = draw("text", { class: "number", x: -length / 2, y: 0.36 * Math.min(2 * h, 14), "text-anchor": "middle", "font-size": Math.min(2 * h, 14) }, String(i + 1));
+    const around = { x: -length - 4, y: -h - 4, width: length + 8, height: 2 * h + 8, rx: 6 };
+    const guard = draw("rect", { class: "guard", ...around });
+    const size = Math.min(2 * h, 14);
+    const place = { x: -length / 2, y: 0.36 * size, "text-anchor": "middle", "font-size": size };
+    const label = draw("text", { class: "number", ...place }, String(i + 1));
     const group = draw("g", { class: driven ? "car driven" : "car" }, guard, body, brake, drive, label);
     this.svg.append(group);
     return { group, brake, drive, guard, driven };
@@ -88,7 +97,8 @@ class Lane {
     this.flashes.replaceChildren(...this.flashesAt(time, fronts));
     const now = countedBy(this.episode, time);
     const words = state.speeds.map((v, i) => `Vehicle ${i + 1} ${plain(v, 1)} metres per second`).join(", ");
-    this.svg.setAttribute("aria-label", `${this.episode.agent} at ${plain(time, 2)} seconds: ${now.impacts} impacts; ${words}`);
+    const told = `${this.episode.agent} at ${plain(time, 2)} seconds: ${now.impacts} impacts; ${words}`;
+    this.svg.setAttribute("aria-label", told);
     return { state, now };
   }
 
@@ -99,10 +109,13 @@ class Lane {
       const r = this.half + 5;
       const points = Array.from({ length: 16 }, (_, k) => {
         const long = k % 2 ? r * 0.5 : r;
-        return `${(x + long * Math.cos((k * Math.PI) / 8)).toFixed(1)},${(this.middle + long * Math.sin((k * Math.PI) / 8)).toFixed(1)}`;
+        const [across, down] = [long * Math.cos((k * Math.PI) / 8), long * Math.sin((k * Math.PI) / 8)];
+        return `${(x + across).toFixed(1)},${(this.middle + down).toFixed(1)}`;
       });
-      const text = draw("text", { class: "closing", x, y: 12, "text-anchor": "middle" }, `${closing < 0.05 ? "< 0.1" : plain(closing, 1)} m/s`);
-      return draw("g", {}, draw("polygon", { class: first ? "flash" : "flash later", points: points.join(" ") }), text);
+      const speed = `${closing < 0.05 ? "< 0.1" : plain(closing, 1)} m/s`;
+      const text = draw("text", { class: "closing", x, y: 12, "text-anchor": "middle" }, speed);
+      const star = draw("polygon", { class: first ? "flash" : "flash later", points: points.join(" ") });
+      return draw("g", {}, star, text);
     });
   }
 }
@@ -130,37 +143,44 @@ class Traces {
       this.y[name] = (v) => y0 + panel - ((v - low) / (high - low)) * panel;
       this.svg.append(draw("text", { class: "title", x: left, y: y0 - 6 }, title));
       for (const v of ticks(low, high, 4)) {
-        this.svg.append(draw("line", { class: v === 0 ? "zero" : "grid", x1: left, x2: width - right, y1: this.y[name](v), y2: this.y[name](v) }));
-        this.svg.append(draw("text", { x: left - 5, y: this.y[name](v) + 3.5, "text-anchor": "end" }, plain(v, 0)));
+        const y = this.y[name](v);
+        this.svg.append(draw("line", { class: v === 0 ? "zero" : "grid", x1: left, x2: width - right, y1: y, y2: y }));
+        this.svg.append(draw("text", { x: left - 5, y: y + 3.5, "text-anchor": "end" }, plain(v, 0)));
       }
     });
     this.bottom = top + 3 * panel + 2 * apart;
-    for (const t of ticks(0, until, Math.min(8, width / 60))) {
-      this.svg.append(draw("text", { x: this.x(t), y: this.bottom + 19, "text-anchor": "middle" }, String(Number(t.toFixed(3)))));
-    }
-    this.svg.append(draw("text", { x: (left + width - right) / 2, y: this.bottom + 33, "text-anchor": "middle" }, "Time since the alert (s)"));
+    const below = (x, y, text) => this.svg.append(draw("text", { x, y, "text-anchor": "middle" }, text));
+    for (const t of ticks(0, until, Math.min(8, width / 60))) below(this.x(t), this.bottom + 19, String(Number(t.toFixed(3))));
+    below((left + width - right) / 2, this.bottom + 33, "Time since the alert (s)");
     this.drawMarks(top);
     this.drawCurves();
     this.cursor = draw("line", { class: "cursor", y1: top, y2: this.bottom });
     this.dots = draw("g");
     this.svg.append(this.cursor, this.dots);
-    const at = (event) => ((event.clientX - this.svg.getBoundingClientRect().left - left) / (width - left - right)) * until;
-    this.svg.addEventListener("pointerdown", (event) => { this.svg.setPointerCapture(event.pointerId); seek(at(event)); });
+    const from = () => this.svg.getBoundingClientRect().left + left;
+    const at = (event) => ((event.clientX - from()) / (width - left - right)) * until;
+    this.svg.addEventListener("pointerdown", (event) => {
+      this.svg.setPointerCapture(event.pointerId);
+      seek(at(event));
+    });
     this.svg.addEventListener("pointermove", (event) => { if (event.buttons) seek(at(event)); });
     holder.append(this.svg);
   }
 
   drawMarks(top) {
-    for (const time of this.episode.stepped)
-      this.svg.append(draw("path", { class: "stepped", d: `M${this.x(time)} ${this.bottom + 1}l4 7h-8z` }, draw("title", {}, `shield stepped in at ${plain(time, 2)} s`)));
+    for (const time of this.episode.stepped) {
+      const title = draw("title", {}, `shield stepped in at ${plain(time, 2)} s`);
+      this.svg.append(draw("path", { class: "stepped", d: `M${this.x(time)} ${this.bottom + 1}l4 7h-8z` }, title));
+    }
     for (const [time, pair, closing, first] of this.episode.impacts) {
       const x = this.x(time);
       if (first) this.svg.append(draw("line", { class: "impact", x1: x, x2: x, y1: top, y2: this.bottom }));
       const r = first ? 4.5 : 2.5;
       const y = this.y.gap(0);
-      const mark = draw("path", { class: first ? "struck" : "struck later", d: `M${x - r} ${y - r}L${x + r} ${y + r}M${x - r} ${y + r}L${x + r} ${y - r}` });
-      mark.append(draw("title", {}, `impact of ${pair < 0 ? "Vehicle 1 and the obstacle" : `Vehicles ${pair + 1} and ${pair + 2}`} at ${plain(time, 2)} s, ${plain(closing, 2)} m/s`));
-      this.svg.append(mark);
+      const whom = pair < 0 ? "Vehicle 1 and the obstacle" : `Vehicles ${pair + 1} and ${pair + 2}`;
+      const title = draw("title", {}, `impact of ${whom} at ${plain(time, 2)} s, ${plain(closing, 2)} m/s`);
+      const cross = `M${x - r} ${y - r}L${x + r} ${y + r}M${x - r} ${y + r}L${x + r} ${y - r}`;
+      this.svg.append(draw("path", { class: first ? "struck" : "struck later", d: cross }, title));
     }
   }
 
@@ -178,9 +198,9 @@ class Traces {
     this.cursor.setAttribute("x1", x);
     this.cursor.setAttribute("x2", x);
     const values = { gap: state.gaps, speed: state.speeds, acceleration: state.accelerations };
-    this.dots.replaceChildren(
-      ...TRACES.flatMap(({ name }) => values[name].map((v, k) => draw("circle", { class: `s${((name === "gap" ? k + 1 : k) + 1) % 7}`, cx: x, cy: this.y[name](v), r: 3 }))),
-    );
+    const dot = (name, v, i) => draw("circle", { class: `s${(i + 1) % 7}`, cx: x, cy: this.y[name](v), r: 3 });
+    const dots = ({ name }) => values[name].map((v, k) => dot(name, v, name === "gap" ? k + 1 : k));
+    this.dots.replaceChildren(...TRACES.flatMap(dots));
   }
 }
 

@@ -191,7 +191,8 @@ class Player {
         make("span", { "data-total": now.total }, `${plain(now.total, 2)} total`),
         make("span", { class: "unit" }, "m²/s²"),
       );
-      if (episode.stepped.length) head.append(make("span", { class: "shield" }, steppedInAt(episode, this.time) ? "shield steps in" : "shielded"));
+      const guarded = steppedInAt(episode, this.time) ? "shield steps in" : "shielded";
+      if (episode.stepped.length) head.append(make("span", { class: "shield" }, guarded));
       readout.replaceChildren(
         ...Array.from({ length: vehicles }, (_, i) => {
           const key = make("span", { class: `key k${(i + 1) % 7}` }, String(i + 1));

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ethbrake_marl.agents.team import Driver
-from ethbrake_marl.evaluation.cells import COLUMNS, MEANINGS, Line, our_lines, paper_blocks
+from ethbrake_marl.errors import count_of
+from ethbrake_marl.evaluation.cells import Line, our_lines, paper_blocks, table_columns, table_meanings
 from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
@@ -24,7 +25,7 @@ from ethbrake_marl.pages.parts import Block, Cell, Row, facts, table
 from ethbrake_marl.pages.player import Played, player
 from ethbrake_marl.pages.vector import drawing
 
-_HEADLINE = (0, 1, 2, 6, 7, 9, 10)  # of COLUMNS
+_HEADLINE = (0, 1, 2, 6, 7, 9, 10)  # of the table's columns; those of registered harm metrics follow
 _OTHERS = (3, 4, 5, 8)
 
 
@@ -96,7 +97,7 @@ def render_report(report: Report) -> str:
         drawn = [drawing(each.figure, each.title, each.description) for each in report.figures]
         sections.append(Section("Figures", drawn))
     sections += [_other_test(test) for test in report.tests]
-    sections += [_measures(report), _reading(), *_settings(report)]
+    sections += [_measures(report), _reading(report), *_settings(report)]
     return page(report.title, sections, lead=report.summary)
 
 
@@ -116,11 +117,13 @@ def _results(report: Report) -> Section:
                 "Mean per world of the squared closing speed of impacts: each pair's first one, and every one.",
             )
         )
-    lines: list[Row] = [_row(line, _HEADLINE) for line in our_lines(rows)]
+    columns = table_columns(rows)
+    shown = (*_HEADLINE, *range(len(table_columns(())), len(columns)))
+    lines: list[Row] = [_row(line, shown) for line in our_lines(rows)]
     blocks = paper_blocks(rows)
     for name, paper in blocks:
-        lines += [Block(f"The paper's {name}, as printed"), *(_row(line, _HEADLINE) for line in paper)]
-    body.append(table(["Agent", *(COLUMNS[k] for k in _HEADLINE)], lines, caption="Means with 95 % intervals"))
+        lines += [Block(f"The paper's {name}, as printed"), *(_row(line, shown) for line in paper)]
+    body.append(table(["Agent", *(columns[k] for k in shown)], lines, caption="Means with 95 % intervals"))
     if rows:
         body.append(paragraph(f"{parameter_line(rows[0].parameters)}. Harm in m²/s².", "quiet"))
     body += [paragraph(text, "note") for text in left_out_lines(rows)]
@@ -138,23 +141,34 @@ def _row(line: Line, columns: Sequence[int]) -> Row:
 def _episodes(report: Report) -> list[Section]:
     if not report.played or report.evaluation is None:
         return []
-    worlds = len(report.played)
-    told = (
-        f"{worlds} of the {report.evaluation.worlds.n:,} worlds"
-        if worlds < report.evaluation.worlds.n
-        else f"All {worlds} worlds"
-    )
+    shown, every = len(report.played), report.evaluation.worlds.n
+    told = f"{shown} of the {every:,} worlds" if shown < every else f"All {shown} worlds"
+    notes = [paragraph(text, "note") for text in _unrepeated(report.played, report.evaluation)]
+    played = player(report.played, report.evaluation.vehicles, focus=report.focus)
+    return [Section("Episodes", [f"{told}, from the alert to rest.", *notes, played])]
+
+
+def _unrepeated(played: Sequence[Played], evaluation: Evaluation) -> list[str]:
+    """Which agents drove otherwise when they drove once more, as sentences; none where all did the same to the bit."""
+    rows = {int(number): row for row, number in enumerate(evaluation.index)}
+    found: dict[str, int] = {}
+    for world in played:
+        for agent, motion in world.motions.items():
+            outcome, row = evaluation.outcome(agent), rows[world.number]
+            counted = (float(outcome.first_impact_harm[row]), float(outcome.total_harm[row]))
+            found[agent] = found.get(agent, 0) + (motion.harm != counted)
     return [
-        Section(
-            "Episodes",
-            [f"{told}, from the alert to rest.", player(report.played, report.evaluation.vehicles, focus=report.focus)],
-        )
+        f"{agent} did not repeat itself in {count_of(count, 'world')} of these: what is played there is another episode"
+        " than the one that the tables count."
+        for agent, count in found.items()
+        if count
     ]
 
 
 def _other_test(test: ReportTest) -> Section:
-    lines = [_row(line, range(len(COLUMNS))) for line in our_lines(test.rows)]
-    body: list[str | Part] = [test.description, table(["Agent", *COLUMNS], lines, caption=test.title)]
+    columns = table_columns(test.rows)
+    lines = [_row(line, range(len(columns))) for line in our_lines(test.rows)]
+    body: list[str | Part] = [test.description, table(["Agent", *columns], lines, caption=test.title)]
     if test.rows:
         told = [f"{parameter_line(test.rows[0].parameters)}.", *limit_lines(test.rows), *identity_lines(test.rows)]
         body += [paragraph(text, "quiet") for text in told]
@@ -163,12 +177,12 @@ def _other_test(test: ReportTest) -> Section:
 
 def _measures(report: Report) -> Section:
     lines = [[line.agent, Cell(line.knows, words=True), *_row(line, _OTHERS)[1:]] for line in our_lines(report.rows)]
-    head = ["Agent", "Knows", *(COLUMNS[k] for k in _OTHERS)]
+    head = ["Agent", "Knows", *(table_columns(())[k] for k in _OTHERS)]
     return Section("Other measures", [table(head, lines, caption="In the same worlds")])
 
 
-def _reading() -> Section:
-    return Section("How to read the tables", [facts(MEANINGS)])
+def _reading(report: Report) -> Section:
+    return Section("How to read the tables", [facts(table_meanings(report.rows))])
 
 
 def _settings(report: Report) -> list[Section]:

@@ -21,6 +21,7 @@ from safetensors import SafetensorError
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
 from ethbrake_marl.files.durable import new_folder, write_file
+from ethbrake_marl.files.messages import first_mistake
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.policies.actor import Actor, Float32s
@@ -88,7 +89,7 @@ def make_policy(tensors: Mapping[str, Float32s], **manifest: Any) -> Policy:
         checked = draft.model_copy(update={"manifest_sha256": own})
         return Policy(checked, _tensors(data, checked))
     except ValidationError as error:
-        raise InvalidInput(f"policy: {first_line(error)}") from None
+        raise InvalidInput(f"policy: {first_mistake(error)}") from None
     except ValueError as error:
         raise InvalidInput(f"policy: {error}") from None
 
@@ -168,7 +169,7 @@ def _manifest(path: Path) -> Manifest:
         content = parse_strict_json(data)
         manifest = Manifest.model_validate_json(data)
     except ValidationError as error:
-        raise CorruptBundle(f"{path}: {first_line(error)}") from None
+        raise CorruptBundle(f"{path}: {first_mistake(error)}") from None
     except ValueError as error:
         raise CorruptBundle(f"{path}: {error}") from None
     found = content_sha256(content)
@@ -178,14 +179,6 @@ def _manifest(path: Path) -> Manifest:
             " was saved"
         )
     return check_observed(path, manifest)
-
-
-def first_line(error: ValidationError) -> str:
-    """Where the first mistake is, and what: pydantic's own message has several lines."""
-    first = error.errors(include_url=False)[0]
-    where = ".".join(str(part) for part in first["loc"])
-    reason = first["msg"].removeprefix("Value error, ")
-    return f"{where}: {reason}" if where else reason
 
 
 def _serialise(tensors: Mapping[str, Float32s]) -> bytes:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.files.messages import first_mistake
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.objectives import Declared, Objective, check_declared, objectives_of
 from ethbrake_marl.rewards.registry import SETTINGS, TERMS, registered_terms, settled_weights
@@ -161,8 +162,5 @@ def _from_settings(settings: Mapping[str, Any]) -> RewardParams:
     try:
         return RewardParams(**settings)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        right = first["msg"].replace("Input should be", "must be").replace("a valid number", "a number")
-        right = right.removeprefix("Value error, ")
-        key = ".".join(str(part) for part in first["loc"]).removeprefix("terms.")
-        raise InvalidInput(f"reward: {key} = {first['input']!r}: {right}") from None
+        first = first_mistake(error)
+        raise InvalidInput(f"reward: {first.place.removeprefix('terms.')} = {first.given!r}: {first.right}") from None

@@ -6,6 +6,7 @@ from ethbrake_marl.scenario.catalogue import (
     list_scenarios,
     load_scenario,
     new_scenario_text,
+    read_scenario,
     scenario_folder,
     scenario_path,
 )
@@ -17,7 +18,8 @@ from ethbrake_marl.scenario.initial_states import (
     worlds_from_table,
 )
 from ethbrake_marl.scenario.roles import constant_command, is_state_free, parse_agent_spec
-from ethbrake_marl.scenario.sampling import Channel, Sample
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.sampling import Channel
 from ethbrake_marl.scenario.schema import Scenario, scenario_json_schema
 from ethbrake_marl.scenario.task import Task
 
@@ -41,6 +43,7 @@ __all__ = [
     "parse_agent_spec",
     "parse_yaml",
     "read_initial_states",
+    "read_scenario",
     "read_yaml",
     "scenario_folder",
     "scenario_json_schema",

@@ -18,7 +18,7 @@ from ethbrake_marl.files.yaml import YamlPath, flow_text
 from ethbrake_marl.objectives import Declared, objectives_of
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.features import listed_features
-from ethbrake_marl.scenario.fields import ScenarioFields
+from ethbrake_marl.scenario.fields import LEFT_OUT, ScenarioFields
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, OPTIONAL, QUANTITIES, QuantityRule
 from ethbrake_marl.scenario.roles import (
     LEARNER,
@@ -28,6 +28,7 @@ from ethbrake_marl.scenario.roles import (
     parse_agent_spec,
 )
 from ethbrake_marl.scenario.sampling import farthest_obstacle_m, quantity_bounds
+from ethbrake_marl.scenario.vehicle_types import TYPE_KEYS, missing_quantity
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
@@ -82,6 +83,29 @@ def check_observation(listed: object) -> None:
         refuse((), listed, str(error).removeprefix("observation: "))
 
 
+def check_given(key: str, value: Any, data: Mapping[str, Any]) -> Any:
+    """The value of a quantity that every vehicle needs; None where every type declares it, and nobody else has to.
+
+    ``data`` are the fields before it. Raises pydantic's error where it is missing, and where nobody would read it.
+    """
+    kinds = data.get("vehicle_types")
+    without = None if kinds is None else missing_quantity(kinds, key)
+    if value is LEFT_OUT:
+        if data.get("mixture") is not None or not {"vehicle_types", "mixture"} <= data.keys():
+            return None
+        if kinds is None:
+            raise PydanticCustomError("missing", "missing", {"at": ()})
+        if without is not None:
+            right = f"type {without} does not declare it: give it there, or here for every type that does not"
+            raise PydanticCustomError("scenario", "{right}", {"right": right, "value": "", "at": ()})
+        return None
+    if value is None:
+        refuse((), value, "must be a number or a distribution; a key that is not used is left out")
+    if kinds is not None and without is None:
+        refuse((), value, "every type declares it; leave it out")
+    return value
+
+
 def check_alternatives(scenario: ScenarioFields) -> None:
     """Gaps and speeds are declared in one of two ways, an obstacle in one at most; deviations need a line speed."""
     if "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None:
@@ -99,10 +123,11 @@ def check_whole(scenario: ScenarioFields) -> None:
     """Fields that limit each other: time step, horizon, latency, speeds, gaps, constant scripts, rejection."""
     if not scenario.time_step_s <= scenario.horizon_s:
         refuse(("time_step_s",), scenario.time_step_s, f"must not be above horizon_s ({scenario.horizon_s:g} s)")
-    for i, latency in enumerate(scenario.quantities("latency_s")):
-        if not support(latency)[1] < scenario.horizon_s:
-            right = f"must be below horizon_s ({scenario.horizon_s:g} s), or the vehicle can never act"
-            refuse(_path(scenario, "latency_s", i), latency, right)
+    for i, latencies in enumerate(scenario.possible_quantities("latency_s")):
+        for kind, latency in latencies.items():
+            if not support(latency)[1] < scenario.horizon_s:
+                right = f"must be below horizon_s ({scenario.horizon_s:g} s), or the vehicle can never act"
+                refuse(_path(scenario, "latency_s", i, kind), latency, right)
     _check_reactions(scenario)
     _check_speeds(scenario)
     if scenario.time_gaps_s is not None:
@@ -121,7 +146,7 @@ def check_whole(scenario: ScenarioFields) -> None:
 
 def _check_reactions(scenario: ScenarioFields) -> None:
     """However late the news is, every vehicle may act before the horizon."""
-    own = np.array([support(latency)[1] for latency in scenario.quantities("latency_s")])
+    own = np.array([latest for _, latest in scenario.supports("latency_s")])
     latest = scenario.v2x.latest_reaction_s(own)
     if not (latest < scenario.horizon_s).all():
         i = int(np.argmin(latest < scenario.horizon_s))
@@ -133,11 +158,12 @@ def _check_reactions(scenario: ScenarioFields) -> None:
 
 
 def _check_speeds(scenario: ScenarioFields) -> None:
-    limits = scenario.quantities("speed_limit_mps")
+    limits = scenario.possible_quantities("speed_limit_mps")
     for i, (low, high) in enumerate(quantity_bounds(scenario, "speeds_mps")):
-        if low >= 0.0 and high <= support(limits[i])[0]:
+        lowest = min(limits[i].values(), key=lambda quantity: support(quantity)[0])
+        if low >= 0.0 and high <= support(lowest)[0]:
             continue
-        limit = f"speed_limit_mps of vehicle_{i + 1}, {flow_text(_plain(limits[i]))} m/s"
+        limit = f"speed_limit_mps of vehicle_{i + 1}, {flow_text(_plain(lowest))} m/s"
         if scenario.line_speed_mps is None:
             speed = scenario.quantities("speeds_mps")[i]
             refuse(_path(scenario, "speeds_mps", i), speed, f"must not be above {limit}")
@@ -167,7 +193,7 @@ def _check_constant_scripts(scenario: ScenarioFields) -> None:
     for i, script in scenario.scripts.items():
         deceleration = constant_deceleration(script) or 0.0
         field = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
-        capacity = support(scenario.quantities(field)[i])[0]
+        capacity = scenario.supports(field)[i][0]
         if not abs(deceleration) <= capacity:
             refuse(("roles", f"vehicle_{i + 1}"), script, f"is above this vehicle's {field}, {capacity:g} m/s2")
 
@@ -181,7 +207,10 @@ def _check_rejection(scenario: ScenarioFields) -> None:
             refuse(("roles", f"vehicle_{i + 1}"), script, right)
 
 
-def _path(scenario: ScenarioFields, field: str, index: int) -> YamlPath:
+def _path(scenario: ScenarioFields, field: str, index: int, kind: int = 0) -> YamlPath:
+    line = scenario.types_of_line
+    if line is not None and field in TYPE_KEYS and getattr(line.kinds[kind], field) is not None:
+        return ("vehicle_types", line.names[kind], field)
     return (field, index) if isinstance(getattr(scenario, field), tuple) else (field,)
 
 

@@ -145,6 +145,22 @@ class Choice(_Distribution):
         return np.asarray(self.choice)[np.searchsorted(cumulative, u, side="right")]
 
 
+class WithLoad(_Distribution):
+    """``{with_load: [empty, full]}``, of a vehicle type only: moves with the load of the vehicle, from 0 to 1."""
+
+    with_load: Pair = Field(description="[empty, full]: at load 0 and at load 1")
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that can be drawn."""
+        return min(self.with_load), max(self.with_load)
+
+    def value(self, load: Floats) -> Floats:
+        """``empty + (full - empty) load``, in the shape of ``load`` in [0, 1]; never beyond either end."""
+        empty, full = self.with_load
+        return np.clip(empty + (full - empty) * load, *self.support)
+
+
 def _require(holds: bool, key: str, value: Any, right: str) -> None:
     """Refuse the value of ``key`` unless ``holds``; ``right`` says what would do."""
     if not holds:
@@ -173,7 +189,7 @@ Quantity = Annotated[
 ]
 
 
-def support(quantity: float | Uniform | LogUniform | Normal | Choice) -> tuple[float, float]:
+def support(quantity: float | Uniform | LogUniform | Normal | Choice | WithLoad) -> tuple[float, float]:
     """Smallest and largest value that the quantity can take."""
     return (quantity, quantity) if isinstance(quantity, float) else quantity.support
 

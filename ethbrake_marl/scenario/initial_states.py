@@ -144,6 +144,11 @@ def initial_state_worlds(initial_state: Mapping[str, Any], scenario: Scenario) -
 
 def _worlds(given: Mapping[Entry, Floats], scenario: Scenario, naming: _Naming) -> Worlds:
     """Check the given columns, each [n], fill in the scenario's fixed numbers, and build the worlds."""
+    if scenario.members:
+        raise InvalidInput(
+            f"{naming.where}: scenario {scenario.name!r} is a mixture, and nothing says which of its scenarios a world"
+            f" belongs to; take one of them: {', '.join(member.name for member in scenario.members)}"
+        )
     n = len(next(iter(given.values()))) if given else 1
     full: dict[str, Floats] = {}
     rules = _quantities(scenario)

@@ -9,7 +9,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.files.messages import explain
+from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.scenario.v2x import CHANNELS, V2X
+from ethbrake_marl.scenario.wording import ScenarioWording
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
@@ -32,9 +35,8 @@ def register_preset(name: str, settings: Mapping[str, Any]) -> None:
     try:
         channel = V2X.model_validate(dict(settings)).channel
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        path = [str(part) for part in (*first["loc"], *first.get("ctx", {}).get("at", ()))]
-        key = f"{'.'.join(path)}: " if path else ""
-        raise InvalidInput(f"preset {name!r}: {key}{first['msg'].replace('Input should', 'must')}") from None
+        raise explain(
+            error, Document(f"preset {name!r}", dict(settings), {}), ScenarioWording(V2X.model_fields)
+        ) from None
     if CHANNELS.setdefault(name, channel) != channel:
         raise AlreadyExists(f"preset {name!r} is registered already; give another name")

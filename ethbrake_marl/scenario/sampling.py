@@ -6,7 +6,7 @@ Speeds from the speed of the line, gaps from time gaps, the distance to an obsta
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -15,11 +15,12 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.episode import first_decision_s
 from ethbrake_marl.physics.events import stopping_distances
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, concatenate, make_worlds
-from ethbrake_marl.scenario.distributions import support, values
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, make_worlds
+from ethbrake_marl.scenario.distributions import WithLoad, support, values
 from ethbrake_marl.scenario.fields import ScenarioFields
 from ethbrake_marl.scenario.quantities import BLOCK, DECLARED, QUANTITIES
 from ethbrake_marl.scenario.roles import constant_command
+from ethbrake_marl.scenario.sample import Sample, join_samples
 from ethbrake_marl.scenario.v2x import PER_LINK, with_news
 
 
@@ -29,7 +30,8 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
     ``speed = line speed + own deviation`` and ``gap = time gap x speed of the rear vehicle of the pair``. Both only
     grow with what they are made of, so the bounds of what is declared give the bounds of what the worlds have.
     """
-    found = {key: declared(key) for key in QUANTITIES if getattr(scenario, key) is not None}
+    other = {"gaps_m": scenario.time_gaps_s, "speeds_mps": scenario.line_speed_mps}
+    found = {key: declared(key) for key in QUANTITIES if other.get(key) is None}
     if scenario.line_speed_mps is not None:
         found["speeds_mps"] = declared("line_speed_mps") + declared("speed_deviations_mps")
     if scenario.time_gaps_s is not None:
@@ -61,14 +63,25 @@ def farthest_obstacle_m(scenario: ScenarioFields) -> float:
     return float(farthest[0])
 
 
-def drawn_quantities(scenario: ScenarioFields, u: Floats) -> dict[str, Floats]:
-    """Every quantity of n worlds, each [n, entries], from their uniform numbers ``u`` [n, width]."""
+def drawn_quantities(
+    scenario: ScenarioFields, u: Floats, typed: tuple[Ints, Floats] | None = None
+) -> dict[str, Floats]:
+    """Every quantity of n worlds, each [n, entries], from their uniform numbers ``u`` [n, width].
+
+    ``typed``: type (index) and load of every vehicle, both [n, N], where the scenario has types.
+    """
 
     def drawn(key: str) -> Floats:
-        entries, rule = scenario.quantities(key), DECLARED[key]
+        entries, rule = scenario.possible_quantities(key), DECLARED[key]
         found = np.empty((len(u), len(entries)))
-        for i, entry in enumerate(entries):
-            found[:, i] = values(entry, u[:, rule.place(i)])
+        for i, possible in enumerate(entries):
+            for kind, entry in possible.items():
+                rows = slice(None) if typed is None or len(possible) == 1 else typed[0][:, i] == kind
+                if isinstance(entry, WithLoad):
+                    assert typed is not None
+                    found[rows, i] = entry.value(typed[1][rows, i])
+                else:
+                    found[rows, i] = values(entry, u[rows, rule.place(i)])
         return found
 
     return world_quantities(scenario, drawn)
@@ -81,7 +94,7 @@ def quantity_bounds(scenario: ScenarioFields, key: str) -> tuple[tuple[float, fl
 
 def _all_bounds(scenario: ScenarioFields) -> dict[str, Floats]:
     """The same of every quantity: each [2, entries]."""
-    return world_quantities(scenario, lambda key: np.array([support(q) for q in scenario.quantities(key)]).T)
+    return world_quantities(scenario, lambda key: np.array(scenario.supports(key)).T)
 
 
 Channel = Literal["list", "training"]
@@ -90,6 +103,8 @@ CHANNELS: dict[str, int] = {"list": 0, "training": 1}
 V2X_NEWS = (1,)  # the stream of the links' delays and losses
 OBSTACLE = (2,)  # the stream of the obstacle's distance
 OBSTACLE_WIDTH = 4  # its numbers per world, of which the first is used
+TYPES = (3,)  # the stream of the vehicles' types and loads
+PER_TYPE = 4  # its numbers per vehicle: type, load, and two that are free; one Philox counter
 MOST_ATTEMPTS = 1000  # draws of one world before its scenario is declared unusable
 _PATIENCE = 10  # attempts of a whole list before one world is tried to its end
 
@@ -97,26 +112,6 @@ MOST_AT_ONCE = 10_000_000  # worlds of one sample; a longer list is drawn in par
 
 _MOST_WORLDS = 2**62  # their numbers are 64-bit integers
 _NUMBERS_PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """Worlds at the alert, and where in the list they stand.
-
-    >>> import ethbrake_marl as eb
-    >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
-    >>> sample.index, sample.worlds.gaps_m.round(2)
-    (array([0, 1]), array([[6.62, 8.49], [5.33, 7.79]]))
-
-    """
-
-    worlds: Worlds  # at t = 0
-    index: Ints  # [n] number of each world in the list of its seed
-    rejected: int  # draws refused because of an early impact
-
-    def __repr__(self) -> str:
-        numbers = f"numbers {self.index.min()} to {self.index.max()}" if len(self.index) else "no numbers"
-        return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
 
 
 def uniform_numbers(
@@ -137,16 +132,19 @@ def uniform_numbers(
 
 def draw_list(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
     """Worlds ``first`` to ``first + n - 1`` of the scenario's list; see ``Scenario.sample``."""
-    _check_request(n, seed, first, channel)
-    seed = int(seed)
-    index = np.arange(first, first + n, dtype=np.int64)
-    worlds = _draw(scenario, seed, channel, 0, index)
+    check_request(n, seed, first, channel)
+    return draw_numbers(scenario, np.arange(first, first + n, dtype=np.int64), int(seed), channel)
+
+
+def draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Channel) -> Sample:
+    """The worlds with these numbers (ascending) of the scenario's list; the request has been checked."""
+    drawn = _draw(scenario, seed, channel, 0, index)
     if scenario.early_impacts == "keep" or not scenario.learners:
-        return Sample(worlds, index, 0)
-    early = early_impact(scenario, worlds)
+        return drawn
+    early = early_impact(scenario, drawn.worlds)
     if not early.any():
-        return Sample(worlds, index, 0)
-    return _redraw(scenario, seed, channel, index, worlds, early)
+        return drawn
+    return _redraw(scenario, seed, channel, drawn, early)
 
 
 def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
@@ -167,31 +165,27 @@ def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
     return np.asarray(impacts.count.sum(axis=1) + impacts.obstacle_count > 0)
 
 
-def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints, worlds: Worlds, early: Bools) -> Sample:
+def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample, early: Bools) -> Sample:
     """Draw refused worlds again, attempt by attempt, until every one is accepted."""
-    accepted = np.flatnonzero(~early)
-    pending = np.flatnonzero(early)
-    parts, rows, rejected = [worlds.take(accepted)], [accepted], len(pending)
+    parts, pending, rejected = [drawn.take(~early)], drawn.index[early], int(early.sum())
     for attempt in range(1, MOST_ATTEMPTS):
         if attempt == _PATIENCE and len(pending) > 1:
-            _redraw_one(scenario, seed, channel, index[pending[:1]])
-        drawn = _draw(scenario, seed, channel, attempt, index[pending])
-        early = early_impact(scenario, drawn)
+            _redraw_one(scenario, seed, channel, pending[:1])
+        drawn = _draw(scenario, seed, channel, attempt, pending)
+        early = early_impact(scenario, drawn.worlds)
         if not early.all():
             parts.append(drawn.take(~early))
-            rows.append(pending[~early])
         pending = pending[early]
         rejected += len(pending)
         if len(pending) == 0:
-            order = np.argsort(np.concatenate(rows))
-            return Sample(concatenate(parts).take(order), index, rejected)
-    raise _unusable(scenario, int(index[pending[0]]))
+            return join_samples(parts, rejected)
+    raise _unusable(scenario, int(pending[0]))
 
 
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
     """Follow one world to its end; if it fails the whole list fails, and this way soon."""
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
-        if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index))[0]:
+        if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index).worlds)[0]:
             return
     raise _unusable(scenario, int(index[0]))
 
@@ -205,31 +199,34 @@ def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
     )
 
 
-def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Worlds:
+def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Sample:
     """The worlds with these numbers (ascending), as drawn in this attempt."""
     first, last = int(index[0]), int(index[-1])
-    u = uniform_numbers(seed, channel, attempt, first, last - first + 1, BLOCK * scenario.vehicles)
-    if len(u) != len(index):
-        u = u[index - first]
-    drawn = drawn_quantities(scenario, u)
 
-    def drawn_obstacle(key: str) -> Floats:
-        u_obstacle = uniform_numbers(seed, channel, attempt, first, last - first + 1, OBSTACLE_WIDTH, of=OBSTACLE)
-        return values(scenario.quantities(key)[0], u_obstacle[index - first, 0])
+    def numbers(width: int, of: tuple[int, ...] = ()) -> Floats:
+        u = uniform_numbers(seed, channel, attempt, first, last - first + 1, width, of=of)
+        return u if len(u) == len(index) else u[index - first]
 
-    obstacle_gap_m = obstacle_gap(scenario, drawn, drawn_obstacle)
+    line, typed = scenario.types_of_line, None
+    if line is not None:
+        u = numbers(PER_TYPE * scenario.vehicles, TYPES)
+        typed = line.draw(u.reshape(len(u), scenario.vehicles, PER_TYPE))
+    drawn = drawn_quantities(scenario, numbers(BLOCK * scenario.vehicles), typed)
+    obstacle_gap_m = obstacle_gap(
+        scenario, drawn, lambda key: values(scenario.quantities(key)[0], numbers(OBSTACLE_WIDTH, OBSTACLE)[:, 0])
+    )
     restitution = drawn.pop("restitution")[:, 0]
     worlds = make_worlds(
         drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, obstacle_gap_m=obstacle_gap_m, **drawn
     )
-    if not scenario.v2x.by_link:
-        return worlds
-    width = PER_LINK * scenario.vehicles * scenario.vehicles
-    u = uniform_numbers(seed, channel, attempt, first, last - first + 1, width, of=V2X_NEWS)[index - first]
-    return replace(worlds, vehicles=with_news(scenario.v2x, worlds.vehicles, u))
+    if scenario.v2x.by_link:
+        u = numbers(PER_LINK * scenario.vehicles * scenario.vehicles, V2X_NEWS)
+        worlds = replace(worlds, vehicles=with_news(scenario.v2x, worlds.vehicles, u))
+    return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
 
 
-def _check_request(n: int, seed: int, first: int, channel: str) -> None:
+def check_request(n: int, seed: int, first: int, channel: str) -> None:
+    """Refuse, with ``InvalidInput``, worlds that no list has."""
     for name, value, least in (("n", n, 1), ("seed", seed, 0), ("first", first, 0)):
         check_whole_number(f"sample: {name}", value, least)
     if not n <= MOST_AT_ONCE:

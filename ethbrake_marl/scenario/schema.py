@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,16 +17,20 @@ from ethbrake_marl.files.yaml import Document, flow_text
 from ethbrake_marl.scenario.checks import (
     check_alternatives,
     check_entries,
+    check_given,
     check_objective,
     check_observation,
     check_roles,
     check_whole,
     refuse,
 )
-from ethbrake_marl.scenario.fields import ScenarioFields
+from ethbrake_marl.scenario.fields import OF_EVERY_VEHICLE, ScenarioFields
+from ethbrake_marl.scenario.mixture import WORDS, build_members, changed_content, draw_mixture
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OLD_KEYS, OPTIONAL, rename_old_keys
 from ethbrake_marl.scenario.roles import LEARNER, complete_roles
-from ethbrake_marl.scenario.sampling import Channel, Sample, draw_list, quantity_bounds
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.sampling import Channel, draw_list, quantity_bounds
+from ethbrake_marl.scenario.vehicle_types import check_type_names, check_types
 from ethbrake_marl.scenario.wording import ScenarioWording
 
 
@@ -67,10 +71,36 @@ class Scenario(ScenarioFields):
             refuse((), value, "must be a number or a distribution; a key that is not used is left out")
         return value
 
+    @field_validator(*OF_EVERY_VEHICLE, mode="before")
+    @classmethod
+    def _needed(cls, value: Any, info: ValidationInfo) -> Any:
+        return check_given(str(info.field_name), value, info.data)
+
+    @field_validator("vehicle_types", "types", "mixture", mode="before")
+    @classmethod
+    def _not_empty(cls, value: Any) -> Any:
+        if value is None or (isinstance(value, dict | list | tuple) and not value):
+            refuse((), value, "must not be empty; a key that is not used is left out")
+        return value
+
+    @field_validator("vehicle_types")
+    @classmethod
+    def _kinds(cls, value: Any) -> Any:
+        check_type_names(value)
+        return value
+
+    @field_validator("types")
+    @classmethod
+    def _types(cls, value: Any, info: ValidationInfo) -> Any:
+        if "vehicles" in info.data and "vehicle_types" in info.data:
+            check_types(value, info.data["vehicle_types"], info.data["vehicles"])
+        return value
+
     @field_validator(*DECLARED)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        check_entries(DECLARED[str(info.field_name)], value, info.data.get("vehicles"))
+        if value is not None:
+            check_entries(DECLARED[str(info.field_name)], value, info.data.get("vehicles"))
         return value
 
     @field_validator("roles")
@@ -97,6 +127,8 @@ class Scenario(ScenarioFields):
 
     @model_validator(mode="after")
     def _whole(self) -> Scenario:
+        if self.mixture is not None:  # its members have been checked
+            return self
         check_alternatives(self)
         check_whole(self)
         return self
@@ -104,16 +136,31 @@ class Scenario(ScenarioFields):
     def _repr_html_(self) -> str:
         """What it declares, for a notebook."""
         told = {key: value for key, value in self.declared().items() if key not in ("name", "title")}
+        if self.mixture is not None:
+            told["mixture"] = ", ".join(f"{e.weight:g} x {e.scenario['name']}" for e in self.mixture)
         rows = [(key, value if isinstance(value, str) else flow_text(value)) for key, value in told.items()]
         return html_table(("Key", "Value"), rows, caption=f"Scenario {self.name}: {self.title or 'no title'}")
 
     def bounds(self, field: str) -> tuple[tuple[float, float], ...]:
         """Smallest and largest value of each entry of ``gaps_m``, ``speeds_mps``, ..., however it is declared."""
-        return quantity_bounds(self, field)
+        each = [quantity_bounds(member, field) for member in self.members or (self,)]
+        return tuple(
+            (min(low for low, _ in entry), max(high for _, high in entry)) for entry in zip(*each, strict=True)
+        )
 
     def declared(self) -> dict[str, Any]:
         """What was given, as plain data: ``Scenario(**scenario.declared())`` is the same scenario."""
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
+
+    def content(self, without: Collection[str]) -> dict[str, Any]:
+        """Every value, defaults too, as plain data; of a mixture also those of its members, by name, without texts."""
+        content = self.model_dump(mode="json", exclude=set(without))
+        if self.mixture is not None and self.members:
+            content["mixture"] = [
+                {"weight": entry.weight, "scenario": member.model_dump(mode="json", exclude=set(WORDS))}
+                for entry, member in zip(self.mixture, self.members, strict=True)
+            ]
+        return content
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
         """Worlds ``first`` to ``first + n - 1`` of the endless list that belongs to ``seed``.
@@ -122,19 +169,17 @@ class Scenario(ScenarioFields):
         ``"training"`` are independent of each other. Raises ``InvalidInput`` for a negative seed or ``first``,
         ``n < 1``, or when early impacts are rejected and (almost) every draw has one.
         """
-        return draw_list(self, n, seed, first=first, channel=channel)
+        draw = draw_mixture if self.members else draw_list
+        return draw(self, n, seed, first=first, channel=channel)
 
     def replace(self, **changes: Any) -> Scenario:
         """The same scenario with other values in some fields, checked again.
 
-        A new way to declare gaps or speeds takes the place of the old one.
+        A new way to declare gaps or speeds takes the place of the old one. In a mixture the values are new in every
+        member.
         """
         changes = rename_old_keys(changes, f"scenario {self.name!r}")
-        old = {key for pair in ALTERNATIVES.items() for key in pair if changes.keys() & set(pair)}
-        if "speeds_mps" in changes:
-            old.add("speed_deviations_mps")
-        kept = {key: value for key, value in self.declared().items() if key not in old}
-        return Scenario(**{**kept, **changes})
+        return Scenario(**changed_content(self.declared(), changes))
 
     def with_learners(self, learners: Sequence[str | int]) -> Scenario:
         """The same scenario with exactly these learners, by name (``vehicle_2``) or index (from 0).
@@ -165,15 +210,17 @@ class Scenario(ScenarioFields):
 
 def scenario_json_schema() -> dict[str, Any]:
     """JSON Schema of a scenario file, for editors that complete and check YAML."""
-    one_of_two = [
+    one_of_two: list[dict[str, Any]] = [
         {"not": {"required": [*pair]}} if pair[0] in OPTIONAL else {"oneOf": [{"required": [key]} for key in pair]}
         for pair in ALTERNATIVES.items()
     ]
+    by_types = {"anyOf": [{"required": ["vehicle_types"]}, {"required": [*OF_EVERY_VEHICLE]}]}
+    whole = {"if": {"not": {"required": ["mixture"]}}, "then": {"allOf": [*one_of_two, by_types]}}
     needed = {"speed_deviations_mps": ["line_speed_mps"]}
     schema = Scenario.model_json_schema(schema_generator=_FileSchema)
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **schema, "allOf": one_of_two, "dependentRequired": needed,
+        **schema, **whole, "dependentRequired": needed,
     }  # fmt: skip
 
 
@@ -195,10 +242,14 @@ def _build(scenario: Scenario, document: Document) -> None:
     if not isinstance(document.content, dict):
         raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance name: my-scenario")
     document = _of_today(document)
+    members: tuple[Scenario, ...] = ()
+    if "mixture" in document.content:
+        document, members = build_members(document, Scenario.from_document)
     try:
         BaseModel.__init__(scenario, **document.content)
     except ValidationError as error:
         raise explain(error, document, ScenarioWording(Scenario.model_fields)) from None
+    scenario._members = members
 
 
 def _of_today(document: Document) -> Document:
@@ -211,7 +262,9 @@ def _of_today(document: Document) -> Document:
 
 
 def _plain(value: Any) -> Any:
-    """Replace numpy numbers and arrays by Python's own, which the strict schema accepts."""
+    """Replace numpy numbers and arrays by Python's own, which the strict schema accepts; scenarios by what they say."""
+    if isinstance(value, Scenario):
+        return value.declared()
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, dict):

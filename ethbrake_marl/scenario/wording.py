@@ -11,8 +11,10 @@ from pydantic_core import ErrorDetails
 from ethbrake_marl.files.messages import Wording, suggestion
 from ethbrake_marl.files.yaml import YamlPath
 from ethbrake_marl.scenario.distributions import DISTRIBUTIONS, Choice, NormalShape
+from ethbrake_marl.scenario.fields import Member
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
 from ethbrake_marl.scenario.v2x import V2X
+from ethbrake_marl.scenario.vehicle_types import VehicleType
 
 _DISTRIBUTION = (
     "{uniform: [low, high]}, {loguniform: [low, high]}, {normal: {mean, sd, low, high}} or {choice: [a, b, ...]}"
@@ -35,6 +37,10 @@ class ScenarioWording(Wording):
         """The keys that may stand where ``path`` ends: at the top, in a distribution, in its parameters, in v2x."""
         if len(path) == 1:
             return list(self.keys)
+        if path[0] == "vehicle_types" and len(path) == 3:
+            return list(VehicleType.model_fields)
+        if path[0] == "mixture":
+            return list(Member.model_fields)
         outer = str(path[-2])
         if outer == "v2x":
             return list(V2X.model_fields)
@@ -43,6 +49,8 @@ class ScenarioWording(Wording):
     def needed(self, path: YamlPath) -> str:
         """What is needed at ``path``, with an example."""
         key = path[-1]
+        if path[0] == "mixture":
+            return "it is needed, for instance {scenario: paper-random, weight: 2}"
         if isinstance(key, int):
             return "two numbers [low, high] are needed"
         rule = DECLARED.get(key)
@@ -64,6 +72,8 @@ class ScenarioWording(Wording):
             return f"must be a number, {_DISTRIBUTION}{_misspelt(detail['input'])}"
         if detail["type"] == "float_type" and detail["loc"][-1] == "#number":
             return f"must be a number or a distribution, {_DISTRIBUTION}"
+        if detail["loc"][:1] == ("mixture",) and detail["loc"][-1] == "scenario":
+            return "must be what a scenario says; names are read where they stand in a file (load_scenario)"
         return ""
 
 

@@ -20,7 +20,7 @@ from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place
 from ethbrake_marl.agents.refined import Refined
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, script_agents, set_others
-from ethbrake_marl.engine.stream import ask_script
+from ethbrake_marl.engine.stream import ask_script, begin_script
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
@@ -77,7 +77,7 @@ class HybridAgent(AgentAround):
         scripts = script_agents(self.scenario, except_for=vehicle)
         for agent in (self.policy, self.backup):
             set_others(agent, vehicle, scripts)
-            agent.begin(worlds, vehicle, rows)
+            begin_script(agent, worlds, vehicle, rows)
         if isinstance(self.policy, Refined):  # was rolled out just now
             policy_harm = self.policy.predicted_harm[rows]
         else:
@@ -191,7 +191,7 @@ class StepShieldAgent(AgentAround):
         if self._asked is not None and len(rows) < len(self._wanted):
             self._commit(self._asked)  # some episodes of a batch are renewed: that step was made
         set_others(self.policy, vehicle, script_agents(self.scenario, except_for=vehicle))
-        self.policy.begin(worlds, vehicle, rows)
+        begin_script(self.policy, worlds, vehicle, rows)
         self.shield.begin(worlds if self._believed is None else self._believed.take(rows), rows, self.policy)
         bound = self.shield.first_bound[rows] + self.shield.allowance
         self.predicted_harm = place(self.predicted_harm, rows, bound)

@@ -25,6 +25,7 @@ from ethbrake_marl.actions import commands_of
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.stream import begin_script
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.rows import params_at
@@ -264,7 +265,7 @@ class AttachedShield(Attached):
     def begun(self, memory: StepShield, alert: Worlds, rows: Ints) -> StepShield:
         """The shield once episodes start in these rows."""
         if self.policy is not None:
-            self.policy.begin(alert, self.vehicle, rows)
+            begin_script(self.policy, alert, self.vehicle, rows)
         shield = copy.copy(memory)
         shield.begin(alert, rows, self.policy)
         moving = int((~shield.settles[rows]).sum())

@@ -12,11 +12,11 @@ from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
-from pettingzoo.utils.conversions import parallel_to_aec
 
 from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.envs.turns import in_turns
 from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
@@ -62,6 +62,11 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         **options: Any,
     ) -> None:
         settings = read_options("HybridShield", {"mode": mode, **options})
+        if isinstance(env, AECEnv):
+            raise InvalidInput(
+                "HybridShield: takes the parallel environment (eb.parallel_env); with agents acting in turn it is"
+                " eb.shielded_aec(eb.parallel_env(...))"
+            )
         engine = engine_of(env, ParallelEnv, "HybridShield", "eb.parallel_env")
         super().__init__(env)
         self._engine = engine
@@ -125,7 +130,7 @@ def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, 
     """
     if isinstance(env, AECEnv):
         raise InvalidInput("shielded_aec: give the parallel environment (eb.parallel_env), not the AEC one")
-    return parallel_to_aec(HybridShield(env, *args, **settings))
+    return in_turns(HybridShield(env, *args, **settings))
 
 
 def _names(agents: object) -> tuple[Any, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from rich.text import Text
 from ethbrake_marl.agents.knowledge import Knowledge, knowledge_text
 from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.errors import check_whole_number, unknown_name
+from ethbrake_marl.evaluation.identity import policies_by_name
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
@@ -45,11 +46,13 @@ class TimedRow:
     first_impact_harm: Estimate
     total_harm: Estimate
     difference: Estimate  # of the harm that is compared, minus the reference agent's, paired by world
+    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> its policy's, where one drives
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; an interval is ``[low, high]`` or null."""
         found: dict[str, Any] = {"agent": self.agent, "knows": knowledge_text(self.knows)}
         found |= {"cpu_ms": self.median_ms, "cpu_ms_range": [self.lowest_ms, self.highest_ms]}
+        found["policy_sha256"] = dict(self.policy_sha256)
         harms = {"first_impact_harm": self.first_impact_harm, "total_harm": self.total_harm}
         return found | estimates_to_json({**harms, "difference": self.difference})
 
@@ -75,7 +78,7 @@ def equal_time(
     if against not in agents:
         raise unknown_name("agent to compare with", against, agents)
     n = sample.worlds.n
-    few = Sample(sample.worlds.take(np.arange(min(n, _WARM_UP))), sample.index[:_WARM_UP], 0)
+    few = sample.take(np.arange(min(n, _WARM_UP)))
     evaluate(few, agents, scenario=scenario, chunk=CHUNK)
     spent: dict[str, list[float]] = {name: [] for name in agents}
     outcomes: dict[str, Outcome] = {}
@@ -98,6 +101,7 @@ def equal_time(
             mean(outcome.first_impact_harm),
             mean(outcome.total_harm),
             paired_difference(outcome.ledger.world_harm(harm_count), reference),
+            policies_by_name(outcome.policies, scenario),
         )
         for name, outcome in outcomes.items()
     ]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.evaluation.identity import result_identity, worlds_sha256
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
 from ethbrake_marl.figures.curves import SeedCurve, at_common_steps, seed_curves
@@ -22,6 +23,7 @@ from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
 from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.learning.training import Training, check_same, resolve
+from ethbrake_marl.policies.policy import load_policy
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Scenario
 
@@ -95,12 +97,18 @@ def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) ->
     that each training kept, and of the last one. Raises ``InvalidInput`` when they have no evaluation in common.
     """
     curves = _read_curves(plan, folder)
-    summary: dict[str, Any] = {"scenario": scenario.name, "recipes": {}}
+    about = result_identity("learning-curves", scenario, None)
+    summary: dict[str, Any] = {**about, "scenario": scenario.name, "recipes": {}}
     for trainings in plan:
         name = trainings.recipe.name
         values = curves[HARM_METRIC[trainings.recipe.reward.harm_count]][name].values
         kept, last = _estimate(values.min(axis=1)), _estimate(values[:, -1])
-        summary["recipes"][name] = {"seeds": trainings.seeds, "kept": kept, "last": last}
+        summary["recipes"][name] = {
+            **_identity(scenario, trainings, folder),
+            "seeds": trainings.seeds,
+            "kept": kept,
+            "last": last,
+        }
     write_picture(folder / FIGURE, curves_figure(scenario, plan, folder), force=True)
     write_output(folder / TABLE, _csv(curves).encode(), force=True)
     write_output(folder / SUMMARY, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode(), force=True)
@@ -160,6 +168,16 @@ def _estimate(harms: Any) -> dict[str, Any]:
     found = interquartile_mean([harms])
     told = found.to_json()
     return {"interquartile_mean": told["value"], "interval": told["interval"], "each": [float(harm) for harm in harms]}
+
+
+def _identity(scenario: Scenario, trainings: Trainings, folder: Path) -> dict[str, Any]:
+    """Hashes of the recipe's fixed list, and of the policy that each of its seeds kept."""
+    fixed = scenario.sample(trainings.recipe.evaluation.worlds, trainings.recipe.evaluation.seed)
+    runs = [folder / f"{trainings.recipe.name}-seed{seed}" for seed in range(trainings.seeds)]
+    return {
+        "worlds_sha256": worlds_sha256(fixed.worlds, fixed.index),
+        "policy_sha256": [load_policy(run).manifest.manifest_sha256 for run in runs],
+    }
 
 
 def _conditions(plan: Sequence[Trainings]) -> str:

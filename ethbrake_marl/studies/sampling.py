@@ -14,6 +14,7 @@ import numpy as np
 
 from ethbrake_marl.agents.registry import make_single_agent
 from ethbrake_marl.errors import count_of
+from ethbrake_marl.evaluation.identity import identity_line
 from ethbrake_marl.figures.curves import draw_errors
 from ethbrake_marl.figures.style import Figure, write_picture
 from ethbrake_marl.harm import empty_ledger
@@ -157,11 +158,11 @@ def convergence_figure(studies: Sequence[Convergence], caption: str) -> Figure:
 def sampling_report(figure_path: str | Path, *, scenario: str = "paper-random", n: int = 2000, seed: int = 7) -> str:
     """Run the whole study, write its figure and return its tables as Markdown; an older figure is overwritten."""
     chosen = load_scenario(scenario)
-    worlds = chosen.sample(n, seed).worlds
-    studies = [convergence(worlds, agent, until_s=chosen.horizon_s) for agent in CONTROLS]
+    sample = chosen.sample(n, seed)
+    studies = [convergence(sample.worlds, agent, until_s=chosen.horizon_s) for agent in CONTROLS]
     caption = (
         f"{scenario}: {count_of(n, 'world')}, seed {seed}; Vehicles 1 and 3 brake fully. Error: sampled minus"
         " exact harm. At 0.2 s the latency of Vehicle 3 falls between two samples, so it brakes 0.1 s late."
     )
     write_picture(figure_path, convergence_figure(studies, caption), force=True)
-    return "\n\n".join(convergence_table(study) for study in studies)
+    return "\n\n".join([*(convergence_table(study) for study in studies), identity_line(chosen, sample)])

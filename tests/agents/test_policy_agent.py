@@ -232,13 +232,52 @@ class OwnAgent:
     ("answer", "told"),
     [
         (lambda worlds: 1 / 0, r"agent 'own' of vehicle_2: act on \d+ worlds at 0.\d\d s: ZeroDivisionError"),
-        (lambda worlds: np.zeros((worlds.n, 1)), r"agent 'own' of vehicle_2: a command of shape \(\d+, 1\); one per"),
+        (
+            lambda worlds: np.zeros((worlds.n, 1)),
+            r"agent 'own', world 0, vehicle_2 at 0.\d\d s: gave float64 of shape \(\d+, 1\); one number per world is",
+        ),
+        (lambda worlds: 1.0, r"agent 'own', world 0, vehicle_2 at 0.\d\d s: gave float64 of shape \(\)"),
+        (lambda worlds: None, r"agent 'own', world 0, vehicle_2 at 0.\d\d s: gave object of shape \(\)"),
+        (lambda worlds: ["x"] * worlds.n, r"agent 'own', world 0, vehicle_2 at 0.\d\d s: gave <U1 of shape"),
     ],
 )
 def test_own_agent__that_raises_or_gives_another_shape_is_named(around, answer, told):
     agent = shielded(OwnAgent(answer), around)
     with pytest.raises(InvalidInput, match=told):
         eb.evaluate(SCENARIO.sample(12, 7), {"own": agent}, scenario=SCENARIO)
+
+
+def test_own_agent__with_too_few_commands_names_the_first_world_without_one() -> None:
+    agent = OwnAgent(lambda worlds: np.zeros(min(7, worlds.n)))
+    told = r"agent 'own', world 7, vehicle_2 at 0.\d\d s: gave float64 of shape \(7,\); .*, shape \(12,\)"
+    with pytest.raises(InvalidInput, match=told):
+        eb.evaluate(SCENARIO.sample(12, 7), {"own": agent}, scenario=SCENARIO)
+
+
+def test_own_agent__with_a_command_that_is_no_number_names_agent_and_world() -> None:
+    agent = OwnAgent(lambda worlds: np.where(np.arange(worlds.n) == 4, np.nan, 0.0))
+    told = r"agent 'own', world 4, vehicle_2 at 0.\d\d s: command nan m/s2; must be in \[-7, 7\]"
+    with pytest.raises(InvalidInput, match=told):
+        eb.evaluate(SCENARIO.sample(12, 7), {"own": agent}, scenario=SCENARIO)
+
+
+class Nameless:
+    def begin(self, worlds):
+        pass
+
+    def act(self, worlds, vehicle):
+        return np.zeros(worlds.n)
+
+
+@pytest.mark.parametrize("around", ["", *AROUND])
+def test_own_agent__without_a_name_or_with_other_parameters_is_told_what_is_wrong(around):
+    with pytest.raises(InvalidInput, match="evaluate: agent 'own': a Nameless is not an agent, it has no name; make_"):
+        eb.evaluate(SCENARIO.sample(3, 7), {"own": Nameless()}, scenario=SCENARIO)
+    agent = Nameless()
+    agent.name = "own"
+    told = r"'own' of vehicle_2: begin on \d+ worlds? at 0.00 s: TypeError: Nameless.begin\(\) takes 2 .* were given$"
+    with pytest.raises(InvalidInput, match=told):
+        eb.evaluate(SCENARIO.sample(3, 7), {"own": shielded(agent, around)}, scenario=SCENARIO)
 
 
 FILE = """

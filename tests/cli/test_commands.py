@@ -164,8 +164,8 @@ def test_scenario_validate__counts_the_refused_draws(ethbrake, scenario_file):
 def test_scenario_schema__is_a_json_schema(ethbrake):
     schema = json.loads(ethbrake("scenario", "schema").out)
     assert schema["$schema"].startswith("https://json-schema.org/")
-    assert "mass_t" in schema["required"]
-    assert {"oneOf": [{"required": ["gaps_m"]}, {"required": ["time_gaps_s"]}]} in schema["allOf"]
+    assert schema["required"] == ["name"]
+    assert {"oneOf": [{"required": ["gaps_m"]}, {"required": ["time_gaps_s"]}]} in schema["then"]["allOf"]
 
 
 def test_scenario__folder_and_short_name_of_a_shipped_one(ethbrake):

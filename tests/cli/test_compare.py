@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -47,7 +50,7 @@ def test_same_agents__differ_by_nothing(results: Path) -> None:
     found = compare_results(read_result(results / "a.csv.json"), read_result(results / "b.csv.json"))
     (only,) = found.differences
     assert only.agent == "full_brake" and only.policy == "none" and found.unpaired_because is None
-    assert only.first_impact_harm == Estimate(0.0, (0.0, 0.0)) == only.total_harm
+    assert only.harms == dict.fromkeys(("first_impact_harm", "total_harm"), Estimate(0.0, (0.0, 0.0)))
     assert found.left_over == (("coast",), ("e_v2x_bm",)) and found.other_versions == {}
 
 
@@ -58,8 +61,9 @@ def test_difference__is_paired_by_world_where_every_world_is_there(results: Path
     for name in ("a", "d"):
         rows = np.genfromtxt(results / f"{name}.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
         columns[name] = rows["total_harm"][rows["agent"] == "coast"]
-    assert paired.differences[1].total_harm == paired_difference(columns["d"], columns["a"])
-    assert paired.differences[1].total_harm.value == pytest.approx(apart.differences[1].total_harm.value)
+    assert paired.differences[1].harms["total_harm"] == paired_difference(columns["d"], columns["a"])
+    both = [found.differences[1].harms["total_harm"].value for found in (paired, apart)]
+    assert both[0] == pytest.approx(both[1])
     assert paired.to_json()["intervals"] == "paired" and apart.to_json()["intervals"] == "unpaired"
     assert "alone.json has none" in str(apart.unpaired_because)
 
@@ -89,10 +93,16 @@ def test_other_worlds_or_scenarios__are_refused_in_one_line(results: Path, tmp_p
     [
         ("[", "is no JSON"),
         ("{}", "is no results file"),
+        ("3", "is no results file"),
         ("[]", "is no results file"),
         ("[1]", "is no results file"),
+        ('[{"kind": "evaluate", "agent": "full_br', "is no JSON, or was not written to its end"),
+        ('[{"kind": "evalute"}]', "unknown kind of results 'evalute'; did you mean 'evaluate'"),
+        ('[{"agent": "x", "episodes": 3}]', r"of an earlier version \(kind is missing\): evaluate again"),
+        ('{"kind": "best-harm"}', "results of ethbrake best-harm cannot be compared; those of evaluate, equal-time"),
+        ('{"kind": "equal-time", "seed": 7}', "agents is missing or no list of objects"),
         (
-            '[{"agent": "x", "episodes": 3}]',
+            '[{"kind": "evaluate", "agent": "x", "episodes": 3}]',
             "worlds_sha256 is missing .* earlier version has no hashes: evaluate again",
         ),
     ],
@@ -141,3 +151,46 @@ def test_compare__a_run_and_its_report_are_results_too(ethbrake: Callable[..., A
     row = json.loads(results.read_text())[0]
     page = (finished_run / "report.html").read_text()
     assert row["worlds_sha256"] in page and row["scenario_sha256"] in page
+
+
+def test_shield_and_equal_time__are_compared_among_themselves(
+    ethbrake: Callable[..., Any], results: Path, tmp_path: Path
+) -> None:
+    commands = {
+        "shield": ("shield", "--agents", "full_brake", "--episodes", "5"),
+        "total": ("shield", "--agents", "full_brake", "--episodes", "5", "--harm-count", "total"),
+        "time": ("equal-time", "--agents", "ppo@shipped,full_brake", "--against", "full_brake", "--episodes", "5",
+                 "--repeats", "1"),
+    }  # fmt: skip
+    for name, command in commands.items():
+        (tmp_path / f"{name}.json").write_text(ethbrake(*command, "--json").out)
+    told = json.loads(ethbrake("compare", tmp_path / "shield.json", tmp_path / "shield.json", "--json").out)
+    assert [each["agent"] for each in told["agents"]] == [
+        f"full_brake ({mode})" for mode in ("none", "episode", "step", "step-alert")
+    ]
+    assert all(each["harm_difference"] == 0.0 for each in told["agents"])
+    told = ethbrake("compare", tmp_path / "time.json", tmp_path / "time.json")
+    assert told.status == 0 and "ppo@shipped" in told.out and "the same" in told.out
+    refused = ethbrake("compare", tmp_path / "shield.json", tmp_path / "total.json")
+    assert (refused.status, refused.err.count("\n")) == (2, 1) and "is about another harm than" in refused.err
+    refused = ethbrake("compare", tmp_path / "shield.json", results / "a.csv.json")
+    assert (refused.status, refused.err.count("\n")) == (2, 1) and "is about another kind of results" in refused.err
+
+
+def test_compare__sees_that_an_agents_file_was_edited(results: Path, tmp_path: Path) -> None:
+    """Each evaluation is a process of its own, as a person's two commands are."""
+    file = tmp_path / "mine.py"
+    program = "import sys; from ethbrake_marl.cli.app import run_command; sys.exit(run_command(sys.argv[1:]))"
+    for name, deceleration in (("before", 2), ("after", 3)):
+        file.write_text(
+            f"import ethbrake_marl as eb\ndef make():\n    return eb.make_agent('constant:{deceleration}')\n"
+        )
+        answer = subprocess.run(
+            [sys.executable, "-c", program, "evaluate", "--agents", f"{file}:make", "--episodes", "5", "--json"],
+            env={**os.environ, "PYTHONPATH": os.getcwd()}, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        (tmp_path / f"{name}.json").write_text(answer.stdout)
+    before, after = (read_result(tmp_path / f"{name}.json") for name in ("before", "after"))
+    assert after.about["versions"]["mine.py"] == f"SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}"
+    assert set(compare_results(before, after).other_versions) == {"mine.py"}
+    assert compare_results(after, after).other_versions == {}

@@ -20,7 +20,7 @@ from ethbrake_marl.files import plugins
 from ethbrake_marl.scenario import new_scenario_text
 from ethbrake_marl.studies.ablation.run import train_all
 from tests.cli.conftest import TINY_RECIPE
-from tests.extending.conftest import TABLES
+from tests.extending.conftest import restore, tables
 
 PLUGIN = '''
 import numpy as np
@@ -52,23 +52,17 @@ eb.register_agent("gentle", make_gentle, about="brakes with a constant share")
 @pytest.fixture(autouse=True)
 def new_process() -> Iterator[None]:
     """Each test begins as a process that has loaded nothing, and leaves nothing."""
-    before = [(getattr(module, name), dict(getattr(module, name))) for module, name in TABLES]
+    before = tables()
     plugins._RUN.clear()
     plugins._LOADED.clear()
     yield
     restore(before)
 
 
-def restore(before) -> None:
-    for table, entries in before:
-        table.clear()
-        table.update(entries)
-
-
 @pytest.fixture
 def again():
     """Call it to go on as in a new process."""
-    before = [(getattr(module, name), dict(getattr(module, name))) for module, name in TABLES]
+    before = tables()
     return lambda: restore(before)
 
 
@@ -266,3 +260,23 @@ def test_agent_file__that_ends_the_process_ends_in_one_line(ethbrake, tmp_path):
     )
     answer = ethbrake("evaluate", "--agents", f"{file}:slow", "--episodes", "3", "--json")
     assert answer.status == 2 and "SystemExit: 0" in answer.err and answer.out == ""
+
+
+def test_plugin__with_a_nul_byte_names_no_line_that_is_not_there(ethbrake, tmp_path):
+    file = tmp_path / "nul.py"
+    file.write_bytes(b"x = 1\n\0\n")
+    answer = ethbrake("agents", "--plugin", file)
+    assert (answer.status, answer.err.count("\n")) == (2, 1)
+    assert "null bytes" in answer.err and "None" not in answer.err
+
+
+def test_command__of_the_users_cannot_take_the_place_of_a_built_in_one(ethbrake, monkeypatch):
+    monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
+
+    @app.command()
+    def evaluate() -> None:
+        """Another one."""
+
+    answer = ethbrake("evaluate", "--episodes", "3")
+    assert (answer.status, answer.err.count("\n")) == (2, 1)
+    assert "command 'evaluate' is there already; give yours another name: app.command('my-evaluate')" in answer.err

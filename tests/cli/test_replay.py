@@ -1,12 +1,17 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
+
+import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation.motion import follow_episodes
-from ethbrake_marl.evaluation.passport import issue_passport
+from ethbrake_marl.evaluation.passport import Passport, issue_passport
 from ethbrake_marl.scenario import load_scenario, new_scenario_text
+from tests.pages.hostile import HOSTILE, UNSEEN
 
 
 def passport_of(spec: str, scenario_name: str | Path = "paper-random", *, seed: int | None = 7, world: int = 3) -> str:
@@ -23,6 +28,14 @@ def test_replay__is_the_same_episode_bit_for_bit(ethbrake):
         assert answer.status == 0, answer.err
         assert "The same episode, bit for bit." in answer.out
         assert "Differs" not in answer.out
+
+
+def test_cli_page__shows_a_passport_that_can_be_replayed(ethbrake):
+    page = (Path(__file__).parents[2] / "docs" / "cli.md").read_text("utf-8")
+    found = re.search(r"\$ ethbrake replay (EB1:\S+)\n(.+)\n", page)
+    assert found is not None
+    answer = ethbrake("replay", found[1])
+    assert answer.status == 0 and answer.out.startswith(found[2])
 
 
 def test_replay__writes_a_page_and_a_film(ethbrake, tmp_path):
@@ -79,6 +92,35 @@ def test_replay__says_what_is_missing(ethbrake, tmp_path):
         assert answer.status == 2 and words in answer.err and answer.err.count("\n") == 1
     answer = ethbrake("replay", passport_of("full_brake"), "--initial-states", path)
     assert answer.status == 2 and "leave --initial-states out" in answer.err
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_replay__of_anything_else_is_refused_in_one_line(ethbrake, tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    passport = str(EXAMPLE)
+    for given in (text, "EB1:" + text, passport.replace("paper-random", text), f"{passport[:-6]}{text}"):
+        answer = ethbrake("replay", "--", given)
+        assert answer.status == 2 and answer.err.count("\n") == 1
+        assert not set(answer.err[:-1]) & UNSEEN
+    made = str(replace(EXAMPLE, agent=text))
+    answer = ethbrake("replay", made)
+    assert answer.status == 2 and answer.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+EXAMPLE = Passport(
+    "paper-random",
+    "0" * 10,
+    7,
+    3,
+    "first",
+    (1,),
+    ("0.1.0", "3.11.7", "0.68.1", "2.4.6"),
+    "0" * 6,
+    "0" * 10,
+    None,
+    "coast",
+)
 
 
 def test_evaluate_report__its_passports_can_be_replayed(ethbrake, tmp_path):

@@ -13,7 +13,9 @@ import yaml
 from stable_baselines3 import PPO
 
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
+from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.policies.policy import load_policy
+from ethbrake_marl.scenario import load_scenario
 from tests.cli.conftest import TINY_RECIPE
 from tests.cli.test_bad_input import refused
 from tests.cli.test_run import ctrl_c_when, run_json
@@ -119,6 +121,12 @@ def test_learning_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_re
     summary = json.loads(answer.out)
     last = [harms["tiny", seed, 256] for seed in "01"]
     assert summary["recipes"]["tiny"]["last"]["each"] == last
+    scenario, told = load_scenario("paper-random"), summary["recipes"]["tiny"]
+    assert (summary["kind"], summary["scenario_sha256"]) == ("learning-curves", scenario_sha256(scenario))
+    fixed = scenario.sample(10, 7)
+    assert told["worlds_sha256"] == worlds_sha256(fixed.worlds, fixed.index)
+    runs = [load_policy(folder / f"tiny-seed{seed}") for seed in (0, 1)]
+    assert told["policy_sha256"] == [policy.manifest.manifest_sha256 for policy in runs]
     assert summary["recipes"]["tiny"]["last"]["interquartile_mean"] == pytest.approx(sum(last) / 2)
     low, high = summary["recipes"]["tiny"]["last"]["interval"]
     assert min(last) <= low <= high <= max(last)

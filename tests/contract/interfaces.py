@@ -126,7 +126,7 @@ def one_row(
 
 class Vector:
     def __init__(self, scenario: Scenario, n: int, **settings: Any) -> None:
-        self.env, self.n = EthBrakeVectorEnv(n, scenario, **settings), n
+        self.env, self.n = EthBrakeVectorEnv(n, scenario, autoreset_mode="SameStep", **settings), n
         self.space = self.env.single_observation_space
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:

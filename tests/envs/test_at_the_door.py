@@ -75,6 +75,34 @@ def test_scenario__as_a_mapping_survives_the_json_of_a_spec():
         parallel_env({**content, "mass_t": -1.0})
 
 
+@pytest.mark.parametrize("observation", [eb.ObservationSpec(2, 0), eb.choose_observation(["own", "front_1.gap"])])
+def test_observation__an_object_survives_the_json_of_a_spec(observation):
+    made = gymnasium.make("EthBrake-v0", observation=observation)
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(made.spec.to_json()))
+    assert again.unwrapped.engine.observation == observation
+    assert np.array_equal(made.reset(seed=5)[0], again.reset(seed=5)[0])
+
+
+def test_spec__with_objects_is_plain_and_makes_the_same_environment():
+    scenario, reward = load_scenario("cooperation-3-pair"), eb.RewardParams(harm=0.5, terminal=2.0)
+    made = gymnasium.make("EthBrake-v0", scenario=scenario, reward=reward, learners=["vehicle_3"])
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(made.spec.to_json()))
+    assert again.unwrapped.engine.scenario == made.unwrapped.engine.scenario
+    made.reset(seed=5), again.reset(seed=5)
+    rewards = [env.step(np.array([1.0], np.float32))[1] for env in (made, again) for _ in range(60)]
+    assert rewards[:60] == rewards[60:]
+    assert eb.EthBrakeEnv().spec is None
+
+
+def test_observation__a_mapping_with_anything_else_is_refused():
+    with pytest.raises(UnknownName, match="fronts"):
+        parallel_env(observation={"fronts": 2})
+    with pytest.raises(InvalidInput, match="front = 'two'"):
+        parallel_env(observation={"front": "two"})
+    with pytest.raises(InvalidInput, match="chosen = 3; must be a list"):
+        parallel_env(observation={"chosen": 3})
+
+
 def test_learners_only__are_the_agents_and_nothing_else_changes():
     whole, learners = parallel_env(PAIR), parallel_env(PAIR, agents="learners")
     assert learners.possible_agents == ["vehicle_2", "vehicle_3"]

@@ -240,6 +240,33 @@ def test_aec__plays_the_same_episode_in_turns(make: Any) -> None:
         in_turn.step(None)
 
 
+@pytest.mark.parametrize("bad", [[2.0], [0.1, 0.2], "x", None, [np.nan]])
+def test_aec__refuses_an_unusable_action_in_its_own_turn_and_loses_nothing(bad: Any) -> None:
+    in_turn, other = env(learners=["vehicle_2", "vehicle_3"]), env(learners=["vehicle_2", "vehicle_3"])
+    for each in (in_turn, other):
+        each.reset(seed=3)
+        each.step(None)
+    with pytest.raises(InvalidInput, match="action of vehicle_2"):
+        in_turn.step(bad)
+    assert in_turn.agent_selection == "vehicle_2"
+    for each in (in_turn, other):
+        for action in ([-1.0], [-0.5]):
+            each.step(np.array(action, np.float32))
+    assert in_turn.observe("vehicle_1").tobytes() == other.observe("vehicle_1").tobytes()
+    assert in_turn.rewards == other.rewards
+
+
+def test_aec__after_the_end_only_none_is_taken() -> None:
+    in_turn = env(max_cycles=1)
+    in_turn.reset(seed=3)
+    for _ in in_turn.possible_agents:
+        in_turn.step(np.zeros(1, np.float32))
+    with pytest.raises(InvalidInput, match="the episode of vehicle_1 is over; only None may follow, or reset"):
+        in_turn.step(np.zeros(1, np.float32))
+    while in_turn.agents:
+        in_turn.step(None)
+
+
 def test_aec__converts_back_to_the_parallel_environment() -> None:
     assert isinstance(aec_to_parallel(env(scenario=FIVE)), EthBrakeParallelEnv)
 

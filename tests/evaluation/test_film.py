@@ -84,3 +84,11 @@ def test_record_command__writes_the_film_once(tmp_path: Path, capsys: pytest.Cap
     assert run_command(arguments) == 2
     assert run_command(["record", "--output", str(tmp_path / "film.avi")]) == 2
     assert "films are written as .gif or .mp4" in capsys.readouterr().err
+
+
+def test_film__has_a_limit_of_agents_and_of_pictures(monkeypatch):
+    scene = film_scenes(WORLD, eb.make_agent("coast"), scenario=CRASH)[:1]
+    with pytest.raises(InvalidInput, match="film: 13 agents, one below the other; at most 12 are shown"):
+        film_bytes({str(k): scene for k in range(13)}, ".gif")
+    with pytest.raises(InvalidInput, match=r"film of 2 agents for 200 s: needs 10,000 pictures, .* shorter horizon_s"):
+        film_bytes({str(k): scene * 5000 for k in range(2)}, ".gif")

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from importlib.metadata import version
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation.identity import policy_sha256, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.shield_modes import compare_modes, modes_to_json
+from ethbrake_marl.scenario import Task
+from tests.failing_worlds import plant
 
 SCENARIO = eb.load_scenario("paper-random")
 SAMPLE = SCENARIO.sample(60, seed=7)
@@ -61,6 +68,42 @@ def test_results__say_worlds_scenario_policy_and_versions() -> None:
     assert braking["scenario_sha256"] == scenario_sha256(SCENARIO)
     assert braking["policy_sha256"] == {}
     assert learned["policy_sha256"] == {"vehicle_2": eb.load_shipped("ppo").manifest.manifest_sha256}
-    assert set(learned["versions"]) == {"python", "ethbrake-marl", "numpy", "numba"}
+    assert {"python", "ethbrake-marl", "numpy", "numba"} <= set(learned["versions"])
     assert learned["versions"]["numpy"] == version("numpy")
     assert found.outcome("ppo").take(np.array([0])).policies == found.outcome("ppo").policies
+
+
+ABOUT = {"worlds_sha256": worlds_sha256(SAMPLE.worlds, SAMPLE.index), "scenario_sha256": scenario_sha256(SCENARIO)}
+
+
+@pytest.mark.parametrize(
+    ("kind", "command"),
+    [
+        ("evaluate", ("evaluate", "--agents", "full_brake")),
+        ("shield", ("shield", "--agents", "full_brake")),
+        ("equal-time", ("equal-time", "--agents", "coast", "--against", "coast", "--repeats", "1", "--seed", "7")),
+        ("best-harm", ("best-harm", "--budget", "20")),
+        ("robustness", ("picture", "robustness", "--output", "x.png")),
+    ],
+    ids=lambda each: each if isinstance(each, str) else "",
+)
+def test_every_results_file__says_its_kind_worlds_scenario_and_versions(
+    kind: str, command: tuple[str, ...], capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run_command([*command, "--episodes", "60", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    for part in content if isinstance(content, list) else [content]:
+        assert part["kind"] == kind and {key: part[key] for key in ABOUT} == ABOUT
+        assert part["versions"]["numpy"] == version("numpy")
+
+
+def test_shield_results__leave_the_same_worlds_out_of_the_hash() -> None:
+    task = Task(SCENARIO, (1,))
+    sample = replace(SAMPLE, worlds=plant(SAMPLE.worlds, [3]))
+    rows = compare_modes({"ppo": eb.make_agent("ppo@shipped", scenario=SCENARIO)}, sample.worlds, task)
+    told = modes_to_json(rows, sample, task)
+    kept = np.delete(np.arange(60), 3)
+    assert {row["worlds_sha256"] for row in told} == {worlds_sha256(SAMPLE.worlds.take(kept), SAMPLE.index[kept])}
+    assert told[0]["episodes"] == 59
+    assert told[0]["policy_sha256"] == {"vehicle_2": eb.load_shipped("ppo").manifest.manifest_sha256}

@@ -17,7 +17,7 @@ from ethbrake_marl.limits import limits
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
 
 ALWAYS = {
-    "agent", "knows", "sees_through_channel", "hidden_share", "episodes", "collisions",
+    "kind", "agent", "knows", "sees_through_channel", "hidden_share", "episodes", "collisions",
     "horizon_ends", "collision_rate", "collision_rate_interval",
     "first_impact_harm", "first_impact_harm_interval", "total_harm", "total_harm_interval",
     "sampled_harm", "sampled_harm_interval", "vehicle_1_shoved_m", "vehicle_1_shoved_m_interval",

@@ -3,34 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from ethbrake_marl import objectives
 from ethbrake_marl.agents import registry as agents
+from ethbrake_marl.evaluation import harm_metrics
 from ethbrake_marl.files import plugins
 from ethbrake_marl.learning import registry as algorithms
 from ethbrake_marl.rewards import registry as terms
-from ethbrake_marl.scenario import features, v2x
+from ethbrake_marl.scenario import catalogue, features, v2x
 
 TABLES = (
+    (catalogue, "FOLDERS"),
     (features, "FEATURES"),
     (v2x, "CHANNELS"),
     (objectives, "KINDS"),
     (agents, "_ENTRIES"),
     (algorithms, "_ENTRIES"),
     (terms, "TERMS"),
+    (harm_metrics, "METRICS"),
     (plugins, "_RUN"),
     (plugins, "_LOADED"),
 )
 
 
-@pytest.fixture(autouse=True)
-def forget_what_is_registered() -> Iterator[None]:
-    """Every table as it was before the test."""
-    before = [(getattr(module, name), dict(getattr(module, name))) for module, name in TABLES]
-    yield
+Tables = list[tuple[dict[Any, Any], dict[Any, Any]]]
+
+
+def tables() -> Tables:
+    """Every table with a copy of what it holds now."""
+    return [(getattr(module, name), dict(getattr(module, name))) for module, name in TABLES]
+
+
+def restore(before: Tables) -> None:
+    """Every table as it was when ``tables`` was called."""
     for table, entries in before:
         table.clear()
         table.update(entries)
     objectives.parse_objective.cache_clear()
+
+
+@pytest.fixture(autouse=True)
+def forget_what_is_registered() -> Iterator[None]:
+    """Every table as it was before the test."""
+    before = tables()
+    yield
+    restore(before)

@@ -27,7 +27,7 @@ def test_page__its_code_runs_from_the_top_down(
     for command in ("train", "evaluate"):
         assert run_command([command, "--help"]) == 0
         told = capsys.readouterr().out
-        assert all(name in told for name in ("comfort", "time_gap", "rural", "front-first", "patient"))
+        assert all(name in told for name in ("comfort", "time_gap", "rural", "front-first", "patient", "absorbed"))
     policy = eb.load_policy(tmp_path / "runs" / "again")
     assert policy.manifest.algorithm == "patient" and "comfort" in policy.manifest.reward["terms"]
     assert policy.manifest.observation.features[-1] == "rear_1.mass_ratio"

@@ -90,15 +90,15 @@ def test_schema__knows_what_is_registered(mine: Any) -> None:
     [
         ("nominal", {"lost": 0.1, "preset": "clear"}, AlreadyExists, "preset 'nominal' is registered already"),
         ("My preset", {}, InvalidInput, "preset 'My preset': must be 1 to 64 of a-z"),
-        ("mine", {"preset": "ruarl"}, InvalidInput, "preset 'mine': preset: must be paper, .* or sensors-only"),
-        ("mine", {"los": 1}, InvalidInput, "preset 'mine': los: Extra inputs"),
+        ("mine", {"preset": "ruarl"}, InvalidInput, "preset 'mine': preset = ruarl: must be paper, .* or sensors-only"),
+        ("mine", {"los": 1}, InvalidInput, "preset 'mine': los: unknown key; did you mean lost"),
         (
             "mine",
             {"preset": "clear", "lost": 2.0},
             InvalidInput,
-            "preset 'mine': lost: must be less than or equal",
+            "preset 'mine': lost = 2(.0)?: must be less than or equal",
         ),
-        ("mine", {"loss_begins": 0.1}, InvalidInput, "preset 'mine': loss_begins: preset paper has no generated"),
+        ("mine", {"loss_begins": 0.1}, InvalidInput, "preset 'mine': loss_begins = 0.1: preset paper has no generated"),
         ("mine", "clear", InvalidInput, "settings = 'clear': must be a mapping"),
     ],
 )

@@ -84,3 +84,22 @@ def test_mappo__learns_to_beat_full_braking(tmp_path: Path) -> None:
     result = eb.evaluate(PAIR.sample(1000, 7), agents, scenario=PAIR)
     harm = {name: result.outcome(name).first_impact_harm.mean() for name in agents}
     assert harm["team"] < 0.9 * harm["full_brake"]
+
+
+def test_tasks__are_in_benchmarls_own_registry_and_make_the_same_worlds() -> None:
+    from benchmarl.environments import task_config_registry
+
+    from ethbrake_marl.learning.benchmarl_tasks import EthBrakeTask, register_tasks
+
+    register_tasks()
+    names = {name for name in task_config_registry if name.startswith("ethbrake/")}
+    assert "ethbrake/cooperation_3_pair" in names
+    assert len(names) == len(list(EthBrakeTask))
+    settings = {"scenario": PAIR.declared(), "reward": {"harm": 1.0}, "horizon_is_end": True}
+    tasks = (
+        EthBrakeTask.COOPERATION_3_PAIR.get_from_yaml(),
+        task_config_registry["ethbrake/cooperation_3_pair"].get_task(settings),
+    )
+    seen = [task.get_env_fun(3, True, 5, "cpu")().reset()["learners", "observation"] for task in tasks]
+    np.testing.assert_array_equal(*(part.numpy() for part in seen))
+    assert [task.group_map(None) for task in tasks] == [{"learners": ["vehicle_2", "vehicle_3"]}] * 2

@@ -22,6 +22,7 @@ from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of
 from ethbrake_marl.policies.policy import Policy, load_policy
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario import load_scenario
+from tests.learning.tiny import TINY_PPO
 
 train = partial(train_module.train, measure=None)
 SCENARIO = load_scenario("paper-random")
@@ -252,3 +253,21 @@ def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> Non
     result = train(recipe, SCENARIO, tmp_path / "run", steps=1)
     assert (result.status, result.updates, result.steps) == ("finished", 1, recipe.n_envs * recipe.rounds)
     assert load_policy(tmp_path / "run").manifest.algorithm == recipe.algorithm
+
+
+def test_train__shows_its_progress_on_stderr_unless_told_not_to(tmp_path, capsys):
+    recipe = TINY_PPO.replace(total_steps=256)
+    train_module.train(recipe, "paper-random", tmp_path / "shown")
+    told = capsys.readouterr()
+    lines = told.err.splitlines()
+    assert told.out == "" and lines[0].startswith("training: 0 of 256, first-impact harm ")
+    assert lines[-1].startswith("training: 256 of 256, first-impact harm ") and len(lines) == len(set(lines))
+    train_module.train(recipe, "paper-random", tmp_path / "quiet", on_progress=None)
+    assert capsys.readouterr().err == ""
+
+
+def test_train__on_a_terminal_rewrites_one_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    train_module.train(TINY_PPO.replace(total_steps=256), "paper-random", tmp_path / "run")
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and told.endswith("\n") and told.count("\r") > 1

@@ -21,6 +21,7 @@ from ethbrake_marl.pages.report import (
     render_report,
     write_report,
 )
+from ethbrake_marl.physics import Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 from tests.pages.hostile import HOSTILE, UNSEEN, Page
 
@@ -104,6 +105,23 @@ def episode_data(html: str) -> dict:
     found = re.search(r'<script type="application/json" id="episode_data">(.*?)</script>', html)
     assert found is not None
     return json.loads(found[1])
+
+
+def test_report__says_who_did_not_repeat_itself(pair: Scenario, html: str) -> None:
+    class Fickle:
+        name, drives = "fickle", iter(range(100))
+
+        def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+            self.command = -float(next(self.drives)) / 2.0
+
+        def act(self, worlds: Worlds, vehicle: int) -> np.ndarray:
+            return np.full(worlds.n, self.command)
+
+    result = evaluate(pair.sample(3, 0), {"fickle": Fickle()}, scenario=pair)
+    played = play_for_report(result, {"fickle": Fickle()}, "fickle")
+    text = render_report(Report("t", summarise(result), result, played, focus="fickle"))
+    assert "fickle did not repeat itself in 3 worlds of these" in text
+    assert "did not repeat itself" not in html
 
 
 def test_chosen__begin_with_the_worst_and_are_the_same_each_time(report: Report) -> None:

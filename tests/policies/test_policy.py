@@ -158,7 +158,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "folder_for_file": (_folder_instead, r"weights.safetensors: (is not a plain file|cannot be read)"),
     "empty_manifest": (_manifest(lambda _: b""), r"manifest.json: "),
     "not_utf8": (_manifest(lambda data: data.replace(b"ppo", b"\xff\xfe")), r"manifest.json: 'utf-8' codec"),
-    "list_manifest": (_manifest(lambda _: b"[]"), r"manifest.json: Input should be an object"),
+    "list_manifest": (_manifest(lambda _: b"[]"), r"manifest.json: must be a mapping"),
     "key_twice": (
         _manifest(lambda data: data.replace(b"{", b'{"algorithm": "ppo",', 1)),
         r"manifest.json: key 'algorithm' stands twice",
@@ -169,14 +169,14 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "deep": (_manifest(lambda _: b"[" * 200_000), r"manifest.json: nested too deeply"),
     "two_values": (_manifest(lambda data: data + data), r"manifest.json: Extra data"),
     "large": (_manifest(lambda data: data + b" " * (1 << 20)), r"manifest.json: larger than 1 MiB"),
-    "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: Extra inputs"),
+    "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: unknown key"),
     "dotted_algorithm": (
         _edit(algorithm="subprocess.Popen"),
-        r"manifest.json: algorithm: String should match pattern",
+        r"manifest.json: algorithm: must match",
     ),
     "dotted_activation": (_edit(network__activation="torch.nn.ReLU"), r"manifest.json: network.activation"),
-    "future_version": (_edit(format_version=3), r"manifest.json: format_version: Input should be 2"),
-    "wrong_type": (_edit(steps="many"), r"manifest.json: steps: Input should be a valid integer"),
+    "future_version": (_edit(format_version=3), r"manifest.json: format_version: must be 2"),
+    "wrong_type": (_edit(steps="many"), r"manifest.json: steps: must be a whole number"),
     "giant_layer": (_edit(network__policy_hidden=[10**9]), r"manifest.json: network.policy_hidden.0"),
     "many_layers": (_edit(network__value_hidden=[1] * 9), r"manifest.json: network.value_hidden"),
     "fewer_inputs": (
@@ -185,7 +185,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     ),
     "other_features": (_edit(observation__features=[f"own.{k}" for k in range(27)]), r"manifest.json: observation: "),
     "other_scaling": (_edit(observation__scaling_sha256="0" * 64), r"manifest.json: observation: features or their"),
-    "older_version": (_edit(format_version=1), r"manifest.json: format_version: Input should be 2"),
+    "older_version": (_edit(format_version=1), r"manifest.json: format_version: must be 2"),
     "other_activation": (_edit(rehash=False, network__activation="tanh"), r"manifest.json: its content has SHA-256"),
     "other_output": (_edit(rehash=False, network__output="tanh"), r"manifest.json: its content has SHA-256"),
     "other_steps": (_edit(rehash=False, steps=999_999_999), r"manifest.json: its content has SHA-256"),
@@ -214,10 +214,10 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "byte_order_mark": (_manifest(lambda data: b"\xef\xbb\xbf" + data), r"manifest.json: "),
     "utf16": (_manifest(lambda data: data.decode().encode("utf-16")), r"manifest.json: "),
     "null_byte": (_manifest(lambda data: data + b"\0"), r"manifest.json: Extra data"),
-    "path_to_weights": (_edit(weights="../../other/weights.safetensors"), r"manifest.json: weights: Extra inputs"),
+    "path_to_weights": (_edit(weights="../../other/weights.safetensors"), r"manifest.json: weights: unknown key"),
     "path_as_learner": (_edit(learners=["../../vehicle_2"]), r"manifest.json: learners: '../../vehicle_2' is no"),
-    "unknown_activation": (_edit(network__activation="gelu"), r"manifest.json: network.activation: Input should be"),
-    "unknown_output": (_edit(network__output="eval"), r"manifest.json: network.output: Input should be"),
+    "unknown_activation": (_edit(network__activation="gelu"), r"manifest.json: network.activation: must be"),
+    "unknown_output": (_edit(network__output="eval"), r"manifest.json: network.output: must be"),
     "negative_layer": (_edit(network__policy_hidden=[-13, 9]), r"manifest.json: network.policy_hidden.0"),
     "layer_not_whole": (_edit(network__policy_hidden=[13.5, 9]), r"manifest.json: network.policy_hidden.0"),
     "true_for_a_number": (_edit(network__action_size=True), r"manifest.json: network.action_size"),
@@ -429,7 +429,7 @@ def test_save_policy__leaves_nothing_when_it_fails(
 def test_make_policy__refuses_what_it_could_not_load(policy: Policy) -> None:
     fields = {name: getattr(policy.manifest, name) for name in type(policy.manifest).model_fields}
     del fields["weights_sha256"], fields["manifest_sha256"]
-    with pytest.raises(InvalidInput, match=r"policy: steps: Input should be greater"):
+    with pytest.raises(InvalidInput, match=r"policy: steps: must be greater"):
         make_policy(policy.tensors, **{**fields, "steps": -1})
     with pytest.raises(InvalidInput, match=r"policy: tensor 'policy.0.bias' holds a number that is not finite"):
         make_policy({**policy.tensors, "policy.0.bias": np.full(13, np.nan, np.float32)}, **fields)

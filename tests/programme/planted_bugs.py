@@ -1,4 +1,4 @@
-"""Forty-four bugs in rewards, V2X, engine, ablation, evaluation and learning: each must turn a test red.
+"""Forty-eight bugs in scenarios, rewards, V2X, engine, ablation, evaluation and learning: each must turn a test red.
 
 ``make planted-bugs`` runs this after the bugs of the physics (``python -m tests.programme.planted_bugs [--jobs J]
 [--only WORD]``). A bug is a textual patch, applied to a temporary copy of the repository, never to the working tree;
@@ -39,6 +39,9 @@ COURSE, EVENTS, KEPT, INDEPENDENT, RECIPE = (
 )
 
 
+SAMPLING, MIXTURE = (f"ethbrake_marl/scenario/{name}.py" for name in ("sampling", "mixture"))
+
+
 class Bug(NamedTuple):
     """A bug: where it is, what stands there, what is written instead, and the tests that are tried."""
 
@@ -49,6 +52,7 @@ class Bug(NamedTuple):
 
 
 OF_REWARDS = ("tests/test_rewards.py", "tests/test_objectives.py")
+OF_SCENARIOS = ("tests/scenario/test_vehicle_types.py", "tests/scenario/test_mixture.py")
 OF_V2X = ("tests/scenario/test_v2x.py",)
 OF_ENGINE = ("tests/engine/test_engine.py", "tests/test_rewards.py", "tests/envs/test_sb3.py")
 OF_ABLATION = ("tests/studies/ablation/test_levels.py", "tests/studies/ablation/test_comparison.py")
@@ -197,6 +201,22 @@ BUGS: dict[str, Bug] = {
         "else np.resize(found[0], len(ledger.mass_t))",
         OF_TABLES,
     ),
+    # ------------------------------------------------------------ types and mixtures
+    "types drawn from the numbers of the quantities": Bug(
+        SAMPLING, "numbers(PER_TYPE * scenario.vehicles, TYPES)", "numbers(PER_TYPE * scenario.vehicles)", OF_SCENARIOS
+    ),
+    "each quantity with a load of its own": Bug(
+        SAMPLING, "entry.value(typed[1][rows, i])", "entry.value(u[rows, rule.place(i)])", OF_SCENARIOS
+    ),
+    "worlds of a member numbered anew": Bug(
+        MIXTURE,
+        "first + np.flatnonzero(chosen == k)",
+        "first + np.arange(int((chosen == k).sum()))",
+        OF_SCENARIOS,
+    ),
+    "the weights of a mixture ignored": Bug(
+        MIXTURE, "[member.weight for member in scenario.mixture]", "[1.0 for _ in scenario.mixture]", OF_SCENARIOS
+    ),
     # ------------------------------------------------------------ learning
     "the best policy judged by the other count": Bug(
         COURSE, "        name = HARM_METRIC[self.harm_count]\n", '        name = HARM_METRIC["first"]\n', OF_LEARNING
@@ -208,7 +228,7 @@ BUGS: dict[str, Bug] = {
         RECIPE, "done = min(max(1.0 - remaining, 0.0), 1.0)", "done = 1.0", OF_LEARNING
     ),
     "the scenario left out of a training's identity": Bug(
-        KEPT, '"scenario": scenario.model_dump(mode="json", exclude=set(WORDS))', '"scenario": {}', OF_FILES
+        KEPT, '"scenario": scenario.content(without=WORDS)', '"scenario": {}', OF_FILES
     ),
     "event files named by the clock": Bug(EVENTS, "default=0) + 1", "default=0) * 0 + int(time.time())", OF_FILES),
     "a learner learns from the rows of another": Bug(

@@ -15,10 +15,12 @@ from ethbrake_marl.scenario import (
     load_scenario,
     new_scenario_text,
     parse_yaml,
+    read_scenario,
     scenario_folder,
     scenario_json_schema,
 )
 from ethbrake_marl.scenario import catalogue as shipped_files
+from ethbrake_marl.scenario.fields import OF_EVERY_VEHICLE
 
 SHIPPED = [entry.path for entry in list_scenarios()]
 ROOT = Path(__file__).resolve().parents[2]
@@ -38,10 +40,13 @@ PAPER = {
 
 def not_used(scenario: Scenario) -> set[str]:
     """The keys of the ways to declare gaps, speeds and an obstacle that it does not use; what it does not choose."""
+    if scenario.members:
+        return set(Scenario.model_fields) - {"name", "title", "description", "source", "mixture"}
     gaps = "gaps_m" if scenario.gaps_m is None else "time_gaps_s"
     speeds = {"speeds_mps"} if scenario.speeds_mps is None else {"line_speed_mps", "speed_deviations_mps"}
     obstacle = {key for key in ("obstacle_gap_m", "obstacle_margin_m") if getattr(scenario, key) is None}
-    return {gaps, *speeds, *obstacle, *(["observation"] if scenario.observation is None else [])}
+    chosen = ("observation", "vehicle_types", "types", "mixture", *OF_EVERY_VEHICLE)
+    return {gaps, *speeds, *obstacle, *(key for key in chosen if getattr(scenario, key) is None)}
 
 
 def test_list__is_sorted_and_has_the_papers_scenarios():
@@ -134,7 +139,7 @@ def test_path__name_and_file_must_agree(tmp_path: Path):
 def test_new__has_every_key_and_the_values_it_is_based_on(path):
     text = new_scenario_text("mine", based_on=path.stem)
     own = {"name", "title", "description", "source"}
-    new, base = Scenario.from_document(parse_yaml(text)), load_scenario(path.stem)
+    new, base = read_scenario(parse_yaml(text).content), load_scenario(path.stem)
     assert new.model_dump(exclude=own) == base.model_dump(exclude=own)
     assert new.name == "mine"
     assert all(re.search(rf"^# .*\n(# )?{key}:", text, re.MULTILINE) for key in Scenario.model_fields)
@@ -152,15 +157,18 @@ def test_json_schema__names_every_field_and_serialises():
     schema = json.loads(json.dumps(scenario_json_schema()))
     assert set(schema["properties"]) == set(Scenario.model_fields)
     assert schema["additionalProperties"] is False
-    assert {"name", "mass_t", "latency_s"} <= set(schema["required"])
-    assert not {"vehicles", "gaps_m", "time_gaps_s"} & set(schema["required"])
+    assert schema["required"] == ["name"]
+    assert schema["if"] == {"not": {"required": ["mixture"]}}  # whose members say everything else
+    every = schema["then"]["allOf"][-1]["anyOf"]
+    assert [way["required"] for way in every] == [["vehicle_types"], [*OF_EVERY_VEHICLE]]
 
 
 def test_json_schema__asks_for_one_of_two_ways_and_knows_no_null():
     schema = scenario_json_schema()
-    pairs = [[way["required"] for way in pair["oneOf"]] for pair in schema["allOf"][:2]]
+    pairs = [[way["required"] for way in pair["oneOf"]] for pair in schema["then"]["allOf"][:2]]
     assert pairs == [[["gaps_m"], ["time_gaps_s"]], [["speeds_mps"], ["line_speed_mps"]]]
-    assert schema["allOf"][2:] == [{"not": {"required": ["obstacle_gap_m", "obstacle_margin_m"]}}]  # optional: not both
+    optional = schema["then"]["allOf"][2]
+    assert optional == {"not": {"required": ["obstacle_gap_m", "obstacle_margin_m"]}}  # not both
     assert schema["dependentRequired"] == {"speed_deviations_mps": ["line_speed_mps"]}
     assert "null" not in json.dumps(schema)
     assert schema["properties"]["time_step_s"]["default"] == 0.1
@@ -177,7 +185,7 @@ def test_docs__the_table_of_keys_has_every_field_with_its_default():
         elif field.default is None:
             other = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps"}
             other |= {new: usual for usual, new in other.items()}
-            assert cells[0] == ("none" if key.startswith(("obstacle_", "observation")) else f"this or `{other[key]}`")
+            assert cells[0] == (f"this or `{other[key]}`" if key in other else "none")
         elif field.default_factory is None:
             assert cells[0] == (f"`{flow_text(field.default)}`" if field.default != "" else "empty"), key
 

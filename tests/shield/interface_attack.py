@@ -75,7 +75,7 @@ def single(worlds: int, seed: int) -> Harms:
 
 
 def vector(worlds: int, seed: int) -> Harms:
-    env = ShieldedVectorEnv(EthBrakeVectorEnv(ROWS, line(3)))
+    env = ShieldedVectorEnv(EthBrakeVectorEnv(ROWS, line(3), autoreset_mode="SameStep"))
     env.reset(seed=seed)
 
     def step(actions: np.ndarray) -> tuple[np.ndarray, Any]:

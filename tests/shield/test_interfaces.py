@@ -12,6 +12,7 @@ from pettingzoo.test import api_test, parallel_api_test
 from stable_baselines3 import PPO
 
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.envs.parallel import env as aec_env
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.envs.single import EthBrakeEnv
@@ -276,3 +277,17 @@ def test_closed__a_shield_says_so_and_bounds_nothing_more(begun):
         for call in (lambda env=env: env.reset(), lambda env=env, step=step: step(env)):
             with pytest.raises(InvalidInput, match="this shield was closed; put a new one around the environment"):
                 call()
+
+
+def test_shield__of_an_environment_in_turns_points_to_its_own_maker():
+    with pytest.raises(InvalidInput, match=r"in turn it is eb.shielded_aec\(eb.parallel_env\(...\)\)"):
+        HybridShield(aec_env(), mode="step")
+
+
+def test_shielded_aec__refuses_an_unusable_proposal_in_its_own_turn():
+    env = shielded_aec(parallel_env(), mode="step")
+    env.reset(seed=7)
+    env.step(None)
+    with pytest.raises(InvalidInput, match="action of vehicle_2"):
+        env.step([3.0])
+    assert env.agent_selection == "vehicle_2"

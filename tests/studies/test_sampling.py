@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from ethbrake_marl.evaluation.identity import identity_line
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.sampling import (
@@ -56,3 +57,5 @@ def test_report__writes_the_figure_and_returns_both_tables(tmp_path):
     assert (tmp_path / "study.png").read_bytes().startswith(b"\x89PNG")
     assert [text.count(f"`{agent}`: exact mean harm") for agent in CONTROLS] == [1, 1]
     assert text.count("\n| order | ") == 2
+    scenario = load_scenario("paper-random")
+    assert text.splitlines()[-1] == identity_line(scenario, scenario.sample(20, 7))

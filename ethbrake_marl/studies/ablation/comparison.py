@@ -40,13 +40,20 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
         steps += [_change(before, after, algorithm) for before, after in pairwise(ladder)]
         by_name = {m.level.name: m for m in own}
         channels += [_change(by_name[m.level.clear], m, algorithm) for m in own if m.level.clear is not None]
-    return {"levels": [_level(one, searched) for one in measured], "steps": steps, "channels": channels}
+    return {
+        "kind": "ablate",
+        "levels": [_level(one, searched) for one in measured],
+        "steps": steps,
+        "channels": channels,
+    }
 
 
 def _level(one: Measured, searched: int) -> Json:
     """What one level reached under one algorithm."""
     scenario = one.level.scenario
     return {
+        **one.identity,
+        "policy_sha256": [dict(seed) for seed in one.reached.policies],
         "level": one.level.name,
         "title": scenario.title,
         "algorithm": one.algorithm,

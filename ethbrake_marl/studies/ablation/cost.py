@@ -78,7 +78,7 @@ def cost_of(plan: Plan) -> Cost:
 def _first(sample: Sample) -> Sample:
     """The worlds that are timed."""
     rows = np.arange(min(_TIMED_DRIVES, sample.worlds.n))
-    return Sample(sample.worlds.take(rows), sample.index[rows], 0)
+    return sample.take(rows)
 
 
 def _time(training: Training, sample: Sample) -> tuple[float, float]:

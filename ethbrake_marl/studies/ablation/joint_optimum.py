@@ -50,7 +50,7 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
     rows = np.arange(plan.search_episodes)
     for level, sample in zip(plan.levels, samples, strict=True):
         if level.trained:
-            part = Sample(sample.worlds.take(rows), sample.index[rows], 0)
+            part = sample.take(rows)
             identity = world_identity(part.worlds, Task(level.scenario, level.scenario.learners)).tobytes()
             found.setdefault(identity, (level, part, []))[2].append(level)
     return list(found.values())

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import make_single_agent
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.identity import policy_sha256, result_identity
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.seed_statistics import mean_over_seeds, share_over_seeds
@@ -57,11 +58,14 @@ class LineResult:
     best_known: Estimate | None  # in the worlds that were searched
     share: Estimate | None  # of the joint optimum's reduction, there
     worse_off: Estimate  # share of worlds in which somebody bears more than under full braking
+    identity: Mapping[str, Any] = field(default_factory=dict)  # of worlds and scenario, and what computed it
+    policy_sha256: tuple[str | None, ...] = ()  # of each policy
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON."""
         names = ("full_brake", "reached", "decrease", "best_known", "share", "worse_off")
-        return {"vehicles": self.vehicles, **estimates_to_json({name: getattr(self, name) for name in names})}
+        told = {"vehicles": self.vehicles, **estimates_to_json({name: getattr(self, name) for name in names})}
+        return {**self.identity, **told, "policy_sha256": list(self.policy_sha256)}
 
 
 def lengthen(scenario: Scenario, vehicles: int) -> Scenario:
@@ -73,13 +77,13 @@ def lengthen(scenario: Scenario, vehicles: int) -> Scenario:
         raise InvalidInput(f"line of {vehicles} vehicles: at least 2 are needed")
     given = scenario.model_dump(mode="json", exclude_unset=True)
     changes: dict[str, Any] = {"vehicles": vehicles, "name": f"{scenario.name}-n{vehicles}"}
-    for field in (*DECLARED, "objective"):
-        values = given.get(field)
+    for key in (*DECLARED, "objective", "types"):
+        values = given.get(key)
         if isinstance(values, list):
             wanted = vehicles - (scenario.vehicles - len(values))
             while len(values) < wanted:
                 values = [*values, values[-2] if len(values) > 1 else values[-1]]
-            changes[field] = values[:wanted]
+            changes[key] = values[:wanted]
     first = scenario.roles.get("vehicle_1", "full_brake")
     roles = {"vehicle_1": first} | {f"vehicle_{i + 1}": LEARNER for i in range(1, vehicles)}
     return scenario.replace(**changes, roles=roles)
@@ -169,6 +173,8 @@ def _of_length(
         None if best is None else mean_over_seeds(best),
         None if best is None else share_over_seeds(own[:, known], worst[:, known], best),
         mean_over_seeds(worse.astype(np.float64)),
+        result_identity("generalise", scenario, sample),
+        tuple(policy_sha256(agent) for agent in agents),
     )
 
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.process import BaseProcess
+from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.agents.team import Team
+from ethbrake_marl.evaluation.identity import policies_by_name, result_identity
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import evaluate
@@ -101,6 +103,7 @@ class Harms:
     world: dict[HarmCount, Floats]  # [seeds, worlds] harm of all vehicles (m2/s2)
     vehicle: dict[HarmCount, Floats]  # [seeds, worlds, N] harm of each
     collided: Bools  # [seeds, worlds]
+    policies: tuple[Mapping[str, str], ...] = ()  # of each seed: vehicle -> SHA-256 of its policy's manifest
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +115,7 @@ class Measured:
     reached: Harms
     full_brake: Harms  # of all vehicles, whatever their roles
     best: dict[HarmCount, Floats] | None  # [1, search_episodes] joint optimum, best known; None: nobody to control
+    identity: Mapping[str, Any] = field(default_factory=dict)  # of worlds and scenario, and what computed it
 
 
 def load_teams(plan: Plan) -> dict[tuple[str, str], list[Team]]:
@@ -142,15 +146,16 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
     found: list[Measured] = []
     for level, sample in zip(plan.levels, samples, strict=True):
         braking = _drive(_all_brake(level.scenario), sample, [Team({}, f"full braking in {level.name}")], say)
+        about = result_identity("ablate", level.scenario, sample)
         if not level.trained:
             scripts = _drive(level.scenario, sample, [Team({}, f"scripts of {level.name}")], say)
-            found.append(Measured(level, None, scripts, braking, None))
+            found.append(Measured(level, None, scripts, braking, None, about))
             continue
         known = best_known(answers[level.name], list(answers.values()))
         best = {harm_count: harm[np.newaxis] for harm_count, harm in known.items()}
         for algorithm in plan.algorithms:
             reached = _drive(level.scenario, sample, teams[level.name, algorithm], say)
-            found.append(Measured(level, algorithm, reached, braking, best))
+            found.append(Measured(level, algorithm, reached, braking, best, about))
     return found
 
 
@@ -166,7 +171,8 @@ def _drive(scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: OnPr
         result = evaluate(sample, {team.name: team}, scenario=scenario, chunk=PROGRESS_EVERY).complete()
         outcomes.append(result.outcome(team.name))
         tell(Progress(f"driving {team.name}", sample.worlds.n, sample.worlds.n))
-    return harms_of(outcomes)
+    policies = tuple(policies_by_name(outcome.policies, scenario) for outcome in outcomes)
+    return replace(harms_of(outcomes), policies=policies)
 
 
 def harms_of(outcomes: Sequence[Outcome]) -> Harms:

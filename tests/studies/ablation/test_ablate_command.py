@@ -52,6 +52,12 @@ def test_ablate__writes_tables_and_figures(ablation):
     found = content(ablation)
     assert [level["level"] for level in found["levels"]] == LEVELS.split(",")
     assert [level["seeds"] for level in found["levels"]] == [1, 2, 2]
+    assert {found["kind"], *(level["kind"] for level in found["levels"])} == {"ablate"}
+    assert len({level["scenario_sha256"] for level in found["levels"]}) == 3
+    learned = found["levels"][1]
+    assert len(learned["worlds_sha256"]) == 64 and learned["versions"]["numpy"]
+    assert len({seed["vehicle_2"] for seed in learned["policy_sha256"]}) == 2
+    assert found["levels"][0]["policy_sha256"] == [{}]
     assert [(step["from"], step["to"]) for step in found["channels"]] == [
         ("cooperation-3-pair", "cooperation-3-congested")
     ]

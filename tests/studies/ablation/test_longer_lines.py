@@ -84,7 +84,10 @@ def test_generalise__prints_a_table_or_json_and_refuses_bad_input(run, tmp_path,
     capsys.readouterr()
     assert run_command([*words, "--search-episodes", "2", "--budget", "20", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
-    assert [row["vehicles"] for row in rows] == [3, 6]
+    assert [row["vehicles"] for row in rows] == [3, 6] and {row["kind"] for row in rows} == {"generalise"}
+    assert len({row["worlds_sha256"] for row in rows}) == 2 == len({row["scenario_sha256"] for row in rows})
+    (policy,) = rows[0]["policy_sha256"]
+    assert policy == load_policy(run).manifest.manifest_sha256
     assert rows[1]["best_known"] <= rows[1]["full_brake"] * 10 and rows[1]["share_interval"] is not None
     assert run_command(words) == 0
     out = capsys.readouterr().out

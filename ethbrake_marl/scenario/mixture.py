@@ -1,0 +1,135 @@
+"""Mixtures of scenarios: each world is drawn from one member, by weight, and is then that member's own world.
+
+World k of a mixture is world k of its member under the same seed, bit for bit. So results on a mixture can be compared
+with results on its members, world by world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.yaml import Document, flow_text
+from ethbrake_marl.scenario.fields import ScenarioFields
+from ethbrake_marl.scenario.quantities import ALTERNATIVES
+from ethbrake_marl.scenario.sample import Sample, join_samples
+from ethbrake_marl.scenario.sampling import Channel, check_request, draw_numbers, uniform_numbers
+
+MIXTURE = (4,)  # the stream of what each world is drawn from
+MIXTURE_WIDTH = 4  # its numbers per world, of which the first is used
+
+WORDS = ("title", "description", "source")
+_OWN = {"name", *WORDS, "mixture"}  # of the mixture itself; every other key beside it holds for all members
+_ONE_FOR_ALL = ("vehicles", "time_step_s", "horizon_s", "roles", "objective", "observation")
+_SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # told of the mixture where all members agree
+
+AnyScenario = TypeVar("AnyScenario", bound=ScenarioFields)
+
+
+def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """What a scenario says, with other values under some keys; a new way to declare gaps takes the old one's place."""
+    old = {key for pair in ALTERNATIVES.items() for key in pair if changes.keys() & set(pair)}
+    if "speeds_mps" in changes:
+        old.add("speed_deviations_mps")
+    return {**{key: value for key, value in content.items() if key not in old}, **changes}
+
+
+def build_members(
+    document: Document, build: Callable[[Document], AnyScenario]
+) -> tuple[Document, tuple[AnyScenario, ...]]:
+    """The members that a document's ``mixture`` lists, and the document with what follows from them.
+
+    What stands beside ``mixture`` replaces what every member says. A list that is none stays for the schema to refuse.
+    Raises ``InvalidInput`` naming the member that is wrong, or the key in which two of them differ.
+    """
+    listed, content = document.content["mixture"], document.content
+    if not (isinstance(listed, list | tuple) and listed and all(_is_whole(entry) for entry in listed)):
+        return document, ()
+    fields = set(ScenarioFields.model_fields) - _OWN - {"vehicles"}
+    beside = {key: value for key, value in content.items() if key in fields}
+    members = tuple(build(_member_document(document, i, entry, beside)) for i, entry in enumerate(listed))
+    _check_members(document, members)
+    mixture = [{**entry, "scenario": member_content(member)} for entry, member in zip(listed, members, strict=True)]
+    own = {key: value for key, value in content.items() if key not in beside}
+    return Document(document.file, {**own, **_shared(members), "mixture": mixture}, document.lines), members
+
+
+def _is_whole(entry: Any) -> bool:
+    return isinstance(entry, dict) and isinstance(entry.get("scenario"), dict)
+
+
+def member_content(member: ScenarioFields) -> dict[str, Any]:
+    """What shapes a member's worlds, as plain data: what it says but its texts, and all that a batch has in common."""
+    declared = member.model_dump(mode="json", exclude_unset=True, exclude_none=True, exclude=set(WORDS))
+    return {**declared, **member.model_dump(mode="json", include=set(_SHARED), exclude_none=True)}
+
+
+def _member_document(document: Document, i: int, entry: Mapping[str, Any], beside: Mapping[str, Any]) -> Document:
+    """What one member says but its texts, with what stands beside the mixture, each on its line."""
+    own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}
+    inside = {path[3:]: line for path, line in document.lines.items() if path[:3] == ("mixture", i, "scenario")}
+    above = {path: line for path, line in document.lines.items() if path and path[0] in beside}
+    where = f"{document.file}: mixture[{i}] ({own.get('name', 'without a name')})"
+    return Document(where, changed_content(own, beside), {**inside, **above})
+
+
+def _check_members(document: Document, members: Sequence[ScenarioFields]) -> None:
+    """Refuse mixtures in mixtures, a name given twice, and members that cannot be one batch."""
+    line = document.line_of(("mixture",))
+    where = f"{document.file}{'' if line is None else f', line {line}'}: mixture"
+    first = members[0]
+    if (given := document.content.get("vehicles", first.vehicles)) != first.vehicles:
+        raise InvalidInput(
+            f"{where}: vehicles = {given}: its scenarios have {first.vehicles}, which nothing beside them can change"
+        )
+    for k, member in enumerate(members):
+        if member.members:
+            raise InvalidInput(f"{where}[{k}]: {member.name} is a mixture itself; list its scenarios here")
+        if member.name in [other.name for other in members[:k]]:
+            raise InvalidInput(f"{where}[{k}]: {member.name} is given twice; give it once, with the sum of the weights")
+        for key in _ONE_FOR_ALL:
+            one, other = (_told(each, key) for each in (first, member))
+            if one != other:
+                way = "" if key == "vehicles" else f"; give {key} beside mixture, and it holds for all"
+                raise InvalidInput(
+                    f"{where}: {key} must be the same in all: {first.name} has {one}, {member.name} has {other}{way}"
+                )
+        if member.has_obstacle != first.has_obstacle:
+            one, other = ("one" if each.has_obstacle else "none" for each in (first, member))
+            raise InvalidInput(
+                f"{where}: an obstacle ahead must be there in all or in none: {first.name} has {one}, {member.name} has"
+                f" {other}"
+            )
+
+
+def _told(scenario: ScenarioFields, key: str) -> str:
+    value = getattr(scenario, key)
+    return "nothing" if value is None else flow_text(dict(value) if key == "roles" else value, 120)
+
+
+def _shared(members: Sequence[ScenarioFields]) -> dict[str, Any]:
+    """Plain values of the keys in which all members agree."""
+    told = [member.model_dump(mode="json", include=set(_SHARED), exclude_none=True) for member in members]
+    return {key: value for key, value in told[0].items() if all(each.get(key) == value for each in told)}
+
+
+def draw_mixture(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
+    """Worlds ``first`` to ``first + n - 1`` of a mixture's list, each drawn from one member; as ``draw_list``."""
+    check_request(n, seed, first, channel)
+    assert scenario.mixture is not None
+    cumulative = np.cumsum([member.weight for member in scenario.mixture])
+    u = uniform_numbers(int(seed), channel, 0, first, n, MIXTURE_WIDTH, of=MIXTURE)[:, 0]
+    chosen = np.searchsorted(cumulative / cumulative[-1], u, side="right")
+    typed = any(member.vehicle_types is not None for member in scenario.members)
+    parts = []
+    for k, member in enumerate(scenario.members):
+        index = first + np.flatnonzero(chosen == k)
+        if len(index):
+            drawn = draw_numbers(member, index, int(seed), channel)
+            no_type = np.full((len(index), scenario.vehicles), "") if typed and drawn.types is None else drawn.types
+            parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
+    return join_samples(parts, sum(part.rejected for part in parts))

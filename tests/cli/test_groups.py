@@ -1,0 +1,47 @@
+"""Results by group on the command line: by the scenario of a mixture, by the type of a vehicle."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+
+def test_by__tells_every_group_and_writes_it_down(ethbrake, tmp_path: Path):
+    out = tmp_path / "w.csv"
+    command = ("evaluate", "--scenario", "mixture-delays", "--agents", "full_brake,coast", "--episodes", "30")
+    told = ethbrake(*command, "--by", "scenario", "--per-world", str(out))
+    assert told.status == 0
+    for name, worlds in (("paper-delay-high", 11), ("paper-delay-low", 8), ("paper-delay-middle", 11)):
+        assert f"\n{name}: {worlds} worlds\n" in told.out
+    rows = json.loads((tmp_path / "w.csv.json").read_text())
+    assert [row["agent"] for row in rows] == ["full_brake", "coast"]
+    for row in rows:
+        assert {name: group["episodes"] for name, group in row["groups"].items()} == {
+            "paper-delay-high": 11,
+            "paper-delay-low": 8,
+            "paper-delay-middle": 11,
+        }
+        assert {group["agent"] for group in row["groups"].values()} == {row["agent"]}
+    lines = list(csv.DictReader(out.read_text().splitlines()))
+    assert sum(line["scenario"] == "paper-delay-low" for line in lines) == 16
+
+
+def test_by__what_cannot_be_is_one_line_before_the_work(ethbrake):
+    typed = ("evaluate", "--scenario", "realistic-mixed", "--agents", "coast", "--episodes", "5")
+    assert "unknown group 'vehicle_9_type'; did you mean 'vehicle_" in ethbrake(*typed, "--by", "vehicle_9_type").err
+    plain = ethbrake("evaluate", "--agents", "coast", "--episodes", "5", "--by", "scenario")
+    assert plain.status == 2
+    assert "by 'scenario': these worlds have no groups" in plain.err
+
+
+def test_validate__counts_types_and_scenarios(ethbrake):
+    assert "; vehicle_1_type: car 714, truck 197, van 89;" in ethbrake("scenario", "validate", "realistic-mixed").out
+    assert "; scenario: paper-delay-high 332, paper-delay-low" in ethbrake("scenario", "validate", "mixture-delays").out
+
+
+def test_set__changes_every_scenario_of_a_mixture(ethbrake):
+    command = ("evaluate", "--scenario", "mixture-delays", "--agents", "full_brake", "--episodes", "5", "--json")
+    (row,) = json.loads(ethbrake(*command, "--set", "mass_t=4", "--set", "gaps_m=9").out)
+    assert row["parameters"]["mass_t"] == [4.0] * 3
+    assert row["parameters"]["gaps_m"] == [9.0] * 2

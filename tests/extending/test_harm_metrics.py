@@ -1,0 +1,137 @@
+"""Harm metrics from the user's own file: beside the two counts of harm wherever an evaluation is told."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.evaluation import markdown_table
+from ethbrake_marl.evaluation.harm_metrics import METRICS
+from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.pages.report import Report, render_report
+
+SCENARIO = eb.load_scenario("paper-random")
+SAMPLE = SCENARIO.sample(40, 7)
+
+
+def squared(episodes: Any) -> Any:
+    """Squared closing speed of every impact."""
+    rows = episodes.rows
+    return np.bincount(rows.world, rows.closing_speed_mps**2, minlength=episodes.worlds.n)
+
+
+def injury(episodes: Any) -> Any:
+    """Probability of a severe injury by each vehicle's largest change of speed, struck at the front."""
+    return 1.0 / (1.0 + np.exp(4.457 - 0.177 * episodes.largest_speed_change_mps))
+
+
+def register(function: Any = squared, name: str = "squared", unit: str = "m2/s2") -> None:
+    eb.register_harm_metric(name, function, unit=unit)
+
+
+def evaluated(**options: Any) -> Any:
+    agents = {name: eb.make_agent(name, scenario=SCENARIO) for name in ("full_brake", "e_v2x_bm", "ppo@shipped+step")}
+    return eb.evaluate(SAMPLE, agents, scenario=SCENARIO, **options)
+
+
+def test_metric__sees_every_impact_whatever_the_chunk() -> None:
+    register()
+    whole, parts = evaluated(), evaluated(chunk=7)
+    for name, outcome in whole.outcomes.items():
+        assert outcome.metrics["squared"] == pytest.approx(outcome.total_harm, rel=1e-9, abs=1e-9)
+        assert outcome.metrics["squared"].tolist() == parts.outcome(name).metrics["squared"].tolist()
+    taken = whole.outcome("full_brake").take(np.array([3, 1]))
+    assert taken.metrics["squared"].tolist() == whole.outcome("full_brake").metrics["squared"][[3, 1]].tolist()
+    assert evaluated(aftermath=False).outcome("full_brake").metrics == {}
+
+
+def test_metric__changes_nothing_else() -> None:
+    before = evaluated()
+    register()
+    after = evaluated()
+    for name, outcome in before.outcomes.items():
+        assert outcome.metrics == {}
+        assert outcome.total_harm.tobytes() == after.outcome(name).total_harm.tobytes()
+
+
+def test_metric_of_each_vehicle__stands_in_rows_frame_markdown_and_report() -> None:
+    register()
+    register(injury, "injury", "1")
+    found = evaluated()
+    rows = eb.summarise(found)
+    assert [*rows[0].metrics] == ["squared", "injury_1", "injury_2", "injury_3"]
+    assert rows[1].metrics["injury_2"] == mean(found.outcome("e_v2x_bm").metrics["injury_2"])
+    told = rows[0].to_json()
+    assert told["metric_squared"] == pytest.approx(told["total_harm"]) and len(told["metric_injury_3_interval"]) == 2
+    assert told["metrics"]["injury_3"] == "injury, vehicle 3 (1)"
+    frame = found.to_frame("columns")
+    assert frame["metric_squared"] == pytest.approx(frame["total_harm"])
+    for text in (markdown_table(rows), render_report(Report("mine", rows))):
+        assert "squared (m2/s2)" in text and "injury, vehicle 2 (1)" in text
+    assert "Squared closing speed of every impact." in render_report(Report("mine", rows))
+
+
+def test_change_of_speed__is_the_largest_of_each_vehicle_and_0_without_an_impact() -> None:
+    register(lambda_free, "change", "m/s")
+    found = evaluated().outcome("full_brake")
+    changes = np.stack([found.metrics[f"change_{i}"] for i in (1, 2, 3)], axis=1)
+    assert ((changes > 0.0).any(axis=1) == found.collided).all() and (changes >= 0.0).all()
+
+
+def lambda_free(episodes: Any) -> Any:
+    """Largest change of speed of each vehicle."""
+    return episodes.largest_speed_change_mps
+
+
+def test_plugin__with_a_metric_is_seen_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine.py").write_text(
+        "import ethbrake_marl as eb\n\n\ndef worst(episodes):\n    'Largest change of speed in the line.'\n"
+        "    return episodes.largest_speed_change_mps.max(axis=1)\n\n\n"
+        "eb.register_harm_metric('worst', worst, unit='m/s')\n"
+    )
+    words = ["evaluate", "--plugin", str(tmp_path / "mine.py"), "--episodes", "5", "--agents", "full_brake"]
+    assert run_command([*words, "--per-world", str(tmp_path / "out.csv")]) == 0
+    assert "worst (m/s)" in capsys.readouterr().out
+    rows = list(csv.DictReader((tmp_path / "out.csv").read_text().splitlines()))
+    (told,) = json.loads((tmp_path / "out.csv.json").read_text())
+    assert told["metric_worst"] == pytest.approx(np.mean([float(row["metric_worst"]) for row in rows]))
+    assert run_command(["evaluate", "--help"]) == 0 and "Harm metrics" in capsys.readouterr().out
+
+
+def test_register_harm_metric__refuses_what_cannot_be_used() -> None:
+    def flat(episodes: Any) -> Any:
+        """One number for all."""
+        return 1.0
+
+    def broken(episodes: Any) -> Any:
+        """Not a number."""
+        return np.full(episodes.worlds.n, np.nan)
+
+    def greedy(episodes: Any) -> Any:
+        """Changes what it is given."""
+        episodes.rows.closing_speed_mps[:] = 0.0
+
+    for function, name, message in (
+        (squared, "Squared", "must be 1 to 64 of a-z"),
+        (squared, "delta_v_2", "not ending in _ and a number"),
+        (3, "mine", "needs a function with a docstring"),
+        (lambda episodes: 0, "mine", "needs a function with a docstring"),
+        (flat, "mine", r"gave float64 of shape \(\); must be numbers of shape \(2,\), one per world, or \(2, 3\)"),
+        (broken, "mine", "'mine': is nan in world 0; must be finite"),
+        (greedy, "mine", r"'mine': its function fails: ValueError: .*read-only"),
+    ):
+        with pytest.raises(InvalidInput, match=message):
+            register(function, name)
+    assert not METRICS
+    register()
+    register()
+    with pytest.raises(AlreadyExists, match="harm metric 'squared' is registered already"):
+        register(injury)
