@@ -15,10 +15,12 @@ from ethbrake_marl.pages.explorer.state import state_of
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.scenario.initial_states import table_columns
+from ethbrake_marl.scenario.quantities import OTHERWISE
 
 Kind = Literal["yaml", "csv"]
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
+_DRAWN = {*OTHERWISE, "vehicle_types", "types"}  # other ways to say what a state says
 _DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{k}" for port in ("com", "lpt") for k in range(10))}
 
 
@@ -43,15 +45,16 @@ def save_state(folder: Path, name: object, kind: object, world: Worlds, scenario
 
 def scenario_text(name: str, world: Worlds, scenario: Scenario) -> str:
     """A scenario whose every world is this one; it keeps scripts, time step, horizon and channel of ``scenario``."""
-    fixed = scenario.replace(
-        name=name,
-        title=f"One world, from {scenario.name}",
-        description="A state that was saved in the explorer.",
-        source="ethbrake explore",
-        early_impacts="keep",  # this very world, whatever happens in it
+    fixed = {
+        **{key: value for key, value in scenario.declared().items() if key not in _DRAWN},
+        "name": name,
+        "title": f"One world, from {scenario.name}",
+        "description": "A state that was saved in the explorer.",
+        "source": "ethbrake explore",
+        "early_impacts": "keep",  # this very world, whatever happens in it
         **state_of(world),
-    )
-    lines = [f"{key}: {flow_text(value)}" for key, value in fixed.declared().items()]
+    }
+    lines = [f"{key}: {flow_text(value)}" for key, value in Scenario(**fixed).declared().items()]
     return "\n".join(["# Saved by ethbrake explore.", *lines, ""])
 
 

@@ -77,7 +77,7 @@ def test_world__is_that_of_the_list(client: Client, scenario: Scenario) -> None:
     assert np.array_equal(read.gaps_m, world.gaps_m) and np.array_equal(read.speeds_mps, world.speeds_mps)
 
 
-@pytest.mark.parametrize("name", ["paper-random", "paper-random-obstacle", "realistic-motorway", "realistic-truck"])
+@pytest.mark.parametrize("name", ["paper-random", "paper-random-obstacle", "realistic-motorway", "realistic-mixed"])
 def test_saved_state__reads_back_to_the_same_harm(name: str, folder: Path) -> None:
     scenario = load_scenario(name)
     world = scenario.sample(1, LIST_SEED, first=3).worlds
