@@ -252,7 +252,7 @@ function cardsOf({ verdict, constant }, best, count) {
   if (constant.first === undefined) cards.push(card("", "H*, best constant deceleration", "–", constant.why));
   else cards.push(card("", "H*, best constant deceleration", `${plain(constant[count], 2)} ${unit}`, `at ${plain(constant.deceleration_mps2, 2)} m/s², held from the first decision on`));
   const least = verdict.proven_harm > 0 && best[count] - verdict.proven_harm < 1e-3 ? "; proven: nothing does less" : "";
-  const who = best.candidates ? `a search of ${best.candidates.toLocaleString("en")} candidates` : best.agent;
+  const who = best.candidates ? `a search of ${best.candidates.toLocaleString("en")} candidates` : best.agent === "by hand" ? "by your hand" : `by ${best.agent}`;
   cards.push(card("good", "Best known", `${plain(best[count], 2)} ${unit}`, who + least));
   return cards;
 }
@@ -267,7 +267,7 @@ function scoreOf(outcomes, best, rival, data) {
   const first = won ? `You beat ${other.agent} by ${plain(by, 2)} m²/s². ` : Math.abs(by) <= LEAST ? `You do as well as ${other.agent}. ` : `${other.agent} does ${plain(-by, 2)} m²/s² less harm than you. `;
   const room = worst[count] - best[count];
   const share = (100 * (worst[count] - you[count])) / room;
-  let saved = `Of what ${worst.agent} leaves to be saved you save ${plain(share, 0)} %.`;
+  let saved = `Compared with ${worst.agent} you save ${plain(share, 0)} % of what the best known saves.`;
   if (room <= LEAST) saved = `${worst.agent} does as well as the best known: nothing is left to be saved.`;
   else if (share < 0) saved = `That is more than ${worst.agent} does.`;
   return [make("span", { class: won ? "won" : "" }, first), `Your harm: ${plain(you.first, 2)} first-impact, ${plain(you.total, 2)} total. ${saved}`];
