@@ -73,7 +73,7 @@ def table_text(world: Worlds, scenario: Scenario) -> str:
 
 def _create(folder: Path, file: str, data: bytes) -> None:
     """A new file right in the folder: the name is looked up there, no link is followed, nothing is replaced."""
-    place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
         with os.fdopen(os.open(file, flags, 0o666, dir_fd=place), "wb") as stream:
