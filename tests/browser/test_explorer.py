@@ -137,6 +137,20 @@ def test_slider__is_answered_by_the_engine(open_explorer: Open, scenario: Scenar
     assert shown != before
 
 
+def test_fast_moves__are_answered_for_the_newest_place(open_explorer: Open, scenario: Scenario) -> None:
+    page = open_explorer()
+    asked: list[str] = []
+    page.on("request", lambda each: asked.append(each.url) if each.url.endswith("/answer") else None)
+    page.get_by_label("Gap, 2 to 3 in m, slider").evaluate(
+        "(e) => { for (let k = 0; k <= 40; k += 1) { e.value = 5 + k / 10; e.dispatchEvent(new Event('input')); } }"
+    )
+    wait_until(page, IDLE)
+    state = page.evaluate(f"{EXPLORER}.state")
+    assert state["gaps_m"][1] == 9.0 and len(asked) == 2
+    shown = harms(page)
+    assert {name: shown[name] for name in AGENTS} == evaluated(initial_state_worlds(state, scenario), scenario)
+
+
 def test_world_that_cannot_be__is_told_and_left_again(open_explorer: Open) -> None:
     page = open_explorer()
     number = page.get_by_label("Speed, Vehicle 1 in m/s", exact=True)

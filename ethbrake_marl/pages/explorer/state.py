@@ -84,11 +84,10 @@ def read_state(given: object, scenario: Scenario) -> Worlds:
     if missing := [key for key in known if key not in given]:
         raise InvalidInput(f"world: {missing[0]} is missing; every quantity must be given")
     for key, value in given.items():
-        count = known[key].count(scenario.vehicles)
         if known[key].per == "world":
             read_number(value, f"world: {key}")
-        elif not isinstance(value, list) or len(value) != count:
-            raise InvalidInput(f"world: {key}: must be a list of {count} numbers")
+        elif not isinstance(value, list):
+            raise InvalidInput(f"world: {key}: must be a list of {known[key].count(scenario.vehicles)} numbers")
         else:
             for i, each in enumerate(value):
                 read_number(each, f"world: {key}[{i}]")

@@ -99,6 +99,15 @@ def test_saved_state__reads_back_to_the_same_harm(name: str, folder: Path) -> No
     assert harms[0] == harms[1] == harms[2]
 
 
+def test_saved_state__may_have_an_impact_before_anybody_acts(folder: Path, scenario: Scenario) -> None:
+    state = state_of(scenario.sample(1, LIST_SEED).worlds)
+    state["gaps_m"][0] = 0.01
+    world = read_state(state, scenario)
+    save_state(folder, "early", "yaml", world, scenario)
+    drawn = load_scenario(folder / "early.yaml").sample(1, 5)
+    assert (drawn.rejected, drawn.worlds.gaps_m[0, 0]) == (0, 0.01)
+
+
 def test_save__never_replaces_and_never_follows(client: Client, folder: Path, state: dict[str, Any]) -> None:
     question = {"world": state, "name": "kept", "kind": "yaml"}
     assert client.ask("save", question).json == {"file": "kept.yaml"}
