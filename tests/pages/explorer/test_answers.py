@@ -56,6 +56,17 @@ def test_search__starts_where_h_star_is_and_is_driven_again(client: Client, stat
     assert worse["first"] == found["first"]
 
 
+def test_search__is_never_worse_than_h_star(
+    explored: Explored, scenario: Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ethbrake_marl.pages.explorer.answer.SLICE", 1)
+    worlds = scenario.sample(20, LIST_SEED).worlds
+    for k in range(worlds.n):
+        world = worlds.take([k])
+        found = explored.search(world, np.array([0.0]), 0.0, lambda: True)
+        assert found["first"] <= explored.best_constant(world)["first"] + 1e-9
+
+
 def test_search__takes_the_profile_by_hand_where_that_is_better(explored: Explored, state: dict[str, Any]) -> None:
     world = read_state(state, explored.scenario)
     good = explored.search(world, np.array([0.0]), 1.0, lambda: False)
@@ -148,6 +159,8 @@ def test_page__shows_hostile_names_as_text(scenario: Scenario, state: dict[str, 
     changed = scenario.replace(title=hostile)
     text = explorer_page(Explored(changed, {hostile: lineup["full_brake"]}), state, world=0, seed=7).html
     assert "<img" not in text and "\u202e" not in text
+    content = json.loads(text.partition('id="explorer_data">')[2].partition("</script>")[0])
+    assert content["named"] == [hostile] and all(name.isprintable() for name in content["agents"])
 
 
 def test_answer__comes_within_100_ms_of_processor_time(scenario: Scenario, state: dict[str, Any]) -> None:
