@@ -157,6 +157,7 @@ def test_world_that_cannot_be__is_told_and_left_again(open_explorer: Open) -> No
     number.fill("90")
     wait_until(page, IDLE)
     assert "must not be above speed_limit_mps" in page.inner_text("[data-part=state]")
+    assert page.evaluate("getComputedStyle(document.querySelector('.cards')).opacity") == "0.45"
     number.fill("20")
     wait_until(page, IDLE)
     assert "Answered" in page.inner_text("[data-part=state]")

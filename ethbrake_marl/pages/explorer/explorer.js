@@ -132,9 +132,10 @@ class Explorer {
       if (found.superseded) this.wanted = true; // by another window
       else if (found.wrong) this.say(found.wrong, true);
       else this.take(found, question, performance.now() - begun);
+      document.body.classList.toggle("stale", Boolean(found.wrong)); // what is shown is of another world
     }
     this.busy = false;
-    this.settled = setTimeout(() => this.search(SEARCH_S), SETTLED_MS);
+    if (!document.body.classList.contains("stale")) this.settled = setTimeout(() => this.search(SEARCH_S), SETTLED_MS);
   }
 
   take(found, question, milliseconds) {
@@ -148,6 +149,7 @@ class Explorer {
   async search(seconds) {
     if (!this.found) return;
     const world = JSON.stringify(this.state);
+    if (seconds > SEARCH_S) this.say(`Searching for ${seconds} s …`);
     const best = await this.ask("best", { world: JSON.parse(world), profile: this.editor.commands.slice(), seconds });
     if (world !== JSON.stringify(this.state) || best.superseded) return;
     if (best.wrong) {
@@ -157,6 +159,7 @@ class Explorer {
     const count = this.data.harm_count;
     if (!this.best || best[count] <= this.best[count] || world !== this.searched) this.best = best;
     this.searched = world;
+    if (seconds > SEARCH_S) this.say(`Searched ${best.candidates.toLocaleString("en")} profiles.`);
     this.show();
   }
 
