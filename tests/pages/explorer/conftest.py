@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from ethbrake_marl.scenario import Scenario, load_scenario
 
 TOKEN, PORT = "the-token-of-this-test", 4711
 HOST = f"127.0.0.1:{PORT}"
+PAGE = f"/{TOKEN}/"
 AGENTS = ("full_brake", "e_v2x_bm", "ppo@shipped")
 
 
@@ -127,4 +128,14 @@ def client(explored: Explored, folder: Path) -> Iterator[Client]:
     yield Client(explorer_app(Setting(explored, folder, LIST_SEED, 0), TOKEN, PORT))
 
 
-Ask = Callable[..., Reply]
+def check_refused(reply: Reply, status: int) -> None:
+    assert reply.status == status, reply.body
+    assert reply.headers["content-type"] == "application/json"
+    assert reply.headers["x-content-type-options"] == "nosniff"
+    told = reply.json["error"]
+    assert 0 < len(told) <= 1_500 and told.isprintable()
+    assert TOKEN not in told
+
+
+def check_alive(client: Client) -> None:
+    assert client.ask("world", {"number": 0}).status == 200
