@@ -9,8 +9,10 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import median
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
@@ -67,6 +69,22 @@ def test_server__answers_and_saves(running: Running) -> None:
     assert status == 200 and len(state["gaps_m"]) == 2
     assert ask(running, "POST", running.path + "save", {"world": state, "name": "three", "kind": "csv"})[0] == 200
     assert [each.name for each in running.folder.iterdir()] == ["three.csv"]
+
+
+def test_server__does_not_wait_for_acknowledgements(running: Running) -> None:
+    """Headers and body are two packets: under Nagle's algorithm the second waits 40 ms for the first."""
+    connection = http.client.HTTPConnection("127.0.0.1", running.port, timeout=60)
+    connection.connect()
+    connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    waited = []
+    for k in range(60):
+        begin = time.monotonic()
+        question = json.dumps({"number": k})
+        connection.request("POST", running.path + "world", question, {"content-type": "application/json"})
+        assert connection.getresponse().read().startswith(b'{"world"')
+        waited.append(time.monotonic() - begin)
+    connection.close()
+    assert median(waited[30:]) < 0.03  # the first packets are acknowledged at once anyway
 
 
 @pytest.mark.parametrize("path", ["/", "/favicon.ico", "/%2e%2e/", "/x/answer"])
