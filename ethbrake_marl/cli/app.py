@@ -21,6 +21,7 @@ from ethbrake_marl.cli.dataset import dataset_command
 from ethbrake_marl.cli.doctor import diagnose
 from ethbrake_marl.cli.equal_time import equal_time_command
 from ethbrake_marl.cli.evaluate import agents_command, evaluate_command, shield_command, show_beside, show_rows
+from ethbrake_marl.cli.explore import explore_command
 from ethbrake_marl.cli.options import (
     ForceOption,
     JsonOption,
@@ -129,6 +130,7 @@ app.command("dataset", epilog="Example: ethbrake dataset --agents best_harm --ep
     dataset_command
 )
 app.command("replay", epilog="Example: ethbrake replay PASSPORT --output again.html")(replay_command)
+app.command("explore", epilog="Example: ethbrake explore --agents full_brake,ppo@shipped")(explore_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
 app.command("equal-time", epilog="Example: ethbrake equal-time --episodes 200 --repeats 1")(equal_time_command)
 

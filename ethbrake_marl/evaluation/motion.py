@@ -74,7 +74,8 @@ class _Follower:
         moving = until_s > before.time_s
         moving |= before.time_s == self._worlds.time_s  # an impact at the very alert
         for k in np.flatnonzero(moving).tolist():
-            world, command, until = before.take([k]), command_mps2[k], float(until_s[k])
+            world = before if before.n == 1 else before.take([k])
+            command, until = command_mps2[k], float(until_s[k])
             rows = advance(world, command, until_s=until, record=True)[1].rows
             assert rows is not None  # they were asked for
             self._impacts[k].append(rows)
@@ -111,7 +112,7 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
     last_of_many[0] = True
     kept: list[Floats] = []
     for row in pieces[last_of_many]:
-        if not kept or not np.allclose(state_at(kept[-1], row[0], vehicles), row[1:], rtol=0.0, atol=_SAME):
+        if not kept or not (np.abs(state_at(kept[-1], row[0], vehicles) - row[1:]) <= _SAME).all():
             kept.append(row)
     return np.array(kept)
 

@@ -52,33 +52,39 @@ class Section:
         return [paragraph(each) if isinstance(each, str) else each for each in self.body]
 
 
-def page(title: str, sections: Sequence[Section], *, lead: str = "") -> str:
+def page(title: str, sections: Sequence[Section], *, lead: str = "", served: bool = False) -> str:
     """A whole page as HTML.
 
     Args:
         title: of the page.
         sections: in this order, each with an entry in the table of contents.
         lead: what the page is about, in a sentence or two below its title.
+        served: it comes from a server of ours, which its script may ask; else it asks nobody.
 
     """
-    parts = [part for section in sections for part in section.parts]
-    styles = _joined(["page.css", *(name for part in parts for name in part.styles)])
-    script = _joined([name for part in parts for name in part.scripts])
-    policy = (
-        f"default-src 'none'; style-src {_source(styles)}; script-src {_source(script)}; img-src data:;"
-        " base-uri 'none'; form-action 'none'"
-    )
+    styles, script = _own_code(sections)
     names = _anchors([section.title for section in sections])
     whole = render(
         "page.html.j2",
         title=title,
         lead=lead,
         sections=list(zip(names, sections, strict=True)),
-        policy=policy,
+        policy=page_policy(sections, served=served),
+        served=served,
         styles=Markup(styles),
         script=Markup(script),
     )
     return str(whole)
+
+
+def page_policy(sections: Sequence[Section], *, served: bool = False) -> str:
+    """The content security policy of a page: its own styles and script, pictures inside it, and nothing else."""
+    styles, script = _own_code(sections)
+    policy = (
+        f"default-src 'none'; style-src {_source(styles)}; script-src {_source(script)}; img-src data:;"
+        " base-uri 'none'; form-action 'none'"
+    )
+    return f"{policy}; connect-src 'self'" if served else policy
 
 
 def render(template: str, **values: object) -> Markup:
@@ -112,6 +118,13 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         finalize=lambda value: value if isinstance(value, Markup) else shown(value),
     )
+
+
+def _own_code(sections: Sequence[Section]) -> tuple[str, str]:
+    """Styles and script of a page with these sections."""
+    parts = [part for section in sections for part in section.parts]
+    styles = _joined(["page.css", *(name for part in parts for name in part.styles)])
+    return styles, _joined([name for part in parts for name in part.scripts])
 
 
 def _joined(names: Sequence[str]) -> str:

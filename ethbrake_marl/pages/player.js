@@ -27,6 +27,10 @@ class Player {
       kinds.get(world.kind).append(make("option", { value: k }, `World ${world.number}${world.why ? ` · ${world.why}` : ""}`));
     });
     this.find("world").append(...kinds.values());
+    this.fillAgents();
+  }
+
+  fillAgents() {
     this.find("agents").append(
       ...this.data.agents.map((agent, k) => {
         const box = make("input", { type: "checkbox", value: k });
@@ -38,7 +42,7 @@ class Player {
   }
 
   listen() {
-    const on = (name, kind, act) => this.find(name).addEventListener(kind, act);
+    const on = (name, kind, act) => this.find(name)?.addEventListener(kind, act); // a live player has no list of worlds
     on("world", "change", (event) => this.choose(Number(event.target.value)));
     on("before", "click", () => this.choose(this.world - 1));
     on("after", "click", () => this.choose(this.world + 1));
@@ -106,7 +110,7 @@ class Player {
 
   // At least one agent and at most three; one more takes the place of the first.
   toggle(k) {
-    if (!this.shown.includes(k)) this.shown = [...this.shown, k].slice(-MOST_AGENTS);
+    if (!this.shown.includes(k)) this.shown = [...this.shown, k].slice(-(this.data.most ?? MOST_AGENTS));
     else if (this.shown.length > 1) this.shown = this.shown.filter((each) => each !== k);
     this.shown.sort((a, b) => a - b);
     for (const box of this.find("agents").querySelectorAll("input")) box.checked = this.shown.includes(Number(box.value));
@@ -157,7 +161,7 @@ class Player {
         traces: new Traces(columns[k], episode, this.data, ranges, this.until, (time) => this.seek(time)),
       };
     });
-    this.find("passports").replaceChildren(...episodes.map((episode) => this.passport(episode)));
+    this.find("passports")?.replaceChildren(...episodes.map((episode) => this.passport(episode)));
     const scrub = this.find("scrub");
     scrub.max = this.until;
     this.show();
@@ -245,6 +249,6 @@ class Player {
   }
 }
 
-for (const root of document.querySelectorAll(".player")) {
+for (const root of document.querySelectorAll(".player[data-episodes]")) {
   root.player = new Player(root, JSON.parse(document.getElementById(root.dataset.episodes).textContent));
 }

@@ -13,6 +13,7 @@ from ethbrake_marl.evaluation.conditions import quantities, quantity_line
 from ethbrake_marl.evaluation.motion import EpisodeMotion
 from ethbrake_marl.pages.frame import Part, render, shown
 from ethbrake_marl.pages.parts import data
+from ethbrake_marl.physics import Worlds
 
 _STYLES = ("player.css",)
 _SCRIPTS = ("player-motion.js", "player-view.js", "player.js")
@@ -67,27 +68,45 @@ def _shown_first(agents: Sequence[str], focus: str) -> list[int]:
     return sorted(list(order)[:3])
 
 
-def _world(world: Played) -> dict[str, Any]:
-    alert = next(iter(world.motions.values())).world
+def live_player(vehicles: int, *, shielded: bool) -> Part:
+    """A player without episodes, for a page whose own script gives it one world after another."""
+    html = render("player.html.j2", name=None, vehicles=vehicles, body=BODY_M, shielded=shielded, episodes="")
+    return Part(html, _STYLES, _SCRIPTS)
+
+
+def played_world(alert: Worlds, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What the player needs of one world (n = 1, at the alert) and its episodes."""
     obstacle = float(alert.obstacle_gap_m[0])
     return {
-        "number": world.number,
-        "kind": shown(world.kind),
-        "why": shown(world.why),
-        "conditions": f"World {world.number}: {quantity_line(quantities(alert))}.",
+        "conditions": quantity_line(quantities(alert)),
         "obstacle": obstacle if np.isfinite(obstacle) else None,
-        "episodes": [_episode(motion, world.passports[agent]) for agent, motion in world.motions.items()],
+        "episodes": list(episodes),
     }
 
 
-def _episode(motion: EpisodeMotion, passport: str) -> dict[str, Any]:
+def played_episode(motion: EpisodeMotion) -> dict[str, Any]:
+    """What the player needs of one episode."""
     pieces = np.ascontiguousarray(motion.pieces, np.dtype("<f8"))
     return {
         "pieces": base64.b64encode(pieces.tobytes()).decode("ascii"),
         "end": motion.end_s,
         "impacts": _impacts(motion),
         "stepped": motion.stepped_in_s.tolist(),
-        "passport": shown(passport),
+    }
+
+
+def _world(world: Played) -> dict[str, Any]:
+    alert = next(iter(world.motions.values())).world
+    passports = world.passports
+    told = played_world(
+        alert,
+        [played_episode(motion) | {"passport": shown(passports[agent])} for agent, motion in world.motions.items()],
+    )
+    return told | {
+        "number": world.number,
+        "kind": shown(world.kind),
+        "why": shown(world.why),
+        "conditions": f"World {world.number}: {told['conditions']}.",
     }
 
 

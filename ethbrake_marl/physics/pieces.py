@@ -8,7 +8,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.episode import onset_s
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED, resolve_impacts
-from ethbrake_marl.physics.obstacle import ahead, with_obstacle, with_post_ahead
+from ethbrake_marl.physics.obstacle import place_obstacle, with_post_ahead
 from ethbrake_marl.physics.segment import (
     ACCELERATION,
     ACTIVE,
@@ -78,24 +78,24 @@ def segment_pieces(world: Worlds, command_mps2: Floats, until_s: float) -> Float
         raise InvalidInput(f"segment_pieces: {world.n} worlds given; exactly 1 is needed")
     start = float(world.time_s[0])
     duration = float(until_s) - start
-    line = with_obstacle(with_post_ahead(world, np.array([duration])))  # its first gap says where Vehicle 1 is
-    table = np.zeros((TABLE_ROWS, line.N))
-    table[COMMAND] = ahead(0.0, command_mps2[np.newaxis])[0]
-    table[SPEED], table[MASS], table[LIMIT] = (
-        line.speeds_mps[0],
-        line.vehicles.mass_t[0],
-        line.vehicles.speed_limit_mps[0],
-    )
-    table[ONSET] = [onset_s(float(latency), start) for latency in line.vehicles.latency_s[0]]
-    table[GAP, : line.N - 1] = line.gaps_m[0]
+    front_gap = float(with_post_ahead(world, np.array([duration])).obstacle_gap_m[0])  # says where Vehicle 1 is
+    v, N = world.vehicles, world.N
+    table = np.zeros((TABLE_ROWS, N + 1))
+    place_obstacle(table, front_gap, 0.0)
+    table[COMMAND, 1:], table[SPEED, 1:] = command_mps2, world.speeds_mps[0]
+    table[MASS, 1:], table[LIMIT, 1:] = v.mass_t[0], v.speed_limit_mps[0]
+    table[ONSET, 0] = onset_s(0.0, start)
+    table[ONSET, 1:] = [onset_s(float(latency), start) for latency in v.latency_s[0]]
+    table[GAP, 1:N] = world.gaps_m[0]
     capacity = _CAPACITY
     while True:
-        rows = np.zeros((capacity, 3 * line.N))
-        count = abs(_pieces(table.copy(), float(line.vehicles.restitution[0]), duration, rows))
+        rows = np.zeros((capacity, 3 * (N + 1)))
+        count = abs(_pieces(table.copy(), float(v.restitution[0]), duration, rows))
         if count <= capacity:
             break
         capacity = count
-    rows = np.delete(rows[:count], [line.N, 2 * line.N], axis=1)  # of the post itself
+    seen = [*range(N + 1), *range(N + 2, 2 * N + 2), *range(2 * N + 3, 3 * N + 3)]  # all but the post's own
+    rows = rows[:count, seen]
     rows[:, 0] += start
-    rows[:, 1] = line.gaps_m[0, 0] - rows[:, 1]
+    rows[:, 1] = front_gap - rows[:, 1]
     return rows

@@ -51,6 +51,7 @@ class Policy:
     manifest: Manifest
     tensors: Mapping[str, Float32s]
     _actor: Actor = field(init=False, compare=False)
+    _observed: ObservationSpec | None = field(default=None, init=False, compare=False, repr=False)
 
     def __repr__(self) -> str:
         told, scenario = self.manifest, self.manifest.scenario.get("name")
@@ -69,8 +70,11 @@ class Policy:
 
     @property
     def observation(self) -> ObservationSpec:
-        """What to observe for this policy."""
-        return self.manifest.observation.spec
+        """What to observe for this policy: found from the names at first use, which takes as long as to act."""
+        if self._observed is None:
+            object.__setattr__(self, "_observed", self.manifest.observation.spec)
+        assert self._observed is not None
+        return self._observed
 
 
 def make_policy(tensors: Mapping[str, Float32s], **manifest: Any) -> Policy:
