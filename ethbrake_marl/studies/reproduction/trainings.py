@@ -1,0 +1,137 @@
+"""The trainings of ``ethbrake reproduce --full``: learning curves, a policy stopped early, and what the paper leaves open.
+
+Each group is a folder of learning curves: finished trainings are kept, begun ones go on, by the rules of
+``learning_curves.train_all``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.learning.run_folder import RunDirectory, read_object
+from ethbrake_marl.progress import OnProgress
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.studies.learning_curves import Trainings, train_all
+
+FOLDER = "trainings"  # inside the folder of a reproduction
+STOPPED, OPEN = "stopped", "open"
+CURVES = {"low": ("low", "low-slow"), "high": ("high", "high-slow")}  # latency -> groups
+SEEDS = 3
+STATED_STATE = (  # positions and speeds of all, and the others' actions: no more is in the paper's state
+    "own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration", "rear_1.gap",
+    "rear_1.closing_speed", "rear_1.acceleration",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class TrainedRecipe:
+    """So many decisions of a recipe, measured every so many updates, and what they take.
+
+    ``per_s``: decisions per second of one core (Intel Xeon), for the estimate that is told beforehand.
+    """
+
+    recipe: str
+    decisions: int
+    every_updates: int
+    per_s: int
+
+    def load(self, name: str | None = None, **changes: Any) -> TrainingRecipe:
+        """The recipe; under another name with ``changes``."""
+        found = load_recipe(self.recipe)
+        evaluation = {**found.evaluation.model_dump(), "every_updates": self.every_updates}
+        return found.replace(name=name or found.name, total_steps=self.decisions, evaluation=evaluation, **changes)
+
+
+PPO = TrainedRecipe("ppo", 400_000, 4, 16_000)
+SAC = TrainedRecipe("sac", 400_000, 250, 6_500)
+PPO_PAPER = TrainedRecipe("ppo-paper", 200_000, 1, 6_000)
+SAC_PAPER = TrainedRecipe("sac-paper", 20_000, 2_000, 110)
+EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the recipe's own number
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Trainings on one scenario in one folder, in the order in which they are done."""
+
+    name: str
+    scenario: str  # a shipped one
+    trained: Mapping[str, tuple[TrainedRecipe, TrainingRecipe]]  # by the name that the recipe has there
+    seeds: int
+
+    @property
+    def plan(self) -> list[Trainings]:
+        """The same for ``learning_curves``."""
+        return [Trainings(recipe, self.seeds) for _, recipe in self.trained.values()]
+
+    def load_scenario(self) -> Scenario:
+        """The scenario."""
+        return load_scenario(self.scenario)
+
+
+def _curves(name: str, scenario: str, recipes: Sequence[TrainedRecipe]) -> Group:
+    return Group(name, scenario, {each.recipe: (each, each.load()) for each in recipes}, SEEDS)
+
+
+def reward_variants() -> dict[str, dict[str, Any]]:
+    """What differs from ``ppo-paper`` in each training of the open quantities, by its name there."""
+    base = PPO_PAPER.load().reward.model_dump(exclude_defaults=True)
+    changed = {"risk-0": {"risk": 0.0}, "risk-1": {"risk": 1.0}, "jerk-0": {"jerk": 0.0}, "jerk-1e-4": {"jerk": 1e-4}}
+    changed["terminal-0"] = {"terminal": 0.0}
+    rewards = {f"ppo-paper-{name}": {"reward": {**base, **own}} for name, own in changed.items()}
+    return {"ppo-paper": {}, **rewards, "ppo-paper-state": {"observation": STATED_STATE}}
+
+
+def groups() -> tuple[Group, ...]:
+    """Every group, the quickest first, so that results are there early."""
+    variants = {name: (PPO_PAPER, PPO_PAPER.load(name, **own)) for name, own in reward_variants().items()}
+    quick = (PPO, SAC, PPO_PAPER)
+    return (
+        Group(STOPPED, "paper-random", {"ppo-stopped": (EARLY, EARLY.load("ppo-stopped"))}, 1),
+        _curves("low", "paper-delay-low", quick),
+        _curves("high", "paper-delay-high", quick),
+        Group(OPEN, "paper-random", variants, 2),
+        _curves("low-slow", "paper-delay-low", (SAC_PAPER,)),
+        _curves("high-slow", "paper-delay-high", (SAC_PAPER,)),
+    )
+
+
+def group_named(name: str) -> Group:
+    """The group of that name."""
+    return {group.name: group for group in groups()}[name]
+
+
+def training_folders(folder: Path, group: Group) -> Iterator[tuple[str, list[Path]]]:
+    """Each recipe of a group, and the folders of its seeds."""
+    for name in group.trained:
+        yield name, [folder / FOLDER / group.name / f"{name}-seed{seed}" for seed in range(group.seeds)]
+
+
+def finished(folder: Path, group: Group) -> dict[str, list[Path]]:
+    """The recipes of a group all of whose seeds have been trained to the end, and their folders."""
+    return {name: paths for name, paths in training_folders(folder, group) if all(_is_finished(p) for p in paths)}
+
+
+def _is_finished(path: Path) -> bool:
+    run = RunDirectory(path)
+    return run.status.is_file() and read_object(run.status).get("status") == "finished"
+
+
+def seconds_left(folder: Path) -> float:
+    """Seconds of one core that the trainings still take, begun ones reckoned whole."""
+    left: dict[Path, float] = {}
+    for group in groups():
+        for name, paths in training_folders(folder, group):
+            trained, _ = group.trained[name]
+            left |= {path: trained.decisions / trained.per_s for path in paths if not _is_finished(path)}
+    return sum(left.values())
+
+
+def train_everything(folder: Path, tell: OnProgress | None = None) -> bool:
+    """Train what is left; False when Ctrl-C stopped it."""
+    return all(
+        train_all(group.load_scenario(), group.plan, folder / FOLDER / group.name, tell=tell) for group in groups()
+    )
