@@ -1,4 +1,4 @@
-"""The trainings of ``ethbrake reproduce --full``: learning curves, a policy stopped early, and what the paper leaves open.
+"""The trainings of ``ethbrake reproduce --full``: learning curves, a policy stopped early, open weights of the reward.
 
 Each group is a folder of learning curves: finished trainings are kept, begun ones go on, by the rules of
 ``learning_curves.train_all``.
