@@ -27,7 +27,7 @@ from ethbrake_marl.scenario import Scenario
 
 FIGURE, TABLE, SUMMARY = "learning_curves.png", "learning_curves.csv", "learning_curves.json"
 
-_RETURN = "rollout/ep_rew_mean"  # mean over the last episodes, exploration included
+RETURN = "rollout/ep_rew_mean"  # mean over the last episodes, exploration included
 _LABELS = {
     "first_impact_harm": "First-impact harm on the fixed list (m²/s²)",
     "total_harm": "Total harm on the fixed list (m²/s²)",
@@ -99,9 +99,9 @@ def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) ->
     summary: dict[str, Any] = {"scenario": scenario.name, "recipes": {}}
     for trainings in plan:
         name = trainings.recipe.name
-        tables = [_table(folder / f"{name}-seed{seed}") for seed in range(trainings.seeds)]
+        tables = [progress_rows(folder / f"{name}-seed{seed}") for seed in range(trainings.seeds)]
         for metric in curves:
-            values = [_column(table, _RETURN if metric == "return" else f"eval/{metric}") for table in tables]
+            values = [progress_column(table, RETURN if metric == "return" else f"eval/{metric}") for table in tables]
             if metric != "return" or all(values):  # no episode may have ended in a very short training
                 curves[metric][name] = at_common_steps(values)
         own = curves.get(HARM_METRIC[trainings.recipe.reward.harm_count])
@@ -118,6 +118,16 @@ def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) ->
     return summary
 
 
+def progress_rows(path: Path) -> list[dict[str, str]]:
+    """The table that a training left, one row per update."""
+    return list(csv.DictReader(RunDirectory(path).progress.read_text("utf-8").splitlines()))
+
+
+def progress_column(table: Sequence[Mapping[str, str]], name: str) -> dict[int, float]:
+    """A column of such a table: step -> value, where there is one."""
+    return {int(row["steps"]): float(row[name]) for row in table if row.get(name)}
+
+
 def _train_one(training: Training, path: Path, settings: Sequence[str], tell: OnProgress | None) -> bool:
     """Whether it is finished now."""
     run = RunDirectory(path)
@@ -130,15 +140,6 @@ def _train_one(training: Training, path: Path, settings: Sequence[str], tell: On
 
 def _tell_named(tell: OnProgress, name: str, progress: Progress) -> None:
     tell(replace(progress, name=name))
-
-
-def _table(path: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(RunDirectory(path).progress.read_text("utf-8").splitlines()))
-
-
-def _column(table: Sequence[Mapping[str, str]], name: str) -> dict[int, float]:
-    """Step -> value, where there is one."""
-    return {int(row["steps"]): float(row[name]) for row in table if row.get(name)}
 
 
 def _estimate(harms: Any) -> dict[str, Any]:

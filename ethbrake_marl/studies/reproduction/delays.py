@@ -88,7 +88,7 @@ def _parameters(episodes: int) -> tuple[Parameter, ...]:
 
 
 def _judge(worlds: str, reading: Reading, found: Mapping[str, Mapping[str, Floats]]) -> list[Verdict]:
-    """ "Both SAC and PPO consistently achieve the lowest harm values across all tested delay setting"."""
+    """Whether "both SAC and PPO consistently achieve the lowest harm values across all tested delay setting"."""
     others = (NAMES[FULL_BRAKE], NAMES[PAIRWISE], NAMES[COUPLED], PREDICTED)
     return [
         judge_statement(

@@ -59,7 +59,7 @@ def reproduce_distance(settings: Settings) -> Made:
         tuple(verdicts),
         parameters,
         tuple(distance_table(reading.name, grouped) for reading, grouped in found.items()),
-        (distance_figure("harm-distance", found, [*NAMES.values(), PREDICTED, PROVEN], episodes),),
+        (distance_figure("harm-distance", found, [*(NAMES[spec] for spec in FOUR), PREDICTED, PROVEN], episodes),),
         {"harm-distance": distance_csv(found)},
     )
 

@@ -1,4 +1,4 @@
-"""The paper's hybrid with a policy that has not converged: figure (``Fig:hybrid illu``) and table (``Table:hybrid``)."""
+"""The paper's hybrid around a policy that has not converged: ``Fig:hybrid illu`` and ``Table:hybrid``."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def _drive(scenario: Scenario, chosen: Unconverged, episodes: int, settings: Set
 
 
 def _judge_choice(reading: Reading, evaluation: Evaluation, grouped: Grouped) -> list[Verdict]:
-    """ "Consistently selects the strategy that results in lower harm": world by world, and group by group."""
+    """Whether it "consistently selects the strategy that results in lower harm": in each world, in each group."""
     harm = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
     verdicts = []
     for name, baseline in ((HYBRID, NAMES[COUPLED]), (AS_PRINTED, NAMES[PAIRWISE])):

@@ -1,4 +1,4 @@
-"""An item of the paper made again: tables, figures, data, parameters and verdicts, as plain text before it is written."""
+"""An item of the paper made again: verdicts, parameters, tables, figures and data, before anything is written."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from ethbrake_marl.studies.reproduction.item import LIST_SEED, Settings
 from ethbrake_marl.studies.reproduction.verdicts import Less
 
 FULL_BRAKE, PAIRWISE, COUPLED = "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm"
-SAC, PPO = "sac@shipped/sac", "ppo@shipped/ppo"
+SAC, PPO, UNIVERSAL = "sac@shipped/sac", "ppo@shipped/ppo", "ppo@shipped/universal"
 PREDICTED, PROVEN = "E-V2X-BM, predicted", "least harm, proven"
 NAMES = {  # of the strategies in tables and figures
     FULL_BRAKE: "Non-ethical (full braking)",
@@ -27,6 +27,7 @@ NAMES = {  # of the strategies in tables and figures
     COUPLED: "E-V2X-BM, coupled",
     SAC: "SAC",
     PPO: "PPO",
+    UNIVERSAL: "universal policy",
 }
 FOUR = (FULL_BRAKE, PAIRWISE, COUPLED, SAC, PPO)  # the paper's four, E-V2X-BM twice
 ABOUT_BASELINE = (

@@ -127,7 +127,9 @@ def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
     """Whether a printed harm decrease follows from the printed harms, to the printed digits."""
     follows = 1.0 - row.average_harm / baseline.average_harm
     printed = row.harm_decrease or 0.0
-    told = f"1 - {row.average_harm:g} / {baseline.average_harm:g} = {100.0 * follows:.2f} %; printed {100 * printed:g} %"
+    told = (
+        f"1 - {row.average_harm:g} / {baseline.average_harm:g} = {100.0 * follows:.2f} %; printed {100 * printed:g} %"
+    )
     what = f"{row.agent}, harm decrease follows from the printed harms"
     return Verdict(what, AGREES if abs(follows - printed) < 0.0001 else CANNOT, told)
 

@@ -19,7 +19,7 @@ from ethbrake_marl.studies.learning_curves import Trainings, train_all
 
 FOLDER = "trainings"  # inside the folder of a reproduction
 STOPPED, OPEN = "stopped", "open"
-CURVES = {"low": ("low", "low-slow"), "high": ("high", "high-slow")}  # latency -> groups
+CURVES = {delay: (delay, f"{delay}-ppo-paper", f"{delay}-sac-paper") for delay in ("low", "high")}  # -> groups
 SEEDS = 3
 STATED_STATE = (  # positions and speeds of all, and the others' actions: no more is in the paper's state
     "own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration", "rear_1.gap",
@@ -47,8 +47,8 @@ class TrainedRecipe:
 
 
 PPO = TrainedRecipe("ppo", 400_000, 4, 16_000)
-SAC = TrainedRecipe("sac", 400_000, 250, 6_500)
-PPO_PAPER = TrainedRecipe("ppo-paper", 200_000, 1, 6_000)
+SAC = TrainedRecipe("sac", 400_000, 250, 4_000)
+PPO_PAPER = TrainedRecipe("ppo-paper", 100_000, 1, 6_000)
 SAC_PAPER = TrainedRecipe("sac-paper", 20_000, 2_000, 110)
 EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the recipe's own number
 
@@ -79,7 +79,7 @@ def _curves(name: str, scenario: str, recipes: Sequence[TrainedRecipe]) -> Group
 def reward_variants() -> dict[str, dict[str, Any]]:
     """What differs from ``ppo-paper`` in each training of the open quantities, by its name there."""
     base = PPO_PAPER.load().reward.model_dump(exclude_defaults=True)
-    changed = {"risk-0": {"risk": 0.0}, "risk-1": {"risk": 1.0}, "jerk-0": {"jerk": 0.0}, "jerk-1e-4": {"jerk": 1e-4}}
+    changed = {"risk-0": {"risk": 0.0}, "risk-1": {"risk": 1.0}, "jerk-1e-4": {"jerk": 1e-4}}
     changed["terminal-0"] = {"terminal": 0.0}
     rewards = {f"ppo-paper-{name}": {"reward": {**base, **own}} for name, own in changed.items()}
     return {"ppo-paper": {}, **rewards, "ppo-paper-state": {"observation": STATED_STATE}}
@@ -88,14 +88,12 @@ def reward_variants() -> dict[str, dict[str, Any]]:
 def groups() -> tuple[Group, ...]:
     """Every group, the quickest first, so that results are there early."""
     variants = {name: (PPO_PAPER, PPO_PAPER.load(name, **own)) for name, own in reward_variants().items()}
-    quick = (PPO, SAC, PPO_PAPER)
     return (
         Group(STOPPED, "paper-random", {"ppo-stopped": (EARLY, EARLY.load("ppo-stopped"))}, 1),
-        _curves("low", "paper-delay-low", quick),
-        _curves("high", "paper-delay-high", quick),
+        *(_curves(delay, f"paper-delay-{delay}", (PPO, SAC)) for delay in CURVES),
+        *(_curves(f"{delay}-ppo-paper", f"paper-delay-{delay}", (PPO_PAPER,)) for delay in CURVES),
         Group(OPEN, "paper-random", variants, 2),
-        _curves("low-slow", "paper-delay-low", (SAC_PAPER,)),
-        _curves("high-slow", "paper-delay-high", (SAC_PAPER,)),
+        *(_curves(f"{delay}-sac-paper", f"paper-delay-{delay}", (SAC_PAPER,)) for delay in CURVES),
     )
 
 

@@ -58,9 +58,7 @@ def reproduce_trajectories(settings: Settings) -> Made:
         over_time = trajectories(own, caption=text)
         figures.append(Drawn(f"trajectories-time-{stem}", f"Over time, {reading.name}", text, over_time))
     verdicts = [verdict for reading in READINGS for verdict in _judge_positions(reading, records)]
-    return Made(
-        tuple(verdicts), _parameters(), (_outcomes(records),), tuple(figures), {"trajectories": _csv(records)}
-    )
+    return Made(tuple(verdicts), _parameters(), (_outcomes(records),), tuple(figures), {"trajectories": _csv(records)})
 
 
 def reproduce_accelerations(settings: Settings) -> Made:
@@ -75,9 +73,7 @@ def reproduce_accelerations(settings: Settings) -> Made:
         figure = profiles_figure(panels, caption=text)
         figures.append(Drawn(f"accelerations-{stem}", f"Acceleration profiles, {reading.name}", text, figure))
     verdicts = [verdict for reading in READINGS for verdict in _judge_commands(reading, records)]
-    return Made(
-        tuple(verdicts), _parameters(), (_profiles(records),), tuple(figures), {"accelerations": _csv(records)}
-    )
+    return Made(tuple(verdicts), _parameters(), (_profiles(records),), tuple(figures), {"accelerations": _csv(records)})
 
 
 def _record_all(settings: Settings) -> Records:
@@ -145,10 +141,14 @@ def _judge_positions(reading: Reading, records: Records) -> list[Verdict]:
             f"root mean square {apart[1]:.2f} m against {apart[2]:.2f} m", apart[1], apart[2]
         ),
         "Scenario 2: PPO keeps the larger distance to Vehicle 3": _below(
-            f"mean gap {gaps['SAC', 1]:.2f} m under SAC, {gaps['PPO', 1]:.2f} m under PPO", gaps["SAC", 1], gaps["PPO", 1]
+            f"mean gap {gaps['SAC', 1]:.2f} m under SAC, {gaps['PPO', 1]:.2f} m under PPO",
+            gaps["SAC", 1],
+            gaps["PPO", 1],
         ),
         "Scenario 2: SAC keeps the larger distance to Vehicle 1": _below(
-            f"mean gap {gaps['PPO', 0]:.2f} m under PPO, {gaps['SAC', 0]:.2f} m under SAC", gaps["PPO", 0], gaps["SAC", 0]
+            f"mean gap {gaps['PPO', 0]:.2f} m under PPO, {gaps['SAC', 0]:.2f} m under SAC",
+            gaps["PPO", 0],
+            gaps["SAC", 0],
         ),
     }
     return [judge_statement(f"{what} ({reading.name})", part, show=_METRES) for what, part in parts.items()]

@@ -2,7 +2,8 @@
 
 A number that the paper prints agrees with ours where the two differ by no more than chance between two lists of worlds,
 or by no more than ``TOLERANCE`` of the printed number. It cannot agree where a bound that holds for every strategy lies
-beyond it by more than chance. A statement agrees where every comparison that it makes comes out as it says.
+beyond it by more than chance. A statement agrees where every comparison that it makes comes out as it says; where one
+does not but its interval holds 0, it is undecided.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from typing import Literal
 
 from ethbrake_marl.evaluation.statistics import Estimate
 
-AGREES, DIFFERS, CANNOT, NOT_RUN = "agrees", "differs", "cannot agree", "not run"
-Outcome = Literal["agrees", "differs", "cannot agree", "not run"]
+AGREES, DIFFERS, CANNOT, UNDECIDED, NOT_RUN = "agrees", "differs", "cannot agree", "undecided", "not run"
+Outcome = Literal["agrees", "differs", "cannot agree", "undecided", "not run"]
 TOLERANCE = 0.02  # of the printed number
-_WORST_FIRST: tuple[Outcome, ...] = (CANNOT, DIFFERS, NOT_RUN, AGREES)
+_WORST_FIRST: tuple[Outcome, ...] = (CANNOT, DIFFERS, UNDECIDED, NOT_RUN, AGREES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +141,12 @@ class Less:
         return _ends(self.difference)[1] < 0.0
 
     @property
+    def is_open(self) -> bool:
+        """Whether the interval holds 0, so that another list or another seed may decide either way."""
+        low, high = _ends(self.difference)
+        return low < 0.0 <= high
+
+    @property
     def is_impossible(self) -> bool:
         """Whether the proven least exceeds the larger one."""
         return self.least is not None and _ends(self.least)[0] > 0.0
@@ -158,11 +165,12 @@ def judge_statement(what: str, parts: Sequence[Less], *, show: Show = HARM) -> V
     if impossible:
         told = ", ".join(f"{part.where} by {show.estimate(part.least)}" for part in impossible if part.least)
         return Verdict(what, CANNOT, f"{counts}{tied}; the harm proven to be the least is above it in: {told}")
-    if failing and len(parts) == 1:
-        return Verdict(what, DIFFERS, f"not so: {parts[0].where}, {show.estimate(parts[0].difference)}")
     if failing:
-        told = ", ".join(f"{part.where} {show.estimate(part.difference)}" for part in failing)
-        return Verdict(what, DIFFERS, f"{counts}{tied}; not in: {told}")
+        is_open = all(part.is_open for part in failing)
+        outcome: Outcome = UNDECIDED if is_open else DIFFERS
+        told = ", ".join(f"{part.where}, {show.estimate(part.difference)}" for part in failing)
+        lead = f"{counts}{tied}; not " if len(parts) > 1 else "not "
+        return Verdict(what, outcome, f"{lead}{'shown' if is_open else 'so'}: {told}")
     worst = max(compared, key=lambda part: part.difference.value)
     lead = f"{counts}{tied}; the nearest is " if len(parts) > 1 else ""
     return Verdict(what, AGREES, f"{lead}{worst.where}, {show.estimate(worst.difference)}")

@@ -69,9 +69,19 @@ def test_judge_statement__holds_where_every_interval_is_below_zero() -> None:
 
 
 def test_judge_statement__names_where_it_fails() -> None:
-    verdict = judge_statement("lower", [Less("a", around(-3.0, 1.0)), Less("b", around(-1.0, 1.5))])
+    verdict = judge_statement("lower", [Less("a", around(-3.0, 1.0)), Less("b", around(2.0, 1.5))])
     assert verdict.outcome == "differs"
-    assert verdict.because == "holds in 1 of 2; not in: b -1.00 [-2.50, 0.50]"
+    assert verdict.because == "holds in 1 of 2; not so: b, 2.00 [0.50, 3.50]"
+    one_world = judge_statement("lower", [Less("b", Estimate(0.5, None))])
+    assert (one_world.outcome, one_world.because) == ("differs", "not so: b, 0.50")
+
+
+def test_judge_statement__is_undecided_where_the_interval_holds_zero() -> None:
+    verdict = judge_statement("lower", [Less("a", around(-3.0, 1.0)), Less("b", around(-1.0, 1.5))])
+    assert verdict.outcome == "undecided"
+    assert verdict.because == "holds in 1 of 2; not shown: b, -1.00 [-2.50, 0.50]"
+    mixed = judge_statement("lower", [Less("a", around(3.0, 1.0)), Less("b", around(-1.0, 1.5))])
+    assert mixed.outcome == "differs"
 
 
 def test_judge_statement__leaves_out_where_nothing_is_left_to_undercut() -> None:
@@ -97,6 +107,7 @@ def test_judge_statement__cannot_agree_where_the_proven_least_is_above() -> None
         (("agrees", "differs"), "differs"),
         (("differs", "cannot agree", "agrees"), "cannot agree"),
         (("agrees", "not run"), "not run"),
+        (("not run", "undecided", "agrees"), "undecided"),
         ((), "not run"),
     ],
 )
