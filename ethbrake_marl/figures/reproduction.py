@@ -43,7 +43,7 @@ def lines_figure(panels: Mapping[str, Mapping[str, Line]], *, x_label: str, y_la
         style_axes(axes)
         for number, (label, line) in enumerate(lines.items()):
             style = series_style(number)
-            axes.plot(line.x, line.y, label=label, **style)  # type: ignore[arg-type]
+            axes.plot(line.x, line.y, label=label, **style)
             axes.fill_between(line.x, line.low, line.high, color=str(style["color"]), alpha=0.18, linewidth=0.0)
         axes.set_title(title, loc="left", fontsize=10)
         axes.set_xlabel(x_label, fontsize=9)
@@ -64,7 +64,8 @@ def bars_figure(
         style_axes(axes)
         width = 0.8 / len(bars)
         for number, (label, estimates) in enumerate(bars.items()):
-            line = Line.of(np.arange(len(estimates)) + (number - 0.5 * (len(bars) - 1)) * width, estimates)
+            offset = (number - 0.5 * (len(bars) - 1)) * width
+            line = Line.of([k + offset for k in range(len(estimates))], estimates)
             colour = str(series_style(number)["color"])
             axes.bar(line.x, line.y, 0.9 * width, color=colour, label=label)
             axes.vlines(line.x, line.low, line.high, color="black", linewidth=1.0)
@@ -120,7 +121,7 @@ def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, captio
         for number, (label, record) in enumerate(records.items()):
             style = {**series_style(number), "marker": ""}
             command = record.command_mps2[:, record.vehicle]
-            axes.plot(record.time_s, command, drawstyle="steps-post", label=label, **style)  # type: ignore[arg-type]
+            axes.plot(record.time_s, command, drawstyle="steps-post", label=label, **style)
         axes.set_title(title, loc="left", fontsize=10)
     for axes in every[::2]:
         axes.set_ylabel("Command (m/s²)", fontsize=9)
@@ -147,7 +148,7 @@ def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: st
         style = series_style(number)
         axes.hlines(line.x, line.low, line.high, color=str(style["color"]), linewidth=1.4)
         axes.plot(line.y, line.x, linestyle="none", marker=style["marker"], markersize=4.5, color=style["color"],
-                  label=label)  # type: ignore[arg-type]  # fmt: skip
+                  label=label)  # fmt: skip
     axes.set_yticks(range(len(rows)), rows[::-1], fontsize=8)
     axes.set_xlabel(x_label, fontsize=9)
     _legend(figure, axes, 3)

@@ -19,7 +19,7 @@ from ethbrake_marl.figures.curves import SeedCurve, at_common_steps, seed_curves
 from ethbrake_marl.figures.style import write_picture
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.learning.run_folder import RunDirectory, read_object
+from ethbrake_marl.learning.run_folder import RETURN, RunDirectory, progress_column, progress_rows, read_object
 from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.learning.training import Training, check_same, resolve
 from ethbrake_marl.progress import OnProgress, Progress
@@ -27,7 +27,6 @@ from ethbrake_marl.scenario import Scenario
 
 FIGURE, TABLE, SUMMARY = "learning_curves.png", "learning_curves.csv", "learning_curves.json"
 
-RETURN = "rollout/ep_rew_mean"  # mean over the last episodes, exploration included
 _LABELS = {
     "first_impact_harm": "First-impact harm on the fixed list (m²/s²)",
     "total_harm": "Total harm on the fixed list (m²/s²)",
@@ -116,16 +115,6 @@ def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) ->
     write_output(folder / TABLE, _csv(curves).encode(), force=True)
     write_output(folder / SUMMARY, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode(), force=True)
     return summary
-
-
-def progress_rows(path: Path) -> list[dict[str, str]]:
-    """The table that a training left, one row per update."""
-    return list(csv.DictReader(RunDirectory(path).progress.read_text("utf-8").splitlines()))
-
-
-def progress_column(table: Sequence[Mapping[str, str]], name: str) -> dict[int, float]:
-    """A column of such a table: step -> value, where there is one."""
-    return {int(row["steps"]): float(row[name]) for row in table if row.get(name)}
 
 
 def _train_one(training: Training, path: Path, settings: Sequence[str], tell: OnProgress | None) -> bool:

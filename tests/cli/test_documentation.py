@@ -30,7 +30,7 @@ def names(typer_app) -> set[str]:
 def test_cli_page__has_every_command_and_agent():
     training = {"run", "train", "resume", "learning-curves", "ablate", "generalise", "export", "import-legacy"}
     measuring = {"evaluate", "compare", "shield", "best-harm", "equal-time"}
-    assert names(app) == training | measuring | {"agents", "doctor", "bench", "record"}
+    assert names(app) == training | measuring | {"agents", "doctor", "bench", "record", "reproduce"}
     for command in names(app) | {"scenario", "recipe"}:
         assert f"\n## {command}\n" in CLI and f"`{command}" in TABLE_OF_COMMANDS
     about_scenarios = CLI.partition("\n## scenario\n")[2].partition("\n## ")[0]

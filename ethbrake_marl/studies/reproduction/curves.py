@@ -13,9 +13,8 @@ from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
 from ethbrake_marl.evaluation.statistics import Estimate, mean, unpaired_difference
 from ethbrake_marl.figures.curves import SeedCurve, at_common_steps, seed_curves
 from ethbrake_marl.figures.style import Figure
-from ethbrake_marl.learning.progress import HARM_METRIC
+from ethbrake_marl.learning.run_folder import RETURN, progress_column, progress_rows
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.studies.learning_curves import RETURN, progress_column, progress_rows
 from ethbrake_marl.studies.reproduction.finished_policies import shipped_ends
 from ethbrake_marl.studies.reproduction.item import (
     FULL,
@@ -28,7 +27,7 @@ from ethbrake_marl.studies.reproduction.item import (
     scenario_parameters,
 )
 from ethbrake_marl.studies.reproduction.measure import AS_STATED, read_scenario
-from ethbrake_marl.studies.reproduction.trainings import CURVES, finished, group_named
+from ethbrake_marl.studies.reproduction.trainings import CURVES, TRAINED_HARM, finished, group_named
 from ethbrake_marl.studies.reproduction.verdicts import HARM, NOT_RUN, Less, Show, Verdict, judge_statement
 
 HIGH, LOW = "high", "low"
@@ -113,7 +112,7 @@ def read_courses(folder: Path, delay: str) -> dict[str, Course]:
         for name, paths in finished(folder, group_named(group)).items():
             tables = [progress_rows(path) for path in paths]
             returns = at_common_steps([progress_column(table, RETURN) for table in tables])
-            harm = at_common_steps([progress_column(table, f"eval/{HARM_METRIC['first']}") for table in tables])
+            harm = at_common_steps([progress_column(table, TRAINED_HARM) for table in tables])
             found[name] = Course(returns, harm)
     return found
 
@@ -226,7 +225,7 @@ def _csv(courses: Mapping[str, Course]) -> str:
     rows = [
         [figure, name, seed, int(step), float(value)]
         for name, course in courses.items()
-        for figure, curve in (("return", course.returns), (HARM_METRIC["first"], course.harm))
+        for figure, curve in (("return", course.returns), ("first_impact_harm", course.harm))
         for seed, values in enumerate(curve.values)
         for step, value in zip(curve.steps, values, strict=True)
     ]

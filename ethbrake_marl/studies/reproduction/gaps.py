@@ -14,11 +14,10 @@ from ethbrake_marl.evaluation.paper import PAPER_ROWS, RANDOM_TEST
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, unpaired_difference
 from ethbrake_marl.figures.reproduction import changes_figure
 from ethbrake_marl.figures.style import Figure
-from ethbrake_marl.learning.progress import HARM_METRIC
+from ethbrake_marl.learning.run_folder import progress_column, progress_rows
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies.shipped import load_shipped
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.studies.learning_curves import progress_column, progress_rows
 from ethbrake_marl.studies.reproduction.item import (
     FULL,
     LIST_SEED,
@@ -43,7 +42,7 @@ from ethbrake_marl.studies.reproduction.measure import (
 )
 from ethbrake_marl.studies.reproduction.policies import hybrid
 from ethbrake_marl.studies.reproduction.register import GAPS, Alternative, Gap
-from ethbrake_marl.studies.reproduction.trainings import OPEN, finished, group_named
+from ethbrake_marl.studies.reproduction.trainings import OPEN, TRAINED_HARM, finished, group_named
 from ethbrake_marl.studies.reproduction.verdicts import AGREES, DIFFERS, HARM, NOT_RUN, PERCENT, Verdict, compare_number
 
 SCENARIO = "paper-random"
@@ -170,8 +169,8 @@ def _sensitivity(base: Headline, found: Found) -> Table:
         rows.append((gap.name, gap.ours, each.value, *cells, *rates))
     head = ("Quantity", "Default", "Alternative", *_SHOWN, "Collisions, E-V2X-BM", "Collisions, PPO")
     note = (
-        "Change of the mean harm (m²/s²) with its 95 % interval, paired by world where the worlds are the same; then the"
-        " collision rates in the alternative. In the rows of H* inside the hybrid, PPO stands behind Algorithm 1."
+        "Change of the mean harm (m²/s²) with its 95 % interval, paired by world where the worlds are the same; then"
+        " the collision rates in the alternative. In the rows of H* inside the hybrid, PPO stands behind Algorithm 1."
     )
     return Table("How far the headline moves", head, tuple(rows), note)
 
@@ -181,9 +180,8 @@ def _trained(settings: Settings) -> Table | None:
     if settings.mode != FULL:
         return None
     rows = []
-    metric = f"eval/{HARM_METRIC['first']}"
     for name, paths in finished(settings.folder, group_named(OPEN)).items():
-        kept = [min(progress_column(progress_rows(path), metric).values()) for path in paths]
+        kept = [min(progress_column(progress_rows(path), TRAINED_HARM).values()) for path in paths]
         each = ", ".join(f"{harm:.2f}" for harm in kept)
         rows.append((name, str(len(kept)), f"{float(np.mean(kept)):.2f}", each))
     note = (

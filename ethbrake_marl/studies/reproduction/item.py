@@ -14,8 +14,9 @@ from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies.reproduction.verdicts import Verdict, summarise_verdicts
 
-QUICK, FULL = "quick", "full"
 Mode = Literal["quick", "full"]
+QUICK: Mode = "quick"
+FULL: Mode = "full"
 LIST_SEED = 7
 MOST_EPISODES = 10_000
 
@@ -26,8 +27,9 @@ class Settings:
 
     mode: Mode
     folder: Path  # of everything; its trainings are read from there
-    episodes: int = MOST_EPISODES  # worlds of a list, where the paper has more; it has at most 10,000
+    episodes: int = MOST_EPISODES  # the most worlds of any list; the paper has 10,000
     tell: OnProgress = lambda progress: None
+    machine: str = ""  # in words
 
     def worlds(self, wanted: int) -> int:
         """How many worlds of a list that should have ``wanted``."""
@@ -105,6 +107,7 @@ class Item:
     title: str
     what: str  # the paper's figure or table, in a sentence
     make: Callable[[Settings], Made]
+    trained: tuple[str, ...] = ()  # the groups of trainings that it shows with ``--full``
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Column]) -> str:

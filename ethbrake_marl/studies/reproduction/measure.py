@@ -48,7 +48,7 @@ class Reading:
         """The scenario so read."""
         if self.acts_s is None:
             return scenario
-        first, _, *others = np.broadcast_to(scenario.latency_s, scenario.vehicles).tolist()
+        first, _, *others = scenario.model_dump()["latency_s"]
         return scenario.replace(latency_s=[first, self.acts_s, *others])
 
 
@@ -75,7 +75,7 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
         seed=LIST_SEED,
         chunk=PROGRESS_EVERY,
         aftermath=False,
-        on_progress=lambda name, done: settings.say(f"{scenario.name}, {name}", done, episodes),
+        on_progress=lambda name, done: settings.say(scenario.name, done, episodes),
     )
 
 

@@ -6,7 +6,7 @@ Each group is a folder of learning curves: finished trainings are kept, begun on
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,12 @@ from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.run_folder import RunDirectory, read_object
 from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.studies.learning_curves import Trainings, train_all
 
 FOLDER = "trainings"  # inside the folder of a reproduction
 STOPPED, OPEN = "stopped", "open"
 CURVES = {delay: (delay, f"{delay}-ppo-paper", f"{delay}-sac-paper") for delay in ("low", "high")}  # -> groups
 SEEDS = 3
+TRAINED_HARM = "eval/first_impact_harm"  # column of a training's table
 STATED_STATE = (  # positions and speeds of all, and the others' actions: no more is in the paper's state
     "own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration", "rear_1.gap",
     "rear_1.closing_speed", "rear_1.acceleration",
@@ -61,11 +61,6 @@ class Group:
     scenario: str  # a shipped one
     trained: Mapping[str, tuple[TrainedRecipe, TrainingRecipe]]  # by the name that the recipe has there
     seeds: int
-
-    @property
-    def plan(self) -> list[Trainings]:
-        """The same for ``learning_curves``."""
-        return [Trainings(recipe, self.seeds) for _, recipe in self.trained.values()]
 
     def load_scenario(self) -> Scenario:
         """The scenario."""
@@ -118,18 +113,30 @@ def _is_finished(path: Path) -> bool:
     return run.status.is_file() and read_object(run.status).get("status") == "finished"
 
 
-def seconds_left(folder: Path) -> float:
-    """Seconds of one core that the trainings still take, begun ones reckoned whole."""
-    left: dict[Path, float] = {}
+def seconds_left(folder: Path, wanted: Collection[str]) -> float:
+    """Seconds of one core that the trainings of these groups still take, begun ones reckoned whole."""
+    left = 0.0
     for group in groups():
-        for name, paths in training_folders(folder, group):
-            trained, _ = group.trained[name]
-            left |= {path: trained.decisions / trained.per_s for path in paths if not _is_finished(path)}
-    return sum(left.values())
+        if group.name in wanted:
+            for name, paths in training_folders(folder, group):
+                trained, _ = group.trained[name]
+                left += sum(trained.decisions / trained.per_s for path in paths if not _is_finished(path))
+    return left
 
 
-def train_everything(folder: Path, tell: OnProgress | None = None) -> bool:
-    """Train what is left; False when Ctrl-C stopped it."""
-    return all(
-        train_all(group.load_scenario(), group.plan, folder / FOLDER / group.name, tell=tell) for group in groups()
-    )
+def trained_names(folder: Path, wanted: Collection[str]) -> list[str]:
+    """Every recipe of these groups whose seeds are all trained, as ``group/recipe``."""
+    return [f"{group.name}/{name}" for group in groups() if group.name in wanted for name in finished(folder, group)]
+
+
+def train_groups(folder: Path, wanted: Collection[str], tell: OnProgress | None = None) -> bool:
+    """Train what is left of these groups, in their order; False when Ctrl-C stopped it."""
+    # torch takes seconds to load, and nothing else here needs it
+    from ethbrake_marl.studies.learning_curves import Trainings, train_all
+
+    for group in groups():
+        if group.name in wanted:
+            plan = [Trainings(recipe, group.seeds) for _, recipe in group.trained.values()]
+            if not train_all(group.load_scenario(), plan, folder / FOLDER / group.name, tell=tell):
+                return False
+    return True

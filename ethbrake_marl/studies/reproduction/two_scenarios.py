@@ -106,7 +106,8 @@ def _parameters() -> tuple[Parameter, ...]:
 def _on_grid(record: EpisodeRecord, values: Floats, until_s: float) -> Floats:
     """A column of a record at equal times; beyond its end it stays."""
     times = np.arange(0.0, until_s, _GRID_S)
-    return np.interp(times, record.time_s, values)
+    found: Floats = np.interp(times, record.time_s, values)
+    return found
 
 
 def _together(records: Records, reading: Reading, number: int) -> tuple[EpisodeRecord, EpisodeRecord, float]:
@@ -181,12 +182,12 @@ def _judge_commands(reading: Reading, records: Records) -> list[Verdict]:
         one, other = (_on_grid(each, each.command_mps2[:, 1], until_s) for each in (first, second))
         apart[number] = float(np.sqrt(np.mean((one - other) ** 2)))
     ppo, sac, _ = _together(records, reading, 2)
-    first, share = _first_command(ppo), _braking_share(sac)
+    command, share = _first_command(ppo), _braking_share(sac)
     parts = {
         "the profiles are more alike in Scenario 1 than in 2": _below(
             f"root mean square difference {apart[1]:.2f} m/s² against {apart[2]:.2f} m/s²", apart[1], apart[2]
         ),
-        "Scenario 2: PPO accelerates before it brakes": _below(f"first command {first:+.2f} m/s²", 0.0, first),
+        "Scenario 2: PPO accelerates before it brakes": _below(f"first command {command:+.2f} m/s²", 0.0, command),
         "Scenario 2: SAC decelerates throughout most of it": _below(
             f"braking in {100.0 * share:.0f} % of the time it moves", 0.5, share
         ),

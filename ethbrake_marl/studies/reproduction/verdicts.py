@@ -15,8 +15,12 @@ from typing import Literal
 
 from ethbrake_marl.evaluation.statistics import Estimate
 
-AGREES, DIFFERS, CANNOT, UNDECIDED, NOT_RUN = "agrees", "differs", "cannot agree", "undecided", "not run"
 Outcome = Literal["agrees", "differs", "cannot agree", "undecided", "not run"]
+AGREES: Outcome = "agrees"
+DIFFERS: Outcome = "differs"
+CANNOT: Outcome = "cannot agree"
+UNDECIDED: Outcome = "undecided"
+NOT_RUN: Outcome = "not run"
 TOLERANCE = 0.02  # of the printed number
 _WORST_FIRST: tuple[Outcome, ...] = (CANNOT, DIFFERS, UNDECIDED, NOT_RUN, AGREES)
 
