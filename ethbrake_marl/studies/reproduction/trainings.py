@@ -43,13 +43,15 @@ class TrainedRecipe:
         """The recipe; under another name with ``changes``."""
         found = load_recipe(self.recipe)
         evaluation = {**found.evaluation.model_dump(), "every_updates": self.every_updates}
+        if "log_every_updates" in type(found).model_fields:  # else a table has a row for every update
+            changes["log_every_updates"] = self.every_updates
         return found.replace(name=name or found.name, total_steps=self.decisions, evaluation=evaluation, **changes)
 
 
 PPO = TrainedRecipe("ppo", 400_000, 4, 16_000)
-SAC = TrainedRecipe("sac", 400_000, 250, 4_000)
+SAC = TrainedRecipe("sac", 120_000, 60, 4_000)
 PPO_PAPER = TrainedRecipe("ppo-paper", 100_000, 1, 6_000)
-SAC_PAPER = TrainedRecipe("sac-paper", 20_000, 2_000, 110)
+SAC_PAPER = TrainedRecipe("sac-paper", 20_000, 1_000, 110)
 EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the recipe's own number
 
 
