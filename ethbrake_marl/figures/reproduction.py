@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
@@ -16,6 +17,7 @@ from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.style import GREY, add_caption, new_figure, series_style, style_axes
 
 _ARROW_STEPS = 10  # the paper draws every tenth time step
+_ROW_CHARACTERS = 52  # of a line beside the axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +138,7 @@ def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: st
     """By how much each change moves a number: one row per change, one mark per label, with its interval."""
     rows = list(changes)
     labels = list(dict.fromkeys(label for each in changes.values() for label in each))
-    figure = new_figure(8.6, 0.27 * len(rows) + 1.6)
+    figure = new_figure(9.4, 0.3 * len(rows) + 1.6)
     axes = figure.subplots()
     style_axes(axes)
     axes.axvline(0.0, color=GREY, linewidth=0.9)
@@ -149,7 +151,7 @@ def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: st
         axes.hlines(line.x, line.low, line.high, color=str(style["color"]), linewidth=1.4)
         axes.plot(line.y, line.x, linestyle="none", marker=style["marker"], markersize=4.5, color=style["color"],
                   label=label)  # fmt: skip
-    axes.set_yticks(range(len(rows)), rows[::-1], fontsize=8)
+    axes.set_yticks(range(len(rows)), [textwrap.fill(row, _ROW_CHARACTERS) for row in rows[::-1]], fontsize=8)
     axes.set_xlabel(x_label, fontsize=9)
     _legend(figure, axes, 3)
     add_caption(figure, caption)
