@@ -27,7 +27,7 @@ def reproduce_command(
     full: Annotated[bool, typer.Option("--full", help="Train learning curves and a policy stopped early.")] = False,
     output: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Folder of everything.", show_default="runs/reproduction-quick or -full"),
+        typer.Option(metavar="FOLDER", help="Folder of everything.", show_default="runs/reproduction"),
     ] = None,
     episodes: Annotated[int, typer.Option(help="The most worlds of any list; the paper has 10,000.")] = EPISODES,
     docs: Annotated[
@@ -61,7 +61,7 @@ def reproduce_command(
         if not 2 <= episodes <= EPISODES:
             raise InvalidInput(f"episodes {episodes}: must be from 2 to {EPISODES:,}")
         mode: Mode = FULL if full else QUICK
-        folder = output or Path("runs") / f"reproduction-{mode}"
+        folder = output or Path("runs") / "reproduction"
         if full:
             need("torch")
         if docs is not None:

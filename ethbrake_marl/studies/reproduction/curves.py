@@ -80,7 +80,7 @@ class Course:
 def reproduce_curves(delay: str, settings: Settings) -> Made:
     """The curves that ``--full`` has trained; without them what finished policies reach at this delay."""
     courses = {each: read_courses(settings.folder, each) if settings.mode == FULL else {} for each in (HIGH, LOW)}
-    ends = shipped_ends(settings)
+    ends = settings.once(("finished policies",), lambda: shipped_ends(settings))
     verdicts = [*_judge(delay, courses), *ends.verdicts]
     scenario = read_scenario(f"paper-delay-{delay}", AS_STATED)
     parameters = (
@@ -139,8 +139,10 @@ def _higher_when_low(courses: Mapping[str, Mapping[str, Course]]) -> Verdict:
     for name in courses[HIGH].keys() & courses[LOW].keys():
         high, low = (courses[delay][name].last_returns for delay in (HIGH, LOW))
         parts.append(Less(name, unpaired_difference(mean(high), len(high), mean(low), len(low))))
-    parts.sort(key=lambda part: part.where)
-    return judge_statement("both algorithms reach higher returns at low delay than at high", parts)
+    what = "both algorithms reach higher returns at low delay than at high"
+    if not parts:
+        return Verdict(what, NOT_RUN, "no recipe is trained at both delays")
+    return judge_statement(what, sorted(parts, key=lambda part: part.where), show=_NUMBER)
 
 
 def _nearly_identical(ppo: Course, sac: Course, about: str) -> Verdict:
@@ -174,9 +176,14 @@ def _faster_and_steadier(ppo: Course, sac: Course, about: str) -> list[Verdict]:
 def _spreads_more(courses: Mapping[str, Mapping[str, Course]]) -> Verdict:
     parts = []
     for name in sorted(courses[HIGH].keys() & courses[LOW].keys()):
+        if any(len(courses[delay][name].returns.values) < 2 for delay in (HIGH, LOW)):
+            continue  # one seed has no spread
         high, low = (courses[delay][name].spread for delay in (HIGH, LOW))
         parts.append(Less(name, unpaired_difference(mean(high), len(high), mean(low), len(low))))
-    return judge_statement("the returns of different seeds spread more at low delay than at high", parts, show=_NUMBER)
+    what = "the returns of different seeds spread more at low delay than at high"
+    if not parts:
+        return Verdict(what, NOT_RUN, "no recipe has several seeds at both delays")
+    return judge_statement(what, parts, show=_NUMBER)
 
 
 def _figure(courses: Mapping[str, Course], caption: str) -> Figure:

@@ -95,7 +95,8 @@ def open_folder(settings: Settings, *, force: bool = False) -> ReproductionFolde
 
 
 def _wanted(settings: Settings) -> Json:
-    return {"mode": settings.mode, "episodes": settings.episodes, "version": __version__}
+    """What every result in a folder shares; the trainings behind a result stand in it."""
+    return {"episodes": settings.episodes, "version": __version__}
 
 
 def _forget(folder: ReproductionFolder) -> None:

@@ -9,7 +9,6 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.evaluation import Evaluation
 from ethbrake_marl.evaluation.paper import HYBRID_TEST, PAPER_ROWS, PaperRow
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies.reproduction.distance import distance_csv, distance_figure, distance_table
 from ethbrake_marl.studies.reproduction.item import (
     Made,
@@ -54,7 +53,7 @@ def reproduce_illustration(settings: Settings) -> Made:
     found: dict[Reading, Grouped] = {}
     verdicts = []
     for reading in READINGS:
-        evaluation = _drive(read_scenario(_FIGURE, reading), chosen, episodes, settings)
+        evaluation = _drive(_FIGURE, reading, chosen, settings)
         found[reading] = group_by_distance(evaluation)
         verdicts += _judge_choice(reading, evaluation, found[reading])
     parameters = (
@@ -74,7 +73,7 @@ def reproduce_hybrid_table(settings: Settings) -> Made:
     beside: list[Beside] = []
     for name, speeds in ((_TABLE, "speeds 18 to 22 m/s"), (_FIGURE, "speeds 20, 18, 20 m/s")):
         for reading in READINGS:
-            evaluation = _drive(read_scenario(name, reading), chosen, episodes, settings)
+            evaluation = _drive(name, reading, chosen, settings)
             beside.append(Beside(f"{speeds}, {reading.name}", evaluation, _ROWS))
     printed = [row for row in PAPER_ROWS if row.table == HYBRID_TEST]
     scenario = read_scenario(_TABLE, AS_STATED)
@@ -124,14 +123,17 @@ def _about(chosen: Unconverged) -> tuple[Parameter, ...]:
     )
 
 
-def _drive(scenario: Scenario, chosen: Unconverged, episodes: int, settings: Settings) -> Evaluation:
+def _drive(name: str, reading: Reading, chosen: Unconverged, settings: Settings) -> Evaluation:
+    """The strategies on the worlds of a scenario; figure and table share those of the figure."""
+    scenario = read_scenario(name, reading)
     agents: dict[str, Agent] = {
         **lineup((PAIRWISE, COUPLED), scenario),
         ALONE: LearnedAgent(chosen.policy, "policy"),
         HYBRID: hybrid(chosen.policy, scenario, "coupled"),
         AS_PRINTED: hybrid(chosen.policy, scenario, "pairwise"),
     }
-    return drive_list(scenario, agents, episodes, settings)
+    key = ("hybrid", name, reading.name, chosen.about)
+    return settings.once(key, lambda: drive_list(scenario, agents, settings.worlds(_WORLDS), settings))
 
 
 def _judge_choice(reading: Reading, evaluation: Evaluation, grouped: Grouped) -> list[Verdict]:

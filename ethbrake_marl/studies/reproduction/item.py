@@ -5,15 +5,16 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from ethbrake_marl.figures.style import Figure
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies.reproduction.verdicts import Verdict, summarise_verdicts
 
+Shared = TypeVar("Shared")
 Mode = Literal["quick", "full"]
 QUICK: Mode = "quick"
 FULL: Mode = "full"
@@ -30,10 +31,18 @@ class Settings:
     episodes: int = MOST_EPISODES  # the most worlds of any list; the paper has 10,000
     tell: OnProgress = lambda progress: None
     machine: str = ""  # in words
+    shared: dict[tuple[object, ...], Any] = field(default_factory=dict)  # what several items show, made once
 
     def worlds(self, wanted: int) -> int:
         """How many worlds of a list that should have ``wanted``."""
         return min(wanted, self.episodes)
+
+    def once(self, key: tuple[object, ...], make: Callable[[], Shared]) -> Shared:
+        """What ``make`` gives, made by the first item that asks for it by this key."""
+        if key not in self.shared:
+            self.shared[key] = make()
+        found: Shared = self.shared[key]
+        return found
 
     def say(self, name: str, done: int, total: int) -> None:
         """Tell how far a part is."""
