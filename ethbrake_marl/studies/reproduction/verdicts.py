@@ -22,6 +22,8 @@ CANNOT: Outcome = "cannot agree"
 UNDECIDED: Outcome = "undecided"
 NOT_RUN: Outcome = "not run"
 TOLERANCE = 0.02  # of the printed number
+_MOST_NAMED = 2
+_PLURAL = {AGREES: "agree", DIFFERS: "differ", CANNOT: "cannot agree", UNDECIDED: "undecided", NOT_RUN: "not run"}
 _WORST_FIRST: tuple[Outcome, ...] = (CANNOT, DIFFERS, UNDECIDED, NOT_RUN, AGREES)
 
 
@@ -160,9 +162,9 @@ def judge_statement(what: str, parts: Sequence[Less], *, show: Show = HARM) -> V
     """Whether every comparison of a statement comes out below 0, by its interval."""
     compared = [part for part in parts if not part.neither]
     ties = [part.where for part in parts if part.neither]
-    tied = f" (both are 0 in {', '.join(ties)})" if ties else ""
+    tied = f" (both are 0 in {_named(ties)})" if ties else ""
     if not compared:
-        return Verdict(what, AGREES, f"nothing to undercut: both are 0 in {', '.join(ties)}")
+        return Verdict(what, AGREES, f"nothing to undercut: both are 0 in {_named(ties)}")
     failing = [part for part in compared if not part.holds]
     impossible = [part for part in failing if part.is_impossible]
     counts = f"holds in {len(compared) - len(failing)} of {len(compared)}"
@@ -180,6 +182,11 @@ def judge_statement(what: str, parts: Sequence[Less], *, show: Show = HARM) -> V
     return Verdict(what, AGREES, f"{lead}{worst.where}, {show.estimate(worst.difference)}")
 
 
+def _named(places: Sequence[str]) -> str:
+    """The places, or how many where they are many."""
+    return ", ".join(places) if len(places) <= _MOST_NAMED else f"{len(places)} more"
+
+
 def _ends(estimate: Estimate) -> tuple[float, float]:
     return estimate.interval or (estimate.value, estimate.value)
 
@@ -190,7 +197,8 @@ def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
         return Verdict("all", NOT_RUN, "nothing was compared")
     worst = min((each.outcome for each in verdicts), key=_WORST_FIRST.index)
     counted = [(outcome, sum(each.outcome == outcome for each in verdicts)) for outcome in _WORST_FIRST]
-    counts = ", ".join(f"{number} {outcome}" for outcome, number in counted if number)
+    words = [(n, outcome if n == 1 else _PLURAL[outcome]) for outcome, n in counted if n]
+    counts = ", ".join(f"{n} {word}" for n, word in words)
     first = next(each for each in verdicts if each.outcome == worst)
     lead = "" if len(verdicts) == 1 else f"of {len(verdicts)} comparisons {counts}; "
     return Verdict("all", worst, f"{lead}{first.what}: {first.because}")
