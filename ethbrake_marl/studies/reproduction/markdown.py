@@ -93,4 +93,5 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _cell(text: str) -> str:
     """Text that is no markup: what would be is escaped."""
-    return re.sub(r"([\\|*_`\[\]])", r"\\\1", plain_text(text, keep="\u00a0")).replace("<", "&lt;")
+    plain = plain_text(text, keep="\u00a0").replace("<", "&lt;")
+    return re.sub(r"([\\|*_`])", r"\\\1", plain).replace("](", "]\\(")
