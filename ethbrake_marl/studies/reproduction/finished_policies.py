@@ -1,4 +1,4 @@
-"""What finished policies reach at high and low delay: the ends of learning curves without the curves."""
+"""The ends of learning curves without the curves: what finished policies reach at high and low delay."""
 
 from __future__ import annotations
 

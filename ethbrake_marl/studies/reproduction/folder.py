@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from ethbrake_marl import __version__
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
@@ -146,27 +148,39 @@ def read_results(folder: ReproductionFolder) -> list[Json]:
     return [checked_result(read_object(file), str(file)) for file in files if file.is_file()]
 
 
-_TEXTS = {"name", "title", "what"}
-_LISTS = {"labels", "comparisons", "parameters", "tables", "figures", "data", "notes"}
+_TEXT, _TEXTS, _ROWS = TypeAdapter(str), TypeAdapter(list[str]), TypeAdapter(list[list[str]])
+_VERDICT = {"what": _TEXT, "outcome": _TEXT, "because": _TEXT}
+_PARTS: dict[str, dict[str, TypeAdapter[Any]]] = {  # of a result, each a list of such objects
+    "comparisons": _VERDICT,
+    "parameters": {"name": _TEXT, "value": _TEXT, "origin": _TEXT},
+    "tables": {"title": _TEXT, "head": _TEXTS, "rows": _ROWS, "note": _TEXT},
+    "figures": {"stem": _TEXT, "title": _TEXT, "text": _TEXT},
+}
+_WHOLE: dict[str, TypeAdapter[Any]] = {
+    **dict.fromkeys(("name", "title", "what", "made_utc", "machine"), _TEXT),
+    **dict.fromkeys(("labels", "data", "notes", "trained"), _TEXTS),
+    "processor_s": TypeAdapter(float),
+    "verdict": TypeAdapter(dict[str, str]),
+    **dict.fromkeys(_PARTS, TypeAdapter(list[dict[str, Any]])),
+}
 
 
 def checked_result(content: Json, where: str) -> Json:
-    """The same result; raises ``InvalidInput`` where a key that pages show is not there or of another kind."""
-    for key in sorted(_TEXTS | _LISTS | {"verdict"}):
-        kind = str if key in _TEXTS else list if key in _LISTS else dict
-        if not isinstance(content.get(key), kind):
-            raise InvalidInput(f"{where}: {key}: is not what a reproduction writes; make it again with --force")
-    rows: Sequence[tuple[str, tuple[str, ...]]] = (
-        ("comparisons", ("what", "outcome", "because")),
-        ("parameters", ("name", "value", "origin")),
-        ("tables", ("title", "head", "rows", "note")),
-        ("figures", ("stem", "title", "text")),
-    )
-    for key, names in (*rows, ("verdict", ("outcome", "because"))):
-        entries = [content[key]] if key == "verdict" else content[key]
-        if not all(isinstance(each, dict) and all(name in each for name in names) for each in entries):
-            raise InvalidInput(f"{where}: {key}: is not what a reproduction writes; make it again with --force")
+    """The same result; raises ``InvalidInput`` where what pages show is not there or of another kind."""
+    _check_keys(content, _WHOLE, where)
+    _check_keys(content["verdict"], _VERDICT, f"{where}: verdict")
+    for name, keys in _PARTS.items():
+        for each in content[name]:
+            _check_keys(each, keys, f"{where}: {name}")
     return content
+
+
+def _check_keys(content: Json, keys: Mapping[str, TypeAdapter[Any]], where: str) -> None:
+    for key, kind in keys.items():
+        try:
+            kind.validate_python(content.get(key), strict=True)
+        except ValidationError:
+            raise InvalidInput(f"{where}: {key}: is not what a reproduction writes; make it again (--force)") from None
 
 
 def read_figure(folder: ReproductionFolder, name: str, stem: str, ending: str) -> bytes:

@@ -1,4 +1,4 @@
-"""How far the headline of the random test moves when a quantity that the paper leaves open changes."""
+"""The sensitivity of the random test: how far its headline moves when what the paper leaves open changes."""
 
 from __future__ import annotations
 

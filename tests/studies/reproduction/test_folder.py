@@ -117,13 +117,23 @@ def test_figures__a_stem_that_is_no_plain_name_is_refused(settings: Settings, st
 
 
 @pytest.mark.parametrize(
-    "change", [{"tables": "x"}, {"verdict": {}}, {"figures": [1]}, {"name": None}, {"comparisons": [{"what": "w"}]}]
+    "change",
+    [
+        {"tables": "x"},
+        {"tables": [{"title": "t", "head": ["h"], "rows": [[1]], "note": ""}]},
+        {"verdict": {}},
+        {"figures": [1]},
+        {"figures": [{"stem": 7, "title": "t", "text": "t"}]},
+        {"name": None},
+        {"comparisons": [{"what": "w"}]},
+        {"notes": ["a", None]},
+    ],
 )
 def test_results__a_damaged_one_is_named(settings: Settings, change) -> None:
     reproduce([planted("gaps", lambda s: made())], settings)
     file = settings.folder / "gaps" / "result.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
-    with pytest.raises(InvalidInput, match=r"result\.json: \w+: is not what a reproduction writes"):
+    with pytest.raises(InvalidInput, match=r"result\.json: [\w: ]+: is not what a reproduction writes"):
         read_results(ReproductionFolder(settings.folder))
 
 
