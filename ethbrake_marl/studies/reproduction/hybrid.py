@@ -47,6 +47,12 @@ _FIGURE, _TABLE = "paper-distance", "paper-random"
 _WORLDS = 5_000
 
 
+_NOT_THEIRS = (
+    "The paper does not describe its policy that has not converged. The rows of Standalone DRL and Hybrid are of ours:"
+    " whether they agree depends on when a training is stopped."
+)
+
+
 def reproduce_illustration(settings: Settings) -> Made:
     """Harm of E-V2X-BM, of a policy that has not converged, and of the hybrid, over the total distance."""
     episodes, chosen = settings.worlds(_WORLDS), unconverged_policy(settings)
@@ -92,6 +98,7 @@ def reproduce_hybrid_table(settings: Settings) -> Made:
         parameters,
         (_printed_table(printed), *(rows_table(each) for each in beside)),
         data={"hybrid-table": rows_csv(beside)},
+        notes=(_NOT_THEIRS,),
     )  # fmt: skip
 
 
@@ -151,6 +158,6 @@ def _judge_choice(reading: Reading, evaluation: Evaluation, grouped: Grouped) ->
         outcome = DIFFERS if worse.any() else AGREES
         verdicts.append(Verdict(f"the {name} takes the lower of the two ({reading.name})", outcome, told))
     for other in (ALONE, NAMES[COUPLED]):
-        what = f"the {HYBRID} harms less than {other} at every distance ({reading.name})"
-        verdicts.append(judge_statement(what, grouped.less(HYBRID, other)))
+        what = f"the {HYBRID} harms no more than {other} at every distance ({reading.name})"
+        verdicts.append(judge_statement(what, grouped.less(HYBRID, other), or_equal=True))
     return verdicts

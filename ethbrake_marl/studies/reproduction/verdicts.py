@@ -158,14 +158,14 @@ class Less:
         return self.least is not None and _ends(self.least)[0] > 0.0
 
 
-def judge_statement(what: str, parts: Sequence[Less], *, show: Show = HARM) -> Verdict:
-    """Whether every comparison of a statement comes out below 0, by its interval."""
+def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Show = HARM) -> Verdict:
+    """Whether every comparison of a statement comes out below 0, or at most 0, by its interval."""
     compared = [part for part in parts if not part.neither]
     ties = [part.where for part in parts if part.neither]
     tied = f" (both are 0 in {_named(ties)})" if ties else ""
     if not compared:
         return Verdict(what, AGREES, f"nothing to undercut: both are 0 in {_named(ties)}")
-    failing = [part for part in compared if not part.holds]
+    failing = [part for part in compared if not part.holds and not (or_equal and _ends(part.difference)[1] <= 0.0)]
     impossible = [part for part in failing if part.is_impossible]
     counts = f"holds in {len(compared) - len(failing)} of {len(compared)}"
     if impossible:

@@ -91,6 +91,13 @@ def test_judge_statement__leaves_out_where_nothing_is_left_to_undercut() -> None
     assert judge_statement("lower", parts[1:]).because == "nothing to undercut: both are 0 in b"
 
 
+def test_judge_statement__at_most_holds_where_both_are_equal() -> None:
+    equal = [Less("a", around(0.0, 0.0))]
+    assert judge_statement("no more", equal, or_equal=True).outcome == "agrees"
+    assert judge_statement("less", equal).outcome == "differs"
+    assert judge_statement("no more", [Less("a", around(0.0, 0.1))], or_equal=True).outcome == "undecided"
+
+
 def test_judge_statement__cannot_agree_where_the_proven_least_is_above() -> None:
     parts = [Less("a", around(-3.0, 1.0)), Less("b", around(1.0, 0.5), least=around(0.4, 0.1))]
     verdict = judge_statement("lower", parts)
