@@ -42,7 +42,7 @@ from ethbrake_marl.studies.reproduction.measure import (
 )
 from ethbrake_marl.studies.reproduction.policies import hybrid
 from ethbrake_marl.studies.reproduction.register import GAPS, Alternative, Gap
-from ethbrake_marl.studies.reproduction.trainings import OPEN, TRAINED_HARM, finished, group_named
+from ethbrake_marl.studies.reproduction.trainings import OPEN, PPO_PAPER, TRAINED_HARM, finished, group_named
 from ethbrake_marl.studies.reproduction.verdicts import AGREES, DIFFERS, HARM, NOT_RUN, PERCENT, Verdict, compare_number
 
 SCENARIO = "paper-random"
@@ -186,7 +186,7 @@ def _trained(settings: Settings) -> Table | None:
         rows.append((name, str(len(kept)), f"{float(np.mean(kept)):.2f}", each))
     note = (
         "First-impact harm (m²/s²) of the kept policy on 1,000 worlds of seed 1007; ppo-paper is the paper's table with"
-        " our weights. Seeds beside each other: two say little about others."
+        f" our weights. {PPO_PAPER.decisions:,} decisions each, far from converged; two seeds say little about others."
     )
     head = ("Training", "Seeds", "Mean harm", "Each seed")
     return Table("What is open in training", head, tuple(rows), note) if rows else None
