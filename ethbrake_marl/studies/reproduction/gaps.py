@@ -14,6 +14,7 @@ from ethbrake_marl.evaluation.paper import PAPER_ROWS, RANDOM_TEST
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, unpaired_difference
 from ethbrake_marl.figures.reproduction import changes_figure
 from ethbrake_marl.figures.style import Figure
+from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.run_folder import progress_column, progress_rows
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies.shipped import load_shipped
@@ -184,9 +185,11 @@ def _trained(settings: Settings) -> Table | None:
         kept = [min(progress_column(progress_rows(path), TRAINED_HARM).values()) for path in paths]
         each = ", ".join(f"{harm:.2f}" for harm in kept)
         rows.append((name, str(len(kept)), f"{float(np.mean(kept)):.2f}", each))
+    whole = load_recipe(PPO_PAPER.recipe).total_steps
     note = (
         "First-impact harm (m²/s²) of the kept policy on 1,000 worlds of seed 1007; ppo-paper is the paper's table with"
-        f" our weights. {PPO_PAPER.decisions:,} decisions each, far from converged; two seeds say little about others."
+        f" our weights. Each had {PPO_PAPER.decisions:,} of the recipe's {whole:,} decisions; two seeds say little about"
+        " others."
     )
     head = ("Training", "Seeds", "Mean harm", "Each seed")
     return Table("What is open in training", head, tuple(rows), note) if rows else None
