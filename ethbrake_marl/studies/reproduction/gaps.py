@@ -188,8 +188,8 @@ def _trained(settings: Settings) -> Table | None:
     whole = load_recipe(PPO_PAPER.recipe).total_steps
     note = (
         "First-impact harm (m²/s²) of the kept policy on 1,000 worlds of seed 1007; ppo-paper is the paper's table with"
-        f" our weights. Each had {PPO_PAPER.decisions:,} of the recipe's {whole:,} decisions; two seeds say little about"
-        " others."
+        f" our weights. Each had {PPO_PAPER.decisions:,} of the recipe's {whole:,} decisions; two seeds say little"
+        " about others."
     )
     head = ("Training", "Seeds", "Mean harm", "Each seed")
     return Table("What is open in training", head, tuple(rows), note) if rows else None
