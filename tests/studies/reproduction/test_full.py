@@ -39,7 +39,7 @@ def test_full__trains_draws_and_keeps_what_is_trained(tiny_groups, settings: Set
     assert seconds_left(full.folder, small.trained) == pytest.approx(2 * 1.024)
     (result,), finished = reproduce([small], full)
     assert finished and result["trained"] == ["low/ppo", "high/ppo"]
-    assert [each["stem"] for each in result["figures"]] == ["learning-low"]
+    assert [each["stem"] for each in result["figures"]] == ["learning-low-ours"]
     assert "1 seeds of ppo to 1,024 decisions" in result["notes"][0] and "sac" in result["notes"][1]
     (higher,) = [each for each in result["comparisons"] if each["what"].startswith("both algorithms reach higher")]
     assert higher["outcome"] in ("agrees", "differs")
@@ -104,7 +104,11 @@ def test_course__measures_of_planted_curves() -> None:
     assert one.rise == 10.0
     assert one.decisions_to_converge.tolist() == [2.0, 1.0]
     assert one.spread.tolist() == [0.0, 0.0]
-    assert one.unrest(np.array([0.0, 1.0, 2.0])).tolist() == pytest.approx([0.1, 0.1])
+    assert one.unrest(2).tolist() == [0.0, 0.0]
+    assert one.unrest(3).tolist() == pytest.approx([0.1, 0.15])  # changes of 2 and 0, 3 and 0
+    assert one.still_rising == 0.0
+    assert course([[-4.0, -3.0, -2.0, -1.0, 0.0]], [[1.0] * 5]).still_rising == pytest.approx(0.25)
+    assert one.worth(shaped=True).tolist() == [0.0, -0.0]
 
 
 def test_read_courses__nothing_where_nothing_is_trained(tmp_path: Path) -> None:
