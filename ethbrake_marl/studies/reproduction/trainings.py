@@ -49,9 +49,9 @@ class TrainedRecipe:
 
 
 PPO = TrainedRecipe("ppo", 400_000, 4, 16_000)
-SAC = TrainedRecipe("sac", 60_000, 30, 4_000)
-PPO_PAPER = TrainedRecipe("ppo-paper", 100_000, 1, 6_000)
-SAC_PAPER = TrainedRecipe("sac-paper", 20_000, 1_000, 110)
+SAC = TrainedRecipe("sac", 60_000, 30, 3_000)
+PPO_PAPER = TrainedRecipe("ppo-paper", 100_000, 1, 5_000)
+SAC_PAPER = TrainedRecipe("sac-paper", 20_000, 1_000, 170)
 EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the recipe's own number
 
 
