@@ -13,6 +13,7 @@ from ethbrake_marl.studies.reproduction.folder import Json, ReproductionFolder, 
 from ethbrake_marl.studies.reproduction.page import LEAD
 
 FIGURES, PREFIX = "figures", "reproduction-"  # of the figures beside the page
+_LOAD = r", load [0-9.]+"  # of the machine, which differs from item to item
 COMMAND = "ethbrake reproduce --full --output runs/reproduction --docs docs/reproduction.md"
 
 
@@ -42,7 +43,8 @@ def write_docs(file: Path, folder: ReproductionFolder, results: Sequence[Json]) 
 
 def docs_page(results: Sequence[Json]) -> str:
     """The page of these results."""
-    made = "; ".join(dict.fromkeys(f"{each['made_utc'][:10]}, {each['machine']}" for each in results))
+    machines = (f"{each['made_utc'][:10]}, {re.sub(_LOAD, '', each['machine'])}" for each in results)
+    made = _cell("; ".join(dict.fromkeys(machines)))
     seconds = sum(each["processor_s"] for each in results)
     blocks = [
         "# The paper, made again",
