@@ -41,6 +41,7 @@ from ethbrake_marl.cli.plugins import accept_plugins, check_commands
 from ethbrake_marl.cli.recipe import recipe_app
 from ethbrake_marl.cli.record import record_command
 from ethbrake_marl.cli.replay import replay_command
+from ethbrake_marl.cli.reproduce import reproduce_command
 from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import (
     abandon_output,
@@ -123,6 +124,9 @@ app.command("best-harm", epilog="Example: ethbrake best-harm --episodes 200 --bu
 app.command("compare", epilog="Example: ethbrake compare before.csv.json after.csv.json")(compare_command)
 app.command("agents", epilog="Example: ethbrake agents")(agents_command)
 app.command("shield", epilog="Example: ethbrake shield --agents ppo@shipped,full_brake --episodes 500")(shield_command)
+app.command("reproduce", epilog="Example: ethbrake reproduce random-table harm-distance --quick --output runs/paper")(
+    reproduce_command
+)
 app.command("record", epilog="Example: ethbrake record --agents full_brake,e_v2x_bm --world 3 --output both.gif")(
     record_command
 )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -111,6 +112,19 @@ def read_object(file: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InvalidInput(f"{file}: is damaged: holds no JSON object")
     return content
+
+
+RETURN = "rollout/ep_rew_mean"  # column of the table: mean over the last episodes, exploration included
+
+
+def progress_rows(path: Path) -> list[dict[str, str]]:
+    """The table of the run in ``path``, one row per update."""
+    return list(csv.DictReader(RunDirectory(path).progress.read_text("utf-8").splitlines()))
+
+
+def progress_column(table: Sequence[Mapping[str, str]], name: str) -> dict[int, float]:
+    """A column of such a table: step -> value, where there is one."""
+    return {int(row["steps"]): float(row[name]) for row in table if row.get(name)}
 
 
 def _now() -> str:

@@ -20,7 +20,7 @@ from ethbrake_marl.figures.curves import SeedCurve, at_common_steps, seed_curves
 from ethbrake_marl.figures.style import Figure, write_picture
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.learning.run_folder import RunDirectory, read_object
+from ethbrake_marl.learning.run_folder import RETURN, RunDirectory, progress_column, progress_rows, read_object
 from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.learning.training import Training, check_same, resolve
 from ethbrake_marl.policies.policy import load_policy
@@ -29,7 +29,6 @@ from ethbrake_marl.scenario import Scenario
 
 FIGURE, TABLE, SUMMARY = "learning_curves.png", "learning_curves.csv", "learning_curves.json"
 
-_RETURN = "rollout/ep_rew_mean"  # mean over the last episodes, exploration included
 _RETURNED = "return"  # what it is called here
 _LABELS = {
     "first_impact_harm": "First-impact harm on the fixed list (m²/s²)",
@@ -133,9 +132,9 @@ def _read_curves(plan: Sequence[Trainings], folder: Path) -> dict[str, dict[str,
     curves: dict[str, dict[str, SeedCurve]] = {metric: {} for metric in (*metrics, _RETURNED)}
     for trainings in plan:
         name = trainings.recipe.name
-        tables = [_table(folder / f"{name}-seed{seed}") for seed in range(trainings.seeds)]
+        tables = [progress_rows(folder / f"{name}-seed{seed}") for seed in range(trainings.seeds)]
         for metric in curves:
-            values = [_column(table, _RETURN if metric == _RETURNED else f"eval/{metric}") for table in tables]
+            values = [progress_column(table, RETURN if metric == _RETURNED else f"eval/{metric}") for table in tables]
             if metric != _RETURNED or all(values):  # no episode may have ended in a very short training
                 curves[metric][name] = at_common_steps(values)
     return {metric: lines for metric, lines in curves.items() if lines}
@@ -153,15 +152,6 @@ def _train_one(training: Training, path: Path, settings: Sequence[str], tell: On
 
 def _tell_named(tell: OnProgress, name: str, progress: Progress) -> None:
     tell(replace(progress, name=name))
-
-
-def _table(path: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(RunDirectory(path).progress.read_text("utf-8").splitlines()))
-
-
-def _column(table: Sequence[Mapping[str, str]], name: str) -> dict[int, float]:
-    """Step -> value, where there is one."""
-    return {int(row["steps"]): float(row[name]) for row in table if row.get(name)}
 
 
 def _estimate(harms: Any) -> dict[str, Any]:

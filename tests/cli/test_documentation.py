@@ -30,7 +30,7 @@ def names(typer_app) -> set[str]:
 def test_cli_page__has_every_command_and_agent():
     training = {"run", "train", "resume", "learning-curves", "ablate", "generalise", "export", "import-legacy"}
     measuring = {"evaluate", "compare", "shield", "best-harm", "equal-time"}
-    looking = {"agents", "record", "replay", "explore"}
+    looking = {"agents", "record", "replay", "explore", "reproduce"}
     assert names(app) == training | measuring | looking | {"doctor", "bench", "dataset"}
     for command in names(app) | {"scenario", "recipe"}:
         assert f"\n## {command}\n" in CLI and f"`{command}" in TABLE_OF_COMMANDS

@@ -1,0 +1,99 @@
+"""docs/reproduction.md: the results of a reproduction as Markdown, with its figures and its data beside it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from ethbrake_marl.errors import InvalidInput, plain_text
+from ethbrake_marl.evaluation.per_world import check_target, write_output
+from ethbrake_marl.studies.reproduction.folder import Json, ReproductionFolder, checked_stem, read_figure
+from ethbrake_marl.studies.reproduction.page import LEAD
+
+FIGURES, PREFIX = "figures", "reproduction-"  # of the figures beside the page
+_LOAD = r", load [0-9.]+"  # of the machine, which differs from item to item
+COMMAND = "ethbrake reproduce --full --output runs/reproduction --docs docs/reproduction.md"
+
+
+def check_docs(file: Path) -> None:
+    """Raise ``InvalidInput`` for a page whose name does not end in ``.md``, or that cannot be written."""
+    if file.suffix != ".md":
+        raise InvalidInput(f"{file}: must end in .md")
+    check_target(file, force=True)
+
+
+def write_docs(file: Path, folder: ReproductionFolder, results: Sequence[Json]) -> None:
+    """Write the page, the results as ``.json`` beside it, and the figures into ``figures/``; all are replaced.
+
+    Raises as ``check_docs``.
+    """
+    check_docs(file)
+    figures = file.parent / FIGURES
+    figures.mkdir(exist_ok=True)
+    for result in results:
+        for each in result["figures"]:
+            data = read_figure(folder, result["name"], each["stem"], ".svg")
+            write_output(figures / f"{PREFIX}{each['stem']}.svg", data, force=True)
+    content = json.dumps(list(results), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    write_output(file.with_suffix(".json"), content.encode(), force=True)
+    write_output(file, docs_page(results).encode(), force=True)
+
+
+def docs_page(results: Sequence[Json]) -> str:
+    """The page of these results."""
+    machines = (f"{each['made_utc'][:10]}, {re.sub(_LOAD, '', each['machine'])}" for each in results)
+    made = _cell("; ".join(dict.fromkeys(machines)))
+    seconds = sum(each["processor_s"] for each in results)
+    blocks = [
+        "# The paper, made again",
+        LEAD,
+        f"Made by `{COMMAND}` ({made}; {seconds:.0f} s of one core without the trainings). The page, its figures and"
+        " `reproduction.json`, which holds the same as data, are written by that command and not by hand;"
+        " `ethbrake reproduce` makes them again without training. [The paper, line by line](paper.md) has the account"
+        " of every equation.",
+        "## Overview",
+        _table(
+            ("Item", "Verdict", "Because"),
+            [(f"[{_cell(each['title'])}](#{_cell(each['name'])})", each["verdict"]["outcome"],
+              _cell(each["verdict"]["because"])) for each in results],
+        ),
+        *(block for each in results for block in _item(each)),
+    ]  # fmt: skip
+    return "\n\n".join(blocks) + "\n"
+
+
+def _item(result: Json) -> list[str]:
+    """The section of one item."""
+    labels = ", ".join(_cell(label) for label in result["labels"])
+    what = f"**{_cell(result['title'])}**. {_cell(result['what'])}"
+    blocks = [f"## {_cell(result['name'])}", f"{what} ({labels})" if labels else what]
+    blocks.append(f"**{_cell(result['verdict']['outcome'])}**: {_cell(result['verdict']['because'])}")
+    blocks += [_cell(note) for note in result["notes"]]
+    for each in result["figures"]:
+        file = f"{FIGURES}/{PREFIX}{checked_stem(each['stem'])}.svg"
+        blocks.append(f"![{_cell(each['title'])}. {_cell(each['text'])}]({file})")
+    for table in result["tables"]:
+        blocks += [f"### {_cell(table['title'])}", _texts(table["head"], table["rows"])]
+        blocks += [_cell(table["note"])] if table["note"] else []
+    rows = [(each["what"], each["outcome"], each["because"]) for each in result["comparisons"]]
+    blocks += ["### Comparisons with the paper", _texts(("What", "Verdict", "Because"), rows)]
+    rows = [(each["name"], each["value"], each["origin"]) for each in result["parameters"]]
+    return [*blocks, "### Parameters", _texts(("Parameter", "Value", "Origin"), rows)]
+
+
+def _texts(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of texts."""
+    return _table([_cell(cell) for cell in head], [[_cell(cell) for cell in row] for row in rows])
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table whose cells are Markdown already."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *rows))
+
+
+def _cell(text: str) -> str:
+    """Text that is no markup: what would be is escaped."""
+    plain = plain_text(text, keep="\u00a0").replace("<", "&lt;")
+    return re.sub(r"([\\|*_`])", r"\\\1", plain).replace("](", "]\\(")

@@ -1,0 +1,147 @@
+"""The folder of a reproduction: whole files, going on, and names and results that somebody else wrote."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.evaluation.statistics import Estimate
+from ethbrake_marl.figures.reproduction import Line, lines_figure
+from ethbrake_marl.studies.reproduction.folder import ReproductionFolder, open_folder, read_results
+from ethbrake_marl.studies.reproduction.item import Drawn, Settings
+from ethbrake_marl.studies.reproduction.markdown import docs_page, write_docs
+from ethbrake_marl.studies.reproduction.run import reproduce
+
+from .conftest import HOSTILE, made, planted
+
+
+def drawn(stem: str = "a-figure") -> Drawn:
+    line = Line.of([0.0, 1.0], [Estimate(1.0, None), Estimate(2.0, (1.0, 3.0))])
+    figure = lines_figure({"panel": {"line": line}}, x_label="x", y_label="y", caption="c")
+    return Drawn(stem, "A figure", "What it shows.", figure)
+
+
+def hidden(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob(".*")]
+
+
+def test_reproduce__writes_figures_data_results_and_one_page(settings: Settings) -> None:
+    items = [planted("gaps", lambda s: made(figures=(drawn(),)))]
+    results, finished = reproduce(items, settings)
+    assert finished and [each["name"] for each in results] == ["gaps"]
+    names = sorted(path.name for path in (settings.folder / "gaps").iterdir())
+    assert names == ["a-figure.png", "a-figure.svg", "data.csv", "result.json"]
+    page = (settings.folder / "index.html").read_text("utf-8")
+    assert "data:image/svg+xml;base64," in page
+    assert "http://" not in page and "https://" not in page and "<script" not in page
+    assert "prefers-color-scheme: dark" in page
+    assert hidden(settings.folder) == []
+
+
+def test_reproduce__keeps_what_is_there_and_makes_it_again_by_force(settings: Settings) -> None:
+    calls = []
+    items = [planted("gaps", lambda s: calls.append(1) or made())]
+    reproduce(items, settings)
+    reproduce(items, settings)
+    assert len(calls) == 1
+    reproduce(items, settings, force=True)
+    assert len(calls) == 2
+
+
+def test_reproduce__an_interruption_leaves_whole_files_and_goes_on(settings: Settings) -> None:
+    def stop(_: Settings):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reproduce([planted("harm-delays", lambda s: made()), planted("gaps", stop)], settings)
+    assert [each["name"] for each in read_results(ReproductionFolder(settings.folder))] == ["harm-delays"]
+    assert "A title" in (settings.folder / "index.html").read_text("utf-8")
+    assert hidden(settings.folder) == []
+    results, _ = reproduce([planted("harm-delays", stop), planted("gaps", lambda s: made())], settings)
+    assert [each["name"] for each in results] == ["harm-delays", "gaps"]
+
+
+def test_open_folder__refuses_what_holds_something_else(settings: Settings, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("text")
+    for force in (False, True):
+        with pytest.raises(AlreadyExists, match="holds no reproduction"):
+            open_folder(replace(settings, folder=tmp_path / "mine"), force=force)
+    with pytest.raises(InvalidInput, match="no plain folder"):
+        open_folder(replace(settings, folder=tmp_path / "mine" / "thesis.txt"))
+    (tmp_path / "link").symlink_to(tmp_path / "mine")
+    with pytest.raises(InvalidInput, match="no plain folder"):
+        open_folder(replace(settings, folder=tmp_path / "link"))
+
+
+def test_open_folder__other_settings_need_force(settings: Settings) -> None:
+    reproduce([planted("gaps", lambda s: made())], settings)
+    with pytest.raises(AlreadyExists, match="episodes 24, here 30"):
+        open_folder(replace(settings, episodes=30))
+    open_folder(replace(settings, episodes=30), force=True)
+    assert read_results(ReproductionFolder(settings.folder)) == []
+
+
+@pytest.mark.parametrize("name", ["<b>out</b>", "a'b\"c", "x\u202ey", "; rm -rf", "{{ 7 * 7 }}"])
+def test_reproduce__a_hostile_folder_name_is_only_a_name(settings: Settings, tmp_path: Path, name: str) -> None:
+    own = replace(settings, folder=tmp_path / name)
+    reproduce([planted("gaps", lambda s: made())], own)
+    assert name not in (own.folder / "index.html").read_text("utf-8")
+
+
+def test_page__whatever_a_result_says_is_text(settings: Settings) -> None:
+    results, _ = reproduce([planted("gaps", lambda s: made(HOSTILE))], settings)
+    page = (settings.folder / "index.html").read_text("utf-8")
+    assert "<script" not in page and "&lt;script&gt;" in page
+    docs = docs_page(results)
+    assert "<script" not in docs
+    assert "\u202e" not in page and "\u202e" not in docs
+    assert all(line.count(" | ") <= 2 for line in docs.splitlines() if line.startswith("| "))
+
+
+@pytest.mark.parametrize("stem", ["../../etc/passwd", "a b", "A", "", "x" * 65, "<svg>", "/tmp/x"])
+def test_figures__a_stem_that_is_no_plain_name_is_refused(settings: Settings, stem: str) -> None:
+    with pytest.raises(InvalidInput, match="must be small letters"):
+        reproduce([planted("gaps", lambda s: made(figures=(drawn(stem),)))], settings)
+    reproduce([planted("gaps", lambda s: made())], settings)
+    file = settings.folder / "gaps" / "result.json"
+    content = json.loads(file.read_text())
+    content["figures"] = [{"stem": stem, "title": "t", "text": "t"}]
+    file.write_text(json.dumps(content))
+    with pytest.raises(InvalidInput, match="must be small letters"):
+        reproduce([planted("harm-delays", lambda s: made())], settings)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"tables": "x"},
+        {"tables": [{"title": "t", "head": ["h"], "rows": [[1]], "note": ""}]},
+        {"verdict": {}},
+        {"figures": [1]},
+        {"figures": [{"stem": 7, "title": "t", "text": "t"}]},
+        {"name": None},
+        {"comparisons": [{"what": "w"}]},
+        {"notes": ["a", None]},
+    ],
+)
+def test_results__a_damaged_one_is_named(settings: Settings, change) -> None:
+    reproduce([planted("gaps", lambda s: made())], settings)
+    file = settings.folder / "gaps" / "result.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
+    with pytest.raises(InvalidInput, match=r"result\.json: [\w: ]+: is not what a reproduction writes"):
+        read_results(ReproductionFolder(settings.folder))
+
+
+def test_write_docs__page_data_and_figures(settings: Settings, tmp_path: Path) -> None:
+    results, _ = reproduce([planted("gaps", lambda s: made(figures=(drawn(),)))], settings)
+    file = tmp_path / "page.md"
+    write_docs(file, ReproductionFolder(settings.folder), results)
+    assert file.read_text("utf-8") == docs_page(json.loads((tmp_path / "page.json").read_text("utf-8")))
+    assert (tmp_path / "figures" / "reproduction-a-figure.svg").is_file()
+    with pytest.raises(InvalidInput, match=r"must end in \.md"):
+        write_docs(tmp_path / "page.html", ReproductionFolder(settings.folder), results)

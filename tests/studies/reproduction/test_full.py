@@ -1,0 +1,115 @@
+"""``--full``: what is trained, that it goes on, and curves made of what is finished."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.figures.curves import SeedCurve
+from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.studies.reproduction import curves, run, trainings
+from ethbrake_marl.studies.reproduction.curves import Course, read_courses
+from ethbrake_marl.studies.reproduction.item import Settings
+from ethbrake_marl.studies.reproduction.items import ITEMS, choose_items
+from ethbrake_marl.studies.reproduction.run import reproduce, tell_cost
+from ethbrake_marl.studies.reproduction.trainings import Group, TrainedRecipe, seconds_left, trained_names
+from tests.learning.tiny import TINY_PPO
+
+from .conftest import made, planted
+
+TINY = TINY_PPO.replace(total_steps=128 * 8, evaluation={"every_updates": 1, "worlds": 5, "seed": 7})
+
+
+@pytest.fixture
+def tiny_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One training of a second at either delay, in the place of all."""
+    trained = {"ppo": (TrainedRecipe("ppo", TINY.total_steps, 1, 1000), TINY)}
+    groups = tuple(Group(delay, f"paper-delay-{delay}", trained, 1) for delay in ("low", "high"))
+    monkeypatch.setattr(trainings, "groups", lambda: groups)
+    monkeypatch.setattr(curves, "CURVES", {"low": ("low",), "high": ("high",)})
+
+
+def test_full__trains_draws_and_keeps_what_is_trained(tiny_groups, settings: Settings) -> None:
+    full = replace(settings, mode="full", episodes=5)
+    (item,) = choose_items(["learning-low"])
+    small = replace(item, trained=("low", "high"))
+    assert seconds_left(full.folder, small.trained) == pytest.approx(2 * 1.024)
+    (result,), finished = reproduce([small], full)
+    assert finished and result["trained"] == ["low/ppo", "high/ppo"]
+    assert [each["stem"] for each in result["figures"]] == ["learning-low-ours"]
+    assert "1 seeds of ppo to 1,024 decisions" in result["notes"][0] and "sac" in result["notes"][1]
+    (higher,) = [each for each in result["comparisons"] if each["what"].startswith("both algorithms reach higher")]
+    assert higher["outcome"] in ("agrees", "differs")
+    assert seconds_left(full.folder, small.trained) == 0.0
+    before = sorted(path.stat().st_mtime_ns for path in (full.folder / "trainings").rglob("run.json"))
+    reproduce([small], full, force=True)
+    assert sorted(path.stat().st_mtime_ns for path in (full.folder / "trainings").rglob("run.json")) == before
+
+
+def test_full__interrupted_makes_the_items_of_what_is_finished(settings: Settings, monkeypatch) -> None:
+    asked = []
+    monkeypatch.setattr(run, "train_groups", lambda *given: bool(asked.append(given)))
+    items = [replace(planted("gaps", lambda s: made()), trained=("open",)), planted("harm-delays", lambda s: made())]
+    results, finished = reproduce(items, replace(settings, mode="full"))
+    assert not finished and len(asked) == 1
+    assert [each["name"] for each in results] == ["harm-delays", "gaps"]
+
+
+def test_full__an_item_is_made_again_when_more_is_trained(settings: Settings, monkeypatch) -> None:
+    trained: list[str] = []
+    monkeypatch.setattr(run, "train_groups", lambda *given: True)
+    monkeypatch.setattr(run, "trained_names", lambda folder, wanted: list(trained))
+    calls = []
+    items = [replace(planted("gaps", lambda s: calls.append(1) or made()), trained=("open",))]
+    for expected in (1, 1):
+        reproduce(items, replace(settings, mode="full"))
+        assert len(calls) == expected
+    trained.append("open/ppo-paper")
+    reproduce(items, replace(settings, mode="full"))
+    assert len(calls) == 2
+
+
+def test_groups__fit_their_recipes_and_every_item_names_groups_that_exist() -> None:
+    found = {group.name: group for group in trainings.groups()}
+    assert len(found) == len(trainings.groups())
+    assert {name for item in ITEMS for name in item.trained} == set(found)
+    for group in found.values():
+        for name, (asked, recipe) in group.trained.items():
+            assert recipe.name == name and recipe.total_steps == asked.decisions
+            stated = load_recipe(asked.recipe)
+            if asked.recipe.endswith("-paper"):  # the paper's table stays as it is
+                for key in ("gamma", "batch_size", "network"):
+                    assert getattr(recipe, key) == getattr(stated, key)
+
+
+def test_cost__is_told_before_and_at_most_an_hour(tmp_path: Path) -> None:
+    settings = Settings("full", tmp_path)
+    assert "trainings before them about" in tell_cost(ITEMS, settings)
+    assert seconds_left(tmp_path, [group.name for group in trainings.groups()]) <= 3_600.0
+    assert "trainings" not in tell_cost(ITEMS, replace(settings, mode="quick"))
+    assert trained_names(tmp_path, ["low"]) == []
+
+
+def course(returns: list[list[float]], harm: list[list[float]]) -> Course:
+    steps = np.arange(len(returns[0]), dtype=float)
+    return Course(SeedCurve(steps, np.array(returns)), SeedCurve(steps, np.array(harm)))
+
+
+def test_course__measures_of_planted_curves() -> None:
+    one = course([[-10.0, -4.0, 0.0, 0.0], [-10.0, -6.0, 0.0, 0.0]], [[100.0, 50.0, 10.0, 0.0], [100.0, 5.0, 1.0, 0.0]])
+    assert one.last_returns.tolist() == [0.0, 0.0]
+    assert one.rise == 10.0
+    assert one.decisions_to_converge.tolist() == [2.0, 1.0]
+    assert one.spread.tolist() == [0.0, 0.0]
+    assert one.unrest(2).tolist() == [0.0, 0.0]
+    assert one.unrest(3).tolist() == pytest.approx([0.1, 0.15])  # changes of 2 and 0, 3 and 0
+    assert one.still_rising == 0.0
+    assert course([[-4.0, -3.0, -2.0, -1.0, 0.0]], [[1.0] * 5]).still_rising == pytest.approx(0.25)
+    assert one.worth(shaped=True).tolist() == [0.0, -0.0]
+
+
+def test_read_courses__nothing_where_nothing_is_trained(tmp_path: Path) -> None:
+    assert read_courses(tmp_path, "low") == {}

@@ -1,0 +1,91 @@
+"""Every item of the paper, made of few worlds."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.studies.reproduction.item import Item, Made, Settings
+from ethbrake_marl.studies.reproduction.items import ITEMS, choose_items, item_names
+from ethbrake_marl.studies.reproduction.register import GAPS
+
+PAPER = Path(__file__).resolve().parents[3] / "docs" / "paper.md"
+
+
+OUTCOMES = {"agrees", "differs", "cannot agree", "undecided", "not run"}
+
+
+@pytest.fixture(scope="module")
+def made_of(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
+    """Every item of ten worlds, made once."""
+    settings = Settings("quick", tmp_path_factory.mktemp("reproduction"), 10)
+    return {item.name: item.make(settings) for item in ITEMS}
+
+
+@pytest.mark.parametrize("name", item_names())
+def test_item__has_verdicts_parameters_tables_and_data(made_of: dict[str, Made], name: str) -> None:
+    made = made_of[name]
+    assert made.verdicts and {verdict.outcome for verdict in made.verdicts} <= OUTCOMES
+    assert all(verdict.because for verdict in made.verdicts)
+    assert "\n" not in made.verdict.because
+    stated = {parameter.name: bool(parameter.stated) for parameter in made.parameters}
+    assert stated["masses"] and stated["braking capacities"]
+    assert not stated["restitution e"] and not stated["time step"] and not stated["horizon"]
+    assert made.tables and all(len(row) == len(table.head) for table in made.tables for row in table.rows)
+    assert made.data and all(text.count("\n") > 1 for text in made.data.values())
+    if name not in ("hybrid-table", "random-table", "learning-high", "learning-low"):
+        assert made.figures
+
+
+@pytest.mark.parametrize("item", ITEMS, ids=item_names())
+def test_item__labels_are_those_of_the_paper(item: Item) -> None:
+    page = PAPER.read_text("utf-8")
+    assert all(f"`{label}`" in page for label in item.labels)
+
+
+def test_items__speak_of_both_readings(made_of: dict[str, Made]) -> None:
+    for name, made in made_of.items():
+        text = " ".join(verdict.what for verdict in made.verdicts)
+        if name != "gaps":  # whose register has it as one of its rows
+            assert "as stated" in text and "0.2 s" in text, name
+
+
+def test_trajectories__of_the_scenarios_have_no_impact_under_the_policies(made_of: dict[str, Made]) -> None:
+    (table,) = made_of["trajectories"].tables
+    assert {row[3] for row in table.rows if row[2] in ("PPO", "SAC")} == {"0"}
+
+
+def test_choose_items__in_the_order_of_the_paper() -> None:
+    assert [item.name for item in choose_items(["random-table", "harm-delays"])] == ["harm-delays", "random-table"]
+    assert len(choose_items([])) == len(ITEMS)
+    with pytest.raises(UnknownName, match="did you mean 'harm-delays'"):
+        choose_items(["harm-delay"])
+    with pytest.raises(InvalidInput, match="given twice"):
+        choose_items(["gaps", "gaps"])
+
+
+def test_register__every_gap_says_what_the_paper_says_and_what_is_measured() -> None:
+    names = [gap.name for gap in GAPS]
+    assert len(set(names)) == len(names)
+    for gap in GAPS:
+        assert gap.paper and gap.ours
+        assert bool(gap.alternatives) + bool(gap.trained) + bool(gap.unmeasured) == 1, gap.name
+
+
+def test_items__need_no_torch_where_nothing_is_trained() -> None:
+    program = "import sys; import ethbrake_marl.studies.reproduction.run, ethbrake_marl.studies.reproduction.items"
+    program += "; sys.exit('torch' in sys.modules)"
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "PYTHONPATH": str(PAPER.parents[1])},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (result.returncode, result.stderr) == (0, "")

@@ -1,0 +1,83 @@
+"""docs/reproduction.md is what its committed data say, and the data are what the worlds give."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from ethbrake_marl.studies.reproduction.folder import checked_result
+from ethbrake_marl.studies.reproduction.item import Settings
+from ethbrake_marl.studies.reproduction.items import ITEMS, choose_items, item_names
+from ethbrake_marl.studies.reproduction.markdown import FIGURES, PREFIX, docs_page
+from ethbrake_marl.studies.reproduction.measure import (
+    FULL_BRAKE,
+    NAMES,
+    READINGS,
+    collision_rate,
+    drive_list,
+    lineup,
+    read_scenario,
+)
+from ethbrake_marl.studies.reproduction.register import GAPS
+from ethbrake_marl.studies.reproduction.verdicts import PERCENT, Verdict, summarise_verdicts
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGE = (DOCS / "reproduction.md").read_text("utf-8")
+RESULTS = {
+    each["name"]: checked_result(each, each["name"])
+    for each in json.loads((DOCS / "reproduction.json").read_text("utf-8"))
+}
+MOST_BYTES = 200_000  # of a figure
+
+
+def test_page__is_made_of_the_committed_data() -> None:
+    assert docs_page(list(RESULTS.values())) == PAGE
+
+
+def test_page__has_every_item_and_every_gap() -> None:
+    assert list(RESULTS) == item_names()
+    rows = RESULTS["gaps"]["tables"][0]["rows"]
+    assert [row[0] for row in rows] == [gap.name for gap in GAPS]
+
+
+def test_page__every_figure_is_there_and_small_and_no_other() -> None:
+    shown = set(re.findall(rf"\]\({FIGURES}/({PREFIX}[a-z0-9-]+\.svg)\)", PAGE))
+    assert shown == {path.name for path in (DOCS / FIGURES).glob(f"{PREFIX}*")}
+    assert {f"{PREFIX}{each['stem']}.svg" for result in RESULTS.values() for each in result["figures"]} == shown
+    for name in shown:
+        assert 1_000 < (DOCS / FIGURES / name).stat().st_size < MOST_BYTES, name
+
+
+@pytest.mark.parametrize("name", item_names())
+def test_verdict__is_that_of_the_comparisons(name: str) -> None:
+    result = RESULTS[name]
+    again = summarise_verdicts([Verdict(**each) for each in result["comparisons"]])
+    assert {"outcome": again.outcome, "because": again.because} == {
+        key: result["verdict"][key] for key in ("outcome", "because")
+    }
+
+
+def test_trajectories__are_as_committed(tmp_path: Path) -> None:
+    (item,) = choose_items(["trajectories"])
+    made = item.make(Settings("quick", tmp_path))
+    assert [table.to_json() for table in made.tables] == RESULTS["trajectories"]["tables"]
+    assert [verdict.to_json() for verdict in made.verdicts] == RESULTS["trajectories"]["comparisons"]
+
+
+def test_random_table__full_braking_is_as_committed(tmp_path: Path) -> None:
+    tables = {table["title"]: table for table in RESULTS["random-table"]["tables"]}
+    for reading in READINGS:
+        scenario = read_scenario("paper-random", reading)
+        evaluation = drive_list(scenario, lineup((FULL_BRAKE,), scenario), 10_000, Settings("quick", tmp_path))
+        outcome = evaluation.outcome(NAMES[FULL_BRAKE])
+        (row,) = (row for row in tables[reading.name]["rows"] if row[0] == NAMES[FULL_BRAKE])
+        assert row[1] == PERCENT.estimate(collision_rate(outcome.collided))
+
+
+def test_page__is_where_the_docs_speak_of_it() -> None:
+    for name in ("README", "cli", "paper"):
+        assert "(reproduction.md)" in (DOCS / f"{name}.md").read_text("utf-8"), name
+    assert all(f"`{item.name}`" in (DOCS / "cli.md").read_text("utf-8") for item in ITEMS)
