@@ -68,8 +68,8 @@ class Policy:
 
     @property
     def observation(self) -> ObservationSpec:
-        """What to observe for this policy."""
-        return self.manifest.observation.spec
+        """What to observe for this policy, at the time steps of the scenario that it was trained on."""
+        return self.manifest.spec
 
 
 def make_policy(tensors: Mapping[str, Float32s], **manifest: Any) -> Policy:
