@@ -134,8 +134,8 @@ _ENTRIES: dict[str, Entry] = {
 
 _WRAPPERS: dict[str, Entry] = {
     "refined": Entry(
-        "+refined",
-        "plus the best deviation that a search at the alert finds",
+        "+refined[:profile]",
+        "plus the best deviation that a search at the alert finds; profile: compiled, it drives what that finds",
         (Source.MODEL,),
         "agents.refined:refine",
     ),
