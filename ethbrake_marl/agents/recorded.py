@@ -1,4 +1,4 @@
-"""What an agent commands in each step of its episodes."""
+"""The recorder of an agent: its commands in each step of its episodes."""
 
 from __future__ import annotations
 
