@@ -184,7 +184,8 @@ def test_contact__needs_the_time_step():
     assert choose_observation(["own"], 0.1).time_step_s is None  # nothing that depends on it
 
 
-def _policy(scenario):
+def contact_policy(scenario):
+    """An untrained policy that observes contacts."""
     spec = choose_observation(["own", "contact"])
     network = NetworkSpec(
         observation_size=spec.size, action_size=1, policy_hidden=(4,), value_hidden=(), activation="relu", output="clip"
@@ -196,18 +197,18 @@ def _policy(scenario):
     }  # fmt: skip
     tensors = {name: draw.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
     return make_policy(
-        tensors, algorithm="ppo", network=network, observation=observation_schema(spec), learners=("vehicle_2",),
-        scenario=scenario, reward={}, seeds={}, steps=0, versions=installed_versions(),
+        tensors, algorithm="counterfactual", network=network, observation=observation_schema(spec),
+        learners=("vehicle_2",), scenario=scenario, reward={}, seeds={}, steps=0, versions=installed_versions(),
     )  # fmt: skip
 
 
 def test_policy__observes_contacts_at_the_steps_of_its_training():
-    policy = _policy(SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"))
+    policy = contact_policy(SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"))
     assert policy.observation == choose_observation(["own", "contact"], 0.05)
     outcome = eb.evaluate(SCENARIO.sample(5, 7), {"mine": LearnedAgent(policy)}, scenario=SCENARIO).outcome("mine")
     assert np.isfinite(outcome.total_harm).all()
     with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
-        _policy({})
+        contact_policy({})
 
 
 def test_contact__failed_forecast_names_its_world(monkeypatch):

@@ -42,6 +42,7 @@ class CounterfactualRecipe(TrainingRecipe):
     counterfactuals: Annotated[int, Field(ge=1)]
     offset: OffsetRange
     holds: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=16)]
+    gradient_limit: Positive
     trust_radius: Rate
     anchor: Positive
     n_epochs: Annotated[int, Field(ge=1, le=1000)]
@@ -93,6 +94,7 @@ class Counterfactual(Algorithm):
             (recipe.offset.smallest, recipe.offset.largest),
             recipe.holds,
             recipe.gamma,
+            recipe.gradient_limit,
             recipe.trust_radius,
             recipe.anchor,
             recipe.n_epochs,

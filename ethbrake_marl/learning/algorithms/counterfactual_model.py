@@ -119,6 +119,7 @@ class TryingOut(NamedTuple):
     offset: tuple[float, float]  # smallest and largest
     holds: tuple[int, ...]  # steps
     gamma: float
+    gradient_limit: float  # a jump counts as no more
     trust_radius: float
     anchor: float
     n_epochs: int
@@ -198,7 +199,7 @@ class CounterfactualModel(BaseAlgorithm):
         engine = branch(self.env.engine, moments.take(worlds))
         offsets = Offsets(np.tile(rows % learners, 2), both, np.tile(holds, 2))
         gained, moved = play_to_the_end(engine, self.policy.act, offsets, how.gamma)
-        gradient = _difference(gained) / _difference(moved)
+        gradient = np.clip(_difference(gained) / _difference(moved), -how.gradient_limit, how.gradient_limit)
         good = np.isfinite(gradient)
         observed = seen.reshape(-1, seen.shape[2])[rows[good]]
         return Tried(observed, self.policy.means(observed), gradient[good].astype(np.float32))
