@@ -76,7 +76,7 @@ def policy_agent(
 
 def _observation_of(policy: Any, scenario: Scenario | None, given: Observation | None) -> ObservationSpec:
     if given is not None:
-        return choose_observation(given)
+        return choose_observation(given, None if scenario is None else scenario.time_step_s)
     if scenario is not None:
         return observation_for(scenario)
     own = getattr(policy, "observation", None)

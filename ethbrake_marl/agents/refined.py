@@ -8,6 +8,7 @@ import numpy as np
 
 from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place, recall
+from ethbrake_marl.agents.refined_profile import RefinedProfile
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, script_agents, set_others
 from ethbrake_marl.engine.stream import ask_script, begin_script
@@ -110,8 +111,10 @@ class Refined(AgentAround):
         )
 
 
-def refine(policy: Agent, argument: None, settings: AgentSettings) -> Agent:
-    """``+refined`` around an agent."""
+def refine(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
+    """``+refined`` or ``+refined:profile`` around an agent."""
+    if argument is not None:
+        return RefinedProfile(policy, settings.needed_scenario(), harm_count=settings.harm_count)
     return Refined(policy, settings.needed_scenario(), harm_count=settings.harm_count)
 
 

@@ -125,14 +125,17 @@ _ENTRIES: dict[str, Entry] = {
     ),
     "ppo": Entry("ppo@PATH", "a policy trained by PPO: a run, a bundle, or shipped", (Source.MESSAGES,), _POLICIES),
     "sac": Entry("sac@PATH", "a policy trained by SAC: a run, a bundle, or shipped", (Source.MESSAGES,), _POLICIES),
+    "counterfactual": Entry(
+        "counterfactual@PATH", "a policy trained by counterfactuals: a run or a bundle", (Source.MESSAGES,), _POLICIES
+    ),
     "universal": Entry("universal@shipped", "the shipped policy for all parameters", (Source.MESSAGES,), _POLICIES),
     "team": Entry("team@RUN", "the learners of a run, each as it was trained", (Source.MESSAGES,), _POLICIES),
 }
 
 _WRAPPERS: dict[str, Entry] = {
     "refined": Entry(
-        "+refined",
-        "plus the best deviation that a search at the alert finds",
+        "+refined[:profile]",
+        "plus the best deviation that a search at the alert finds; profile: compiled, it drives what that finds",
         (Source.MODEL,),
         "agents.refined:refine",
     ),

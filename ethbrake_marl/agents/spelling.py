@@ -1,7 +1,7 @@
 """The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
 
-``+refined`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``. A name may be
-a function of a Python file, ``my_file.py:make_agent``.
+``+refined`` or ``+refined:profile`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or
+``+robust``. A name may be a function of a Python file, ``my_file.py:make_agent``.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from difflib import get_close_matches
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.scenario.roles import parse_agent_spec
 
-REFINED = "refined"
+REFINED = ("refined", "refined:profile")
 SHIELDS = ("episode", "episode:pairwise", "step", "robust")
-AROUND = (REFINED, *SHIELDS)  # in the order in which they are put around an agent
+AROUND = (*REFINED, *SHIELDS)  # in the order in which they are put around an agent
 
 OLD_SPELLINGS = {  # of a policy; ``hybrid@PATH`` is ``ppo@PATH+episode`` now
     "rehearsed": "+refined",
@@ -98,10 +98,10 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
     if plus and _is_meant_around(before, core, last):
         raise unknown_name("shield or refinement", last, AROUND)
     shields = [each for each in around if each in SHIELDS]
-    if len(shields) > 1 or around.count(REFINED) > 1 or REFINED in around[1:]:
+    if len(shields) > 1 or any(each in REFINED for each in around[1:]):
         raise InvalidInput(
-            f"agent {spec!r}: +{REFINED} comes first and once, then one shield of +{', +'.join(SHIELDS)}; for instance"
-            " ppo@shipped+refined+step"
+            f"agent {spec!r}: +{REFINED[0]} comes first and once, then one shield of +{', +'.join(SHIELDS)}; for"
+            " instance ppo@shipped+refined+step"
         )
     return core, tuple(around)
 

@@ -151,7 +151,7 @@ class Engine:
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
         self.reward, self._objectives = resolved_objective(reward_params(reward), scenario.objective, scenario.vehicles)
-        self.observation = observation or observation_for(scenario)
+        self.observation = (observation or observation_for(scenario)).at_steps_of(scenario.time_step_s)
         self._plan = plan_of(self.observation)
         self._memories: dict[Watcher, Any] = {}
         self.steps_made = 0  # steps of the batch that watchers let pass

@@ -39,7 +39,7 @@ LADDER = (  # from no decision at all up to the best that is known
     "best_harm",
 )
 _LADDER_SPEC = "ladder"
-_LEARNED = ("ppo", "sac", "universal", "team")  # around whom ``--shield`` puts a shield
+_LEARNED = ("ppo", "sac", "counterfactual", "universal", "team")  # around whom ``--shield`` puts a shield
 OLD_SHIELDS = ("none", "episode", "step", "robust")  # of ``--shield``, the old spelling of ``+episode`` and so on
 
 

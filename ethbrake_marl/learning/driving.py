@@ -1,6 +1,11 @@
-"""Trained policies as agents: ``ppo@PATH``, ``sac@PATH``, ``universal@shipped`` and ``team@RUN``. Needs no torch."""
+"""Trained policies as agents: ``ppo@PATH``, ``sac@PATH``, ``counterfactual@PATH``, ``universal@shipped``, ``team@RUN``.
+
+Needs no torch.
+"""
 
 from __future__ import annotations
+
+from typing import get_args
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.registry import AgentSettings
@@ -10,7 +15,7 @@ from ethbrake_marl.learning.team_file import is_team, load_driver, load_team
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import SHIPPED, PolicyKind, load_named_policy
 
-_KINDS: dict[str, PolicyKind] = {"ppo": "ppo", "sac": "sac", "universal": "universal"}
+_KINDS: dict[str, PolicyKind] = {name: name for name in get_args(PolicyKind)}
 
 
 def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
@@ -40,9 +45,9 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
 
 
 def _check_algorithm(name: str, path: str, policy: Policy) -> None:
-    """``ppo@PATH`` and ``sac@PATH`` are for policies of that algorithm."""
+    """``ppo@PATH``, ``sac@PATH`` and ``counterfactual@PATH`` are for policies of that algorithm."""
     trained_by = policy.manifest.algorithm
-    if name in ("ppo", "sac") and name != trained_by:
+    if name in ("ppo", "sac", "counterfactual") and name != trained_by:
         raise InvalidInput(
             f"agent '{name}@{path}': that policy was trained by {trained_by.upper()}: {trained_by}@{path}"
         )

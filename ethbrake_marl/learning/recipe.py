@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.messages import Wording, explain
@@ -82,6 +82,38 @@ class SquashedShape(_Part):
             activation=self.activation,
             output="tanh",
         )
+
+
+class ActorShape(_Part):
+    """Hidden layers of the actor, where there is no critic."""
+
+    policy: Layers
+    activation: Activation = "relu"
+
+    def spec(self, observation_size: int) -> NetworkSpec:
+        """What a bundle holds."""
+        return NetworkSpec(
+            observation_size=observation_size,
+            action_size=1,
+            policy_hidden=self.policy,
+            value_hidden=(),
+            activation=self.activation,
+            output="clip",
+        )
+
+
+class OffsetRange(_Part):
+    """How far an action is moved to see what comes of it; the logarithm of what is drawn is uniform."""
+
+    smallest: Rate
+    largest: Rate
+
+    @field_validator("largest")
+    @classmethod
+    def _in_order(cls, value: float, info: ValidationInfo) -> float:
+        if "smallest" in info.data and not value >= info.data["smallest"]:
+            raise ValueError(f"must be at least smallest = {info.data['smallest']:g}")
+        return value
 
 
 class EvaluationPlan(_Part):

@@ -14,7 +14,7 @@ _MEANINGS = {
     "title": "one line for lists",
     "description": "what it is for",
     "source": "where the values come from",
-    "algorithm": "a registered name: ppo, sac",
+    "algorithm": "a registered name: ppo, sac, counterfactual",
     "scheme": "how several learners train together: single, shared, independent, centralised",
     "total_steps": "decisions of all learners",
     "n_envs": "worlds that are advanced together",
@@ -45,6 +45,14 @@ _MEANINGS = {
     "initial_ent_coef": "where an automatic ent_coef starts",
     "target_entropy": "what an automatic ent_coef keeps; without it -1 per action",
     "target_update_interval": "updates between two of the target critic",
+    "start": "a policy to go on from, ppo@shipped; left out: random weights",
+    "counterfactuals": "how many of the decisions of a round are tried in two ways",
+    "offset": "how far an action is moved to see what comes of it; the logarithm of what is drawn is uniform",
+    "holds": "for how many steps it is moved, one of these",
+    "gradient_limit": "a larger gradient, at a jump, counts as this one; return per unit of action",
+    "trust_radius": "farthest that one update asks an action to move",
+    "anchor": "how much an action that makes no difference holds to where it is",
+    "averaging": "share of itself that the average of the weights, which drives, keeps in each gradient step",
     "log_every_updates": "updates between two rows of the progress table",
 }
 

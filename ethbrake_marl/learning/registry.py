@@ -28,6 +28,9 @@ class _Entry:
 _ENTRIES: dict[str, _Entry] = {
     "ppo": _Entry(f"{_PLACE}.ppo:PpoRecipe", f"{_PLACE}.ppo:Ppo"),
     "sac": _Entry(f"{_PLACE}.sac:SacRecipe", f"{_PLACE}.sac:Sac"),
+    "counterfactual": _Entry(
+        f"{_PLACE}.counterfactual:CounterfactualRecipe", f"{_PLACE}.counterfactual:Counterfactual"
+    ),
 }
 
 

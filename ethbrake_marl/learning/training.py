@@ -70,7 +70,9 @@ def resolve(recipe: TrainingRecipe | str | Path, scenario: Scenario | str | Path
 
 def observation_of(recipe: TrainingRecipe, scenario: Scenario) -> ObservationSpec:
     """What learners observe: what the recipe says; where it says nothing, what the scenario says."""
-    return observation_for(scenario) if recipe.observation is None else choose_observation(recipe.observation)
+    if recipe.observation is None:
+        return observation_for(scenario)
+    return choose_observation(recipe.observation, scenario.time_step_s)
 
 
 def training_in(folder: Path, config: Mapping[str, Any]) -> Training:

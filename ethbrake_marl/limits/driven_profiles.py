@@ -8,14 +8,13 @@ from functools import partial
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Agent, AgentAround
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.recorded import record_commands
 from ethbrake_marl.errors import check_one_learner
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.best_harm import scripted_commands, world_identity
 from ethbrake_marl.limits.best_harm_table import BestHarmTable
 from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
-from ethbrake_marl.physics.episode import decision_at, first_decision_s
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.search.problem import profile_problem
 from ethbrake_marl.search.profiles import Profiles, follow_profiles
@@ -70,41 +69,15 @@ def _driven_in(agent: Agent, every: Worlds, task: Task, last_step: Ints, rows: I
 
 def driven_profiles(agent: Agent, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
     """What ``agent`` commands the vehicle in every step of its episodes, as profiles; equal neighbours are joined."""
-    recorder = _Recorder(agent, int(last_step.max()), task.scenario.time_step_s)
-    drive(worlds, recorder, task.scenario, task.vehicle)
-    return _joined(recorder.commands_mps2, last_step)
-
-
-class _Recorder(AgentAround):
-    """An agent that drives as another one does and keeps every command."""
-
-    def __init__(self, agent: Agent, steps: int, time_step_s: float) -> None:
-        super().__init__(agent)
-        self.commands_mps2: Floats = np.empty((0, steps))  # [n, steps], NaN after an episode's end
-        self._time_step_s = time_step_s
-        self._start_s: Floats = np.empty(0)
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """All episodes begin at once here."""
-        self._start_s = first_decision_s(worlds, [vehicle])
-        self.commands_mps2 = np.full((worlds.n, self.commands_mps2.shape[1]), np.nan)
-        super().begin(worlds, vehicle, rows)
-
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        command = self.policy.act(worlds, vehicle)
-        step = decision_at(worlds.time_s, self._start_s, self._time_step_s)
-        deciding = np.flatnonzero((step >= 0) & (step < self.commands_mps2.shape[1]))
-        self.commands_mps2[deciding, step[deciding]] = command[deciding]
-        return command
+    commands = record_commands(agent, worlds, task.scenario, task.vehicle, int(last_step.max()))
+    return _joined(commands, last_step)
 
 
 def _joined(commands_mps2: Floats, last_step: Ints) -> Profiles:
-    """Step by step commands [n, steps] as profiles with one phase per change; after NaN the last command goes on."""
+    """Step by step commands [n, steps] as profiles with one phase per change."""
     steps = commands_mps2.shape[1]
-    latest = np.maximum.accumulate(np.where(np.isnan(commands_mps2), 0, np.arange(steps)), axis=1)
-    filled = np.take_along_axis(commands_mps2, latest, axis=1)
-    ends = [np.append(np.flatnonzero(row[1:] != row[:-1]) + 1, steps) for row in filled]
+    ends = [np.append(np.flatnonzero(row[1:] != row[:-1]) + 1, steps) for row in commands_mps2]
     width = max(len(each) for each in ends)
     padded = np.array([np.append(each, np.full(width - len(each), steps)) for each in ends])
-    chosen = np.take_along_axis(filled, padded - 1, axis=1)
+    chosen = np.take_along_axis(commands_mps2, padded - 1, axis=1)
     return Profiles(np.minimum(padded, last_step[:, np.newaxis]), chosen[:, :, np.newaxis])

@@ -8,11 +8,14 @@ news that has not arrived will.
 
 Where an obstacle stands ahead of Vehicle 1 (``observation_for``), the vehicle's place in the line and what it knows of
 the obstacle follow. Vehicle 1 sees it; any other vehicle knows of it as soon as it has Vehicle 1's news.
+
+Where an observation lists the group ``contact``, it is followed by what three forecasts say (``observations.contact``).
 """
 
 from ethbrake_marl.observations.observe import Observations, observe, observe_packed, plan_of
 from ethbrake_marl.observations.spec import Observation, ObservationSpec, choose_observation, observation_for
 from ethbrake_marl.scenario.features import (
+    CONTACT_FEATURES,
     NEIGHBOUR_FEATURES,
     OBSTACLE_FEATURES,
     OWN_FEATURES,
@@ -22,6 +25,7 @@ from ethbrake_marl.scenario.features import (
 from ethbrake_marl.scenario.registered_features import register_feature
 
 __all__ = [
+    "CONTACT_FEATURES",
     "NEIGHBOUR_FEATURES",
     "OBSTACLE_FEATURES",
     "OWN_FEATURES",

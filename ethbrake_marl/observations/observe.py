@@ -1,4 +1,4 @@
-"""From worlds to observations: a compiled loop over the built-in features, then the functions of registered ones."""
+"""From worlds to observations: compiled loops over the built-in features, then the functions of registered ones."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.observations.contact import Contacts, contacts_of, observe_contacts
 from ethbrake_marl.observations.spec import ObservationSpec
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.compiled import compiled
@@ -30,6 +31,7 @@ from ethbrake_marl.physics.rows import (
     vehicles_in,
 )
 from ethbrake_marl.scenario.features import (
+    CONTACT_FEATURES,
     NEIGHBOUR_FEATURES,
     OBSTACLE_FEATURES,
     OWN_FEATURES,
@@ -72,9 +74,10 @@ class Extra(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """How an observation is made: by the kernel, which fills whole groups, and by functions of registered features."""
+    """How an observation is made: by kernels, which fill whole groups, and by functions of registered features."""
 
     scaling: Scaling
+    contacts: Contacts | None  # their group is the last one; None: it holds none
     picked: Ints | None  # [F] columns of the whole groups; None: all of them
     extras: tuple[Extra, ...]
 
@@ -90,14 +93,16 @@ def plan_of(spec: ObservationSpec) -> Plan:
 @cache
 def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature], ...]) -> Plan:
     whole, entries = spec.whole, dict(registered)
+    usual = whole[: len(whole) - spec.contact * len(CONTACT_FEATURES)]
     scaling = Scaling(
         np.array([offset for _, offset in spec.sides], np.int64),
         spec.role,
         spec.obstacle,
-        np.array([[1.0 / f.scale for f in whole], [f.low for f in whole], [f.high for f in whole]]),
+        np.array([[1.0 / f.scale for f in usual], [f.low for f in usual], [f.high for f in usual]]),
     )
+    contacts = _contacts(spec) if spec.contact else None
     if not spec.chosen:
-        return Plan(scaling, None, ())
+        return Plan(scaling, contacts, None, ())
     place, offsets = {feature.name: c for c, feature in enumerate(whole)}, dict(spec.sides)
     extras = []
     for column, name in enumerate(spec.chosen):
@@ -105,7 +110,12 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
             side, _, own = name.rpartition(".")
             extras.append(Extra(column, entries[own], offsets.get(side, 0), place.get(f"{side}.known", 0)))
     picked = np.array([place.get(name, 0) for name in spec.chosen], np.int64)
-    return Plan(scaling, picked, tuple(extras))
+    return Plan(scaling, contacts, picked, tuple(extras))
+
+
+def _contacts(spec: ObservationSpec) -> Contacts:
+    inside = (name.partition(".") for name in spec.chosen or (feature.name for feature in spec.whole))
+    return contacts_of({own for group, _, own in inside if group == "contact"}, spec.time_step_s)
 
 
 def observe_packed(
@@ -117,6 +127,8 @@ def observe_packed(
     """
     whole = np.empty((len(state), len(vehicles), plan.scaling.features.shape[1]), np.float32)
     _observe_rows(state, params, vehicles, *plan.scaling, whole)
+    if plan.contacts is not None:
+        whole = np.concatenate([whole, observe_contacts(state, params, vehicles, plan.contacts)], axis=2)
     if plan.picked is None:
         return whole
     observation: Observations = whole.take(plan.picked, axis=2)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.scenario.features import (
+    CONTACT_FEATURES,
     MOST_NEIGHBOURS,
     NEIGHBOUR_FEATURES,
     OBSTACLE_FEATURES,
@@ -25,7 +27,7 @@ from ethbrake_marl.scenario.features import (
 
 @dataclass(frozen=True, slots=True)
 class ObservationSpec:
-    """How many neighbours an observation holds on each side, and whether its own place and an obstacle follow.
+    """How many neighbours an observation holds on each side, and whether place, obstacle and contacts follow.
 
     With ``chosen`` it holds these features alone, in this order; ``choose_observation`` makes such a one.
 
@@ -42,7 +44,9 @@ class ObservationSpec:
     rear: int = 1  # neighbours behind
     role: bool = False  # ROLE_FEATURES
     obstacle: bool = False  # OBSTACLE_FEATURES
-    chosen: tuple[str, ...] = ()  # full names; the fields above say how far these look
+    chosen: tuple[str, ...] = ()  # full names; the other fields say how far these look
+    contact: bool = False  # CONTACT_FEATURES
+    time_step_s: float | None = None  # between two decisions; contact features need it, others do not look at it
 
     def __post_init__(self) -> None:
         """Refuse what is not a number of neighbours, and features that the rest does not fit."""
@@ -50,10 +54,12 @@ class ObservationSpec:
             whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
             if not whole or not 0 <= count <= MOST_NEIGHBOURS:
                 raise InvalidInput(f"observation: {side} = {count!r}; must be a whole number in 0..{MOST_NEIGHBOURS}")
-        for name, shown in (("role", self.role), ("obstacle", self.obstacle)):
+        for name, shown in (("role", self.role), ("obstacle", self.obstacle), ("contact", self.contact)):
             if not isinstance(shown, bool):
                 raise InvalidInput(f"observation: {name} = {shown!r}; must be True or False")
-        if self.chosen and _reach(self.chosen) != (self.front, self.rear, self.role, self.obstacle):
+        if self.time_step_s is not None and not 0.0 < self.time_step_s < math.inf:
+            raise InvalidInput(f"observation: time_step_s = {self.time_step_s!r}; must be a positive number of seconds")
+        if self.chosen and _reach(self.chosen) != (self.front, self.rear, self.role, self.obstacle, self.contact):
             raise InvalidInput("observation: chosen: the other fields do not fit; use eb.choose_observation([...])")
 
     @property
@@ -73,6 +79,7 @@ class ObservationSpec:
         groups = [("own", OWN_FEATURES), *((prefix, NEIGHBOUR_FEATURES) for prefix, _ in self.sides)]
         groups += [("role", ROLE_FEATURES)] if self.role else []
         groups += [("obstacle", OBSTACLE_FEATURES)] if self.obstacle else []
+        groups += [("contact", CONTACT_FEATURES)] if self.contact else []
         return tuple(
             Feature(f"{prefix}.{f.name}", f.unit, f.scale, f.low, f.high, f.meaning)
             for prefix, group in groups
@@ -83,28 +90,39 @@ class ObservationSpec:
     def size(self) -> int:
         """Length F of an observation."""
         further = self.role * len(ROLE_FEATURES) + self.obstacle * len(OBSTACLE_FEATURES)
+        further += self.contact * len(CONTACT_FEATURES)
         return len(self.chosen) or len(OWN_FEATURES) + (self.front + self.rear) * len(NEIGHBOUR_FEATURES) + further
+
+    def at_steps_of(self, time_step_s: float) -> ObservationSpec:
+        """The same for decisions every ``time_step_s`` (s), where it needs to know and does not say so itself."""
+        return replace(self, time_step_s=time_step_s) if self.contact and self.time_step_s is None else self
 
 
 Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # or a list of groups and features, or the fields
 
 
-def choose_observation(listed: Observation) -> ObservationSpec:
+def choose_observation(listed: Observation, time_step_s: float | None = None) -> ObservationSpec:
     """The observation of a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
 
-    A mapping names the fields of an ``ObservationSpec``, which is what JSON makes of one.
-    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no such list.
+    A mapping names the fields of an ``ObservationSpec``, which is what JSON makes of one. ``time_step_s`` (s) is the
+    time between two decisions; an environment knows its own, so only who observes without one gives it, for contact
+    features. Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no such list.
     """
+    spec = _spec_of(listed)
+    return spec if time_step_s is None else spec.at_steps_of(time_step_s)
+
+
+def _spec_of(listed: Observation) -> ObservationSpec:
     if isinstance(listed, ObservationSpec):
         return listed
     if isinstance(listed, Mapping):
         return _spec_of_fields(listed)
     names = listed_features(listed)
-    front, rear, role, obstacle = _reach(names)
-    usual = ObservationSpec(front, rear, role, obstacle)
+    front, rear, role, obstacle, contact = _reach(names)
+    usual = ObservationSpec(front, rear, role, obstacle, contact=contact)
     if tuple(feature.name for feature in usual.features) == names:
         return usual
-    return ObservationSpec(front, rear, role, obstacle, names)
+    return replace(usual, chosen=names)
 
 
 def _spec_of_fields(given: Mapping[str, Any]) -> ObservationSpec:
@@ -118,12 +136,12 @@ def _spec_of_fields(given: Mapping[str, Any]) -> ObservationSpec:
     return ObservationSpec(**{**given, "chosen": listed_features(chosen) if chosen else ()})
 
 
-def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool]:
-    """How far features look: neighbours in front and behind, the own place, the obstacle."""
+def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
+    """How far features look: neighbours in front and behind, the own place, the obstacle, contacts."""
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
-    return front, rear, "role" in groups, "obstacle" in groups
+    return front, rear, "role" in groups, "obstacle" in groups, "contact" in groups
 
 
 def observation_for(scenario: Scenario) -> ObservationSpec:
@@ -133,5 +151,5 @@ def observation_for(scenario: Scenario) -> ObservationSpec:
     the line and the obstacle.
     """
     if scenario.observation is not None:
-        return choose_observation(scenario.observation)
+        return choose_observation(scenario.observation, scenario.time_step_s)
     return ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)

@@ -155,11 +155,25 @@ class Manifest(_Strict):
     weights_sha256: Sha256
     manifest_sha256: Sha256  # of everything above, see ``content_sha256``
 
+    @property
+    def spec(self) -> ObservationSpec:
+        """The observation as the environment builds it; raises ``UnknownName``."""
+        spec, step = self.observation.spec, self.scenario.get("time_step_s")
+        return spec.at_steps_of(float(step)) if isinstance(step, int | float) else spec
+
     @model_validator(mode="after")
     def _one_input_per_feature(self) -> Manifest:
         features, inputs = len(self.observation.features), self.network.observation_size
         if features != inputs:
             raise ValueError(f"{features} observation features for a network that takes {inputs}")
+        return self
+
+    @model_validator(mode="after")
+    def _a_time_step_for_contacts(self) -> Manifest:
+        if any(name.startswith("contact.") for name in self.observation.features):
+            step = self.scenario.get("time_step_s")
+            if isinstance(step, bool) or not isinstance(step, int | float) or not step > 0.0:
+                raise ValueError(f"scenario: time_step_s = {step!r}; contact features need a number above 0")
         return self
 
     @model_validator(mode="after")

@@ -70,9 +70,12 @@ class Policy:
 
     @property
     def observation(self) -> ObservationSpec:
-        """What to observe for this policy: found from the names at first use, which takes as long as to act."""
+        """What to observe for this policy, at the time steps of the scenario that it was trained on.
+
+        Found from the names at first use, which takes as long as to act.
+        """
         if self._observed is None:
-            object.__setattr__(self, "_observed", self.manifest.observation.spec)
+            object.__setattr__(self, "_observed", self.manifest.spec)
         assert self._observed is not None
         return self._observed
 

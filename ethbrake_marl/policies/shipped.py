@@ -17,7 +17,7 @@ from ethbrake_marl.scenario import Scenario
 SHIPPED = "shipped"
 BUNDLE, CARD = "policy", "card.md"
 
-PolicyKind = Literal["ppo", "sac", "universal"]
+PolicyKind = Literal["ppo", "sac", "counterfactual", "universal"]
 
 _FOLDER = Path(__file__).resolve().parents[1] / "_policies"
 

@@ -74,7 +74,33 @@ OBSTACLE_FEATURES = (
     Feature("fitting_deceleration", "m/s2", 10.0, 0.0, 2.0, "own constant deceleration that ends at rest, touching it"),
 )
 
-_BUILT_IN = {"own": OWN_FEATURES, "role": ROLE_FEATURES, "obstacle": OBSTACLE_FEATURES}
+CONTACT_COMMANDS = ("brake", "coast", "drive")  # own commands that are forecast: full braking, none, full driving
+CONTACT_SIDES = ("front", "rear")  # own pairs; in front of Vehicle 1 an obstacle
+
+
+def _contact_features(command: str) -> tuple[Feature, ...]:
+    """What one forecast tells: four numbers of each own pair, then the harm of the line."""
+    held = {"brake": "braking fully", "coast": "coasting", "drive": "driving fully"}[command]
+    pairs = [
+        feature
+        for side, where in zip(CONTACT_SIDES, ("in front", "behind"), strict=True)
+        for feature in (
+            Feature(f"{command}_{side}_time", "s", 2.0, 0.0, 2.0, f"{held}: time to the first impact {where}"),
+            Feature(f"{command}_{side}_closing_speed", "m/s", 10.0, 0.0, 4.0, "its closing speed; 0 without one"),
+            Feature(f"{command}_{side}_fraction", "1", 1.0, 0.0, 1.0, "where in its decision step it falls"),
+            Feature(f"{command}_{side}_steps", "1", 10.0, 0.0, 2.0, "whole decision steps before that one"),
+        )
+    ]
+    return (
+        *pairs,
+        Feature(f"{command}_first_impact_harm", "m2/s2", 50.0, 0.0, 4.0, f"{held}: first-impact harm of the line"),
+        Feature(f"{command}_total_harm", "m2/s2", 50.0, 0.0, 4.0, f"{held}: total harm of the line"),
+    )
+
+
+CONTACT_FEATURES = tuple(feature for command in CONTACT_COMMANDS for feature in _contact_features(command))
+
+_BUILT_IN = {"own": OWN_FEATURES, "role": ROLE_FEATURES, "obstacle": OBSTACLE_FEATURES, "contact": CONTACT_FEATURES}
 _SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 
@@ -156,7 +182,7 @@ def built_in_names() -> set[str]:
 
 def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
     """What an ``observation:`` may list: groups, then single features, of these neighbours."""
-    groups = ["own", *sides, "role", "obstacle"]
+    groups = ["own", *sides, "role", "obstacle", "contact"]
     single = [f"{group}.{feature.name}" for group in groups for feature in _group(group)]
     own = [name for name, entry in FEATURES.items() if entry.of == "own"]
     each = [f"{side}.{name}" for side in sides for name, entry in FEATURES.items() if entry.of == "neighbour"]

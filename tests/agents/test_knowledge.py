@@ -18,8 +18,10 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.physics import Worlds
+from ethbrake_marl.policies.policy import save_policy
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.v2x import hidden_from
+from tests.test_contact_features import contact_policy
 
 PAPER = load_scenario("paper-random")
 BLOCKED = load_scenario("cooperation-2-blocked")
@@ -76,8 +78,8 @@ def agent_of(spec: str, scenario: Scenario = PAPER) -> Agent:
 
 
 def test_knowledge__every_agent_of_the_registry_states_it():
-    kinds = {spec.partition("@")[0].partition(":")[0] for spec in STATED}
-    assert set(agent_names()) - {"team"} <= kinds, "an agent is registered that this test does not know"
+    kinds = {spec.partition("@")[0].partition(":")[0] for spec in STATED} | {"team", "counterfactual"}
+    assert set(agent_names()) <= kinds, "an agent is registered that this test does not know"
     for spec, knows in STATED.items():
         assert knowledge_of(agent_of(spec)) == knows, spec
         if "+" not in spec and spec != "e_v2x_bm:pairwise":
@@ -176,6 +178,15 @@ def test_own_sensors_and_messages__what_was_not_received_changes_no_action(spec,
     scenario = BLOCKED.replace(v2x=channel)
     assert hidden_from(scenario.sample(60, 11).worlds.vehicles, 1).sum() > 20
     assert changed_actions(agent_of(spec, scenario), scenario) == 0
+
+
+@pytest.mark.parametrize("channel", CHANNELS, ids=str)
+def test_messages__contact_features_tell_nothing_that_was_not_received(channel, tmp_path):
+    scenario = BLOCKED.replace(v2x=channel)
+    save_policy(contact_policy(scenario.model_dump(mode="json")), tmp_path / "policy")
+    agent = agent_of(f"counterfactual@{tmp_path}", scenario)
+    assert knowledge_of(agent) == (MESSAGES,)
+    assert changed_actions(agent, scenario) == 0
 
 
 def test_own_sensors_and_messages__a_planted_leak_is_found():

@@ -95,7 +95,7 @@ def test_own_algorithm__its_class_checks_the_recipe(tmp_path: Path) -> None:
         load_recipe(_file(tmp_path, n_stepz=3))
     with pytest.raises(InvalidInput, match=r"mine.yaml, line \d+: n_steps = 2.5: must be a whole number"):
         load_recipe(_file(tmp_path, n_steps=2.5))
-    with pytest.raises(InvalidInput, match=r"algorithm = a3c: must be ppo or sac or a2c"):
+    with pytest.raises(InvalidInput, match=r"algorithm = a3c: must be ppo or sac or counterfactual or a2c"):
         load_recipe(_file(tmp_path, algorithm="a3c"))
     with pytest.raises(InvalidInput, match="scheme independent: recipe 'mine' is for A2C; it needs one for PPO"):
         train(loaded, "cooperation-3-pair", tmp_path / "run", scheme="independent")
@@ -114,7 +114,7 @@ def test_own_algorithm__its_class_checks_the_recipe(tmp_path: Path) -> None:
 def test_register__refuses_what_cannot_be_used(name: str, recipe: Any, algorithm: Any, message: str) -> None:
     with pytest.raises(InvalidInput, match=message):
         register_algorithm(name, recipe, algorithm)
-    assert algorithm_names() == ("ppo", "sac", "a2c")
+    assert algorithm_names() == ("ppo", "sac", "counterfactual", "a2c")
 
 
 def test_checkpoint__of_the_own_algorithm_that_was_changed_is_refused(tmp_path: Path) -> None:

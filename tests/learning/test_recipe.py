@@ -81,7 +81,7 @@ def test_load_recipe__the_papers_table_of_sac() -> None:
         ({"buffer_size": 63}, r"buffer_size = 63: must be at least n_envs = 128"),
         ({"n_steps": 3}, r"n_steps: unknown key"),
         ({"tau": 0.0}, r"tau = 0.*: must be greater than 0"),
-        ({"algorithm": "td3"}, r"algorithm = td3: must be ppo or sac"),
+        ({"algorithm": "td3"}, r"algorithm = td3: must be ppo or sac or counterfactual"),
     ],
 )
 def test_sac_recipe__refuses_bad_input(change: dict[str, object], message: str) -> None:

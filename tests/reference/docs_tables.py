@@ -40,6 +40,7 @@ def environment_tables() -> dict[str, str]:
     return {
         "observation": feature_table(ObservationSpec().features),
         "obstacle": feature_table(ObservationSpec(role=True, obstacle=True).features, ObservationSpec().size),
+        "contact": feature_table(ObservationSpec(contact=True).features, ObservationSpec().size),
         "state": feature_table(state_features(load_scenario("paper-random"))),
         "terms": term_table(TERMS.values()),
         "rewards": reward_table(REWARDS),

@@ -1,0 +1,149 @@
+"""Branches of running episodes: the same moment, played on to the end in more than one way.
+
+A learner's action is moved by an offset for a few steps; then the policy goes on in closed loop. What two branches
+gain differs by nothing but the offset: everything else in them is the same, to the bit.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.stream import Roster
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.observations import Observations
+from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.physics.rows import command_at, gap_at, harm_at, has_news, params_at, previous_at, speed_at
+
+ROUNDING_MPS2 = 1e-5  # a command that differs by less is the same: networks round by the size of their batch
+
+Act = Callable[[Observations], NDArray[np.float32]]  # observations [rows, F] -> actions [rows] in [-1, 1]
+
+
+class Moment(NamedTuple):
+    """Running worlds between two steps, row by row."""
+
+    state: Floats  # as rows of ``physics.rows``
+    params: Floats
+    clock: Floats
+    wanted: Floats
+
+    def take(self, rows: Ints) -> Moment:
+        """Some of the rows, or one of them several times."""
+        return Moment(*(array.take(rows, axis=0) for array in self))
+
+
+class Offsets(NamedTuple):
+    """How one learner's actions in each row differ from those of its policy."""
+
+    learner: Ints  # [n] place among the learners
+    size: Floats  # [n] added to its action, which stays in [-1, 1]
+    steps: Ints  # [n] for so many steps, at least 1
+
+
+def moment_of(engine: Engine) -> Moment:
+    """The present moment of all rows, in its own memory."""
+    return Moment(engine._state.copy(), engine._params.copy(), engine._clock.copy(), engine._wanted.copy())
+
+
+def join_moments(moments: list[Moment]) -> Moment:
+    """The rows of all of them, one after the other; all are of one engine."""
+    return Moment(*(np.concatenate(arrays) for arrays in zip(*moments, strict=True)))
+
+
+def branch(engine: Engine, moment: Moment) -> Engine:
+    """An engine of the same scenario whose rows go on from ``moment``; ``engine`` is not touched.
+
+    Raises ``InvalidInput`` for an engine with a reward that is shaped, which tells of more than what happens, or with a
+    script that remembers its episode: it has no memory of the branch.
+    """
+    if engine.reward.shaping > 0.0:
+        raise InvalidInput(f"branches: reward: shaping = {engine.reward.shaping:g}: must be 0; a branch has an end")
+    for vehicle, script in engine._remembering.items():
+        name = getattr(script, "name", type(script).__name__)
+        raise InvalidInput(
+            f"branches: vehicle_{vehicle + 1} is driven by {name!r}, which remembers its episode; only scripts whose"
+            " command is fixed at the alert can be branched, such as full_brake, coast and constant:A"
+        )
+    new = copy.copy(engine)
+    new.n, new._memories = len(moment.state), {}
+    new.roster = Roster(new.n, engine.seed, None)
+    new.roster.warns = False
+    new._state, new._params, new._clock, new._wanted = (array.copy() for array in moment)
+    new._potential = np.zeros(moment.wanted.shape)
+    return new
+
+
+def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
+    """Play every row to the end of its episode; what its learner of ``offsets`` gains, and how far it was moved.
+
+    Args:
+        engine: branches, which this changes.
+        act: drives all learners, by nothing but what is seen.
+        offsets: whose actions are moved in each row, how far, and how long.
+        gamma: discount of one time step.
+
+    Returns the return [n] of that learner from now on (NaN for a row that could not be advanced), and the sum of the
+    offsets that its actions, which stay in [-1, 1], had room for [n]. Where the reward is of harm alone, a row ends as
+    soon as nothing can change any more.
+
+    """
+    vehicles, L = np.array(engine.learners, np.int64), len(engine.learners)
+    gained, moved = np.zeros(engine.n), np.zeros(engine.n)
+    whose = vehicles[offsets.learner]
+    running, discount, most = np.flatnonzero(~engine.ended), 1.0, int(offsets.steps.max(initial=0))
+    actions = np.zeros((engine.n, L))
+    number, only_harm = 0, set(engine.reward_terms) <= {"harm"}
+    while len(running):
+        before = engine._state.take(running, axis=0)
+        seen = engine.observe_all(vehicles, running)
+        wanted = act(seen.reshape(len(running) * L, -1)).astype(np.float64).reshape(len(running), L)
+        if number < most:
+            _add(wanted, offsets, running, number, moved)
+        actions[running] = wanted
+        step = engine.step(actions)
+        gained[running] += discount * step.reward[running, whose[running]]
+        goes_on = ~engine.ended[running]
+        if only_harm and number >= most:
+            goes_on &= ~_stands_for_good(engine, before, running)
+        running = running[goes_on]
+        discount *= gamma
+        number += 1
+    gained[list(engine.roster.failed)] = np.nan
+    return gained, moved
+
+
+def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
+    """In which of ``rows`` everything stands as it stood ``before`` [rows], and the same is going to be done again.
+
+    A policy that sees the same does the same, and no latency or news is left that could change what it sees.
+    """
+    N = engine.scenario.vehicles
+    stands: Bools = (before[:, speed_at(N) : command_at(N)] == 0.0).all(axis=1)
+    some = np.flatnonzero(stands)
+    now, then, params = engine._state[rows[some]], before[some], engine._params[rows[some]]
+    same = (now[:, speed_at(N) : command_at(N)] == 0.0).all(axis=1)
+    same &= (now[:, gap_at(N) : harm_at(N)] == then[:, gap_at(N) : harm_at(N)]).all(axis=1)
+    commands = slice(command_at(N), previous_at(N))
+    same &= (np.abs(now[:, commands] - then[:, commands]) < ROUNDING_MPS2).all(axis=1)
+    latency = params[:, params_at(2, N) : params_at(3, N)]
+    news = params[:, params_at(6, N) :] if has_news(params, N) else latency
+    for known in (latency, news):
+        same &= ((known < then[:, :1]) | np.isinf(known)).all(axis=1)
+    stands[some] = same
+    return stands
+
+
+def _add(wanted: Floats, offsets: Offsets, running: Ints, number: int, moved: Floats) -> None:
+    """Add the offsets that still last to the actions ``wanted`` [running, L], and to what was ``moved`` so far."""
+    some = np.flatnonzero(number < offsets.steps[running])
+    rows = running[some]
+    before = wanted[some, offsets.learner[rows]]
+    after = np.clip(before + offsets.size[rows], -1.0, 1.0)
+    wanted[some, offsets.learner[rows]] = after
+    moved[rows] += after - before

@@ -1,0 +1,143 @@
+"""Branches: the same moment played on in several ways, against the engine itself and against a slow replay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.engine import branches
+from ethbrake_marl.engine.branches import Offsets, branch, join_moments, moment_of, play_to_the_end
+from ethbrake_marl.envs.setup import make_engine
+from ethbrake_marl.errors import InvalidInput
+
+PAIR = ["vehicle_2", "vehicle_3"]
+
+
+def act(seen):
+    """A policy whose row k depends on row k alone: more braking where the gap is small."""
+    return (seen[:, 8] - np.float32(0.9)).clip(-1.0, 1.0)
+
+
+def no_offsets(n):
+    return Offsets(np.zeros(n, np.int64), np.zeros(n), np.ones(n, np.int64))
+
+
+def step_by_policy(engine):
+    seen = engine.observe_all(np.array(engine.learners))
+    n, L, F = seen.shape
+    return engine.step(act(seen.reshape(n * L, F)).astype(np.float64).reshape(n, L))
+
+
+@pytest.mark.parametrize("learners", [["vehicle_2"], PAIR])
+def test_branch__without_an_offset_is_what_the_engine_does(learners):
+    engine = make_engine("paper-random", 6, learners=learners, seed=3)
+    moments, rewards = [], []
+    for _ in range(90):
+        moments.append(moment_of(engine))
+        rewards.append(step_by_policy(engine).reward)
+    last = len(learners) - 1
+    whole = join_moments(moments[:5])
+    offsets = Offsets(np.full(30, last), np.zeros(30), np.ones(30, np.int64))
+    before = moment_of(engine)
+    gained, moved = play_to_the_end(branch(engine, whole), act, offsets, 1.0)
+    vehicle = engine.learners[last]
+    to_come = [sum(r[:, vehicle] for r in rewards[k:]) for k in range(5)]
+    np.testing.assert_allclose(gained, np.concatenate(to_come), rtol=1e-12)
+    assert (moved == 0.0).all() and gained.min() < 0.0
+    assert all((a == b).all() for a, b in zip(before, moment_of(engine), strict=True))  # untouched
+
+
+def test_branch__discounts_from_its_own_moment_on():
+    engine = make_engine("paper-random", 4, seed=3)
+    whole = moment_of(engine)
+    rewards = np.array([step_by_policy(engine).reward[:, 1] for _ in range(90)])
+    gained, _ = play_to_the_end(branch(engine, whole), act, no_offsets(4), 0.9)
+    np.testing.assert_allclose(gained, (0.9 ** np.arange(90)) @ rewards, rtol=1e-12)
+
+
+def test_branch__moves_one_learner_for_some_steps_within_its_bounds():
+    """Each row against a world of its own that is stepped by hand."""
+    engine = make_engine("paper-random", 8, learners=PAIR, seed=5)
+    for _ in range(3):
+        step_by_policy(engine)
+    moment = moment_of(engine)
+    sizes = np.array([0.2, -0.2, 0.05, -0.3, 1.9, -1.9, 0.1, -0.1])
+    offsets = Offsets(np.array([0, 1] * 4), sizes, np.array([1, 2, 4, 1, 2, 4, 1, 2]))
+    gained, moved = play_to_the_end(branch(engine, moment), act, offsets, 1.0)
+    for k in range(8):
+        one = branch(engine, moment.take(np.array([k])))
+        total, way, number = 0.0, 0.0, 0
+        while not one.ended[0]:
+            seen = one.observe_all(np.array(one.learners))[0]
+            actions = act(seen).astype(np.float64)
+            if number < offsets.steps[k]:
+                was = actions[offsets.learner[k]]
+                actions[offsets.learner[k]] = min(max(was + sizes[k], -1.0), 1.0)
+                way += actions[offsets.learner[k]] - was
+            total += one.step(actions[np.newaxis]).reward[0, one.learners[offsets.learner[k]]]
+            number += 1
+        assert (gained[k], moved[k]) == (pytest.approx(total, rel=1e-12), way)
+    assert moved[0] == sizes[0] and (abs(moved) < abs(sizes) * offsets.steps - 0.1).any()
+
+
+def test_branch__difference_is_the_gradient_of_the_harm():
+    """Vehicle 1, at v = 20 m/s, meets an obstacle d = 1 m ahead within its first step: H = v^2 + 2 u d.
+
+    Braking at the share a of 6 m/s2 is u = 6 a, so dH/da = 12 m2/s2; the return is minus the harm.
+    """
+    scenario = eb.load_scenario("cooperation-4-all").with_learners(["vehicle_1"])
+    engine = make_engine(scenario, 1)
+    alert = eb.make_worlds(
+        [200.0, 200.0], [20.0, 0.0, 0.0], braking_capacity_mps2=6.0, driving_capacity_mps2=3.0, latency_s=0.0,
+        mass_t=5.0, restitution=0.0, obstacle_gap_m=1.0,
+    )  # fmt: skip
+    engine.reset(worlds=alert)
+    size = 1e-3
+    both = Offsets(np.zeros(2, np.int64), np.array([size, -size]), np.ones(2, np.int64))
+    half = np.float32(-0.5)
+    new = branch(engine, moment_of(engine).take(np.zeros(2, np.int64)))
+    gained, moved = play_to_the_end(new, lambda seen: np.full(len(seen), half), both, 1.0)
+    assert gained.mean() == pytest.approx(-(400.0 - 6.0))
+    assert (gained[0] - gained[1]) / (moved[0] - moved[1]) == pytest.approx(-12.0, rel=1e-6)
+
+
+def test_branch__row_that_cannot_be_advanced_tells_nothing():
+    engine = make_engine("paper-random", 3, seed=3)
+    moment = moment_of(engine)
+    moment.state[1, -1 - 5] = np.nan
+    new = branch(engine, moment)
+    new.roster.failed[1] = "a contact was missed"
+    gained, _ = play_to_the_end(new, act, no_offsets(3), 1.0)
+    assert np.isnan(gained[1]) and np.isfinite(gained[[0, 2]]).all()
+
+
+def test_branch__refuses_what_it_cannot_play():
+    shaped = make_engine("paper-random", 2, reward={"harm": 1.0, "shaping": 0.1})
+    with pytest.raises(InvalidInput, match=r"branches: reward: shaping = 0.1: must be 0"):
+        branch(shaped, moment_of(shaped))
+    scenario = eb.load_scenario("paper-random").replace(
+        early_impacts="keep", roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "planner:8"}
+    )
+    remembering = make_engine(scenario, 2)
+    with pytest.raises(InvalidInput, match="vehicle_3 is driven by 'planner:8', which remembers its episode"):
+        branch(remembering, moment_of(remembering))
+
+
+def test_branch__ends_where_nothing_can_change_any_more(monkeypatch):
+    """A policy that presses on against a standing line: the same returns, and fewer steps than to the horizon."""
+    engine = make_engine("paper-random", 30, seed=3)
+
+    def press(seen):
+        return np.where(seen[:, 0] > 0.3, np.float32(-1.0), np.float32(0.2))
+
+    offsets = Offsets(np.zeros(30, np.int64), np.full(30, 0.1), np.full(30, 2))
+    taken = []
+    for stop in (True, False):
+        if not stop:
+            monkeypatch.setattr(branches, "_stands_for_good", lambda engine, before, rows: np.zeros(len(rows), bool))
+        new = branch(engine, moment_of(engine))
+        taken.append((play_to_the_end(new, press, offsets, 1.0), new.steps.copy()))
+    (early, some), (whole, every) = taken
+    assert (early[0] == whole[0]).all() and (early[1] == whole[1]).all()
+    assert every.max() == 75 and some.max() < 75 and (some <= every).all()

@@ -1,0 +1,221 @@
+"""Contact features: what three forecasts say of the next impacts, against the recorded impacts of ``advance``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.observations import (
+    CONTACT_FEATURES,
+    ObservationSpec,
+    choose_observation,
+    contact,
+    observation_for,
+    observe,
+)
+from ethbrake_marl.observations.contact import FORECAST_S
+from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.policies.manifest import NetworkSpec, installed_versions, observation_schema
+from ethbrake_marl.policies.policy import make_policy
+
+SCENARIO = eb.load_scenario("paper-random")
+STEP_S = 0.1
+CONTACT = choose_observation(["contact"], STEP_S)
+SCALE = {f.name.removeprefix("contact."): f.scale for f in CONTACT.features}
+
+
+def seen_by(worlds, vehicle, spec=CONTACT):
+    """The features of one vehicle by name, before scaling, [n] each."""
+    values = observe(worlds, vehicle, spec)
+    return {f.name.removeprefix("contact."): values[:, c] * f.scale for c, f in enumerate(spec.features)}
+
+
+def line(gaps, speeds, **changes):
+    setting = {
+        "braking_capacity_mps2": [6.0, 7.0, 6.0], "driving_capacity_mps2": 3.0, "latency_s": [0.0, 0.5, 0.8],
+        "mass_t": [4.5, 5.5, 5.9], "restitution": 0.1,
+    }  # fmt: skip
+    return make_worlds(gaps, speeds, **{**setting, **changes})
+
+
+def test_contact__by_hand():
+    """The middle one coasts behind one that brakes at 4 m/s2: 2 t + 2 t^2 = 3 m, closing at sqrt(4 + 2 * 4 * 3)."""
+    worlds = line([3.0, 30.0], [20.0, 22.0, 20.0], latency_s=0.0, braking_capacity_mps2=[4.0, 7.0, 6.0])
+    worlds, _ = advance(worlds, [-4.0, 0.0, -6.0], duration_s=0.0)
+    seen = seen_by(worlds, 1)
+    contact_s = (-2.0 + math.sqrt(4.0 + 2 * 4.0 * 3.0)) / 4.0
+    assert seen["coast_front_time"][0] == pytest.approx(contact_s, rel=1e-6)
+    assert seen["coast_front_closing_speed"][0] == pytest.approx(math.sqrt(28.0), rel=1e-6)
+    assert seen["coast_front_steps"][0] == pytest.approx(8)
+    assert seen["coast_front_fraction"][0] == pytest.approx(contact_s / 0.1 - 8, rel=1e-4)
+    assert seen["coast_first_impact_harm"][0] == pytest.approx(28.0, rel=1e-5)
+    assert seen["brake_front_closing_speed"][0] == 0.0 and seen["brake_front_fraction"][0] == 0.0
+    assert seen["brake_front_time"][0] == 4.0 and seen["brake_front_steps"][0] == 20.0  # clipped: there is none
+
+
+def expected(worlds, vehicle, own_mps2, others_mps2, step_s=STEP_S):
+    """The same of one forecast, from the impacts that ``advance`` records."""
+    command = others_mps2.copy()
+    command[:, vehicle] = own_mps2
+    impacts = advance(worlds, command, duration_s=FORECAST_S, record=True)[1]
+    rows, told = impacts.rows, {}
+    for side, pair in (("front", vehicle - 1), ("rear", vehicle)):
+        for k in range(worlds.n):
+            at = np.flatnonzero((rows.world == k) & (rows.pair == pair))
+            time = rows.time_s[at[0]] - worlds.time_s[k] if len(at) else FORECAST_S
+            whole = max(math.ceil(time / step_s) - 1, 0)
+            told.setdefault(f"{side}_time", []).append(time)
+            told.setdefault(f"{side}_closing_speed", []).append(rows.closing_speed_mps[at[0]] if len(at) else 0.0)
+            told.setdefault(f"{side}_fraction", []).append(time / step_s - whole if len(at) else 0.0)
+            told.setdefault(f"{side}_steps", []).append(whole)
+    told["first_impact_harm"] = impacts.first_impact_harm.sum(axis=1) + impacts.obstacle_first_harm
+    told["total_harm"] = impacts.total_harm.sum(axis=1) + impacts.obstacle_total_harm
+    return told
+
+
+def check(worlds, vehicle, others_mps2, step_s=STEP_S, skip=()):
+    spec = choose_observation(["contact"], step_s)
+    seen, v = seen_by(worlds, vehicle, spec), worlds.vehicles
+    own = {"brake": -v.braking_capacity_mps2[:, vehicle], "coast": 0.0, "drive": v.driving_capacity_mps2[:, vehicle]}
+    bounds = {f.name.removeprefix("contact."): (f.low * f.scale, f.high * f.scale) for f in spec.features}
+    for command, own_mps2 in own.items():
+        for name, wanted in expected(worlds, vehicle, own_mps2, others_mps2, step_s).items():
+            if not name.startswith(tuple(skip)):
+                full = f"{command}_{name}"
+                np.testing.assert_allclose(seen[full], np.clip(wanted, *bounds[full]), rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("until_s", [0.8, 1.3, 2.1])
+def test_contact__is_what_advance_records(until_s):
+    start = SCENARIO.sample(60, 3).worlds
+    v = start.vehicles
+    command = np.column_stack([-v.braking_capacity_mps2[:, 0], np.full(60, -4.0), -v.braking_capacity_mps2[:, 2]])
+    worlds, _ = advance(start, command, until_s=until_s)
+    assert worlds.pair_hit.any() == (until_s > 1.0)  # a pair that has met may meet again
+    check(worlds, 1, command)
+    check(worlds, 1, command, step_s=0.04)
+
+
+def test_contact__others_go_on_as_they_are_seen_and_brake_fully_where_nothing_is_seen_yet():
+    start = SCENARIO.sample(40, 3).worlds
+    early, _ = advance(start, np.column_stack([np.full(40, -3.0), np.zeros(40), np.full(40, -2.0)]), until_s=0.5)
+    assert (early.command_mps2[:, 2] == 0.0).all()  # its latency of 0.8 s has not elapsed
+    check(early, 1, np.column_stack([np.full(40, -3.0), np.zeros(40), -early.vehicles.braking_capacity_mps2[:, 2]]))
+    late, _ = advance(early, np.column_stack([np.full(40, -3.0), np.zeros(40), np.full(40, -2.0)]), until_s=1.0)
+    check(late, 1, np.column_stack([np.full(40, -3.0), np.zeros(40), np.full(40, -2.0)]))
+
+
+def test_contact__sees_the_obstacle_and_vehicle_1_meets_it_in_front():
+    scenario = eb.load_scenario("cooperation-4-all")
+    start = scenario.sample(40, 5).worlds
+    worlds, _ = advance(start, -start.vehicles.braking_capacity_mps2, until_s=1.0)
+    others = -worlds.vehicles.braking_capacity_mps2
+    check(worlds, 0, others, skip=["front"] if worlds.N < 2 else [])
+    check(worlds, 1, others)
+    near = line([8.0, 40.0], [20.0, 18.0, 15.0], latency_s=0.0, obstacle_gap_m=20.0)
+    front = seen_by(near, 0)
+    assert front["brake_front_time"][0] == pytest.approx((20 - math.sqrt(400 - 240)) / 6, rel=1e-5)
+    assert front["brake_front_closing_speed"][0] == pytest.approx(math.sqrt(160.0), rel=1e-5)
+
+
+def test_contact__hides_whom_no_news_has_come_from():
+    before = line([7.0, 7.0], [20.0, 18.0, 20.0])
+    assert all((values == 0.0).all() for values in seen_by(before, 1).values())  # at the alert it knows of nobody
+    first, last = seen_by(before, 0), seen_by(before, 2)
+    assert (first["brake_front_time"] == 0.0).all() and (first["brake_rear_time"] > 0.0).all()
+    assert all((values == 0.0).all() for values in last.values())
+
+    scenario = SCENARIO.replace(v2x="blocked", horizon_s=20, early_impacts="keep")
+    worlds = advance(scenario.sample(300, 1).worlds, np.zeros((300, 3)), until_s=0.6)[0]
+    news = worlds.vehicles.known_from_s[:, 1] <= 0.6
+    seen = seen_by(worlds, 1)
+    assert news[:, 0].any() and not news[:, 0].all() and not news[:, 2].all()
+    assert ((seen["coast_front_time"] > 0.0) == news[:, 0]).all()
+    assert ((seen["coast_rear_time"] > 0.0) == news[:, 2]).all()
+    alone = ~news[:, 0] & ~news[:, 2]
+    assert (seen["drive_total_harm"][alone] == 0.0).all() and alone.any()
+
+
+def test_contact__nothing_of_the_unknown_part_of_the_line_shows():
+    """Whatever an unheard vehicle does, the features of the others are the same to the bit."""
+    scenario = SCENARIO.replace(v2x="blocked", horizon_s=20, early_impacts="keep")
+    worlds = advance(scenario.sample(300, 1).worlds, np.zeros((300, 3)), until_s=0.6)[0]
+    unheard = worlds.vehicles.known_from_s[:, 1, 2] > 0.6
+    speeds = worlds.speeds_mps.copy()
+    speeds[unheard, 2] = 39.0
+    changed = replace(worlds, speeds_mps=speeds)
+    assert observe(changed, 1, CONTACT)[unheard].tobytes() == observe(worlds, 1, CONTACT)[unheard].tobytes()
+
+
+def test_contact__of_some_commands_only_is_the_same():
+    worlds = advance(SCENARIO.sample(20, 3).worlds, np.zeros((20, 3)), until_s=0.8)[0]
+    some = ["contact.brake_rear_fraction", "own.speed", "contact.drive_total_harm"]
+    whole = dict(zip([f.name for f in CONTACT.features], observe(worlds, 1, CONTACT).T, strict=True))
+    picked = observe(worlds, 1, choose_observation(some, STEP_S))
+    assert picked[:, 0].tobytes() == whole[some[0]].tobytes() and picked[:, 2].tobytes() == whole[some[2]].tobytes()
+
+
+def test_contact__leaves_other_features_alone_in_every_interface():
+    groups = ["own", "front_1", "rear_1", "contact"]
+    declared = SCENARIO.replace(observation=groups)
+    assert observation_for(declared) == ObservationSpec(contact=True, time_step_s=0.1)
+    plain, more = (eb.make_sb3_vec_env(s, 6, seed=3) for s in (SCENARIO, declared))
+    seen, wider = plain.reset(), more.reset()
+    assert wider.shape == (6, 27 + len(CONTACT_FEATURES))
+    assert wider[:, :27].tobytes() == seen.tobytes()
+    env = eb.parallel_env(scenario=declared)
+    assert env.reset(seed=3)[0]["vehicle_2"].tobytes() == wider[0].tobytes()
+    listed = eb.make_sb3_vec_env(SCENARIO, 6, seed=3, observation=groups)
+    assert listed.reset().tobytes() == wider.tobytes()
+
+
+def test_contact__needs_the_time_step():
+    worlds = SCENARIO.sample(2, 1).worlds
+    with pytest.raises(InvalidInput, match="contact features need the time between two decisions"):
+        observe(worlds, 1, choose_observation(["own", "contact"]))
+    with pytest.raises(InvalidInput, match=r"time_step_s = -1\.0; must be a positive number"):
+        ObservationSpec(contact=True, time_step_s=-1.0)
+    assert choose_observation(["own"], 0.1).time_step_s is None  # nothing that depends on it
+
+
+def contact_policy(scenario):
+    """An untrained policy that observes contacts."""
+    spec = choose_observation(["own", "contact"])
+    network = NetworkSpec(
+        observation_size=spec.size, action_size=1, policy_hidden=(4,), value_hidden=(), activation="relu", output="clip"
+    )
+    draw = np.random.default_rng(0)
+    shapes = {
+        "policy.0.weight": (4, spec.size), "policy.0.bias": (4,), "policy.output.weight": (1, 4),
+        "policy.output.bias": (1,), "policy.log_std": (1,),
+    }  # fmt: skip
+    tensors = {name: draw.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+    return make_policy(
+        tensors, algorithm="counterfactual", network=network, observation=observation_schema(spec),
+        learners=("vehicle_2",), scenario=scenario, reward={}, seeds={}, steps=0, versions=installed_versions(),
+    )  # fmt: skip
+
+
+def test_policy__observes_contacts_at_the_steps_of_its_training():
+    policy = contact_policy(SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"))
+    assert policy.observation == choose_observation(["own", "contact"], 0.05)
+    outcome = eb.evaluate(SCENARIO.sample(5, 7), {"mine": LearnedAgent(policy)}, scenario=SCENARIO).outcome("mine")
+    assert np.isfinite(outcome.total_harm).all()
+    with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
+        contact_policy({})
+
+
+def test_contact__failed_forecast_names_its_world(monkeypatch):
+    def fail(*arguments):
+        arguments[-1][1] = True
+
+    monkeypatch.setattr(contact, "_observe_contacts", fail)
+    worlds = SCENARIO.sample(3, 1).worlds
+    with pytest.raises(PhysicsError, match="world 1: a forecast of contacts could not look 10 s ahead"):
+        observe(worlds, 1, CONTACT)
