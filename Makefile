@@ -27,7 +27,7 @@ if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for th
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -41,6 +41,7 @@ help:
 	@echo "make test-light       install the wheel alone: at most 650 MB, no torch, and its examples run"
 	@echo "make test-libraries   train with other people's libraries, each in its own environment below .venvs/, and print the matrix"
 	@echo "make shield-bugs      plant 19 bugs in copies of the shield; each must turn a test red"
+	@echo "make test-bounds      the tests at the lowest versions that pyproject.toml allows, and at the newest"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
 	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of the physics (ARGS='--modules rewards,v2x --sample 40': of others)"
@@ -124,6 +125,10 @@ test-shield: $(STAMP)
 test-light: $(STAMP)
 	@echo "== the wheel alone in an empty environment: size, and what it must do without torch"
 	@$(BIN)/python -m tests.wheel $(ARGS)
+
+test-bounds: $(STAMP)
+	@echo "== the lowest and the highest versions"
+	@$(BIN)/python -m tests.programme.bounds $(ARGS)
 
 test-order: $(STAMP)
 	@echo "== the suite in random orders"

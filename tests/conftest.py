@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,18 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # No deadline: the first example of a property pays for the kernel's compilation.
 settings.register_profile("deterministic", derandomize=True, deadline=None, database=None, print_blob=True)
 settings.load_profile("deterministic")
+
+
+@pytest.fixture(autouse=True)
+def _own_user_files() -> Iterator[None]:
+    """What a test ran of users' files is no part of the versions that the next test's results tell."""
+    plugins = sys.modules.get("ethbrake_marl.files.plugins")
+    before = {} if plugins is None else dict(plugins._RUN)
+    yield
+    plugins = sys.modules.get("ethbrake_marl.files.plugins")
+    if plugins is not None and plugins._RUN != before:
+        plugins._RUN.clear()
+        plugins._RUN.update(before)
 
 
 @pytest.fixture(autouse=True)

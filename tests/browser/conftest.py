@@ -25,9 +25,9 @@ def chromium_path() -> str | None:
     return named or next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """One browser for all tests."""
+    """One browser for the tests of a module: while it is open, its event loop runs, and other tests have their own."""
     api = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install 'ethbrake-marl[dev]'")
     path = chromium_path()
     if path is None:

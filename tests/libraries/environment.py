@@ -27,13 +27,13 @@ def ready_python(name: str, library: Library) -> Path:
     wanted = _fingerprint(library)
     if stamp.is_file() and stamp.read_text("utf-8") == wanted:
         return python
-    uv = _find_uv()
-    _call([uv, "venv", "--quiet", "--clear", "--python", sys.executable, str(folder)])
+    uv = find_uv()
+    call_uv([uv, "venv", "--quiet", "--clear", "--python", sys.executable, str(folder)])
     install = [uv, "pip", "install", "--quiet", "--python", str(python)]
-    _install_torch(install)
+    install_torch(install)
     overrides = folder / "overrides.txt"
     overrides.write_text("\n".join((TORCH, *library.overrides)), "utf-8")
-    _call([*install, "--override", str(overrides), "-e", str(ROOT), TORCH, *library.requires])
+    call_uv([*install, "--override", str(overrides), "-e", str(ROOT), TORCH, *library.requires])
     stamp.write_text(wanted, "utf-8")
     return python
 
@@ -44,7 +44,7 @@ def _fingerprint(library: Library) -> str:
     return hashlib.sha256(repr(told).encode()).hexdigest()
 
 
-def _find_uv() -> str:
+def find_uv() -> str:
     beside = Path(sys.executable).parent / "uv"
     found = str(beside) if beside.is_file() else shutil.which("uv")
     if found is None:
@@ -52,18 +52,18 @@ def _find_uv() -> str:
     return found
 
 
-def _install_torch(install: list[str]) -> None:
+def install_torch(install: list[str]) -> None:
     """The build for this machine from where torch publishes them; where that is out of reach, what the index has."""
     own = [] if os.environ.get("UV_FIND_LINKS") or os.environ.get("PIP_FIND_LINKS") else ["--torch-backend", "auto"]
     try:
-        _call([*install, *own, "--no-deps", TORCH])
+        call_uv([*install, *own, "--no-deps", TORCH])
     except NotInstalled:
         if not own:
             raise
-        _call([*install, "--no-deps", TORCH])
+        call_uv([*install, "--no-deps", TORCH])
 
 
-def _call(command: list[str]) -> None:
+def call_uv(command: list[str]) -> None:
     """Run uv where pip's own settings hold too; raises ``NotInstalled`` with the line that says what is wrong."""
     given = {"UV_HTTP_TIMEOUT": "60", "UV_HTTP_RETRIES": "1", **os.environ}
     if "PIP_FIND_LINKS" in given:
