@@ -42,7 +42,7 @@ def _own_user_files() -> Iterator[None]:
     before = {} if plugins is None else dict(plugins._RUN)
     yield
     plugins = sys.modules.get("ethbrake_marl.files.plugins")
-    if plugins is not None and plugins._RUN != before:
+    if plugins is not None and before != plugins._RUN:
         plugins._RUN.clear()
         plugins._RUN.update(before)
 

@@ -1,9 +1,9 @@
 """The tests at the lowest versions that ``pyproject.toml`` allows, and at the newest that resolve.
 
-``make test-bounds`` (or ``python -m tests.programme.bounds [lowest highest] [--python PATH] [--tests PATH ...]``). Makes
-one environment below ``.venvs/`` for each resolution and each Python, installs the project with what it needs to train
-and to be tested, and runs pytest there. Prints one line for each. What cannot be installed is skipped with a clear
-word. Exits with status 1 when tests have failed.
+``make test-bounds`` (or ``python -m tests.programme.bounds [lowest highest] [--python PATH] [--tests PATH ...]``)
+makes one environment below ``.venvs/`` for each resolution and each Python, installs the project with what it needs to
+train and to be tested, and runs pytest there. Prints one line for each. What cannot be installed is skipped with a
+clear word. Exits with status 1 when tests have failed.
 """
 
 from __future__ import annotations
