@@ -63,7 +63,7 @@ def page(title: str, sections: Sequence[Section], *, lead: str = "", served: boo
 
     """
     styles, script = _own_code(sections)
-    names = _anchors([section.title for section in sections])
+    names = anchors([section.title for section in sections])
     whole = render(
         "page.html.j2",
         title=title,
@@ -102,6 +102,15 @@ def paragraph(text: str, kind: str = "") -> Part:
     return Part(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
 
 
+def anchors(titles: Sequence[str]) -> list[str]:
+    """The name of each section of a page with these titles, for links: of letters and digits, no two alike."""
+    found: list[str] = []
+    for k, title in enumerate(titles):
+        name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
+        found.append(f"{name}-{k + 1}" if name in found or not name else name)
+    return found
+
+
 @cache
 def read_file(name: str) -> str:
     """A file of this folder, as text."""
@@ -137,12 +146,3 @@ def _source(text: str) -> str:
     if not text:
         return "'none'"
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-
-
-def _anchors(titles: Sequence[str]) -> list[str]:
-    """A name for each section, of letters and digits, no two alike."""
-    found: list[str] = []
-    for k, title in enumerate(titles):
-        name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
-        found.append(f"{name}-{k + 1}" if name in found or not name else name)
-    return found

@@ -37,15 +37,23 @@ def table(head: Sequence[object], rows: Iterable[Row], *, caption: str = "") -> 
         caption: what the table is.
 
     """
+    rows = list(rows)
     lines = [Markup('<div class="wide" tabindex="0" role="region" aria-label="{}"><table>').format(
         shown(caption or f"Table: {head[0]}")
     )]  # fmt: skip
     lines += [Markup("<caption>{}</caption>").format(shown(caption))] if caption else []
-    headings = Markup("").join(Markup('<th scope="col">{}</th>').format(_text(each)) for each in head)
+    headings = Markup("").join(_heading(text, k, rows) for k, text in enumerate(head))
     lines += [Markup("<thead><tr>{}</tr></thead>").format(headings), Markup("<tbody>")]
     lines += [_row(row, len(head)) for row in rows]
     lines.append(Markup("</tbody></table></div>\n"))
     return Part(Markup("\n").join(lines))
+
+
+def _heading(text: object, column: int, rows: Sequence[Row]) -> Markup:
+    """The heading of a column, above its words where it has some."""
+    cells = [row[column] for row in rows if not isinstance(row, Block)]
+    words = any(isinstance(cell, Cell) and cell.words for cell in cells)
+    return Markup('<th scope="col"{}>{}</th>').format(Markup(' class="words"') if words else Markup(), _text(text))
 
 
 def _row(row: Row, columns: int) -> Markup:

@@ -14,6 +14,9 @@ from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.figures.run import harm_against_total_gap
 from ethbrake_marl.pages.report import Report, ReportFigure, focus_of, play_for_report, write_report
 from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.studies.reproduction.item import Settings
+from ethbrake_marl.studies.reproduction.items import choose_items
+from ethbrake_marl.studies.reproduction.run import reproduce
 from tests.browser.conftest import AGENTS
 from tests.pages.hostile import HOSTILE
 from tests.pages.test_frame import whole_page
@@ -25,7 +28,26 @@ MOST_MS = 2_000
 
 @pytest.mark.parametrize("width", [360, 500, 768, 1440])
 def test_report__never_scrolls_sideways(open_page: Open, report_file: Path, width: int) -> None:
-    page = open_page(report_file, width=width)
+    check_width(open_page(report_file, width=width), width)
+
+
+@pytest.mark.parametrize("width", [360, 1440])
+def test_reproduction__never_scrolls_sideways(open_page: Open, reproduction_file: Path, width: int) -> None:
+    page = open_page(reproduction_file, width=width)
+    check_width(page, width)
+    assert page.evaluate("document.querySelectorAll('svg').length") == 3
+
+
+@pytest.fixture(scope="module")
+def reproduction_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of three items of the paper made again in few worlds."""
+    settings = Settings("quick", tmp_path_factory.mktemp("reproduction") / "out", 10)
+    reproduce(choose_items(["harm-distance", "accelerations", "gaps"]), settings)
+    return settings.folder / "index.html"
+
+
+def check_width(page: Any, width: int) -> None:
+    """Nothing stands outside a page whose every part is open."""
     page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
     assert page.evaluate("document.documentElement.scrollWidth") == width
     outside = page.evaluate(

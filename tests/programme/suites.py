@@ -134,6 +134,27 @@ ABLATION = Suite(
     preloaded=(*SCIENCE, *TORCH),
 )
 
+OF_ITEMS = ("tests/studies/reproduction/test_items.py",)
+REPRODUCTION = Suite(
+    files=("studies/reproduction/*.py",),
+    quick={
+        "studies/reproduction/verdicts.py": ("tests/studies/reproduction/test_verdicts.py",),
+        "studies/reproduction/printed.py": ("tests/studies/reproduction/test_printed.py",),
+        "studies/reproduction/folder.py": ("tests/studies/reproduction/test_folder.py",),
+        "studies/reproduction/item.py": ("tests/studies/reproduction/test_folder.py", *OF_ITEMS),
+        "studies/reproduction/run.py": (
+            "tests/studies/reproduction/test_folder.py",
+            "tests/studies/reproduction/test_full.py",
+        ),
+        "studies/reproduction/curves.py": ("tests/studies/reproduction/test_full.py", *OF_ITEMS),
+        "studies/reproduction/trainings.py": ("tests/studies/reproduction/test_full.py",),
+    },
+    otherwise=OF_ITEMS,
+    whole=("tests/studies/reproduction", "tests/test_reproduction_page.py", "tests/cli/test_reproduce.py"),
+    left_out=frozenset({"__init__.py", "page.py", "markdown.py", "register.py"}),  # pages, and what the paper says
+    preloaded=SCIENCE,
+)
+
 TABLES = ("tests/evaluation/test_table.py", "tests/evaluation/test_rollout.py")
 EVALUATION = Suite(
     files=(
@@ -206,6 +227,7 @@ SUITES = {
     "v2x": V2X,
     "engine": ENGINE,
     "ablation": ABLATION,
+    "reproduction": REPRODUCTION,
     "evaluation": EVALUATION,
     "learning": LEARNING,
 }

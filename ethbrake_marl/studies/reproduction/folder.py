@@ -172,6 +172,9 @@ def checked_result(content: Json, where: str) -> Json:
     for name, keys in _PARTS.items():
         for each in content[name]:
             _check_keys(each, keys, f"{where}: {name}")
+    for table in content["tables"]:
+        if {len(row) for row in table["rows"]} - {len(table["head"])} or not table["head"]:
+            raise _damaged(f"{where}: tables: rows")
     return content
 
 
@@ -180,7 +183,11 @@ def _check_keys(content: Json, keys: Mapping[str, TypeAdapter[Any]], where: str)
         try:
             kind.validate_python(content.get(key), strict=True)
         except ValidationError:
-            raise InvalidInput(f"{where}: {key}: is not what a reproduction writes; make it again (--force)") from None
+            raise _damaged(f"{where}: {key}") from None
+
+
+def _damaged(where: str) -> InvalidInput:
+    return InvalidInput(f"{where}: is not what a reproduction writes; make it again (--force)")
 
 
 def read_figure(folder: ReproductionFolder, name: str, stem: str, ending: str) -> bytes:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import base64
+import re
 from collections.abc import Sequence
+from urllib.parse import quote
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
-from ethbrake_marl.errors import plain_text
+from ethbrake_marl.pages.frame import Part, Section, anchors, page, paragraph, shown
+from ethbrake_marl.pages.parts import Cell, facts, opened, table
+from ethbrake_marl.pages.vector import kept_drawing
 from ethbrake_marl.studies.reproduction.folder import Json, ReproductionFolder, read_figure
 from ethbrake_marl.studies.reproduction.verdicts import TOLERANCE
 
-_TEMPLATE = "page.html.j2"
 TITLE = "The paper, made again"
 LEAD = (
     "Every figure and table of How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning, with the"
@@ -19,30 +21,76 @@ LEAD = (
     f" two lists of worlds or {100.0 * TOLERANCE:g} % of what is printed, and cannot agree where a bound that holds for"
     " every strategy excludes it. Statements are those of the paper's text; its figures hold no printed numbers."
 )
+_OVERVIEW = "Overview"
+_INTERVAL = re.compile(r"(.*) \[([^][]*)\]")
+_NUMBER = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
 def render_page(folder: ReproductionFolder, results: Sequence[Json]) -> str:
-    """The page as HTML; whatever the results say is shown as text."""
-    environment = Environment(
-        loader=PackageLoader("ethbrake_marl.studies.reproduction", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        finalize=_as_text,
-    )
-    sources = {
-        each["stem"]: _source(folder, result["name"], each["stem"]) for result in results for each in result["figures"]
+    """The page as HTML; whatever the results say is shown as text.
+
+    Raises ``InvalidInput`` for a figure that is not there or holds more than a figure of ours does.
+    """
+    _, *names = anchors([_OVERVIEW, *(result["title"] for result in results)])
+    rows = [
+        [Markup('<a href="#{}">{}</a>').format(name, shown(result["title"])), _verdict(result["verdict"])]
+        for name, result in zip(names, results, strict=True)
+    ]
+    overview = Section(_OVERVIEW, [table(["Item", "Verdict"], rows, caption="Verdict on each item")])
+    return page(TITLE, [overview, *(_section(folder, result) for result in results)], lead=LEAD)
+
+
+def _section(folder: ReproductionFolder, result: Json) -> Section:
+    body: list[str | Part] = [result["what"], _account(result), *result["notes"]]
+    body += [_figure(folder, result["name"], each) for each in result["figures"]]
+    for each in result["tables"]:
+        body.append(table(each["head"], _rows(each["rows"]), caption=each["title"]))
+        body += [paragraph(each["note"], "quiet")] if each["note"] else []
+    compared = [[each["what"], _verdict(each)] for each in result["comparisons"]]
+    comparisons = table(["What", "Verdict"], compared, caption="Comparisons with the paper")
+    body.append(opened(f"Comparisons: {len(compared)}", [comparisons]))
+    rows = [[p["name"], Cell(p["value"], words=True), Cell(p["origin"], words=True)] for p in result["parameters"]]
+    parameters = table(["Parameter", "Value", "Origin"], rows, caption="What shapes the item")
+    body.append(opened(f"Parameters: {len(rows)}", [parameters]))
+    return Section(result["title"], body)
+
+
+def _account(result: Json) -> Part:
+    """Verdict, labels of the paper, and where the data are."""
+    code, link = Markup("<code>{}</code>"), Markup('<a href="./{}/{}">{}</a>')
+    labels = [code.format(shown(label)) for label in result["labels"]]
+    name = result["name"]
+    data = [link.format(quote(name, ""), quote(file, ""), shown(f"{name}/{file}")) for file in result["data"]]
+    found = {
+        "Verdict": Markup("<strong>{}</strong>").format(shown(result["verdict"]["outcome"])),
+        "Because": result["verdict"]["because"],
+        "In the paper's source": Markup(", ").join(labels),
+        "Data": Markup(", ").join(data),
     }
-    return environment.get_template(_TEMPLATE).render(title=TITLE, lead=LEAD, results=results, sources=sources)
+    return facts({name: value for name, value in found.items() if value})
 
 
-def _as_text(value: object) -> object:
-    """What the template shows: nothing in a text turns the line around or moves a cursor."""
-    return plain_text(value, keep="\u00a0") if isinstance(value, str) else value
+def _figure(folder: ReproductionFolder, name: str, each: Json) -> Part:
+    svg = read_figure(folder, name, each["stem"], ".svg")
+    return kept_drawing(svg, each["title"], each["text"], str(folder.figure(name, each["stem"], ".svg")))
 
 
-def _source(folder: ReproductionFolder, name: str, stem: str) -> str:
-    """A figure as a data URI: a picture, whose own scripts and links a browser does not follow."""
-    encoded = base64.b64encode(read_figure(folder, name, stem, ".svg")).decode("ascii")
-    return f"data:image/svg+xml;base64,{encoded}"
+def _verdict(verdict: Json) -> Cell:
+    """The outcome, and the numbers that it follows from below it."""
+    return Cell(verdict["outcome"], verdict["because"], words=True)
+
+
+def _rows(rows: Sequence[Sequence[str]]) -> list[list[str | Cell]]:
+    """Rows of a page's table: intervals below their values, and columns of more than numbers as words."""
+    split = [[_cell(text) for text in row] for row in rows]
+    words = [not all(_NUMBER.fullmatch(str(cell.value)) for cell in column) for column in zip(*split, strict=True)]
+    return [
+        [row[0], *(cell._replace(words=wordy) for cell, wordy in zip(cells[1:], words[1:], strict=True))]
+        for row, cells in zip(rows, split, strict=True)
+    ]
+
+
+def _cell(text: str) -> Cell:
+    """A value, and its interval below it."""
+    match = _INTERVAL.fullmatch(text)
+    return Cell(match[1], match[2]) if match else Cell(text)

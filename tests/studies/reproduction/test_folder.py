@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,11 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.reproduction import Line, lines_figure
 from ethbrake_marl.studies.reproduction.folder import ReproductionFolder, open_folder, read_results
-from ethbrake_marl.studies.reproduction.item import Drawn, Settings
+from ethbrake_marl.studies.reproduction.item import Drawn, Settings, Table
 from ethbrake_marl.studies.reproduction.markdown import docs_page, write_docs
+from ethbrake_marl.studies.reproduction.page import render_page
 from ethbrake_marl.studies.reproduction.run import reproduce
+from tests.pages.hostile import Page
 
 from .conftest import HOSTILE, made, planted
 
@@ -36,10 +39,35 @@ def test_reproduce__writes_figures_data_results_and_one_page(settings: Settings)
     names = sorted(path.name for path in (settings.folder / "gaps").iterdir())
     assert names == ["a-figure.png", "a-figure.svg", "data.csv", "result.json"]
     page = (settings.folder / "index.html").read_text("utf-8")
-    assert "data:image/svg+xml;base64," in page
-    assert "http://" not in page and "https://" not in page and "<script" not in page
-    assert "prefers-color-scheme: dark" in page
+    assert page.count("<svg") == 1 and "var(--series-0)" in page and "<img" not in page and "<script" not in page
+    assert re.search(r"https?://", re.sub(r'xmlns(:\w+)?="[^"]*"', "", page)) is None
     assert hidden(settings.folder) == []
+
+
+def test_page__tells_everything_that_a_result_holds(settings: Settings) -> None:
+    told = replace(
+        made(), tables=(Table("A table", ("Who", "Harm"), (("PPO", "1.50 [1.25, 1.75]"),), "Of 24 worlds."),)
+    )
+    (result,), _ = reproduce([planted("gaps", lambda s: told)], settings)
+    page = Page((settings.folder / "index.html").read_text("utf-8"))
+    assert page.open == []
+    for text in ("A table", "PPO 1.50 1.25, 1.75", "Of 24 worlds.", "What it is.", "label", "Comparisons: 1"):
+        assert text in page.text
+    assert result["verdict"]["because"] in page.text and "stated in the paper (told)" in page.text
+    links = [attributes["href"] for tag, attributes in page.tags if tag == "a"]
+    assert "./gaps/data.csv" in links and links.count("#a-title") == 1
+    around = [attributes.get("class") for tag, attributes in page.tags if tag == "div"]
+    assert around.count("wide") == sum(tag == "table" for tag, _ in page.tags) == 4
+
+
+def test_page__no_name_of_a_result_leads_elsewhere(settings: Settings) -> None:
+    reproduce([planted("gaps", lambda s: made())], settings)
+    file = settings.folder / "gaps" / "result.json"
+    content = json.loads(file.read_text()) | {"name": "javascript:alert(1)", "data": ["//x", '" onclick="']}
+    page = Page(render_page(ReproductionFolder(settings.folder), [content]))
+    links = [attributes["href"] for tag, attributes in page.tags if tag == "a"]
+    assert links[-2:] == ["./javascript%3Aalert%281%29/%2F%2Fx", "./javascript%3Aalert%281%29/%22%20onclick%3D%22"]
+    assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
 
 
 def test_reproduce__keeps_what_is_there_and_makes_it_again_by_force(settings: Settings) -> None:
@@ -117,10 +145,36 @@ def test_figures__a_stem_that_is_no_plain_name_is_refused(settings: Settings, st
 
 
 @pytest.mark.parametrize(
+    "inside",
+    [
+        "<script>alert(1)</script>",
+        '<g onload="alert(1)"/>',
+        '<g style="onload: alert(1)"/>',
+        '<use href="#x"/>',
+        '<use xmlns:l="http://www.w3.org/1999/xlink" l:href="https://example.org/x.svg#x"/>',
+        '<path fill="url(https://example.org/x)"/>',
+        '<path style="fill: URL(https://example.org/x)"/>',
+        "<foreignObject/>",
+        '<g xmlns="http://www.w3.org/1999/xhtml"/>',
+        "<g>",
+        "<g>" * 20_000 + "</g>" * 20_000,
+    ],
+)
+def test_page__a_figure_that_is_none_of_ours_is_refused(settings: Settings, inside: str) -> None:
+    results, _ = reproduce([planted("gaps", lambda s: made(figures=(drawn(),)))], settings)
+    file = settings.folder / "gaps" / "a-figure.svg"
+    file.write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{inside}</svg>')
+    with pytest.raises(InvalidInput, match=r"a-figure\.svg: is not a figure as it was drawn"):
+        render_page(ReproductionFolder(settings.folder), results)
+
+
+@pytest.mark.parametrize(
     "change",
     [
         {"tables": "x"},
         {"tables": [{"title": "t", "head": ["h"], "rows": [[1]], "note": ""}]},
+        {"tables": [{"title": "t", "head": ["h"], "rows": [["a"], []], "note": ""}]},
+        {"tables": [{"title": "", "head": [], "rows": [], "note": ""}]},
         {"verdict": {}},
         {"figures": [1]},
         {"figures": [{"stem": 7, "title": "t", "text": "t"}]},
