@@ -68,7 +68,7 @@ def test_results__say_worlds_scenario_policy_and_versions() -> None:
     assert braking["scenario_sha256"] == scenario_sha256(SCENARIO)
     assert braking["policy_sha256"] == {}
     assert learned["policy_sha256"] == {"vehicle_2": eb.load_shipped("ppo").manifest.manifest_sha256}
-    assert {"python", "ethbrake-marl", "numpy", "numba"} <= set(learned["versions"])
+    assert set(learned["versions"]) == {"python", "ethbrake-marl", "numpy", "numba"}
     assert learned["versions"]["numpy"] == version("numpy")
     assert found.outcome("ppo").take(np.array([0])).policies == found.outcome("ppo").policies
 
