@@ -310,6 +310,6 @@ def test_defect_of_the_program__keeps_its_traceback(ethbrake, monkeypatch):
     def broken() -> None:
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr("ethbrake_marl.cli.app.list_scenarios", broken)
+    monkeypatch.setattr("ethbrake_marl.cli.scenario.list_scenarios", broken)
     with pytest.raises(RuntimeError, match="a defect"):
         ethbrake("scenario", "list")

@@ -144,8 +144,18 @@ def item_json(item: Item, made: Made, more: Mapping[str, Any]) -> Json:
 
 def read_results(folder: ReproductionFolder) -> list[Json]:
     """The results that are there, in the order of the paper; raises ``InvalidInput`` for one that is damaged."""
-    files = [folder.result(item.name) for item in ITEMS]
-    return [checked_result(read_object(file), str(file)) for file in files if file.is_file()]
+    return [read_result(folder, item) for item in ITEMS if folder.result(item.name).is_file()]
+
+
+def read_result(folder: ReproductionFolder, item: Item) -> Json:
+    """The result of an item that was made; raises ``InvalidInput`` for one that is damaged, or another item's."""
+    file = folder.result(item.name)
+    content = checked_result(read_object(file), str(file))
+    if content["name"] != item.name:
+        raise _damaged(f"{file}: name")
+    if any(Path(name).name != name for name in content["data"]):
+        raise _damaged(f"{file}: data")
+    return content
 
 
 _TEXT, _TEXTS, _ROWS = TypeAdapter(str), TypeAdapter(list[str]), TypeAdapter(list[list[str]])

@@ -8,12 +8,11 @@ from datetime import UTC, datetime
 
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.files.durable import write_file
-from ethbrake_marl.learning.run_folder import read_object
 from ethbrake_marl.studies.reproduction.folder import (
     Json,
     ReproductionFolder,
-    checked_result,
     open_folder,
+    read_result,
     read_results,
     write_item,
 )
@@ -69,10 +68,9 @@ def make_item(folder: ReproductionFolder, item: Item, settings: Settings) -> Jso
 
 def _kept(folder: ReproductionFolder, item: Item, trained: list[str]) -> Json | None:
     """The result that is there already, if the same trainings stand behind it."""
-    file = folder.result(item.name)
-    if not file.is_file():
+    if not folder.result(item.name).is_file():
         return None
-    content = checked_result(read_object(file), str(file))
+    content = read_result(folder, item)
     return content if content.get("trained") == trained else None
 
 

@@ -24,7 +24,7 @@ NOT_RUN: Outcome = "not run"
 TOLERANCE = 0.02  # of the printed number
 _MOST_NAMED = 2
 _PLURAL = {AGREES: "agree", DIFFERS: "differ", CANNOT: "cannot agree", UNDECIDED: "undecided", NOT_RUN: "not run"}
-_WORST_FIRST: tuple[Outcome, ...] = (CANNOT, DIFFERS, UNDECIDED, NOT_RUN, AGREES)
+OUTCOMES: tuple[Outcome, ...] = (CANNOT, DIFFERS, UNDECIDED, NOT_RUN, AGREES)  # the worst first
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,8 +195,8 @@ def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
     """All of an item in one line: how many came out how, and the first of the worst."""
     if not verdicts:
         return Verdict("all", NOT_RUN, "nothing was compared")
-    worst = min((each.outcome for each in verdicts), key=_WORST_FIRST.index)
-    counted = [(outcome, sum(each.outcome == outcome for each in verdicts)) for outcome in _WORST_FIRST]
+    worst = min((each.outcome for each in verdicts), key=OUTCOMES.index)
+    counted = [(outcome, sum(each.outcome == outcome for each in verdicts)) for outcome in OUTCOMES]
     words = [(n, outcome if n == 1 else _PLURAL[outcome]) for outcome, n in counted if n]
     counts = ", ".join(f"{n} {word}" for n, word in words)
     first = next(each for each in verdicts if each.outcome == worst)
