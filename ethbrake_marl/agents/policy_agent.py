@@ -165,8 +165,8 @@ class PolicyAgent:
             return self._answer(seen, np.arange(worlds.n))
         except Exception as error:
             k = self._find_failing(seen)
-            where = "" if k is None else self._when(k, worlds) + ": "
-            reason = f"{where}observations of shape {seen.shape}: {describe_error(error)}"
+            where = self._whenever() if k is None else self._when(k, worlds)
+            reason = f"{where}: observations of shape {seen.shape}: {describe_error(error)}"
             raise AgentFailed(self.name, None if k is None else int(self._rows[k]), reason) from error
 
     def _answer(self, seen: Observations, rows: Ints) -> tuple[NDArray[Any], State]:
@@ -198,7 +198,7 @@ class PolicyAgent:
         """The actions [n] in [-1, 1]."""
         n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
         if action.shape != (n, 1) or action.dtype.kind not in "fiu":
-            first = len(action) if action.ndim and len(action) < n else 0
+            first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0
             raise self._refusal(first, worlds, f"{what}; one number per world is needed, shape ({n}, 1)")
         values: Floats = action[:, 0].astype(np.float64)
         if not np.isfinite(values).all():
@@ -213,6 +213,11 @@ class PolicyAgent:
 
     def _refusal(self, k: int, worlds: Worlds, reason: str) -> AgentFailed:
         return AgentFailed(self.name, int(self._rows[k]), f"{self._when(k, worlds)}: {reason}")
+
+    def _whenever(self) -> str:
+        """The step, of all running episodes, at which nobody knows whose it was."""
+        first, last = self._steps.min(initial=10**9) + 1, self._steps.max(initial=0) + 1
+        return f"step {first}" if first >= last else f"steps {first} to {last}"
 
     def _when(self, k: int, worlds: Worlds) -> str:
         return f"step {self._steps[k] + 1} ({worlds.time_s[k]:.2f} s)"

@@ -22,7 +22,7 @@ from ethbrake_marl.cli.explore import explore_command
 from ethbrake_marl.cli.options import VersionOption, rename_old_options
 from ethbrake_marl.cli.parts import CommandWithParts
 from ethbrake_marl.cli.picture import picture_app
-from ethbrake_marl.cli.plugins import accept_plugins, check_commands
+from ethbrake_marl.cli.plugins import accept_plugins, check_commands, keep_results_alone
 from ethbrake_marl.cli.recipe import recipe_app
 from ethbrake_marl.cli.record import record_command
 from ethbrake_marl.cli.replay import replay_command
@@ -117,7 +117,7 @@ def run_command(arguments: Sequence[str]) -> int:
     try:
         check_commands(app)
         variable = None if shell_asks(os.environ) else _NO_VARIABLE  # None: the usual one
-        command = accept_plugins(get_command(app))
+        command = keep_results_alone(accept_plugins(get_command(app)))
         arguments = rename_old_options(arguments, command)
         with naming_extras():
             status = command(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)

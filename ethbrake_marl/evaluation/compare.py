@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from ethbrake_marl.physics import Floats
 HARMS = ("first_impact_harm", "total_harm")
 _COMPARED: dict[Kind, tuple[str, ...]] = {"evaluate": HARMS, "equal-time": HARMS, "shield": ("harm",)}  # harms of each
 _LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one with every world
+_MOST_EPISODES = 10**12
 _MOST_HARM = 1e100  # m2/s2; a number that can be squared
 _HASHES = {"worlds_sha256": "another list of worlds", "scenario_sha256": "another scenario"}
 _SAME = {"kind": "another kind of results", **_HASHES, "harm_count": "another harm"}  # the last: where it is told
@@ -72,13 +74,8 @@ class Result:
     def estimate(self, agent: str, harm: str) -> Estimate:
         """The mean of a harm, with its interval."""
         row = self.rows[agent]
-        interval = row.get(f"{harm}_interval")
-        numbers = [row.get(harm), *(interval if isinstance(interval, list) else [])]
-        floats = [float(each) for each in numbers if isinstance(each, int | float) and not isinstance(each, bool)]
-        whole = len(floats) == len(numbers) == (1 if interval is None else 3)
-        if not (whole and all(abs(each) <= _MOST_HARM for each in floats) and row["episodes"] >= len(floats[:2])):
-            raise InvalidInput(f"{self.path}: {agent}: {harm} is no mean with an interval [low, high]")
-        return Estimate(floats[0], None if interval is None else (floats[1], floats[2]))
+        mean, interval = row[harm], row.get(f"{harm}_interval")
+        return Estimate(float(mean), None if interval is None else (float(interval[0]), float(interval[1])))
 
     def harms(self) -> dict[str, dict[int, tuple[float, ...]]]:
         """Those of every world; raises ``InvalidInput`` where the file that holds them is not to be had."""
@@ -149,9 +146,33 @@ def read_result(path: Path) -> Result:
                     f"{path}: {key} is missing or no {kind.__name__}; a results file of an earlier version has no"
                     " hashes: evaluate again"
                 )
+        _check_numbers(path, row)
     if len({tuple(row.get(key) for key in _SAME) for row in rows}) > 1:
         raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
-    return Result(path, {_name_of(row): row for row in rows})
+    named = [_name_of(row) for row in rows]
+    if twice := {name for name in named if named.count(name) > 1}:
+        raise InvalidInput(f"{path}: {min(twice)} stands in it twice")
+    return Result(path, dict(zip(named, rows, strict=True)))
+
+
+def _check_numbers(path: Path, row: Mapping[str, Any]) -> None:
+    """Refuse what is no number of episodes, and no mean harm with an interval around it."""
+    who = f"{path}: {row['agent']}"
+    if not 1 <= row["episodes"] <= _MOST_EPISODES or isinstance(row["episodes"], bool):
+        raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
+    for harm in _COMPARED[row["kind"]]:
+        if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), row["episodes"]):
+            raise InvalidInput(f"{who}: {harm} is no mean with an interval [low, high] around it")
+
+
+def _is_mean(mean: Any, interval: Any, episodes: int) -> bool:
+    """Whether these are a mean harm and its interval, which no single episode has."""
+    ends = [mean, mean] if interval is None else interval
+    if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and episodes == 1):
+        return False
+    low, high = ends
+    are_numbers = all(type(each) in (int, float) for each in (low, mean, high))
+    return are_numbers and -_MOST_HARM <= low <= mean <= high <= _MOST_HARM and mean >= 0
 
 
 def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
@@ -225,7 +246,17 @@ def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tup
         if len(worlds) != first.rows[agent]["episodes"] or worlds != sorted(other.get(agent, {})):
             return None, f"the rows per world of {agent} are not those of {count_of(len(worlds), 'same world')}"
         found[agent] = tuple(np.array([side[agent][world] for world in worlds]) for side in (one, other))
+        for result, harms in zip((first, second), found[agent], strict=True):
+            _check_means(result, agent, harms)
     return found, None  # type: ignore[return-value]  # two of them each
+
+
+def _check_means(result: Result, agent: str, harms: Floats) -> None:
+    """Refuse means that are not those of the file with every world [n, 2]."""
+    for name, mean in zip(HARMS, harms.mean(axis=0), strict=True):
+        told = result.rows[agent].get(name)
+        if told is not None and not math.isclose(told, mean, rel_tol=1e-9, abs_tol=1e-9):
+            raise InvalidInput(f"{result.path}: {agent}: {name} = {told:g}, but the mean of its worlds is {mean:g}")
 
 
 def _differences(first: Result, second: Result, agent: str, worlds: Worlds | None) -> dict[str, Estimate]:

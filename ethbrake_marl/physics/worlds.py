@@ -172,11 +172,12 @@ def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles
 
 def read_only(worlds: Worlds) -> Worlds:
     """The same worlds as arrays that cannot be written to; those given stay as they are."""
-    vehicles = _combined(_unwritable, worlds.vehicles)
-    return Worlds(vehicles, *(_unwritable(getattr(worlds, name)) for name in _OF_WORLDS))
+    vehicles = _combined(unwritable, worlds.vehicles)
+    return Worlds(vehicles, *(unwritable(getattr(worlds, name)) for name in _OF_WORLDS))
 
 
-def _unwritable(array: NDArray[Any]) -> NDArray[Any]:
+def unwritable(array: NDArray[Any]) -> NDArray[Any]:
+    """The same array, which cannot be written to; the one given can."""
     view = array.view()
     view.flags.writeable = False
     return view

@@ -115,13 +115,43 @@ def test_read_result__refuses_what_is_no_result(tmp_path: Path, text: str, reaso
 
 @pytest.mark.parametrize(
     "change",
-    [{"total_harm": "x"}, {"total_harm": None}, {"total_harm_interval": [1]}, {"total_harm": 1e300}, {"episodes": 1}],
+    [
+        {"total_harm": "x"},
+        {"total_harm": None},
+        {"total_harm": True},
+        {"total_harm_interval": [1]},
+        {"total_harm_interval": [1e6, 2e6]},
+        {"total_harm_interval": [9, 1]},
+        {"total_harm": 1e300},
+        {"total_harm": 10**400},
+        {"total_harm": -5.0, "total_harm_interval": [-6, 1]},
+        {"episodes": 1},
+        {"episodes": 0},
+        {"episodes": 10**30},
+        {"episodes": True},
+    ],
 )
-def test_compare__refuses_means_that_are_none(results: Path, tmp_path: Path, change: dict[str, Any]) -> None:
+def test_read_result__refuses_means_that_are_none(results: Path, tmp_path: Path, change: dict[str, Any]) -> None:
     rows = [row | change for row in json.loads((results / "alone.json").read_text())]
     (tmp_path / "x.json").write_text(json.dumps(rows))
-    with pytest.raises(InvalidInput, match=r"x\.json: full_brake: .* is no mean with an interval"):
-        compare_results(read_result(results / "alone.json"), read_result(tmp_path / "x.json"))
+    with pytest.raises(InvalidInput, match=r"x\.json: full_brake: .*(is no mean with an interval|episodes = )"):
+        read_result(tmp_path / "x.json")
+
+
+def test_read_result__refuses_an_agent_that_stands_in_it_twice(results: Path, tmp_path: Path) -> None:
+    rows = json.loads((results / "alone.json").read_text())
+    (tmp_path / "x.json").write_text(json.dumps([*rows, rows[0]]))
+    with pytest.raises(InvalidInput, match=r"x\.json: full_brake stands in it twice"):
+        read_result(tmp_path / "x.json")
+
+
+def test_compare__refuses_a_mean_that_is_not_that_of_its_worlds(results: Path, tmp_path: Path) -> None:
+    rows = json.loads((results / "a.csv.json").read_text())
+    rows[0] |= {"first_impact_harm": 3.0, "first_impact_harm_interval": [2.0, 4.0]}
+    (tmp_path / "a.csv.json").write_text(json.dumps(rows))
+    (tmp_path / "a.csv").write_bytes((results / "a.csv").read_bytes())
+    with pytest.raises(InvalidInput, match=r"first_impact_harm = 3, but the mean of its worlds is \d"):
+        compare_results(read_result(results / "a.csv.json"), read_result(tmp_path / "a.csv.json"))
 
 
 def test_unpaired_difference__is_welchs() -> None:
