@@ -39,12 +39,13 @@ settings.load_profile("deterministic")
 def _own_user_files() -> Iterator[None]:
     """What a test ran of users' files is no part of the versions that the next test's results tell."""
     plugins = sys.modules.get("ethbrake_marl.files.plugins")
-    before = {} if plugins is None else dict(plugins._RUN)
+    before = ({}, {}) if plugins is None else (dict(plugins._RUN), dict(plugins._READ))
     yield
     plugins = sys.modules.get("ethbrake_marl.files.plugins")
-    if plugins is not None and before != plugins._RUN:
-        plugins._RUN.clear()
-        plugins._RUN.update(before)
+    for now, then in () if plugins is None else zip((plugins._RUN, plugins._READ), before, strict=True):
+        if now != then:
+            now.clear()
+            now.update(then)
 
 
 @pytest.fixture(autouse=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import sys
 from collections.abc import Callable
@@ -86,6 +87,24 @@ def _open_onnx(path: Path, name: str) -> Any:
     with naming_extras():
         import onnxruntime
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+
+def weights_sha256(policy: Any) -> str | None:
+    """SHA-256 of an .onnx file, or of the weights of a torch module or a Stable-Baselines3 model as they are now.
+
+    None for anything else, whose weights nobody can find.
+    """
+    if isinstance(policy, str | os.PathLike):
+        return hashlib.sha256(Path(policy).read_bytes()).hexdigest() if Path(policy).is_file() else None
+    module: Any = policy if _is_torch_module(policy) else getattr(policy, "policy", None)
+    if not _is_torch_module(module):
+        return None
+    digest = hashlib.sha256()
+    for name, tensor in module.state_dict().items():
+        array = to_array(tensor)
+        digest.update(f"{name} {array.dtype} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def to_array(value: Any) -> NDArray[Any]:

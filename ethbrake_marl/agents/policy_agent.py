@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import LARGEST, action_to_command
-from ethbrake_marl.agents.foreign import Infer, State, adapt_policy, to_array
+from ethbrake_marl.agents.foreign import Infer, State, adapt_policy, to_array, weights_sha256
 from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, describe_error
 from ethbrake_marl.observations import (
@@ -71,7 +71,8 @@ def policy_agent(
             f"agent {named!r}: the policy takes observations of shape {shape}, here are {spec.size} features;"
             " give what it was trained on: scenario or observation"
         )
-    return PolicyAgent(adapt_policy(policy, named, initial_state is not None), named, spec, initial_state, clip)
+    infer = adapt_policy(policy, named, initial_state is not None)
+    return PolicyAgent(infer, named, spec, initial_state, clip, lambda: weights_sha256(policy))
 
 
 def _observation_of(policy: Any, scenario: Scenario | None, given: Observation | None) -> ObservationSpec:
@@ -102,8 +103,10 @@ class PolicyAgent:
         observation: ObservationSpec,
         initial_state: Callable[[int], State] | None,
         clip: bool,
+        weights_sha256: Callable[[], str | None],
     ) -> None:
         self.name = name
+        self.weights_sha256 = weights_sha256  # of the policy as it is now; None where nobody can find its weights
         self.observation = observation
         self._infer, self._initial_state, self._clip = infer, initial_state, clip
         self._steps: Ints = np.zeros(0, np.int64)  # [n] decisions of the running episodes

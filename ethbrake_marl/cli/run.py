@@ -19,8 +19,9 @@ from ethbrake_marl.cli.options import (
     VehicleOption,
 )
 from ethbrake_marl.cli.settings import SetOption, read_settings
-from ethbrake_marl.cli.terminal import interruptible, progress_bars, say
+from ethbrake_marl.cli.terminal import interruptible, progress_bars, say, write_json
 from ethbrake_marl.cli.train import KEPT, end_of_training
+from ethbrake_marl.evaluation.compare import results_to_json
 from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, load_driven
 from ethbrake_marl.evaluation.per_world import PER_WORLD
 from ethbrake_marl.learning.recipe import load_recipe
@@ -67,8 +68,10 @@ def run_experiment_command(
                 settings=given.texts,
                 on_progress=bars.show_progress,
             )
-    show_rows(result.rows, as_json, per_world=result.directory / PER_WORLD)
-    if not as_json:
+    if as_json:
+        write_json(results_to_json(result.rows, per_world=result.directory / PER_WORLD))
+    else:
+        show_rows(result.rows)
         show_beside(result.beside)
     say(f"report: {result.report}")
     end_of_training(result.status, result.steps, folder)

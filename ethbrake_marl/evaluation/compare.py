@@ -25,7 +25,13 @@ _LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one w
 _MOST_EPISODES = 10**12
 _MOST_HARM = 1e100  # m2/s2; a number that can be squared
 _HASHES = {"worlds_sha256": "another list of worlds", "scenario_sha256": "another scenario"}
-_SAME = {"kind": "another kind of results", **_HASHES, "harm_count": "another harm"}  # the last: where it is told
+_SAME = {  # all but the hashes: where they are told
+    "kind": "another kind of results",
+    "worlds_sha256": _HASHES["worlds_sha256"],
+    "controlled_vehicle": "another driven vehicle",
+    "scenario_sha256": _HASHES["scenario_sha256"],
+    "harm_count": "another harm",
+}
 _NEEDED = {"agent": str, "episodes": int, **dict.fromkeys(_HASHES, str), "policy_sha256": dict, "versions": dict}
 
 
@@ -35,13 +41,16 @@ def results_to_json(
     told: Sequence[Rescored] = (),
     groups: Mapping[str, Sequence[SummaryRow]] | None = None,
     per_world: Path | None = None,
+    settings: Mapping[str, str | None] | None = None,
 ) -> list[dict[str, Any]]:
     """What a results file holds: one object per row, with what was ``told`` of it under other objectives.
+
+    ``settings`` are those of all agents: the harm that they minimise, what a robust shield does not know.
 
     ``groups``, by name, are rows of the same agents on parts of the worlds (``summarise_by``).
     ``per_world`` is the file with one row per world, written before; its name and hash go into every object.
     """
-    found = [row.to_json() for row in rows]
+    found = [row.to_json() | ({} if settings is None else {"agent_settings": dict(settings)}) for row in rows]
     if told:
         found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
     for row in found if groups else ():
@@ -112,6 +121,9 @@ class Comparison:
     differences: tuple[Difference, ...]
     unpaired_because: str | None  # None: intervals are paired by world
     left_over: tuple[tuple[str, ...], tuple[str, ...]]  # agents of the first alone, and of the second
+    other_settings: Mapping[
+        str, tuple[str | None, str | None]
+    ]  # of the agents of the first and of the second, likewise
     other_versions: Mapping[str, tuple[str | None, str | None]]  # of the first and of the second, where they differ
 
     def to_json(self) -> dict[str, Any]:
@@ -122,6 +134,7 @@ class Comparison:
             "agents": [difference.to_json() for difference in self.differences],
             "only_in_first": list(self.left_over[0]),
             "only_in_second": list(self.left_over[1]),
+            "other_settings": {name: list(both) for name, both in self.other_settings.items()},
             "other_versions": {name: list(both) for name, both in self.other_versions.items()},
         }
 
@@ -147,12 +160,19 @@ def read_result(path: Path) -> Result:
                     " hashes: evaluate again"
                 )
         _check_numbers(path, row)
-    if len({tuple(row.get(key) for key in _SAME) for row in rows}) > 1:
+    if len({tuple(_told(row, key) for key in _SAME) for row in rows}) > 1:
         raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
     named = [_name_of(row) for row in rows]
     if twice := {name for name in named if named.count(name) > 1}:
         raise InvalidInput(f"{path}: {min(twice)} stands in it twice")
     return Result(path, dict(zip(named, rows, strict=True)))
+
+
+def _told(row: Mapping[str, Any], key: str) -> str | None:
+    """What a row says of itself, or its parameters do; None for neither."""
+    parameters = row.get("parameters")
+    told = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
+    return None if told is None else str(told)
 
 
 def _check_numbers(path: Path, row: Mapping[str, Any]) -> None:
@@ -213,7 +233,7 @@ def compare_results(first: Result, second: Result) -> Comparison:
     different worlds or scenarios, or without a common agent.
     """
     for key, what in _SAME.items():
-        one, other = first.about.get(key), second.about.get(key)
+        one, other = (_told(result.about, key) for result in (first, second))
         if one != other:
             raise InvalidInput(
                 f"{second.path}: is about {what} than {first.path} ({key} {other!s:.12} and {one!s:.12}): no comparison"
@@ -228,7 +248,7 @@ def compare_results(first: Result, second: Result) -> Comparison:
         Difference(agent, _policies(first, second, agent), _differences(first, second, agent, worlds))
         for agent in common
     )
-    return Comparison(differences, because, (left_over[0], left_over[1]), _other_versions(first, second))
+    return Comparison(differences, because, (left_over[0], left_over[1]), *_others(first, second))
 
 
 Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of the first and of the second, world by world
@@ -278,7 +298,11 @@ def _policies(first: Result, second: Result, agent: str) -> Literal["same", "oth
     return "same" if one == other else "other"
 
 
-def _other_versions(first: Result, second: Result) -> dict[str, tuple[str | None, str | None]]:
-    one, other = first.about["versions"], second.about["versions"]
-    names = dict.fromkeys([*one, *other])
-    return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}
+def _others(first: Result, second: Result) -> list[dict[str, tuple[str | None, str | None]]]:
+    """Settings of the agents, and versions, that are not the same in both."""
+    found = []
+    for key in ("agent_settings", "versions"):
+        one, other = (each if isinstance(each := result.about.get(key), dict) else {} for result in (first, second))
+        names = dict.fromkeys([*one, *other])
+        found.append({name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)})
+    return found

@@ -61,13 +61,19 @@ def rate(successes: int, count: int, *, confidence: float = CONFIDENCE) -> Estim
     """
     if not (count >= 1 and 0 <= successes <= count):
         raise InvalidInput(f"rate: {successes} of {count}: must be 0 <= successes <= count, and count at least 1")
-    p, z = successes / count, _normal_quantile(confidence)
+    p = successes / count
+    return Estimate(p, wilson(p, count, confidence=confidence))
+
+
+def wilson(p: float, count: int, *, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Wilson's score interval of a share ``p`` of ``count`` draws, which need not be a whole number of them."""
+    z = _normal_quantile(confidence)
     shrink = 1.0 + z * z / count
     centre = (p + z * z / (2.0 * count)) / shrink
     half = z / shrink * math.sqrt(p * (1.0 - p) / count + z * z / (4.0 * count * count))
-    low = 0.0 if successes == 0 else max(centre - half, 0.0)
-    high = 1.0 if successes == count else min(centre + half, 1.0)
-    return Estimate(p, (low, high))
+    low = 0.0 if p == 0.0 else max(centre - half, 0.0)
+    high = 1.0 if p == 1.0 else min(centre + half, 1.0)
+    return low, high
 
 
 def mean(values: Floats, *, confidence: float = CONFIDENCE) -> Estimate:

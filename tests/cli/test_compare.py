@@ -19,6 +19,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.compare import compare_results, read_result
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, unpaired_difference
+from ethbrake_marl.files import plugins
 
 
 @pytest.fixture(scope="module")
@@ -224,3 +225,41 @@ def test_compare__sees_that_an_agents_file_was_edited(results: Path, tmp_path: P
     assert after.about["versions"]["mine.py"] == f"SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}"
     assert set(compare_results(before, after).other_versions) == {"mine.py"}
     assert compare_results(after, after).other_versions == {}
+
+
+def test_compare__tells_other_settings_of_the_agents_and_another_driven_vehicle(
+    ethbrake: Callable[..., Any], tmp_path: Path
+) -> None:
+    line = ["evaluate", "--scenario", "paper-random", "--episodes", "5", "--json"]
+    ways = {
+        "first": ["--agents", "e_v2x_bm"],
+        "total": ["--agents", "e_v2x_bm", "--harm-count", "total"],
+        "front": ["--agents", "e_v2x_bm", "--vehicle", "vehicle_3"],
+    }
+    for name, more in ways.items():
+        (tmp_path / f"{name}.json").write_text(ethbrake(*line, *more).out)
+    told = ethbrake("compare", tmp_path / "first.json", tmp_path / "total.json")
+    assert told.status == 0 and "note: harm_count first in the first, total in the second" in told.err
+    found = compare_results(read_result(tmp_path / "first.json"), read_result(tmp_path / "total.json"))
+    assert found.to_json()["other_settings"] == {"harm_count": ["first", "total"]}
+    other = ethbrake("compare", tmp_path / "first.json", tmp_path / "front.json")
+    assert other.status == 2 and "is about another driven vehicle than" in other.err
+
+
+def test_weights_of_another_library__have_a_hash_and_a_file_behind_the_at_is_told(
+    ethbrake: Callable[..., Any], tmp_path: Path
+) -> None:
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np, ethbrake_marl as eb\n"
+        "def make(argument, settings):\n"
+        "    share = np.load(settings.policy)[0]\n"
+        "    return eb.policy_agent(lambda seen: np.full((len(seen), 1), share), scenario=settings.scenario)\n"
+    )
+    line = ["evaluate", "--episodes", "5", "--json", "--agents", f"{tmp_path}/mine.py:make@{tmp_path}/w.npy"]
+    rows = []
+    for share in (-1.0, -0.2):
+        np.save(tmp_path / "w.npy", [share])
+        plugins._READ.clear()
+        rows += json.loads(ethbrake(*line).out)
+    one, other = (row["versions"]["w.npy"] for row in rows)
+    assert one.startswith("SHA-256 ") and one != other

@@ -20,6 +20,7 @@ from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.learning.run_folder import read_object
 from ethbrake_marl.studies.reproduction.item import Item, Made, Settings
 from ethbrake_marl.studies.reproduction.items import ITEMS
+from ethbrake_marl.studies.reproduction.verdicts import OUTCOMES, Verdict, summarise_verdicts
 
 Json = dict[str, Any]
 
@@ -155,6 +156,11 @@ def read_result(folder: ReproductionFolder, item: Item) -> Json:
         raise _damaged(f"{file}: name")
     if any(Path(name).name != name for name in content["data"]):
         raise _damaged(f"{file}: data")
+    compared = [Verdict(**each) for each in content["comparisons"]]
+    if any(each.outcome not in OUTCOMES for each in compared):
+        raise _damaged(f"{file}: comparisons")
+    if content["verdict"] != summarise_verdicts(compared).to_json():
+        raise _damaged(f"{file}: verdict")
     return content
 
 
