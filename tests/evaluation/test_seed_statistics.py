@@ -10,9 +10,9 @@ from ethbrake_marl.evaluation.seed_statistics import (
     mean_over_seeds,
     paired_over_seeds,
     rate_over_seeds,
+    share_over_seeds,
 )
 from ethbrake_marl.evaluation.statistics import rate
-)
 
 
 @pytest.mark.parametrize(
