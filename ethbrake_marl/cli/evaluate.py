@@ -130,8 +130,8 @@ def evaluate_command(
     groups = {} if by is None else summarise_by(evaluation, by)
     if per_world is not None:
         write_per_world(per_world, evaluation, objectives=objectives, force=force)
-    agent_settings = {"harm_count": harm_count, "uncertainty": uncertainty}
-    results = results_to_json(rows, told=told, groups=groups, per_world=per_world, settings=agent_settings)
+    agents_told = {"harm_count": harm_count, "uncertainty": uncertainty}
+    results = results_to_json(rows, told=told, groups=groups, per_world=per_world, settings=agents_told)
     if per_world is not None:
         _write_results_beside(per_world, results, force=force)
     if as_json:

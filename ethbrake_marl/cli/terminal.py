@@ -127,7 +127,7 @@ class Bars:
     def __init__(self, bars: Progress | None) -> None:
         self._bars = bars
         self._tasks: dict[str, TaskID] = {}
-        self._last_line = ""
+        self._last_label, self._last_done = "", False
 
     def show(
         self, name: str, done: int, total: int, metrics: Mapping[str, float] | None = None, note: str = ""
@@ -138,9 +138,9 @@ class Bars:
         if note:
             self.tell(note)
         if self._bars is None:
-            if label != self._last_line:
+            if label != self._last_label or (done >= total and not self._last_done):
                 say(f"{label}: {done:,} of {total:,}")
-            self._last_line = label
+            self._last_label, self._last_done = label, done >= total
             return
         if name not in self._tasks:
             self._tasks[name] = self._bars.add_task(label, total=total)

@@ -20,6 +20,7 @@ from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.physics import Floats
 
 HARMS = ("first_impact_harm", "total_harm")
+USUAL: Mapping[str, str | None] = {"harm_count": "first", "uncertainty": None}  # settings of agents
 _COMPARED: dict[Kind, tuple[str, ...]] = {"evaluate": HARMS, "equal-time": HARMS, "shield": ("harm",)}  # harms of each
 _LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one with every world
 _MOST_EPISODES = 10**12
@@ -41,7 +42,7 @@ def results_to_json(
     told: Sequence[Rescored] = (),
     groups: Mapping[str, Sequence[SummaryRow]] | None = None,
     per_world: Path | None = None,
-    settings: Mapping[str, str | None] | None = None,
+    settings: Mapping[str, str | None] = USUAL,
 ) -> list[dict[str, Any]]:
     """What a results file holds: one object per row, with what was ``told`` of it under other objectives.
 
@@ -50,7 +51,7 @@ def results_to_json(
     ``groups``, by name, are rows of the same agents on parts of the worlds (``summarise_by``).
     ``per_world`` is the file with one row per world, written before; its name and hash go into every object.
     """
-    found = [row.to_json() | ({} if settings is None else {"agent_settings": dict(settings)}) for row in rows]
+    found = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
     if told:
         found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
     for row in found if groups else ():

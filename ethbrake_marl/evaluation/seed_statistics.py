@@ -91,9 +91,10 @@ def rate_over_seeds(happened: ArrayLike, *, seed: int = 0) -> Estimate:
     """
     given = np.atleast_2d(np.asarray(happened, np.float64))
     found, worlds = mean_over_seeds(given, seed=seed), given.shape[1]
-    low, high = wilson(found.value, worlds)
+    share = min(found.value, 1.0)  # a mean of ones may be rounded up
+    low, high = wilson(share, worlds)
     ends = found.interval or (low, high)
-    return Estimate(found.value, (min(low, ends[0]), max(high, ends[1])))
+    return Estimate(share, (max(min(low, ends[0]), 0.0), min(max(high, ends[1]), 1.0)))
 
 
 def share_over_seeds(

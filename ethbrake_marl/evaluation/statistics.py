@@ -30,10 +30,10 @@ class Estimate:
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
         """``24.19 [23.85, 24.53]``: value and interval, each times ``scale``."""
-        value = f"{scale * self.value:.{digits}f}{unit}"
+        value = f"{scale * self.value:z.{digits}f}{unit}"
         if self.interval is None:
             return value
-        low, high = (f"{scale * end:.{digits}f}" for end in self.interval)
+        low, high = (f"{scale * end:z.{digits}f}" for end in self.interval)
         return f"{value} [{low}, {high}]"
 
     def to_json(self) -> dict[str, Any]:

@@ -108,6 +108,18 @@ def test_agent_that_fails__is_called_as_its_user_calls_it():
         eb.evaluate(SCENARIO.sample(4, 1), {"mine": eb.policy_agent(wrong)}, scenario=SCENARIO)
 
 
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda seen: (np.zeros((len(seen), 1)), None), "gave a tuple of 2 .* needs initial_state"),
+        (lambda seen: np.ma.masked_array(np.zeros((len(seen), 1)), mask=True), "in which stands nan"),
+    ],
+)
+def test_answer_that_is_no_action__is_told(answer, message):
+    with pytest.raises(InvalidInput, match=message):
+        eb.evaluate(SCENARIO.sample(4, 1), {"mine": eb.policy_agent(answer)}, scenario=SCENARIO)
+
+
 def test_agent_that_fails_once__is_told_with_its_step():
     calls = []
 
