@@ -8,6 +8,7 @@ import numpy as np
 
 from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place, recall
+from ethbrake_marl.agents.refined_again import RefinedAgain
 from ethbrake_marl.agents.refined_profile import RefinedProfile
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, script_agents, set_others
@@ -112,7 +113,9 @@ class Refined(AgentAround):
 
 
 def refine(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """``+refined`` or ``+refined:profile`` around an agent."""
+    """``+refined``, ``+refined:profile``, ``+refined:50`` or ``+refined:200us`` around an agent."""
+    if argument not in (None, "profile"):
+        return RefinedAgain(policy, settings.needed_scenario(), argument, harm_count=settings.harm_count)
     if argument is not None:
         return RefinedProfile(policy, settings.needed_scenario(), harm_count=settings.harm_count)
     return Refined(policy, settings.needed_scenario(), harm_count=settings.harm_count)

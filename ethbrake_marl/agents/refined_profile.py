@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,8 +16,8 @@ from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.episode import START, decision_at
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.problem import profile_problem
-from ethbrake_marl.search.refine import refine_commands
+from ethbrake_marl.search.problem import ProfileProblem, profile_problem
+from ethbrake_marl.search.refine import Refinement, refine_commands
 
 CANDIDATES = 500  # per world, at the alert
 
@@ -46,7 +47,7 @@ class RefinedProfile(AgentAround):
     """
 
     adds = Source.MODEL
-    divides_along = ("_commands", "_start_s", "predicted_harm")
+    divides_along: ClassVar[tuple[str, ...]] = ("_commands", "_start_s", "predicted_harm")
 
     def __init__(
         self, policy: Agent, scenario: Scenario, *, candidates: int = CANDIDATES, harm_count: HarmCount = "first"
@@ -65,23 +66,31 @@ class RefinedProfile(AgentAround):
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Search for these rows; ``worlds`` holds those rows only, at the alert."""
-        scenario, scripts = self.scenario, script_agents(self.scenario, except_for=vehicle)
-        problem = profile_problem(
-            worlds,
-            [vehicle],
-            harm_count=self.harm_count,
-            horizon_s=scenario.horizon_s,
-            time_step_s=scenario.time_step_s,
-            others_mps2=fixed_commands(scripts, worlds, f"agent {self.name!r}", vehicle=vehicle),
-        )
-        own = record_commands(self._stage, worlds, scenario, vehicle, int(problem.last_step.max()))
-        found = refine_commands(problem, own, budget=self.candidates)
+        scripts = script_agents(self.scenario, except_for=vehicle)
+        others = fixed_commands(scripts, worlds, f"agent {self.name!r}", vehicle=vehicle)
+        problem = self._problem(worlds, vehicle, others)
+        own = record_commands(self._stage, worlds, self.scenario, vehicle, int(problem.last_step.max()))
+        found = self._search(problem, own)
         more = self._commands.shape[1] - own.shape[1]
         commands = np.pad(found.commands_mps2, ((0, 0), (0, more)), mode="edge")
         self._commands = place(self._commands, rows, commands)
         self._start_s = place(self._start_s, rows, problem.clock[:, START])
         harm = found.first_impact_harm if self.harm_count == "first" else found.total_harm
         self.predicted_harm = place(self.predicted_harm, rows, harm)
+
+    def _problem(self, worlds: Worlds, vehicle: int, others_mps2: Floats) -> ProfileProblem:
+        return profile_problem(
+            worlds,
+            [vehicle],
+            harm_count=self.harm_count,
+            horizon_s=self.scenario.horizon_s,
+            time_step_s=self.scenario.time_step_s,
+            others_mps2=others_mps2,
+        )
+
+    def _search(self, problem: ProfileProblem, commands_mps2: Floats) -> Refinement:
+        """The best that is found around these commands."""
+        return refine_commands(problem, commands_mps2, budget=self.candidates)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The command of the step, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source
 from ethbrake_marl.agents.protocol import Agent, check_agent
-from ethbrake_marl.agents.spelling import AROUND, OLD_NAMES, OLD_SPELLINGS, AgentSpec, parse_spec
+from ethbrake_marl.agents.spelling import OLD_NAMES, OLD_SPELLINGS, AgentSpec, is_around, parse_spec
 from ethbrake_marl.agents.team import Driver, Team
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, OldSpelling, describe_error, unknown_name
 from ethbrake_marl.harm import HarmCount, check_harm_count
@@ -134,8 +134,9 @@ _ENTRIES: dict[str, Entry] = {
 
 _WRAPPERS: dict[str, Entry] = {
     "refined": Entry(
-        "+refined[:profile]",
-        "plus the best deviation that a search at the alert finds; profile: compiled, it drives what that finds",
+        "+refined[:profile|:50|:200us]",
+        "plus the best deviation that a search at the alert finds; profile: compiled, it drives what that finds;"
+        " with a budget: again at every decision",
         (Source.MODEL,),
         "agents.refined:refine",
     ),
@@ -290,7 +291,7 @@ def _make(entry: Entry, argument: str | None, settings: AgentSettings) -> Driver
 
 
 def _put_around(driver: Driver, around: str, settings: AgentSettings) -> Agent:
-    assert around in AROUND
+    assert is_around(around)
     if isinstance(driver, Team):
         raise InvalidInput(
             f"agent {settings.spec!r}: is a team, and +{around} is for one driven vehicle, the others following"

@@ -1,7 +1,8 @@
 """The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
 
-``+refined`` or ``+refined:profile`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or
-``+robust``. A name may be a function of a Python file, ``my_file.py:make_agent``.
+``+refined``, ``+refined:profile`` or, at every decision, ``+refined:50`` or ``+refined:200us`` comes first, then one
+shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``. A name may be a function of a Python file,
+``my_file.py:make_agent``.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ OLD_SPELLINGS = {  # of a policy; ``hybrid@PATH`` is ``ppo@PATH+episode`` now
 }
 OLD_NAMES = frozenset(old.partition(":")[0] for old in OLD_SPELLINGS)
 
+_WITH_BUDGET = re.compile(r"refined:[0-9]+(us)?")
 _IN_FILE = re.compile(r"(?P<name>[^:]+\.py:[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
 _BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
 
@@ -92,18 +94,23 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
         parse_agent_spec(spec)  # says what is right
     while True:
         before, plus, last = core.rpartition("+")
-        if not plus or last not in AROUND:
+        if not plus or not is_around(last):
             break
         core, around = before, [last, *around]
     if plus and _is_meant_around(before, core, last):
         raise unknown_name("shield or refinement", last, AROUND)
     shields = [each for each in around if each in SHIELDS]
-    if len(shields) > 1 or any(each in REFINED for each in around[1:]):
+    if len(shields) > 1 or any(each not in SHIELDS for each in around[1:]):
         raise InvalidInput(
             f"agent {spec!r}: +{REFINED[0]} comes first and once, then one shield of +{', +'.join(SHIELDS)}; for"
             " instance ppo@shipped+refined+step"
         )
     return core, tuple(around)
+
+
+def is_around(word: str) -> bool:
+    """Whether this stands behind a ``+``: one of ``AROUND``, or a refinement with a budget for each decision."""
+    return word in AROUND or _WITH_BUDGET.fullmatch(word) is not None
 
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
