@@ -30,6 +30,7 @@ from ethbrake_marl.cli.options import (
     RecipeOption,
     ScenarioOption,
     StepsOption,
+    StopWhenLostOption,
     TrainingSeedOption,
     VehicleOption,
     VersionOption,
@@ -195,6 +196,7 @@ def run(
     vehicle: VehicleOption = None,
     name: NameOption = None,
     output: OutputOption = None,
+    stop_when_lost: StopWhenLostOption = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -221,6 +223,7 @@ def run(
                 seed=seed,
                 episodes=episodes,
                 list_seed=list_seed,
+                stop_when_lost=stop_when_lost,
                 force=force,
                 settings=given.texts,
                 on_progress=bars.show_progress,
