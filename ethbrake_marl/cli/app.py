@@ -191,7 +191,7 @@ def run(
     seed: TrainingSeedOption = None,
     episodes: Annotated[int, typer.Option(help="Worlds of the evaluation list.")] = EPISODES,
     list_seed: Annotated[int, typer.Option(help="Seed of the evaluation list.")] = LIST_SEED,
-    recipe: RecipeOption = "ppo",
+    recipe: RecipeOption = "quick",
     settings: SetOption = None,
     vehicle: VehicleOption = None,
     name: NameOption = None,
