@@ -32,6 +32,9 @@ StepsOption = Annotated[int | None, typer.Option(help="Training steps (decisions
 TrainingSeedOption = Annotated[
     int | None, typer.Option("--seed", help="Seed of the training alone.", show_default="the recipe's")
 ]
+StopWhenLostOption = Annotated[
+    bool, typer.Option("--stop-when-lost", help="Stop, resumable, when harm comes back and stays.")
+]
 NameOption = Annotated[
     str | None, typer.Option(help="Folder of the run inside runs/.", show_default="SCENARIO-RECIPE-seedSEED")
 ]

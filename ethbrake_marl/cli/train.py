@@ -17,6 +17,7 @@ from ethbrake_marl.cli.options import (
     ScenarioOption,
     SchemeOption,
     StepsOption,
+    StopWhenLostOption,
     TrainingSeedOption,
 )
 from ethbrake_marl.cli.settings import SetOption, read_settings
@@ -47,6 +48,7 @@ def train_command(
     seed: TrainingSeedOption = None,
     name: NameOption = None,
     output: OutputOption = None,
+    stop_when_lost: StopWhenLostOption = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -79,7 +81,15 @@ def train_command(
                 bars.show_progress(progress)
 
             result = train(
-                plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell, settings=given.texts
+                plan,
+                chosen,
+                folder,
+                steps=steps,
+                seed=seed,
+                force=force,
+                stop_when_lost=stop_when_lost,
+                on_progress=tell,
+                settings=given.texts,
             )
     _show_result(result, as_json)
 
@@ -92,6 +102,7 @@ def resume_command(
             "--other-versions", help="Go on although other versions or plug-ins trained it; numbers may differ."
         ),
     ] = False,
+    stop_when_lost: StopWhenLostOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Go on with a training that was stopped or killed.
@@ -102,7 +113,12 @@ def resume_command(
         from ethbrake_marl.learning.train import resume
 
         with progress_bars() as bars:
-            result = resume(folder, on_progress=bars.show_progress, other_versions=other_versions)
+            result = resume(
+                folder,
+                stop_when_lost=stop_when_lost,
+                on_progress=bars.show_progress,
+                other_versions=other_versions,
+            )
     _show_result(result, as_json)
 
 

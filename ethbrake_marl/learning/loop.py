@@ -15,7 +15,15 @@ from ethbrake_marl.agents.team import Driver, Team
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.learning.algorithms.protocol import Algorithm
 from ethbrake_marl.learning.model_state import Model
-from ethbrake_marl.learning.progress import RETURN, Course, check_losses, check_rollout, check_step, check_weights
+from ethbrake_marl.learning.progress import (
+    AT_HORIZON,
+    RETURN,
+    Course,
+    check_losses,
+    check_rollout,
+    check_step,
+    check_weights,
+)
 from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.learning.training import Training
 from ethbrake_marl.policies.policy import Policy
@@ -34,7 +42,11 @@ Evaluate = Callable[[Any], Mapping[str, float]]  # of what is trained: a ``Polic
 
 
 class StopRequested(Exception):
-    """Raised inside the training loop to leave it between two updates; never seen outside this room."""
+    """Raised inside the training loop to leave it between two updates, for this reason; never seen outside."""
+
+    def __init__(self, reason: str | None = None) -> None:
+        super().__init__(reason)
+        self.reason = reason
 
 
 class Save(Protocol):
@@ -47,7 +59,8 @@ class Save(Protocol):
 class BetweenUpdates(BaseCallback):
     """Runs before the first rollout and after each update.
 
-    ``stop`` is asked before every rollout; ``StopRequested`` is raised when it says yes, with everything saved.
+    ``stop`` is asked before every rollout; ``StopRequested`` is raised when it says yes, with everything saved. With
+    ``stop_when_lost`` also where the evaluation just before has found the training lost.
     """
 
     model: Model
@@ -60,12 +73,15 @@ class BetweenUpdates(BaseCallback):
         *,
         save: Save,
         stop: Callable[[], bool],
+        stop_when_lost: bool,
         evaluate: Evaluate | None,
         on_progress: OnProgress | None,
     ) -> None:
         super().__init__()
         self.recipe, self._algorithm, self._policy_now, self._save = recipe, algorithm, policy_now, save
-        self._stop, self._evaluate, self._on_progress = stop, evaluate, on_progress
+        self._stop, self._stop_when_lost, self._evaluate, self._on_progress = (
+            stop, stop_when_lost, evaluate, on_progress,
+        )  # fmt: skip
         self.updates = 0
         self.course = Course(recipe.reward.harm_count)
         self.notes: list[str] = []  # to be told when the training begins
@@ -109,10 +125,11 @@ class BetweenUpdates(BaseCallback):
         if not self._resumed:
             self._after_update()
         self._resumed = False
-        if self._stop():
+        lost = self.course.lost if self._stop_when_lost else None
+        if self._stop() or lost is not None:
             self._rest()
             self._save(self)
-            raise StopRequested
+            raise StopRequested(lost)
 
     def _on_step(self) -> bool:
         infos = self.locals["infos"]
@@ -195,7 +212,8 @@ def measure_on_list(training: Training) -> Evaluate:
         row = summarise(evaluate(worlds, {"policy": driver_of(trained, scenario)}, scenario=scenario, aftermath=False))[
             0
         ]
-        return {name: getattr(row, name).value for name in METRICS}
+        found = {name: getattr(row, name).value for name in METRICS}
+        return found | {AT_HORIZON: row.horizon_ends / row.episodes}
 
     return measure
 

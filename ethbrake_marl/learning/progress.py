@@ -1,4 +1,4 @@
-"""The progress of a training: its policies, its evaluations, and an alarm when the return misleads."""
+"""The progress of a training: its policies, its evaluations, and alarms when it is lost or its return misleads."""
 
 from __future__ import annotations
 
@@ -20,9 +20,15 @@ from ethbrake_marl.policies.team import Trained
 
 HARM_METRIC: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
 RETURN = "episode_return"
+AT_HORIZON = "horizon_rate"  # share of the fixed list's episodes in which something still moves at the horizon
 
-ALARM_AFTER = 5  # evaluations that are looked at
-RISEN = 0.05  # by this share of its size the return must have grown to count as risen
+ALARM_AFTER = 3  # evaluations that are compared with as many before them
+RISEN = 0.05  # by this share of its size the harm must have grown to count as risen
+
+LOST_AFTER = 2  # evaluations in a row; one may be an accident
+TIMES_LEAST = 1.5  # so much harm, in the least harm so far
+GIVEN_BACK = 0.1  # and so much of what the training had gained since its first evaluation
+CUT_OFF = 0.5  # or any harm that has risen, with so many more of the episodes cut off by the horizon
 
 
 @dataclass
@@ -41,6 +47,7 @@ class Course:
     updates: int = 0
     evaluations: list[dict[str, float]] = field(default_factory=list)  # steps, updates and what ``evaluate`` gave
     alarms: list[str] = field(default_factory=list)
+    lost: str | None = None  # the alarm of the last evaluation, if by that one the training is lost
     wall_before_s: float = 0.0  # of the parts of this training that other processes did
     started: float = field(default_factory=time.monotonic)
 
@@ -61,7 +68,8 @@ class Course:
         name = HARM_METRIC[self.harm_count]
         if name in metrics and metrics[name] < self.best_harm:
             self.best, self.best_harm = policy, metrics[name]
-        alarm = misleading_return(self.evaluations, name)
+        self.lost = lost_training(self.evaluations, name)
+        alarm = self.lost or misleading_return(self.evaluations, name)
         if alarm is not None:
             self.alarms.append(alarm)
         return alarm
@@ -84,24 +92,66 @@ class Course:
 
 
 def misleading_return(evaluations: Sequence[Mapping[str, float]], harm: str) -> str | None:
-    """The alarm if the return has risen over the last evaluations while none of them has less harm than the first.
+    """The alarm if each of the last three evaluations has more return, and more harm, than each of the three before.
 
-    The return is the mean of the training's recent episodes, exploration included; its rise counts from a twentieth
-    of its size on. A policy that learns to please the reward instead of sparing people looks like this.
+    The return is the mean of the training's recent episodes, exploration included. The mean harm must have risen by a
+    twentieth. A policy that learns to please the reward instead of sparing people looks like this. At an optimum harm
+    stays, while the return rises as exploration shrinks: no alarm.
     """
-    last = [entry for entry in evaluations if RETURN in entry and harm in entry][-ALARM_AFTER:]
-    if len(last) < ALARM_AFTER:
+    last = [entry for entry in evaluations if RETURN in entry and harm in entry][-2 * ALARM_AFTER :]
+    if len(last) < 2 * ALARM_AFTER:
         return None
-    first = last[0]
-    risen = last[-1][RETURN] - first[RETURN]
-    lowest = min(entry[harm] for entry in last[1:])
-    if not (risen > RISEN * abs(first[RETURN]) and lowest >= first[harm]):
+    before, now = last[:ALARM_AFTER], last[ALARM_AFTER:]
+    if not all(min(e[name] for e in now) > max(e[name] for e in before) for name in (RETURN, harm)):
+        return None
+    (gained, harmed), (gains, harms) = ([_mean(part, name) for name in (RETURN, harm)] for part in (before, now))
+    if not harms > (1.0 + RISEN) * harmed:
         return None
     return (
-        f"step {int(last[-1]['steps']):,}: since step {int(first['steps']):,} the return rose from {first[RETURN]:.4g}"
-        f" to {last[-1][RETURN]:.4g}, but {harm} did not fall ({first[harm]:.4g}, since then at best {lowest:.4g});"
-        " does the reward say what you mean?"
+        f"step {int(last[-1]['steps']):,}: since step {int(before[-1]['steps']):,} the return rose from {gained:.4g} to"
+        f" {gains:.4g}, and {harm} from {harmed:.4g} to {harms:.4g} (means of {ALARM_AFTER} evaluations); does the"
+        " reward say what you mean?"
     )
+
+
+def _mean(entries: Sequence[Mapping[str, float]], name: str) -> float:
+    return sum(entry[name] for entry in entries) / len(entries)
+
+
+def lost_training(evaluations: Sequence[Mapping[str, float]], harm: str) -> str | None:
+    """The alarm if the last two evaluations have lost what the training had learned.
+
+    Each has half as much harm again as the least so far, and that is a tenth of what had been gained since the first
+    evaluation; or its harm has risen by a twentieth, and half of all episodes that ended by themselves at the least
+    harm are cut off by the horizon now.
+    """
+    measured = [entry for entry in evaluations if harm in entry]
+    if len(measured) <= LOST_AFTER:
+        return None
+    least = min(measured, key=lambda entry: entry[harm])
+    limit = max(TIMES_LEAST * least[harm], least[harm] + GIVEN_BACK * (measured[0][harm] - least[harm]))
+
+    def is_lost(entry: Mapping[str, float]) -> bool:
+        risen = entry[harm] > (1.0 + RISEN) * least[harm]
+        return entry[harm] > limit or (risen and _cut_off_since(least, entry) > CUT_OFF)
+
+    if not all(is_lost(entry) for entry in measured[-LOST_AFTER:]):
+        return None
+    last, at_horizon = measured[-1], ""
+    if AT_HORIZON in last and AT_HORIZON in least:
+        at_horizon = (
+            f"; the horizon cuts off {100.0 * last[AT_HORIZON]:.1f} % of the episodes"
+            f" (then {100.0 * least[AT_HORIZON]:.1f} %)"
+        )
+    return (
+        f"step {int(last['steps']):,}: training is lost: {harm} is {last[harm]:.4g}, and was {least[harm]:.4g} at step"
+        f" {int(least['steps']):,}{at_horizon}; the policy of then is kept"
+    )
+
+
+def _cut_off_since(before: Mapping[str, float], now: Mapping[str, float]) -> float:
+    """By how much the share of episodes that the horizon cuts off has risen; 0 where it is not measured."""
+    return now[AT_HORIZON] - before[AT_HORIZON] if AT_HORIZON in now and AT_HORIZON in before else 0.0
 
 
 _LOSSES = (

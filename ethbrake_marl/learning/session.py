@@ -91,28 +91,29 @@ class Session:
         if state is not None:
             restore_log(model, state.numbers)
         status: Ended = "finished"
+        reason: str | None = None
         try:
             steps = self._training.recipe.total_steps - model.num_timesteps
             model.learn(steps, callback=between, log_interval=None, reset_num_timesteps=state is None)  # type: ignore[arg-type]
-        except StopRequested:
-            status = "interrupted"
+        except StopRequested as stop:
+            status, reason = "interrupted", stop.reason
         except BaseException as error:
             cause = self._explain(error)
-            self._close(between, "interrupted" if isinstance(error, KeyboardInterrupt) else "failed", cause)
+            ended: RunStatus = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            self._close(between, ended, f"{type(cause).__name__}: {cause}")
             if cause is error:
                 raise
             raise cause from error
         finally:
             logger.close()
-        self._close(between, status)
+        self._close(between, status, reason)
         return status
 
-    def _close(self, between: BetweenUpdates, status: RunStatus, cause: BaseException | None = None) -> None:
+    def _close(self, between: BetweenUpdates, status: RunStatus, reason: str | None) -> None:
         """Save the best and the last good policy, say how the run ended; a finished one needs no checkpoint."""
         course = between.course
         self._save_policy(course.kept, "policy")
         self._save_policy(course.policy, "policy-last")
-        reason = None if cause is None else f"{type(cause).__name__}: {cause}"
         left: dict[str, Any] = {
             "wall_s": round(course.wall_s, 3),
             "steps": course.steps,

@@ -57,7 +57,7 @@ class TrainResult:
     updates: int  # rounds of collecting and learning
     wall_s: float  # s, of all stretches together
     evaluations: tuple[Mapping[str, float], ...]  # what was measured on the way, in order
-    alarms: tuple[str, ...]  # return up, harm not down
+    alarms: tuple[str, ...]  # training lost, or harm up with the return
 
     @property
     def policies(self) -> dict[str, Policy]:
@@ -87,6 +87,7 @@ def train(
     force: bool = False,
     settings: Sequence[str] = (),
     measure: Measure | None = measure_on_list,
+    stop_when_lost: bool = False,
     on_progress: Told = "show",
 ) -> TrainResult:
     """Train the learners of ``scenario`` into the new ``directory``.
@@ -108,6 +109,7 @@ def train(
         settings: by which recipe and scenario differ from their files, ``KEY=VALUE`` each: noted in ``config.json``.
         measure: makes of the training what measures its policies before the first update, then as the recipe says, and
             at the end: by default on the recipe's fixed list. None: nothing is measured.
+        stop_when_lost: stop, ``interrupted``, at an evaluation that finds the training lost (docs/learning.md).
         on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.
 
     Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` where recipe and scenario do
@@ -122,13 +124,14 @@ def train(
         config = {**training.config(), **({"settings": list(settings)} if settings else {})}
         return create_run(Path(directory), config, team=team, force=force), None
 
-    return _run(begin, training, measure, listener(on_progress))
+    return _run(begin, training, measure, listener(on_progress), stop_when_lost)
 
 
 def resume(
     directory: str | Path,
     *,
     measure: Measure | None = measure_on_list,
+    stop_when_lost: bool = False,
     on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
@@ -140,6 +143,7 @@ def resume(
     Args:
         directory: the run's folder.
         measure: as it was given to ``train``.
+        stop_when_lost: stop again at the next evaluation that finds the training lost.
         on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.
         other_versions: go on from a checkpoint that other versions, or other plug-ins, wrote, although its numbers may
             differ.
@@ -164,7 +168,7 @@ def resume(
         run.write_json(run.team, team_content(training.scheme, training.scenario))  # a damaged one would stay
         return run, other_versions
 
-    return _run(begin, training, measure, listener(on_progress))
+    return _run(begin, training, measure, listener(on_progress), stop_when_lost)
 
 
 def _run(
@@ -172,6 +176,7 @@ def _run(
     training: Training,
     measure: Measure | None,
     on_progress: OnProgress | None,
+    stop_when_lost: bool,
 ) -> TrainResult:
     """Train in the folder that ``begin`` makes or finds, once nothing can be wrong with environment and model.
 
@@ -194,6 +199,7 @@ def _run(
                 policy_now,
                 save=session.save,
                 stop=stop,
+                stop_when_lost=stop_when_lost,
                 evaluate=evaluate,
                 on_progress=on_progress,
             )

@@ -83,6 +83,7 @@ def run_experiment(
     seed: int | None = None,
     episodes: int = EPISODES,
     list_seed: int = LIST_SEED,
+    stop_when_lost: bool = False,
     force: bool = False,
     settings: Sequence[str] = (),
     on_progress: OnProgress | None = None,
@@ -91,7 +92,8 @@ def run_experiment(
 
     On one of the three tests the policy also drives the other two, which it was not trained for.
 
-    ``seed`` is the training's; the list is ``episodes`` worlds of ``list_seed``; ``settings`` are noted.
+    ``seed`` is the training's; the list is ``episodes`` worlds of ``list_seed``; ``settings`` are noted;
+    ``stop_when_lost`` is as in ``train``.
     Ctrl-C during the training ends it
     after the update in progress, and the policy so far is evaluated; a second one, or one during the evaluation,
     raises ``KeyboardInterrupt``, and the folder keeps the policy. ``run.json`` always says which. Raises what
@@ -108,6 +110,7 @@ def run_experiment(
         steps=steps,
         seed=seed,
         force=force,
+        stop_when_lost=stop_when_lost,
         settings=settings,
         on_progress=on_progress,
     )

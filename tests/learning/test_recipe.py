@@ -101,6 +101,12 @@ def test_shipped_recipes__are_found_by_name() -> None:
         load_recipe("ppo-papre")
 
 
+def test_shipped_recipes__of_ppo_expect_nothing_beyond_the_horizon() -> None:
+    recipes = [load_recipe(name) for name in shipped_recipes()]
+    without = [each.name for each in recipes if each.algorithm == "ppo" and not each.horizon_is_end]
+    assert without == ["ppo-paper"]  # whose values are the paper's
+
+
 def test_learning_rate__cosine_by_hand() -> None:
     rate = LearningRate(start=5e-4, end=1e-4)
     assert [rate.at(x) for x in (1.0, 0.5, 0.0)] == pytest.approx([5e-4, 3e-4, 1e-4])

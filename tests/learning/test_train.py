@@ -172,6 +172,53 @@ def test_train__ctrl_c_stops_after_the_update_in_progress(
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
 
+class _Planted:
+    """Measures a harm that was written down before, so that a training seems to collapse."""
+
+    def __init__(self, *harms: float) -> None:
+        self._left = list(harms)
+
+    def __call__(self, policy: Policy) -> dict[str, float]:
+        return {"first_impact_harm": self._left.pop(0)}
+
+
+def test_train__a_collapse_raises_an_alarm_and_by_default_goes_on(recipe: TrainingRecipe, tmp_path: Path) -> None:
+    said: list[str] = []
+    planted = _Planted(90.0, 7.0, 60.0, 60.0, 7.0)
+    result = train(
+        recipe, SCENARIO, tmp_path / "run", steps=8 * ROLLOUT, measure=lambda training: planted,
+        on_progress=lambda progress: said.append(progress.note),
+    )  # fmt: skip
+    assert (result.status, result.updates, len(result.alarms)) == ("finished", 8, 1)
+    assert "training is lost" in result.alarms[0]
+    assert [note for note in said if note] == [f"alarm: {result.alarms[0]}"]
+    rows = [row for row in _rows(tmp_path / "run" / "progress.csv") if row["eval/alarm"]]
+    assert [row["eval/alarm"] for row in rows] == ["0", "0", "0", "1", "0"]
+
+
+def test_train__stops_when_lost_and_goes_on_to_the_same_bits(recipe: TrainingRecipe, tmp_path: Path) -> None:
+    harms = (90.0, 7.0, 60.0, 61.0, 7.0)
+    whole = train(recipe, SCENARIO, tmp_path / "whole", steps=8 * ROLLOUT, measure=lambda training: _Planted(*harms))
+    stopped = train(
+        recipe, SCENARIO, tmp_path / "run", steps=8 * ROLLOUT, measure=lambda training: _Planted(*harms),
+        stop_when_lost=True,
+    )  # fmt: skip
+    assert (stopped.status, stopped.updates) == ("interrupted", 6)
+    status = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (status["status"], status["reason"]) == ("interrupted", stopped.alarms[0])
+    assert load_policy(tmp_path / "run").manifest.steps == 2 * ROLLOUT  # of the least harm
+    result = train_module.resume(
+        tmp_path / "run", measure=lambda training: _Planted(*harms[4:]), on_progress=None, stop_when_lost=True
+    )
+    assert (result.status, result.alarms) == ("finished", whole.alarms)
+    assert _bytes(tmp_path / "run" / "policy-last") == _bytes(tmp_path / "whole" / "policy-last")
+
+
+def test_train__measures_how_many_episodes_the_horizon_cuts_off(recipe: TrainingRecipe, tmp_path: Path) -> None:
+    result = train_module.train(recipe, SCENARIO, tmp_path / "run", steps=ROLLOUT, on_progress=None)
+    assert all(0.0 <= entry["horizon_rate"] <= 1.0 for entry in result.evaluations)
+
+
 def test_train__second_ctrl_c_stops_at_once_and_keeps_the_last_policy(
     recipe: TrainingRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -262,8 +262,8 @@ def test_table__a_damaged_file_is_refused(tmp_path: Path, content: bytes) -> Non
 
 def test_shipped_tables__hold_the_shipped_lists_and_their_profiles_do_the_stored_harm() -> None:
     assert shipped_tables(), f"no table in {TABLES}"
-    three = [(name, 10_000) for name in TESTS]
-    for name, n in [*three, ("paper-delay-low", 2000), ("paper-delay-high", 2000)]:
+    long = [(name, 10_000) for name in (*TESTS, "paper-random-early", "paper-distance")]
+    for name, n in [*long, ("paper-delay-low", 2000), ("paper-delay-high", 2000)]:
         scenario = load_scenario(name)
         for first in (0, n - 5):
             worlds = scenario.sample(5, seed=7, first=first).worlds

@@ -1,4 +1,4 @@
-"""Forty-eight bugs in scenarios, rewards, V2X, engine, ablation, evaluation and learning: each must turn a test red.
+"""Fifty bugs in scenarios, rewards, V2X, engine, ablation, evaluation and learning: each must turn a test red.
 
 ``make planted-bugs`` runs this after the bugs of the physics (``python -m tests.programme.planted_bugs [--jobs J]
 [--only WORD]``). A bug is a textual patch, applied to a temporary copy of the repository, never to the working tree;
@@ -33,9 +33,9 @@ COMPARISON, OPTIMUM, PLAN = (
 STATISTICS, SEEDS, TABLE, REGRET, ROLLOUT = (
     f"ethbrake_marl/evaluation/{name}.py" for name in ("statistics", "seed_statistics", "table", "regret", "rollout")
 )
-COURSE, EVENTS, KEPT, INDEPENDENT, RECIPE = (
+COURSE, LOOP, EVENTS, KEPT, INDEPENDENT, RECIPE = (
     f"ethbrake_marl/learning/{name}.py"
-    for name in ("progress", "run_log", "training", "algorithms/independent_ppo", "recipe")
+    for name in ("progress", "loop", "run_log", "training", "algorithms/independent_ppo", "recipe")
 )
 
 
@@ -222,7 +222,13 @@ BUGS: dict[str, Bug] = {
         COURSE, "        name = HARM_METRIC[self.harm_count]\n", '        name = HARM_METRIC["first"]\n', OF_LEARNING
     ),
     "no alarm where the harm rises with the return": Bug(
-        COURSE, "lowest >= first[harm]", "lowest == first[harm]", OF_LEARNING
+        COURSE, "harms > (1.0 + RISEN) * harmed", "harms < (1.0 - RISEN) * harmed", OF_LEARNING
+    ),
+    "a collapse must be four times the least harm": Bug(
+        COURSE, "max(TIMES_LEAST * least[harm],", "max(4.0 * least[harm],", OF_LEARNING
+    ),
+    "a lost training is not stopped": Bug(
+        LOOP, "self.course.lost if self._stop_when_lost else None", "None", OF_LEARNING
     ),
     "the learning rate falls at once": Bug(
         RECIPE, "done = min(max(1.0 - remaining, 0.0), 1.0)", "done = 1.0", OF_LEARNING
