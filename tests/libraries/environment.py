@@ -32,7 +32,7 @@ def ready_python(name: str, library: Library) -> Path:
     install = [uv, "pip", "install", "--quiet", "--python", str(python)]
     install_torch(install)
     overrides = folder / "overrides.txt"
-    overrides.write_text("\n".join((TORCH, *library.overrides)), "utf-8")
+    overrides.write_text(TORCH, "utf-8")
     call_uv([*install, "--override", str(overrides), "-e", str(ROOT), TORCH, *library.requires])
     stamp.write_text(wanted, "utf-8")
     return python
@@ -40,7 +40,7 @@ def ready_python(name: str, library: Library) -> Path:
 
 def _fingerprint(library: Library) -> str:
     """Of all that decides what is in the environment."""
-    told = (sys.version, str(ROOT), TORCH, library.requires, library.overrides, (ROOT / "pyproject.toml").read_text())
+    told = (sys.version, str(ROOT), TORCH, library.requires, (ROOT / "pyproject.toml").read_text())
     return hashlib.sha256(repr(told).encode()).hexdigest()
 
 

@@ -50,8 +50,7 @@ class Way:
 class Library:
     """A library, what its environment holds beside the project, and the ways in.
 
-    ``overrides`` are versions that it is made to take against its own requirements. ``in_ci``: cheap enough for a stage
-    of the CI.
+    ``in_ci``: cheap enough for a stage of the CI.
     """
 
     title: str
@@ -59,7 +58,6 @@ class Library:
     requires: tuple[str, ...]  # at the versions that were tried
     about: str  # what is to know, Markdown
     in_ci: bool = False
-    overrides: tuple[str, ...] = ()
     version: str = "{}"  # how it is told
     ways: list[Way] = field(default_factory=list)
 

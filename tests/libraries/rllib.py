@@ -9,11 +9,9 @@ LIBRARY = Library(
     package="ray",
     requires=("ray[rllib]==2.60.0",),
     about=(
-        "`ray[rllib]` 2.60 asks for exactly Gymnasium 1.2.2, and this project for 1.4 ([RLlib's own "
-        "issue](https://github.com/ray-project/ray/issues/53776)), so that the two do not resolve together; "
-        "with Gymnasium 1.4 it runs: `uv pip install --override` with a file that says `gymnasium>=1.4`."
+        "`ray[rllib]` 2.60 asks for exactly Gymnasium 1.2.2 ([RLlib's own "
+        "issue](https://github.com/ray-project/ray/issues/53776)), which this project takes."
     ),
-    overrides=("gymnasium>=1.4",),
 )
 
 
