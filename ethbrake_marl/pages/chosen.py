@@ -41,7 +41,7 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
     def add(kind: str, rows: Sequence[int] | Ints, most_of_kind: int) -> None:
         fresh = [int(row) for row in rows if int(row) not in found][: min(most_of_kind, most - len(found))]
         for row in fresh:
-            found[row] = Chosen(row, kind, f"harm {first[row]:.2f} first-impact, {total[row]:.2f} total")
+            found[row] = Chosen(row, kind, f"{focus}: harm {first[row]:.2f} first-impact, {total[row]:.2f} total")
 
     add(f"Where {focus} did worst", worst_rows(evaluation, focus), WORST)
     regrets = assess(evaluation)

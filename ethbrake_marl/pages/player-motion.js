@@ -61,6 +61,11 @@ function frontsOf(state) {
   return fronts;
 }
 
+// The gap ahead of each vehicle: of Vehicle 1 to the obstacle, null where there is none.
+function gapsAhead(state, obstacle) {
+  return [obstacle === null ? null : Math.max(obstacle - state.front, 0), ...state.gaps];
+}
+
 // Impacts are [time, pair, closing speed, first, number so far, first-impact harm so far, total harm so far].
 function countedBy(episode, time) {
   const k = lastBegun(episode.impacts, time, (impact) => impact[0]);

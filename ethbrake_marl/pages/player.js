@@ -180,8 +180,10 @@ class Player {
 
   show() {
     const { vehicles } = this.data;
+    const { obstacle } = this.data.worlds[this.world];
     for (const { head, readout, lane, traces } of this.rows) {
       const { state, now } = lane.show(this.time);
+      const ahead = gapsAhead(state, obstacle);
       traces.show(this.time, state);
       const episode = lane.episode;
       head.replaceChildren(
@@ -196,7 +198,7 @@ class Player {
       readout.replaceChildren(
         ...Array.from({ length: vehicles }, (_, i) => {
           const key = make("span", { class: `key k${(i + 1) % 7}` }, String(i + 1));
-          const gap = i + 1 < vehicles ? ` · gap ${plain(state.gaps[i], 2)} m` : "";
+          const gap = ahead[i] === null ? "" : ` · gap ahead ${plain(ahead[i], 2)} m`;
           return make("span", { class: "each" }, key, ` ${plain(state.speeds[i], 1)} m/s, ${plain(state.accelerations[i], 1)} m/s²${gap}`);
         }),
       );

@@ -135,6 +135,25 @@ def test_report__hostile_agent_is_text_in_the_player(open_page: Open, tmp_path: 
     assert page.locator(".head strong").first.inner_text() in HOSTILE
 
 
+@pytest.mark.parametrize("width", [360, 768])
+def test_report__long_names_never_scroll_sideways(open_page: Open, long_names_file: Path, width: int) -> None:
+    check_width(open_page(long_names_file, width=width), width)
+
+
+@pytest.fixture(scope="module")
+def long_names_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report whose agents are called by the files they come from."""
+    scenario = load_scenario("paper-random")
+    names = ("my_agent_file_with_a_long_name_of_a_policy.py:drive+step", "x" * 120)
+    agents = dict(zip(names, make_lineup(["constant:2", "constant:3"], scenario).values(), strict=True))
+    found = evaluate(scenario.sample(12, 7), agents, scenario=scenario, seed=7)
+    rows, focus = summarise(found), names[0]
+    played = play_for_report(found, agents, focus)
+    path = tmp_path_factory.mktemp("long") / "report.html"
+    write_report(path, Report("t", rows, found, played, None, focus, versions={names[0]: "1", names[1]: "y" * 64}))
+    return path
+
+
 @pytest.mark.long
 def test_report__of_ten_thousand_worlds_is_small_and_soon_ready(open_page: Open, tmp_path: Path) -> None:
     scenario = load_scenario("paper-random")

@@ -97,6 +97,23 @@ def test_player__places_are_those_of_the_recorded_episode(
         assert state["speeds"] == pytest.approx(record.speeds_mps[k].tolist(), abs=1e-9)
 
 
+def test_player__gap_stands_at_the_vehicle_behind_it(open_page: Open, report_file: Path) -> None:
+    page = open_page(report_file)
+    page.evaluate(f"{PLAYER}.seek(0.7)")
+    gaps = page.evaluate(f"stateAt({PLAYER}.episodes()[0], 0.7).gaps")
+    first, *others = page.locator(".readout").first.locator(".each").all_inner_texts()
+    assert "gap" not in first
+    assert [text.rsplit(" · ")[1] for text in others] == [f"gap ahead {gap:.2f} m" for gap in gaps]
+
+
+def test_player__gap_of_the_first_vehicle_is_that_to_an_obstacle(open_page: Open, report_file: Path) -> None:
+    page = open_page(report_file)
+    page.evaluate(f"{PLAYER}.data.worlds[{PLAYER}.world].obstacle = 60; {PLAYER}.build(); {PLAYER}.seek(0.7)")
+    front = page.evaluate(f"stateAt({PLAYER}.episodes()[0], 0.7).front")
+    told = page.locator(".readout .each").first.inner_text()
+    assert told.endswith(f"gap ahead {60.0 - front:.2f} m")
+
+
 def test_player__plays_in_real_time_and_pauses(open_page: Open, report_file: Path) -> None:
     page = open_page(report_file)
     page.get_by_role("button", name="Play").click()

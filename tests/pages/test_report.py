@@ -134,6 +134,14 @@ def test_chosen__begin_with_the_worst_and_are_the_same_each_time(report: Report)
     assert focus_of(report.rows) == "constant:4.5"
 
 
+def test_chosen__say_whose_harm_it_is(report: Report) -> None:
+    assert report.evaluation is not None
+    outcome = report.evaluation.outcome("full_brake")
+    for each in choose_shown(report.evaluation, "full_brake"):
+        first, total = outcome.first_impact_harm[each.row], outcome.total_harm[each.row]
+        assert each.why == f"full_brake: harm {first:.2f} first-impact, {total:.2f} total"
+
+
 def test_worst__are_those_of_the_largest_regret(pair: Scenario) -> None:
     worlds = pair.replace(gaps_m={"uniform": [0.5, 9.0]}).sample(40, 0)
     result = evaluate(worlds, {"coast": make_agent("coast")}, scenario=pair)
