@@ -9,8 +9,9 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from ethbrake_marl.pages.frame import Part, Section, anchors, page, paragraph, shown
-from ethbrake_marl.pages.parts import Cell, facts, opened, table
+from ethbrake_marl.pages.parts import Cell, facts, heading, opened, table
 from ethbrake_marl.pages.vector import kept_drawing
+from ethbrake_marl.studies.reproduction.episodes import kept_player
 from ethbrake_marl.studies.reproduction.folder import Json, ReproductionFolder, read_figure
 from ethbrake_marl.studies.reproduction.verdicts import OUTCOMES, TOLERANCE
 
@@ -43,6 +44,8 @@ def render_page(folder: ReproductionFolder, results: Sequence[Json]) -> str:
 def _section(folder: ReproductionFolder, result: Json) -> Section:
     body: list[str | Part] = [result["what"], _account(result), *result["notes"]]
     body += [_figure(folder, result["name"], each) for each in result["figures"]]
+    played = kept_player(folder.path / result["name"])
+    body += [heading("Episodes"), played] if played else []
     for each in result["tables"]:
         body.append(table(each["head"], _rows(each["rows"]), caption=each["title"]))
         body += [paragraph(each["note"], "quiet")] if each["note"] else []
