@@ -157,6 +157,8 @@ def read_result(folder: ReproductionFolder, item: Item) -> Json:
         raise _damaged(f"{file}: name")
     if any(Path(name).name != name for name in content["data"]):
         raise _damaged(f"{file}: data")
+    if type(content.get("episodes", 2)) is not int:
+        raise _damaged(f"{file}: episodes")
     return content
 
 
