@@ -72,7 +72,7 @@ def kept_drawing(svg: bytes, title: str, description: str, where: str) -> Part:
 
 def _framed(svg: bytes, title: str, description: str, *, alone: bool = False, known: str = "") -> Part:
     inner, caption = inline_svg(svg, f"{title}. {description}", recolour=not alone)
-    for told in (known, description):
+    for told in (known.strip(), description):
         caption = caption.replace(told, "").strip() if told else caption
     below = Markup('<p class="quiet">{}</p>').format(shown(caption)) if caption else Markup()
     return Part(
