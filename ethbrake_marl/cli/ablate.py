@@ -185,4 +185,5 @@ def _run(plan: Plan, jobs: int, as_json: bool) -> None:
         write_json(found)
     else:
         show((plan.folder / TEXT).read_text("utf-8"), end="")
-    say(f"page: {plan.folder / PAGE}; tables: {plan.folder / TEXT}; figures: {', '.join(FIGURES)}")
+    figures = ", ".join(str(plan.folder / name) for name in FIGURES if (plan.folder / name).is_file())
+    say(f"page: {plan.folder / PAGE}; tables: {plan.folder / TEXT}" + (f"; figures: {figures}" if figures else ""))

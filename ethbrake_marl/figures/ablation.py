@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, NullLocator
 
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.figures.style import COLOURS, GREY, add_caption, new_figure, series_style, style_axes
@@ -18,6 +18,7 @@ from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 LINEAR = 0.1  # m2/s2; axes are linear up to there and logarithmic beyond: harm falls to a hundredth
 
 _LEAST_IN = 2.6  # height of a figure with few rows: titles and caption need it
+_LEAST_TICKS = 4
 _BESIDE = 0.42  # of a worse channel, right of its clear one
 _TITLES = {"first": "First-impact harm (m²/s²)", "total": "Total harm (m²/s²)"}
 
@@ -51,7 +52,7 @@ def harm_curve(found: Json, caption: str) -> Figure:
 def change_figure(found: Json, caption: str) -> Figure:
     """What each step and each worse channel changes, with its interval: left of the line is less harm."""
     changes = found["steps"] + found["channels"]
-    figure = new_figure(10.5, max(_LEAST_IN, 1.6 + 0.42 * len(changes)))
+    figure = new_figure(10.5, max(_LEAST_IN, 1.6 + 0.6 * len(changes)))
     for axes, harm_count in zip(figure.subplots(1, 2, sharey=True), HARM_COUNTS, strict=True):
         style_axes(axes)
         axes.axvline(0.0, color=GREY, linewidth=0.9)
@@ -63,14 +64,19 @@ def change_figure(found: Json, caption: str) -> Figure:
                 value, row, xerr=[[value - low], [high - value]], fmt="o", color=colour, capsize=3, markersize=5
             )
             share = 100.0 * change[harm_count]["worse_off"]["value"]
-            text = f"{value:+.2f} [{low:+.2f}, {high:+.2f}]; somebody worse off in {share:.0f} %"
-            axes.text(0.99, row - 0.28, text, transform=axes.get_yaxis_transform(), ha="right", fontsize=7, color=GREY)
+            text = f"{value:+.2f} [{low:+.2f}, {high:+.2f}]\nsomebody worse off in {share:.0f} %"
+            axes.text(
+                0.99, row - 0.12, text, transform=axes.get_yaxis_transform(), ha="right", va="bottom", fontsize=7,
+                color=GREY, bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
+            )  # fmt: skip
         axes.set_title(f"Change of {_TITLES[harm_count][0].lower()}{_TITLES[harm_count][1:]}", loc="left", fontsize=10)
         axes.set_xscale("symlog", linthresh=LINEAR)
-        axes.xaxis.set_major_formatter(FuncFormatter(_plain))
         axes.margins(x=0.1)
+        axes.set_xticks(signed_ticks(*axes.get_xlim()))
+        axes.xaxis.set_major_formatter(FuncFormatter(_plain))
+        axes.xaxis.set_minor_locator(NullLocator())
     figure.axes[0].set_yticks(range(len(changes)), [_of_change(change, found) for change in changes], fontsize=8)
-    figure.axes[0].set_ylim(len(changes) - 0.5, -0.6)  # from top to bottom
+    figure.axes[0].set_ylim(len(changes) - 0.5, -0.8)  # from top to bottom
     add_caption(figure, caption)
     return figure
 
@@ -92,9 +98,23 @@ def who_pays(found: Json, caption: str) -> Figure:
         axes.set_xticks(range(grid.shape[1]), [f"Vehicle {i + 1}" for i in range(grid.shape[1])], fontsize=9)
         axes.set_title(f"Change of {_TITLES[harm_count][0].lower()}{_TITLES[harm_count][1:]}", loc="left", fontsize=10)
     every[0].set_yticks(range(len(changes)), [_of_change(change, found) for change in changes], fontsize=8)
-    figure.colorbar(image, ax=list(every), shrink=0.8, label="m²/s²", format=FuncFormatter(_plain))
+    bar = figure.colorbar(image, ax=list(every), label="m²/s²", format=FuncFormatter(_plain))
+    bar.set_ticks(signed_ticks(-largest, largest))
+    bar.ax.yaxis.set_minor_locator(NullLocator())
     add_caption(figure, caption)
     return figure
+
+
+def signed_ticks(low: float, high: float) -> list[float]:
+    """Round numbers from ``low`` to ``high``, 0 among them, for an axis that is linear up to ``LINEAR``: a few."""
+    first = -1 if max(-low, high) > LINEAR else -3
+    found: list[float] = []
+    for steps in ((1,), (1, 3), (1, 2, 5)):
+        sizes = [float(f"{step}e{power}") for power in range(first, 6) for step in steps]
+        found = [tick for tick in sorted({0.0, *sizes, *(-size for size in sizes)}) if low <= tick <= high]
+        if len(found) >= _LEAST_TICKS:
+            break
+    return found
 
 
 def _plain(value: float, _: int) -> str:

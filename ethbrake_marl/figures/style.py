@@ -23,6 +23,8 @@ DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", "--", "-.", (0, (1
 GREY = "#555555"
 DPI = 150
 
+CAPTION = "caption"  # the name of a caption's group in an SVG
+CAPTION_PT = 7.5
 _CHARACTERS_PER_INCH = 17.0  # of a caption
 _NO_DATES: dict[str, dict[str, None]] = {  # what would differ from one writing to the next, and from one version too
     ".png": {"Software": None},
@@ -74,7 +76,8 @@ def style_axes(axes: Axes) -> None:
 def add_caption(figure: Figure, text: str) -> None:
     """The conditions of a figure, small, below it."""
     width = int(figure.get_figwidth() * _CHARACTERS_PER_INCH)
-    figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=7.5, color=GREY)
+    label = figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=CAPTION_PT, color=GREY)
+    label.set_gid(CAPTION)
 
 
 def picture_bytes(figure: Figure, path: str | Path) -> bytes:

@@ -16,7 +16,8 @@ from ethbrake_marl.evaluation.regret import assess
 from ethbrake_marl.evaluation.table import BASELINE
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.pages.player import Played
-from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.scenario import Scenario
 
 MOST_WORLDS = 50
 WORST = 10
@@ -100,15 +101,42 @@ def play_chosen(
         scenario = scenario.with_learners(evaluation.vehicles)
     played = [Played(int(n), each.kind, each.why, {}, {}) for n, each in zip(numbers, chosen, strict=True)]
     for name, agent in agents.items():
-        drivers = team_of(agent, scenario.learners).drivers
-        policies = {i: sha for i, driver in drivers.items() if (sha := policy_sha256(driver)) is not None}
-        for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
-            passport = issue_passport(
-                motion, scenario, (spellings or {}).get(name, name), seed=evaluation.seed, number=one.number,
-                harm_count=harm_count, policies=policies,
-            )  # fmt: skip
-            one.motions[name] = motion
-            one.passports[name] = str(passport)
+        spelling = (spellings or {}).get(name, name)
+        drive_played(played, worlds, name, agent, scenario, spelling, seed=evaluation.seed, harm_count=harm_count)
         if on_agent is not None:
             on_agent(name)
     return played
+
+
+def drive_played(
+    played: Sequence[Played],
+    worlds: Worlds,
+    name: str,
+    agent: Driver,
+    scenario: Scenario,
+    spelling: str,
+    *,
+    seed: int | None,
+    harm_count: HarmCount = "first",
+) -> None:
+    """Let one agent drive the worlds of ``played`` and keep each motion and passport there, by the agent's name.
+
+    Args:
+        played: one for each world.
+        worlds: at the alert, in the same order.
+        name: of the agent on the page.
+        agent: is left as it is.
+        scenario: of the worlds, with the vehicles that are driven as its learners.
+        spelling: how the agent is written on a command line.
+        seed: of the list of worlds; None: they came from a file.
+        harm_count: that the agent minimised.
+
+    """
+    drivers = team_of(agent, scenario.learners).drivers
+    policies = {i: sha for i, driver in drivers.items() if (sha := policy_sha256(driver)) is not None}
+    for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
+        passport = issue_passport(
+            motion, scenario, spelling, seed=seed, number=one.number, harm_count=harm_count, policies=policies
+        )
+        one.motions[name] = motion
+        one.passports[name] = str(passport)

@@ -83,7 +83,7 @@ function steppedInAt(episode, time) {
 }
 
 // The stretch of road that holds these episodes from the alert to their ends.
-function roadOf(episodes, obstacle) {
+function roadOf(episodes) {
   let left = Infinity;
   let right = -Infinity;
   for (const episode of episodes) {
@@ -92,8 +92,8 @@ function roadOf(episodes, obstacle) {
       left = Math.min(left, fronts[fronts.length - 1] - BODY_M);
       right = Math.max(right, fronts[0]);
     }
+    if (episode.obstacle !== null) right = Math.max(right, episode.obstacle + 1);
   }
-  if (obstacle !== null) right = Math.max(right, obstacle + 1);
   return { left: left - 3, right: right + 3 };
 }
 

@@ -31,8 +31,8 @@ const plain = (value, digits) => value.toFixed(digits).replace(/^-(0(\.0*)?)$/, 
 
 // One lane of road, to scale, with the line of one agent on it.
 class Lane {
-  constructor(holder, episode, world, data, view, scaleBelow) {
-    Object.assign(this, { episode, world, data });
+  constructor(holder, episode, data, view, scaleBelow) {
+    Object.assign(this, { episode });
     const width = Math.max(holder.clientWidth, 200);
     this.scale = width / (view.right - view.left);
     this.x = (m) => (m - view.left) * this.scale;
@@ -47,8 +47,8 @@ class Lane {
     for (const y of [this.middle - this.half - 5, this.middle + this.half + 5])
       this.svg.append(draw("line", { class: "dash", x1: 0, x2: width, y1: y, y2: y, "stroke-dasharray": dashes }));
     if (scaleBelow) this.drawScale(view, bottom, width);
-    if (world.obstacle !== null) {
-      const block = { x: this.x(world.obstacle), width: Math.max(this.scale, 4), ...band };
+    if (episode.obstacle !== null) {
+      const block = { x: this.x(episode.obstacle), width: Math.max(this.scale, 4), ...band };
       this.svg.append(draw("rect", { class: "obstacle", ...block }));
     }
     this.cars = Array.from({ length: data.vehicles }, (_, i) => this.makeCar(i));
@@ -70,7 +70,7 @@ class Lane {
     const h = this.half;
     const box = { x: -length, y: -h, height: 2 * h };
     const body = draw("rect", { class: `body s${(i + 1) % 7}`, ...box, width: length, rx: Math.min(4, h / 2) });
-    const driven = this.data.driven.includes(i);
+    const driven = this.episode.driven.includes(i);
     const brake = draw("rect", { class: "brake", ...box, width: Math.max(2.5, length / 12) });
     const drive = draw("path", { class: "drive", d: `M${-length * 0.12} ${-h * 0.6}L0 0L${-length * 0.12} ${h * 0.6}Z` });
     const around = { x: -length - 4, y: -h - 4, width: length + 8, height: 2 * h + 8, rx: 6 };

@@ -24,7 +24,7 @@ class Player {
     const kinds = new Map();
     this.data.worlds.forEach((world, k) => {
       if (!kinds.has(world.kind)) kinds.set(world.kind, make("optgroup", { label: world.kind }));
-      kinds.get(world.kind).append(make("option", { value: k }, `World ${world.number}${world.why ? ` · ${world.why}` : ""}`));
+      kinds.get(world.kind).append(make("option", { value: k }, `${world.title}${world.why ? ` · ${world.why}` : ""}`));
     });
     this.find("world").append(...kinds.values());
     this.fillAgents();
@@ -140,7 +140,7 @@ class Player {
     const episodes = this.episodes();
     this.until = Math.max(...episodes.map((each) => Math.min(each.end, restOf(each) + 0.5)), 0.5);
     this.time = Math.min(this.time, this.until);
-    const view = roadOf(episodes, world.obstacle);
+    const view = roadOf(episodes);
     const ranges = rangesOf(episodes);
     this.find("conditions").textContent = world.conditions;
     const road = this.find("road");
@@ -157,7 +157,7 @@ class Player {
       return {
         head,
         readout,
-        lane: new Lane(holder, episode, world, this.data, view, k === episodes.length - 1),
+        lane: new Lane(holder, episode, this.data, view, k === episodes.length - 1),
         traces: new Traces(columns[k], episode, this.data, ranges, this.until, (time) => this.seek(time)),
       };
     });
@@ -180,10 +180,9 @@ class Player {
 
   show() {
     const { vehicles } = this.data;
-    const { obstacle } = this.data.worlds[this.world];
     for (const { head, readout, lane, traces } of this.rows) {
       const { state, now } = lane.show(this.time);
-      const ahead = gapsAhead(state, obstacle);
+      const ahead = gapsAhead(state, lane.episode.obstacle);
       traces.show(this.time, state);
       const episode = lane.episode;
       head.replaceChildren(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from ethbrake_marl.physics import Worlds
 
 _STYLES = ("player.css",)
 _SCRIPTS = ("player-motion.js", "player-view.js", "player.js")
+DATA = "episode_data"  # the name of its data in a page, which no section has
 _BIN_S = 1e-3  # of the later impacts of a pair in so short a time the last one is drawn; all are counted
 
 
@@ -28,35 +29,44 @@ class Played(NamedTuple):
     why: str  # what is special about it, in a few words
     motions: dict[str, EpisodeMotion]  # by agent
     passports: dict[str, str]  # by agent
+    title: str = ""  # what the world is called; empty: World and its number
 
 
-def player(worlds: Sequence[Played], driven: Sequence[int], *, focus: str = "") -> Part:
+def player(worlds: Sequence[Played], driven: Sequence[int] | Mapping[str, Sequence[int]], *, focus: str = "") -> Part:
     """The player of these worlds, all driven by the same agents.
 
     Args:
         worlds: at least one.
-        driven: indices (0 = front) of the vehicles that the agents drive.
+        driven: indices (0 = front) of the vehicles that the agents drive; by agent where they drive others.
         focus: the agent that is shown from the beginning, between the first and the last.
 
     """
-    first = worlds[0]
-    motions = [motion for world in worlds for motion in world.motions.values()]
-    vehicles = motions[0].world.N
-    content = {
-        "vehicles": vehicles,
-        "driven": list(driven),
-        "agents": [shown(agent) for agent in first.motions],
-        "shown": _shown_first(list(first.motions), focus),
-        "worlds": [_world(world) for world in worlds],
+    return player_of(player_content(worlds, driven, focus=focus))
+
+
+def player_content(
+    worlds: Sequence[Played], driven: Sequence[int] | Mapping[str, Sequence[int]], *, focus: str = ""
+) -> dict[str, Any]:
+    """What the player of these worlds holds, as plain data for ``player_of``; the arguments are those of ``player``."""
+    agents = list(worlds[0].motions)
+    by_agent = driven if isinstance(driven, Mapping) else dict.fromkeys(agents, driven)
+    return {
+        "vehicles": worlds[0].motions[agents[0]].world.N,
+        "agents": [shown(agent) for agent in agents],
+        "shown": _shown_first(agents, focus),
+        "worlds": [_world(world, by_agent) for world in worlds],
     }
-    name = "episode_data"  # no section is called so
+
+
+def player_of(content: Mapping[str, Any]) -> Part:
+    """The player of what ``player_content`` gave."""
     html = render(
         "player.html.j2",
-        name=name,
-        vehicles=vehicles,
+        name=DATA,
+        vehicles=content["vehicles"],
         body=BODY_M,
-        shielded=any(len(motion.stepped_in_s) for motion in motions),
-        episodes=data(name, content),
+        shielded=any(episode["stepped"] for world in content["worlds"] for episode in world["episodes"]),
+        episodes=data(DATA, content),
     )
     return Part(html, _STYLES, _SCRIPTS)
 
@@ -76,37 +86,38 @@ def live_player(vehicles: int, *, shielded: bool) -> Part:
 
 def played_world(alert: Worlds, episodes: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """What the player needs of one world (n = 1, at the alert) and its episodes."""
-    obstacle = float(alert.obstacle_gap_m[0])
-    return {
-        "conditions": quantity_line(quantities(alert)),
-        "obstacle": obstacle if np.isfinite(obstacle) else None,
-        "episodes": list(episodes),
-    }
+    return {"conditions": quantity_line(quantities(alert)), "episodes": list(episodes)}
 
 
-def played_episode(motion: EpisodeMotion) -> dict[str, Any]:
-    """What the player needs of one episode."""
+def played_episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:
+    """What the player needs of one episode, in which an agent drove these vehicles."""
+    obstacle = float(motion.world.obstacle_gap_m[0])
     pieces = np.ascontiguousarray(motion.pieces, np.dtype("<f8"))
     return {
         "pieces": base64.b64encode(pieces.tobytes()).decode("ascii"),
         "end": motion.end_s,
         "impacts": _impacts(motion),
         "stepped": motion.stepped_in_s.tolist(),
+        "driven": list(driven),
+        "rest": motion.at_rest,
+        "obstacle": obstacle if np.isfinite(obstacle) else None,
     }
 
 
-def _world(world: Played) -> dict[str, Any]:
+def _world(world: Played, driven: Mapping[str, Sequence[int]]) -> dict[str, Any]:
     alert = next(iter(world.motions.values())).world
-    passports = world.passports
-    told = played_world(
-        alert,
-        [played_episode(motion) | {"passport": shown(passports[agent])} for agent, motion in world.motions.items()],
-    )
+    title = shown(world.title or f"World {world.number}")
+    episodes = [
+        played_episode(motion, driven[agent]) | {"passport": shown(world.passports[agent])}
+        for agent, motion in world.motions.items()
+    ]
+    told = played_world(alert, episodes)
     return told | {
         "number": world.number,
+        "title": title,
         "kind": shown(world.kind),
         "why": shown(world.why),
-        "conditions": f"World {world.number}: {told['conditions']}.",
+        "conditions": f"{title}: {told['conditions']}.",
     }
 
 

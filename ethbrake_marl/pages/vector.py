@@ -1,4 +1,7 @@
-"""Figures inside a page: SVG with the text as outlines, in the colours of the page, light or dark."""
+"""Figures inside a page: SVG with the text as outlines, in the colours of the page, light or dark.
+
+The caption of a figure is taken out of the SVG and stands below it as text of the page, which a phone can show.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from xml.etree import ElementTree
 from markupsafe import Markup
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.figures.style import Figure, picture_bytes
+from ethbrake_marl.figures.style import CAPTION, CAPTION_PT, Figure, picture_bytes
 from ethbrake_marl.pages.frame import Part, shown
 
 _SVG, _LINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
@@ -39,15 +42,17 @@ _ATTRIBUTES = {
     "stroke-dashoffset", "stroke-miterlimit", "version",
 }  # fmt: skip
 _MOST_DEEP = 50
+_LINE_PT = 1.2 * CAPTION_PT  # of a caption, from one line to the next
+_NARROW_PT = 540.0  # figures up to this width have one panel
 
 
-def drawing(figure: Figure, title: str, description: str, *, alone: bool = False) -> Part:
+def drawing(figure: Figure, title: str, description: str, *, alone: bool = False, known: str = "") -> Part:
     """A figure with its title and, in words, what it shows.
 
-    ``alone``: in colours that must not change, such as those of a map; it then stands on white.
+    ``alone``: in colours that must not change, such as those of a map; it then stands on white. ``known``: what its
+    caption need not say, because the page does.
     """
-    svg = picture_bytes(figure, "figure.svg")
-    return _framed(inline_svg(svg, f"{title}. {description}", recolour=not alone), title, description, alone=alone)
+    return _framed(picture_bytes(figure, "figure.svg"), title, description, alone=alone, known=known)
 
 
 def kept_drawing(svg: bytes, title: str, description: str, where: str) -> Part:
@@ -62,31 +67,41 @@ def kept_drawing(svg: bytes, title: str, description: str, where: str) -> Part:
         ours = False
     if not ours:
         raise InvalidInput(f"{where}: is not a figure as it was drawn; make it again (--force)")
-    return _framed(inline_svg(svg, f"{title}. {description}"), title, description)
+    return _framed(svg, title, description)
 
 
-def _framed(inner: Markup, title: str, description: str, *, alone: bool = False) -> Part:
+def _framed(svg: bytes, title: str, description: str, *, alone: bool = False, known: str = "") -> Part:
+    inner, caption = inline_svg(svg, f"{title}. {description}", recolour=not alone)
+    for told in (known.strip(), description):
+        caption = caption.replace(told, "").strip() if told else caption
+    below = Markup('<p class="quiet">{}</p>').format(shown(caption)) if caption else Markup()
     return Part(
         Markup(
             "<figure><figcaption><strong>{}</strong> <span>{}</span></figcaption>"
-            '<div class="drawing{}" tabindex="0" role="group" aria-label="{}">{}</div></figure>\n'
-        ).format(shown(title), shown(description), " map" * alone, shown(title), inner)
+            '<div class="drawing{}" tabindex="0" role="group" aria-label="{}">{}</div>{}</figure>\n'
+        ).format(shown(title), shown(description), " map" * alone, shown(title), inner, below)
     )
 
 
-def inline_svg(svg: bytes, label: str, *, recolour: bool = True) -> Markup:
-    """An SVG of ours as an element of a page, whose policy allows no ``style``, and where no two names may be alike."""
-    root = ElementTree.fromstring(svg)
+def inline_svg(svg: bytes, label: str, *, recolour: bool = True) -> tuple[Markup, str]:
+    """An SVG of ours as an element of a page, whose policy allows no ``style``, and its caption, which is taken out.
+
+    No two names in a page may be alike.
+    """
+    root = ElementTree.fromstring(svg, ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True)))
+    caption = _take_caption(root)
     prefix = f"f{hashlib.sha256(svg + label.encode()).hexdigest()[:8]}-"
     for parent in list(root.iter()):
         for child in list(parent):
-            if child.tag in _DROPPED:
+            if child.tag in _DROPPED or not isinstance(child.tag, str):  # the latter are comments
                 parent.remove(child)
     for element in root.iter():
         _restyle(element, recolour)
         _rename(element, prefix)
     for name in ("width", "height", "version"):
         root.attrib.pop(name, None)
+    if _size_pt(root)[0] > _NARROW_PT:
+        root.attrib["class"] = "broad"
     root.attrib |= {"role": "img", "aria-label": shown(label)}
     root.attrib |= {
         "stroke-linejoin": "round",
@@ -95,7 +110,33 @@ def inline_svg(svg: bytes, label: str, *, recolour: bool = True) -> Markup:
     }
     ElementTree.register_namespace("", _SVG)
     ElementTree.register_namespace("xlink", _LINK)
-    return Markup(ElementTree.tostring(root, encoding="unicode"))
+    return Markup(ElementTree.tostring(root, encoding="unicode")), caption
+
+
+def _take_caption(root: ElementTree.Element) -> str:
+    """Take the caption out of a figure, and the room below that it had; gives its text, which stands in comments.
+
+    Outlines of its letters stay, because texts drawn after it use them.
+    """
+    group = root.find(f".//{{{_SVG}}}g[@id='{CAPTION}']")
+    if group is None:
+        return ""
+    lines = [(each.text or "").strip() for each in group.iter(ElementTree.Comment)]  # type: ignore[arg-type]
+    outlines = list(group.iter(f"{{{_SVG}}}defs"))
+    for child in list(group):
+        group.remove(child)
+    group.extend(outlines)
+    width, height = _size_pt(root)
+    if height > len(lines) * _LINE_PT:
+        root.attrib["viewBox"] = f"0 0 {width:g} {height - len(lines) * _LINE_PT:g}"
+    joined = "".join(line if re.search(r"\w-$", line) else f"{line} " for line in lines)
+    return joined.strip()
+
+
+def _size_pt(root: ElementTree.Element) -> tuple[float, float]:
+    """Width and height of a figure; 0 where it does not say them as ours do."""
+    found = re.fullmatch(r"0 0 (\d+(?:\.\d+)?) (\d+(?:\.\d+)?)", root.attrib.get("viewBox", ""))
+    return (float(found[1]), float(found[2])) if found else (0.0, 0.0)
 
 
 def _is_ours(root: ElementTree.Element) -> bool:

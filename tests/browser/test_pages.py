@@ -46,6 +46,22 @@ def reproduction_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return settings.folder / "index.html"
 
 
+@pytest.mark.parametrize(("width", "hint"), [(360, "block"), (768, "block"), (1440, "none")])
+def test_figures__say_that_they_scroll_and_can_be_read(
+    open_page: Open, report_file: Path, width: int, hint: str
+) -> None:
+    page = open_page(report_file, width=width)
+    broad = "document.querySelector('.drawing:has(svg.broad)')"
+    assert page.evaluate(f"getComputedStyle({broad}, '::before').display") == hint
+    assert page.evaluate(f"{broad}.scrollWidth > {broad}.clientWidth") == (hint == "block")
+    least_px = page.evaluate(
+        "Math.min(...[...document.querySelectorAll('.drawing svg')]"
+        ".map((e) => e.clientWidth / e.viewBox.baseVal.width))"
+    )
+    assert least_px * 8.0 >= 9.0  # labels are of 8 pt or more
+    assert page.locator("figure > p").first.evaluate("(e) => parseFloat(getComputedStyle(e).fontSize)") >= 13.0
+
+
 def check_width(page: Any, width: int) -> None:
     """Nothing stands outside a page whose every part is open."""
     page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")

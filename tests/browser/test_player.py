@@ -108,7 +108,7 @@ def test_player__gap_stands_at_the_vehicle_behind_it(open_page: Open, report_fil
 
 def test_player__gap_of_the_first_vehicle_is_that_to_an_obstacle(open_page: Open, report_file: Path) -> None:
     page = open_page(report_file)
-    page.evaluate(f"{PLAYER}.data.worlds[{PLAYER}.world].obstacle = 60; {PLAYER}.build(); {PLAYER}.seek(0.7)")
+    page.evaluate(f"{PLAYER}.episodes()[0].obstacle = 60; {PLAYER}.build(); {PLAYER}.seek(0.7)")
     front = page.evaluate(f"stateAt({PLAYER}.episodes()[0], 0.7).front")
     told = page.locator(".readout .each").first.inner_text()
     assert told.endswith(f"gap ahead {60.0 - front:.2f} m")

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from ethbrake_marl.errors import plain_text
-from ethbrake_marl.figures.style import COLOURS, new_figure
+from ethbrake_marl.figures.style import COLOURS, add_caption, new_figure
 from ethbrake_marl.pages.frame import Section, page, paragraph, read_file
 from ethbrake_marl.pages.parts import Block, Cell, data, facts, heading, opened, table
 from ethbrake_marl.pages.vector import drawing, inline_svg
@@ -101,10 +101,28 @@ def test_drawing__has_text_as_outlines_and_the_colours_of_the_page() -> None:
 
 @pytest.mark.parametrize("text", HOSTILE[:24])
 def test_drawing__label_is_text(text: str) -> None:
-    tags = [tag for tag, _ in Page(str(inline_svg(b'<svg xmlns="http://www.w3.org/2000/svg"/>', text))).tags]
+    tags = [tag for tag, _ in Page(str(inline_svg(b'<svg xmlns="http://www.w3.org/2000/svg"/>', text)[0])).tags]
     assert tags == ["svg"]
 
 
 def test_page__has_the_palette_of_the_figures() -> None:
     css = read_file("page.css")
     assert [re.search(rf"--series-{k}: (#\w+)", css)[1].lower() for k in range(7)] == [c.lower() for c in COLOURS]  # type: ignore[index]
+
+
+def test_drawing__the_caption_is_text_of_the_page() -> None:
+    figure = new_figure(6.0, 3.0)
+    figure.subplots().plot([0.0, 1.0])
+    text = (
+        "One hundred worlds of the list of seed 7; gaps from 5 to 10 m, each drawn alone, and the first-impact harm "
+        * 2
+    )
+    add_caption(figure, f"{text.strip()} Known.")
+    html = drawing(figure, "Title", "Words.", known="Known.").html
+    shown = Page(str(html)).text.replace("\n", " ")
+    assert shown.endswith(text.strip()) and "<!--" not in html
+    taken = re.search(r'viewBox="0 0 432 ([0-9.]+)"', html)
+    assert taken is not None and float(taken[1]) < 216.0
+    names = set(re.findall(r' id="([^"]+)"', html))
+    assert set(re.findall(r'href="#([^"]+)"', html)) <= names
+    assert figure.get_supxlabel().startswith("One hundred worlds")

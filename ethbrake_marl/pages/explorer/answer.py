@@ -73,7 +73,7 @@ class Explored:
         drivers: dict[str, Agent] = {**self.lineup, "by hand": self.by_hand(profile)}  # type: ignore[dict-item]  # no teams
         motions = {name: self.follow(world, driver) for name, driver in drivers.items()}
         return {
-            "world": played_world(world, [played_episode(motion) for motion in motions.values()]),
+            "world": played_world(world, [played_episode(motion, (self.vehicle,)) for motion in motions.values()]),
             "outcomes": [outcome(name, motion) for name, motion in motions.items()],
             "verdict": self.verdict(world),
             "constant": self.best_constant(world),
@@ -149,7 +149,7 @@ class Explored:
             "commands": commands if which == 0 else profile.tolist(),
             "candidates": used,
             "by_hand": which == 1,
-            "episode": played_episode(motions[which]),
+            "episode": played_episode(motions[which], (self.vehicle,)),
         }
 
     def _starts(self, world: Worlds, problem: ProfileProblem) -> Profiles:

@@ -15,10 +15,11 @@ from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.ablation import change_figure, harm_curve, who_pays
 from ethbrake_marl.figures.style import Figure, write_picture
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.pages.frame import Section, page, paragraph
+from ethbrake_marl.pages.frame import Section, page
 from ethbrake_marl.pages.parts import facts, table
 from ethbrake_marl.pages.vector import drawing
 from ethbrake_marl.studies.ablation.comparison import compare
+from ethbrake_marl.studies.ablation.episodes import episodes_section
 from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, LineResult
 from ethbrake_marl.studies.ablation.plan import Plan
 from ethbrake_marl.studies.ablation.run import Measured
@@ -45,17 +46,20 @@ def markdown(found: Json, conditions: str) -> str:
     return "\n\n".join([*blocks, conditions]) + "\n"
 
 
-def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure]) -> str:
-    """The figures by name and all tables as one HTML page, with their conditions."""
+def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], episodes: Sequence[Section] = ()) -> str:
+    """The figures by name, sections of episodes to watch and all tables as one HTML page, with their conditions."""
     drawn = [
-        drawing(figure, *FIGURE_TEXTS[name], alone=name == "ablation-who-pays.png") for name, figure in figures.items()
+        drawing(figure, *FIGURE_TEXTS[name], alone=name == "ablation-who-pays.png", known=conditions)
+        for name, figure in figures.items()
     ]
-    sections = [Section("Figures", [*drawn, paragraph(conditions, "quiet")])] if drawn else []
+    sections = [Section("Conditions", [conditions])]
+    sections += [Section("Figures", drawn)] if drawn else []
+    sections += episodes
     for title, tables in _blocks(found):
         parts = [
             table(t.head, [[cell.replace("`", "") for cell in row] for row in t.rows]) for t in map(_alone, tables)
         ]
-        sections.append(Section(title, [*parts, paragraph(conditions, "quiet")]))
+        sections.append(Section(title, parts))
     settings = {name: value for name, value in found["settings"].items() if name != "recipes"}
     sections.append(Section("Settings", [facts(settings)]))
     return page("What cooperation is worth", sections, lead="Who learns, who knows, whose harm counts: step by step.")
@@ -251,7 +255,8 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> di
     figures = {name: draw(found, conditions) for name, draw in FIGURES.items() if drawn}
     for name, figure in figures.items():
         write_picture(plan.folder / name, figure, force=True)
-    write_output(plan.folder / PAGE, ablation_page(found, conditions, figures).encode(), force=True)
+    page_text = ablation_page(found, conditions, figures, [episodes_section(plan, measured)])
+    write_output(plan.folder / PAGE, page_text.encode(), force=True)
     return found
 
 

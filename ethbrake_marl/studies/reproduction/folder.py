@@ -18,6 +18,7 @@ from ethbrake_marl.figures.style import picture_bytes
 from ethbrake_marl.files.durable import check_writable, write_file
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.learning.run_folder import read_object
+from ethbrake_marl.studies.reproduction.episodes import keep_episodes
 from ethbrake_marl.studies.reproduction.item import Item, Made, Settings
 from ethbrake_marl.studies.reproduction.items import ITEMS
 from ethbrake_marl.studies.reproduction.verdicts import OUTCOMES, Verdict, summarise_verdicts
@@ -120,6 +121,7 @@ def write_item(folder: ReproductionFolder, item: Item, made: Made, more: Mapping
             write_output(file, picture_bytes(drawn.figure, file), force=True)
     for stem, text in (made.data or {}).items():
         write_output(place / f"{stem}.csv", text.encode(), force=True)
+    keep_episodes(place, made.episodes)
     result = item_json(item, made, more)
     write_output(folder.result(item.name), _text(result), force=True)
     return result
@@ -161,6 +163,8 @@ def read_result(folder: ReproductionFolder, item: Item) -> Json:
         raise _damaged(f"{file}: comparisons")
     if content["verdict"] != summarise_verdicts(compared).to_json():
         raise _damaged(f"{file}: verdict")
+    if type(content.get("episodes", 2)) is not int:
+        raise _damaged(f"{file}: episodes")
     return content
 
 

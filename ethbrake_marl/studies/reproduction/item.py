@@ -100,6 +100,7 @@ class Made:
     figures: tuple[Drawn, ...] = ()
     data: Mapping[str, str] | None = None  # stem of a CSV file -> its text
     notes: tuple[str, ...] = ()  # computed sentences: what was run, what was not
+    episodes: Mapping[str, Any] | None = None  # to watch on the page: what ``player_content`` gave
 
     @property
     def verdict(self) -> Verdict:

@@ -10,11 +10,10 @@ from pathlib import Path
 from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.evaluation.per_world import check_target, write_output
 from ethbrake_marl.studies.reproduction.folder import Json, ReproductionFolder, checked_stem, read_figure
-from ethbrake_marl.studies.reproduction.page import LEAD
+from ethbrake_marl.studies.reproduction.page import command_of, few_worlds, lead_of, made_in
 
 FIGURES, PREFIX = "figures", "reproduction-"  # of the figures beside the page
-_LOAD = r", load [0-9.]+"  # of the machine, which differs from item to item
-COMMAND = "ethbrake reproduce --full --output runs/reproduction --docs docs/reproduction.md"
+_PLACES = "--output runs/reproduction --docs docs/reproduction.md"
 
 
 def check_docs(file: Path) -> None:
@@ -43,16 +42,15 @@ def write_docs(file: Path, folder: ReproductionFolder, results: Sequence[Json]) 
 
 def docs_page(results: Sequence[Json]) -> str:
     """The page of these results."""
-    machines = (f"{each['made_utc'][:10]}, {re.sub(_LOAD, '', each['machine'])}" for each in results)
-    made = _cell("; ".join(dict.fromkeys(machines)))
-    seconds = sum(each["processor_s"] for each in results)
+    few = few_worlds(results)
     blocks = [
         "# The paper, made again",
-        LEAD,
-        f"Made by `{COMMAND}` ({made}; {seconds:.0f} s of one core without the trainings). The page, its figures and"
+        lead_of(results),
+        f"Made by `{command_of(results)} {_PLACES}` ({_cell(made_in(results))}). The page, its figures and"
         " `reproduction.json`, which holds the same as data, are written by that command and not by hand;"
         " `ethbrake reproduce` makes them again without training. [The paper, line by line](paper.md) has the account"
         " of every equation.",
+        *([few] if few else []),
         "## Overview",
         _table(
             ("Item", "Verdict", "Because"),

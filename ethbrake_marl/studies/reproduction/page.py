@@ -9,19 +9,23 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from ethbrake_marl.pages.frame import Part, Section, anchors, page, paragraph, shown
-from ethbrake_marl.pages.parts import Cell, facts, opened, table
+from ethbrake_marl.pages.parts import Cell, facts, heading, opened, table
 from ethbrake_marl.pages.vector import kept_drawing
+from ethbrake_marl.studies.reproduction.episodes import kept_player
 from ethbrake_marl.studies.reproduction.folder import Json, ReproductionFolder, read_figure
+from ethbrake_marl.studies.reproduction.item import FULL, MOST_EPISODES
+from ethbrake_marl.studies.reproduction.items import ITEMS
 from ethbrake_marl.studies.reproduction.verdicts import OUTCOMES, TOLERANCE
 
 TITLE = "The paper, made again"
-LEAD = (
-    "Every figure and table of How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning, with the"
+_LEAD = (
+    " of How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning, with the"
     " paper's numbers and statements. Every verdict is computed: a number agrees where it is within the chance between"
     f" two lists of worlds or {100.0 * TOLERANCE:g} % of what is printed, and cannot agree where a bound that holds for"
     " every strategy excludes it. Statements are those of the paper's text; its figures hold no printed numbers."
 )
 _OVERVIEW = "Overview"
+_LOAD = r", load [0-9.]+"  # of the machine, which differs from item to item
 _INTERVAL = re.compile(r"(.*) \[([^][]*)\]")
 _NUMBER = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
@@ -36,13 +40,57 @@ def render_page(folder: ReproductionFolder, results: Sequence[Json]) -> str:
         [Markup('<a href="#{}">{}</a>').format(name, shown(result["title"])), _verdict(result["verdict"])]
         for name, result in zip(names, results, strict=True)
     ]
-    overview = Section(_OVERVIEW, [table(["Item", "Verdict"], rows, caption="Verdict on each item")])
-    return page(TITLE, [overview, *(_section(folder, result) for result in results)], lead=LEAD)
+    told = Markup("<p>Made by <code>{}</code> ({}).</p>\n").format(shown(command_of(results)), shown(made_in(results)))
+    few = [paragraph(text, "note") for text in (few_worlds(results),) if text]
+    body = [Part(told), *few, table(["Item", "Verdict"], rows, caption="Verdict on each item")]
+    sections = [Section(_OVERVIEW, body), *(_section(folder, result) for result in results)]
+    return page(TITLE, sections, lead=lead_of(results))
+
+
+def lead_of(results: Sequence[Json]) -> str:
+    """What a page of these results is about."""
+    if len(results) == len(ITEMS):
+        return f"Every figure and table{_LEAD}"
+    return f"{len(results)} of the {len(ITEMS)} items{_LEAD}"
+
+
+def command_of(results: Sequence[Json]) -> str:
+    """The command that makes these results."""
+    names = [] if len(results) == len(ITEMS) else [result["name"] for result in results]
+    full = any(result.get("mode") == FULL for result in results)
+    most = _most_worlds(results)
+    few = [] if most is None else ["--episodes", str(most)]
+    return " ".join(["ethbrake reproduce", *names, "--full" if full else "--quick", *few])
+
+
+def made_in(results: Sequence[Json]) -> str:
+    """Dates, machines with versions, and processor time of these results."""
+    machines = (f"{each['made_utc'][:10]}, {re.sub(_LOAD, '', each['machine'])}" for each in results)
+    seconds = sum(each["processor_s"] for each in results)
+    return f"{'; '.join(dict.fromkeys(machines))}; {seconds:.0f} s of one core without the trainings"
+
+
+def few_worlds(results: Sequence[Json]) -> str:
+    """That lists are shorter than the paper's, as a sentence; empty where they are not, or where nobody noted it."""
+    most = _most_worlds(results)
+    return (
+        ""
+        if most is None
+        else f"At most {most:,} worlds of each list are driven here; the paper has {MOST_EPISODES:,}."
+    )
+
+
+def _most_worlds(results: Sequence[Json]) -> int | None:
+    """The most worlds of any list, where that is fewer than the paper's."""
+    most = max((result.get("episodes", MOST_EPISODES) for result in results), default=MOST_EPISODES)
+    return most if most < MOST_EPISODES else None
 
 
 def _section(folder: ReproductionFolder, result: Json) -> Section:
     body: list[str | Part] = [result["what"], _account(result), *result["notes"]]
     body += [_figure(folder, result["name"], each) for each in result["figures"]]
+    played = kept_player(folder.path / result["name"])
+    body += [heading("Episodes"), played] if played else []
     for each in result["tables"]:
         body.append(table(each["head"], _rows(each["rows"]), caption=each["title"]))
         body += [paragraph(each["note"], "quiet")] if each["note"] else []

@@ -54,6 +54,7 @@ def make_item(folder: ReproductionFolder, item: Item, settings: Settings) -> Jso
     made = item.make(settings)
     more = {
         "mode": settings.mode,
+        "episodes": settings.episodes,
         "trained": trained,
         "processor_s": round(time.process_time() - started, 1),
         "made_utc": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.evaluation import EpisodeRecord, record_episode
+from ethbrake_marl.evaluation.inputs import make_agents
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.episode import trajectories
 from ethbrake_marl.figures.reproduction import profiles_figure, road_figure
+from ethbrake_marl.pages.chosen import drive_played
+from ethbrake_marl.pages.player import Played, player_content
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.studies.reproduction.item import (
     LIST_SEED,
@@ -58,7 +62,10 @@ def reproduce_trajectories(settings: Settings) -> Made:
         over_time = trajectories(own, caption=text)
         figures.append(Drawn(f"trajectories-time-{stem}", f"Over time, {reading.name}", text, over_time))
     verdicts = [verdict for reading in READINGS for verdict in _judge_positions(reading, records)]
-    return Made(tuple(verdicts), _parameters(), (_outcomes(records),), tuple(figures), {"trajectories": _csv(records)})
+    return Made(
+        tuple(verdicts), _parameters(), (_outcomes(records),), tuple(figures), {"trajectories": _csv(records)},
+        episodes=_played(),
+    )  # fmt: skip
 
 
 def reproduce_accelerations(settings: Settings) -> Made:
@@ -85,6 +92,22 @@ def _record_all(settings: Settings) -> Records:
                 found[reading, number, name] = record_episode(world, agent, scenario=scenario)
                 settings.say("recorded episodes", len(found), len(READINGS) * len(_SCENARIOS) * len(_AGENTS))
     return found
+
+
+def _played() -> dict[str, Any]:
+    """Both scenarios in both readings, PPO and SAC side by side, for the player of the page."""
+    found = []
+    for reading in READINGS:
+        for number in _SCENARIOS:
+            scenario = read_scenario(f"paper-scenario-{number}", reading)
+            world = scenario.sample(1, LIST_SEED).worlds
+            latencies = ",".join(f"{each:g}" for each in scenario.model_dump()["latency_s"])
+            again = "" if reading.acts_s is None else f"replay with --set latency_s=[{latencies}]"
+            one = Played(0, reading.name, again, {}, {}, f"Scenario {number}, {reading.name}")
+            for spec, agent in make_agents(_AGENTS, scenario).items():
+                drive_played([one], world, NAMES[spec], agent, scenario, spec, seed=LIST_SEED)
+            found.append(one)
+    return player_content(found, scenario.learners) | {"shown": [_AGENTS.index(PPO), _AGENTS.index(SAC)]}
 
 
 def _panel(number: int, name: str) -> str:

@@ -14,6 +14,8 @@ import pytest
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.passport import parse_passport
+from ethbrake_marl.evaluation.replay import Given, replay
 from ethbrake_marl.learning import train as learning_train
 from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.studies.ablation import run as trainings
@@ -63,6 +65,21 @@ def test_ablate__writes_tables_and_figures(ablation):
     ]
     pair = found["levels"][1]["total"]
     assert pair["searched"]["best_known"]["value"] <= pair["searched"]["full_brake"]["value"]
+
+
+@pytest.mark.parametrize("column", [0, 1])
+def test_page__plays_the_same_worlds_at_every_level(ablation, column):
+    html = (ablation / "ablation.html").read_text("utf-8")
+    assert len(html) <= 5 << 20
+    told = html.split('<script type="application/json" id="episode_data">')[1].partition("</script>")[0]
+    content = json.loads(told)
+    assert content["agents"] == LEVELS.split(",")
+    assert [episode["driven"] for episode in content["worlds"][0]["episodes"]] == [[], [1, 2], [1, 2]]
+    assert 3 <= len(content["worlds"]) <= 7
+    passport = parse_passport(content["worlds"][2]["episodes"][column]["passport"])
+    (folder,) = (ablation / "trainings").glob("cooperation-3-pair-*-seed0")
+    again = replay(passport, Given(agent=f"ppo@{folder}" if column else None))
+    assert again.same and again.passport.policy_sha == passport.policy_sha
 
 
 def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(ablation, tmp_path, tiny, monkeypatch, capsys):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ethbrake_marl.figures.ablation import change_figure, harm_curve, who_pays
+from ethbrake_marl.figures.ablation import change_figure, harm_curve, signed_ticks, who_pays
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.ablation.comparison import compare
 from ethbrake_marl.studies.ablation.plan import Level
@@ -115,7 +115,34 @@ def test_page__holds_the_tables_and_figures(found):
     shown = Page(html)
     assert shown.open == [] and not {"script", "b", "img"} & {tag for tag, _ in shown.tags}
     assert "cooperation-2-paper 100.0 % [91.2, 100.0] 20.00 11.00 [10.00, 12.00]" in shown.text
+    assert shown.text.count("40 worlds.") == 1
     assert "`" not in shown.text and html.count("<figure>") == 3 and "</script><b>" in shown.text
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "ticks"),
+    [
+        (-0.47, 0.05, [-0.2, -0.1, 0.0]),
+        (-0.6, 0.3, [-0.3, -0.1, 0.0, 0.1, 0.3]),
+        (-30.0, 12.0, [-10.0, -1.0, -0.1, 0.0, 0.1, 1.0, 10.0]),
+        (-0.02, 0.0, [-0.01, -0.001, 0.0]),
+        (0.0, 0.0, [0.0]),
+    ],
+)
+def test_ticks__are_a_few_round_numbers(low, high, ticks):
+    assert set(ticks) <= set(signed_ticks(low, high)) and len(signed_ticks(low, high)) <= 11
+
+
+def test_figures__texts_stand_inside_and_the_colour_bar_reaches_its_end(found):
+    figure = change_figure(found, "40 worlds")
+    FigureCanvasAgg(figure).draw()
+    for axes in figure.axes:
+        inside = axes.get_window_extent()
+        for text in axes.texts:
+            box = text.get_window_extent()
+            assert inside.x0 <= box.x0 and box.x1 <= inside.x1 and box.y1 <= inside.y1
+    bar = who_pays(found, "40 worlds").axes[-1]
+    assert max(bar.get_yticks()) >= 0.3 * bar.get_ylim()[1]
 
 
 def test_tables__name_the_algorithm_where_there_are_two(ablation):

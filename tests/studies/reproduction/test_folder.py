@@ -205,3 +205,21 @@ def test_write_docs__page_data_and_figures(settings: Settings, tmp_path: Path) -
     assert (tmp_path / "figures" / "reproduction-a-figure.svg").is_file()
     with pytest.raises(InvalidInput, match=r"must end in \.md"):
         write_docs(tmp_path / "page.html", ReproductionFolder(settings.folder), results)
+
+
+def test_pages__say_command_machine_and_how_little_was_made(settings: Settings) -> None:
+    results, _ = reproduce(
+        [planted("gaps", lambda s: made())], replace(settings, machine="a CPU, load 3.1, numpy 2.4.6")
+    )
+    page = Page((settings.folder / "index.html").read_text("utf-8"))
+    for text in (page.text, docs_page(results)):
+        assert "1 of the 10 items" in text and "ethbrake reproduce gaps --quick --episodes 24" in text
+        assert f"({results[0]['made_utc'][:10]}, a CPU, numpy 2.4.6; " in text
+        assert "At most 24 worlds of each list are driven here; the paper has 10,000." in text
+
+
+def test_pages__of_results_that_do_not_say_how_many_worlds_say_nothing_of_it(settings: Settings) -> None:
+    (result,), _ = reproduce([planted("gaps", lambda s: made())], settings)
+    result.pop("episodes")
+    page = Page(render_page(ReproductionFolder(settings.folder), [result]))
+    assert "worlds of each list" not in page.text and "reproduce gaps --quick (" in page.text
