@@ -182,6 +182,15 @@ class AgentFailed(InvalidInput):
         return AgentFailed(self.agent, None if self.row is None else int(rows[self.row]), self.reason)
 
 
+@contextmanager
+def naming_agent(name: str) -> Iterator[None]:
+    """Name an agent that fails inside the block as the user does: on the command line, or in a mapping."""
+    try:
+        yield
+    except AgentFailed as error:
+        raise AgentFailed(name, error.row, error.reason) from error
+
+
 class OldSpelling(FutureWarning):
     """Something is written as it was before this version; the message holds the new spelling. The next refuses it."""
 

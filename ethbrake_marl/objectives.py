@@ -26,10 +26,10 @@ from pydantic import GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.harm import HarmCount, Ledger
-from ethbrake_marl.physics.worlds import Floats
+from ethbrake_marl.physics.worlds import Floats, unwritable
 
 STANDARD = ("total", "own", "social:45", "maximin", "mass-weighted")  # those that need no knowledge of the scenario
 
@@ -47,7 +47,7 @@ class Objective(NamedTuple):
 
 
 class HarmSoFar(NamedTuple):
-    """What objectives are computed from, for n worlds of N vehicles; read it, do not change it."""
+    """What objectives are computed from, for n worlds of N vehicles; it cannot be written to."""
 
     borne: Floats  # [n, N] what each vehicle bears, m2/s2
     whole: Floats  # [n] what all do
@@ -119,7 +119,8 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
 
 def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
     """What the objective of each vehicle makes of the harm so far, [n, N] (m2/s2): less is better."""
-    harm = HarmSoFar(ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count), ledger.mass_t)
+    told = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count), ledger.mass_t
+    harm = HarmSoFar(*(unwritable(each) for each in told))
     return np.stack([KINDS[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
 
 
@@ -146,7 +147,11 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
         raise InvalidInput(f"objective {name!r}: needs a function with a docstring that says what it is")
 
     def amount(_: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
-        return _checked(name, function(harm, vehicle), vehicle, len(harm.whole))
+        try:
+            value = function(harm, vehicle)
+        except Exception as error:
+            raise InvalidInput(f"objective {name!r}: of vehicle_{vehicle + 1}: {describe_error(error)}") from error
+        return _checked(name, value, vehicle, len(harm.whole))
 
     entry = Kind(name, " ".join((function.__doc__ or "").split()), amount, function)
     if KINDS.setdefault(name, entry).function is not function:

@@ -39,12 +39,15 @@ settings.load_profile("deterministic")
 def _own_user_files() -> Iterator[None]:
     """What a test ran of users' files is no part of the versions that the next test's results tell."""
     plugins = sys.modules.get("ethbrake_marl.files.plugins")
-    before = {} if plugins is None else dict(plugins._RUN)
+    tables = ("_RUN", "_READ", "_LOADED")
+    before = [{} if plugins is None else dict(getattr(plugins, name)) for name in tables]
     yield
     plugins = sys.modules.get("ethbrake_marl.files.plugins")
-    if plugins is not None and before != plugins._RUN:
-        plugins._RUN.clear()
-        plugins._RUN.update(before)
+    for name, then in () if plugins is None else zip(tables, before, strict=True):
+        now = getattr(plugins, name)
+        if now != then:
+            now.clear()
+            now.update(then)
 
 
 @pytest.fixture(autouse=True)

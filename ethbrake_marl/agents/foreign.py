@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import sys
 from collections.abc import Callable
@@ -33,7 +34,7 @@ def adapt_policy(policy: Any, name: str, with_state: bool) -> Infer:
     elif _is_torch_module(policy):
         return _ask_torch(policy, with_state)
     elif callable(policy):
-        return policy if with_state else lambda seen, _: (policy(seen), None)
+        return policy if with_state else lambda seen, _: (_without_memory(policy(seen)), None)
     else:
         raise InvalidInput(f"agent {name!r}: a {type(policy).__name__} is no policy; must be {_KINDS}")
     if with_state:
@@ -42,6 +43,15 @@ def adapt_policy(policy: Any, name: str, with_state: bool) -> Infer:
             " around this model"
         )
     return lambda seen, _: (call(seen), None)
+
+
+def _without_memory(action: Any) -> Any:
+    if isinstance(action, tuple):
+        raise InvalidInput(
+            f"gave a tuple of {len(action)} in place of an action; a policy with a memory gives (action, state), and"
+            " needs initial_state"
+        )
+    return action
 
 
 def _ask_model(model: Any) -> Callable[[Observations], Any]:
@@ -88,6 +98,26 @@ def _open_onnx(path: Path, name: str) -> Any:
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 
+def weights_sha256(policy: Any) -> str | None:
+    """SHA-256 of an .onnx file, or of the weights of a torch module or a Stable-Baselines3 model as they are now.
+
+    None for anything else, whose weights nobody can find.
+    """
+    if isinstance(policy, str | os.PathLike):
+        return hashlib.sha256(Path(policy).read_bytes()).hexdigest() if Path(policy).is_file() else None
+    module: Any = policy if _is_torch_module(policy) else getattr(policy, "policy", None)
+    if not _is_torch_module(module):
+        return None
+    digest = hashlib.sha256()
+    for name, tensor in module.state_dict().items():
+        array = to_array(tensor)
+        digest.update(f"{name} {array.dtype} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
 def to_array(value: Any) -> NDArray[Any]:
-    """An array, of a tensor too."""
+    """An array, of a tensor too; what is masked is no number."""
+    if isinstance(value, np.ma.MaskedArray):
+        return np.ma.filled(value.astype(np.float64), np.nan)
     return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)

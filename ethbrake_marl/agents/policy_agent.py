@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import LARGEST, action_to_command
-from ethbrake_marl.agents.foreign import Infer, State, adapt_policy, to_array
+from ethbrake_marl.agents.foreign import Infer, State, adapt_policy, to_array, weights_sha256
 from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, describe_error
 from ethbrake_marl.observations import (
@@ -71,7 +71,8 @@ def policy_agent(
             f"agent {named!r}: the policy takes observations of shape {shape}, here are {spec.size} features;"
             " give what it was trained on: scenario or observation"
         )
-    return PolicyAgent(adapt_policy(policy, named, initial_state is not None), named, spec, initial_state, clip)
+    infer = adapt_policy(policy, named, initial_state is not None)
+    return PolicyAgent(infer, named, spec, initial_state, clip, lambda: weights_sha256(policy))
 
 
 def _observation_of(policy: Any, scenario: Scenario | None, given: Observation | None) -> ObservationSpec:
@@ -102,8 +103,10 @@ class PolicyAgent:
         observation: ObservationSpec,
         initial_state: Callable[[int], State] | None,
         clip: bool,
+        weights_sha256: Callable[[], str | None],
     ) -> None:
         self.name = name
+        self.weights_sha256 = weights_sha256  # of the policy as it is now; None where nobody can find its weights
         self.observation = observation
         self._infer, self._initial_state, self._clip = infer, initial_state, clip
         self._steps: Ints = np.zeros(0, np.int64)  # [n] decisions of the running episodes
@@ -165,8 +168,8 @@ class PolicyAgent:
             return self._answer(seen, np.arange(worlds.n))
         except Exception as error:
             k = self._find_failing(seen)
-            where = "" if k is None else self._when(k, worlds) + ": "
-            reason = f"{where}observations of shape {seen.shape}: {describe_error(error)}"
+            where = self._whenever() if k is None else self._when(k, worlds)
+            reason = f"{where}: observations of shape {seen.shape}: {describe_error(error)}"
             raise AgentFailed(self.name, None if k is None else int(self._rows[k]), reason) from error
 
     def _answer(self, seen: Observations, rows: Ints) -> tuple[NDArray[Any], State]:
@@ -198,7 +201,7 @@ class PolicyAgent:
         """The actions [n] in [-1, 1]."""
         n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
         if action.shape != (n, 1) or action.dtype.kind not in "fiu":
-            first = len(action) if action.ndim and len(action) < n else 0
+            first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0
             raise self._refusal(first, worlds, f"{what}; one number per world is needed, shape ({n}, 1)")
         values: Floats = action[:, 0].astype(np.float64)
         if not np.isfinite(values).all():
@@ -213,6 +216,11 @@ class PolicyAgent:
 
     def _refusal(self, k: int, worlds: Worlds, reason: str) -> AgentFailed:
         return AgentFailed(self.name, int(self._rows[k]), f"{self._when(k, worlds)}: {reason}")
+
+    def _whenever(self) -> str:
+        """The step, of all running episodes, at which nobody knows whose it was."""
+        first, last = self._steps.min(initial=10**9) + 1, self._steps.max(initial=0) + 1
+        return f"step {first}" if first >= last else f"steps {first} to {last}"
 
     def _when(self, k: int, worlds: Worlds) -> str:
         return f"step {self._steps[k] + 1} ({worlds.time_s[k]:.2f} s)"

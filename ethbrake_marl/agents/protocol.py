@@ -63,7 +63,7 @@ def check_agent(agent: object, where: str) -> None:
     if not isinstance(agent, Agent):
         missing = [what for what in ("name", "begin", "act") if not hasattr(agent, what)]
         raise InvalidInput(
-            f"{where}: a {type(agent).__name__} is not an agent, it has no {' and no '.join(missing)};"
+            f"{where}: {type(agent).__name__!r} is no agent: it has no {' and no '.join(missing)};"
             " make_agent(name) makes one, policy_agent(policy) one of a function or a model, and"
             " LearnedAgent(load_policy(path)) one of a policy bundle"
         )

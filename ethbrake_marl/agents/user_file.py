@@ -10,7 +10,7 @@ from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.spelling import parse_spec
 from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.plugins import load_function
+from ethbrake_marl.files.plugins import load_function, note_file
 
 
 def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
@@ -22,6 +22,8 @@ def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
     named = parse_spec(settings.spec).file
     assert named is not None
     function = load_function(*named)
+    if settings.policy is not None:
+        note_file(settings.policy)
     if not _takes_nothing(function):
         made: Driver = function(argument, settings)
         return made

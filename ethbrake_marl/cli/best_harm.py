@@ -196,4 +196,4 @@ def _show_shipped(*, as_json: bool) -> None:
         write_json([bounds.to_json() for bounds in found])
         return
     for line in shipped_lines(found):
-        typer.echo(line)
+        show(line)

@@ -51,12 +51,12 @@ def comparison_table(found: Comparison) -> Table:
 
 
 def tell_conditions(found: Comparison) -> None:
-    """On stderr: how the intervals were made, who stands in one result only, and which versions differ."""
+    """On stderr: how the intervals were made, who stands in one result only, and which settings and versions differ."""
     say("second minus first, mean per world in m²/s²; in brackets: 95 % intervals,")
     why = found.unpaired_because
     say("paired by world" if why is None else f"NOT paired, wider than they would be paired by world: {why}")
     for which, agents in zip(("first", "second"), found.left_over, strict=True):
         if agents:
             say(f"in the {which} only: {', '.join(agents)}")
-    for name, (one, other) in found.other_versions.items():
+    for name, (one, other) in {**found.other_settings, **found.other_versions}.items():
         say(f"note: {name} {one} in the first, {other} in the second")

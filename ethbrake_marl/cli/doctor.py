@@ -7,17 +7,21 @@ import platform
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from time import perf_counter
+from typing import Annotated
 
 import numpy as np
+import typer
 from packaging.requirements import Requirement
 from packaging.version import Version
 
 from ethbrake_marl import __version__
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.cli.options import JsonOption
+from ethbrake_marl.cli.terminal import show, write_json
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import LIST_SEED, make_lineup, make_proposers
 from ethbrake_marl.evaluation.shield_modes import compare_modes
@@ -180,3 +184,24 @@ def _world(
         mass_t=5.0,
         restitution=0.1,
     )
+
+
+def doctor_command(
+    warm_up: Annotated[
+        bool, typer.Option("--warm-up", help="Compile all of the physics now, so that no later command waits for it.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Check this installation: versions, folders, physics.
+
+    One line per check, OK or FAIL; exit status 1 when any failed.
+    """
+    checks = diagnose(warm_up=warm_up)
+    if as_json:
+        write_json([asdict(check) for check in checks])
+    else:
+        width = max(len(check.name) for check in checks)
+        for check in checks:
+            show(f"{'OK' if check.ok else 'FAIL':4}  {check.name:{width}}  {check.detail}")
+    if not all(check.ok for check in checks):
+        raise typer.Exit(1)

@@ -11,7 +11,7 @@ import typer
 from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import JsonOption, ScenarioOption
 from ethbrake_marl.cli.settings import SetOption, read_settings
-from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, write_json
+from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, show, write_json
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.inputs import check_agents, load_driven, make_lineup
@@ -78,9 +78,7 @@ def equal_time_command(
         write_json({"machine": asdict(machine), **conditions, "agents": [row.to_json() for row in rows]})
         return
     result_console().print(timed_table(rows, against))
-    typer.echo(
-        f"{chosen.name}: {count_of(episodes, 'world')}, seed {seed}; {harm_count} harm minimised. Machine: {machine}"
-    )
+    show(f"{chosen.name}: {count_of(episodes, 'world')}, seed {seed}; {harm_count} harm minimised. Machine: {machine}")
 
 
 def _check_unknown(worlds: Worlds, scenario: Scenario, harm_count: HarmCount, seed: int) -> None:

@@ -18,9 +18,8 @@ from ethbrake_marl.cli.picture import PictureOption, counted_without, picture_ap
 from ethbrake_marl.cli.report import ReportOption, check_page, write_evaluation_report
 from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
-from ethbrake_marl.errors import count_of
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation import (
-    Rescored,
     SummaryRow,
     check_target,
     declared_objectives,
@@ -32,7 +31,7 @@ from ethbrake_marl.evaluation import (
     summarise,
 )
 from ethbrake_marl.evaluation.compare import results_to_json
-from ethbrake_marl.evaluation.frame import check_parquet, write_per_world
+from ethbrake_marl.evaluation.frame import check_per_world, write_per_world
 from ethbrake_marl.evaluation.groups import check_group, summarise_by
 from ethbrake_marl.evaluation.inputs import (
     EPISODES,
@@ -106,12 +105,7 @@ def evaluate_command(
     +refined, then one shield, +episode, +step or +robust; for instance full_brake+step or ppo@PATH+refined+episode.
     PATH is a run or a policy bundle, or shipped.
     """
-    if per_world is not None:
-        check_parquet(per_world)
-        for file in (per_world, results_beside(per_world)):
-            check_target(file, force=force)
-    if report is not None:
-        check_page(report, force=force)
+    _check_outputs(per_world, report, force=force)
     chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
     objectives = declared_objectives(objective or (), chosen.vehicles)
     sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
@@ -136,9 +130,14 @@ def evaluate_command(
     groups = {} if by is None else summarise_by(evaluation, by)
     if per_world is not None:
         write_per_world(per_world, evaluation, objectives=objectives, force=force)
-        write_results_beside(per_world, rows, told, groups=groups, force=force)
-    show_rows(rows, as_json, told, groups=groups, per_world=per_world)
-    if not as_json:
+    agents_told = {"harm_count": harm_count, "uncertainty": uncertainty}
+    results = results_to_json(rows, told=told, groups=groups, per_world=per_world, settings=agents_told)
+    if per_world is not None:
+        _write_results_beside(per_world, results, force=force)
+    if as_json:
+        write_json(results)
+    else:
+        show_rows(rows)
         show_groups(groups)
     moving = {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
     if note := horizon_note(moving, sample.worlds.n, chosen.horizon_s):
@@ -147,38 +146,36 @@ def evaluate_command(
         result_console().print(rescored_table(told, harm_count))
 
 
-def results_beside(per_world: Path) -> Path:
+def _check_outputs(per_world: Path | None, report: Path | None, *, force: bool) -> None:
+    """Refuse outputs that cannot be written, or that would replace one another, before any work."""
+    if report is not None:
+        check_page(report, force=force)
+    if per_world is None:
+        return
+    check_per_world(per_world)
+    for file in (per_world, _results_beside(per_world)):
+        check_target(file, force=force)
+        if report is not None and file.resolve() == report.resolve():
+            raise InvalidInput(f"{file}: is the report, too (--report, --per-world); give another name")
+
+
+def _results_beside(per_world: Path) -> Path:
     """The results file that stands beside a file with one row per world."""
     return per_world.with_name(f"{per_world.name}.json")
 
 
-def write_results_beside(
-    per_world: Path, rows: Sequence[SummaryRow], told: Sequence[Rescored], *, groups: Groups, force: bool
-) -> None:
+def _write_results_beside(per_world: Path, results: object, *, force: bool) -> None:
     """Write the results file of the file with one row per world that has just been written."""
-    content = (
-        json.dumps(results_to_json(rows, told=told, groups=groups, per_world=per_world), indent=2, allow_nan=False)
-        + "\n"
-    )
-    write_output(results_beside(per_world), content.encode(), force=force)
-    say(f"every world: {per_world}; the results: {results_beside(per_world)}")
+    content = json.dumps(results, indent=2, allow_nan=False) + "\n"
+    write_output(_results_beside(per_world), content.encode(), force=force)
+    say(f"every world: {per_world}; the results: {_results_beside(per_world)}")
 
 
-def show_rows(
-    rows: Sequence[SummaryRow],
-    as_json: bool,
-    told: Sequence[Rescored] = (),
-    *,
-    groups: Groups | None = None,
-    per_world: Path | None = None,
-) -> None:
-    """The rows as a table, or as a results file, see ``results_to_json``."""
-    if not as_json:
-        result_console().print(rich_table(rows))
-        if rows and rows[0].metrics:
-            result_console().print(metrics_table(rows))
-        return
-    write_json(results_to_json(rows, told=told, groups=groups, per_world=per_world))
+def show_rows(rows: Sequence[SummaryRow]) -> None:
+    """The rows as a table."""
+    result_console().print(rich_table(rows))
+    if rows and rows[0].metrics:
+        result_console().print(metrics_table(rows))
 
 
 def show_groups(groups: Groups) -> None:

@@ -7,13 +7,15 @@ from typing import Annotated, Any
 import typer
 from typer.main import get_command
 
+from ethbrake_marl.cli.terminal import results_alone
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.files.plugins import load_plugin
 
 
 def _load_all(sources: list[str] | None) -> None:
-    for source in sources or ():
-        load_plugin(source)
+    with results_alone():
+        for source in sources or ():
+            load_plugin(source)
 
 
 PluginOption = Annotated[
@@ -42,6 +44,20 @@ def accept_plugins(command: Any) -> Any:
     for each in waiting:
         each.params.append(option)
         waiting += getattr(each, "commands", {}).values()
+    return command
+
+
+def keep_results_alone(command: Any) -> Any:
+    """The command, or group of them, of which those of this package leave stdout to their results.
+
+    A command of somebody's plug-in prints where it likes.
+    """
+    waiting = [command]
+    for each in waiting:
+        inner = getattr(each, "commands", None)
+        waiting += (inner or {}).values()
+        if inner is None and each.callback.__module__.startswith("ethbrake_marl."):
+            each.callback = results_alone()(each.callback)
     return command
 
 

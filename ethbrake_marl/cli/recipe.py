@@ -50,7 +50,8 @@ def recipe_show(recipe: Annotated[str, typer.Argument(metavar="NAME|PATH")]) -> 
 def recipe_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")]) -> None:
     """Check a recipe: one line, OK or what is wrong."""
     recipe = load_recipe(path)
-    scheme = recipe.scheme or f"single, or shared for several learners; also {', '.join(recipe.schemes)}"
+    others = ", ".join(name for name in recipe.schemes if name not in ("single", "shared"))
+    scheme = recipe.scheme or f"single, or shared for several learners{f'; also {others}' if others else ''}"
     show(f"OK  {recipe.name}: {recipe.algorithm}, {recipe.total_steps:,} steps, seed {recipe.seed}, scheme {scheme}")
 
 

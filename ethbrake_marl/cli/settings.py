@@ -59,7 +59,7 @@ def read_settings(texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe]
         inside = override.inside() if whose == [override.top] else override
         owners = [each for each in whose if inside.top in known[each]]
         if not owners:
-            raise unknown_name("setting", inside.top, {key for each in whose for key in known[each]})
+            raise unknown_name("setting", inside.top, {key for each in whose for key in known[each]} - {*OLD_KEYS})
         if len(owners) > 1:
             raise InvalidInput(f"--set {override.key}: write scenario.{override.key} or recipe.{override.key}")
         found[owners[0]].append(inside)

@@ -8,9 +8,9 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -33,12 +33,30 @@ def say(text: str) -> None:
 
 def show(text: str, end: str = "\n") -> None:
     """Lines of a result, on stdout; nothing in them but line ends and tabs moves the cursor."""
-    typer.echo(plain_text(text, keep=_KEPT) + end, nl=False)
+    typer.echo(plain_text(text, keep=_KEPT) + end, _stdout(), nl=False)
 
 
 def write_json(content: Any) -> None:
     """JSON on stdout."""
-    typer.echo(json.dumps(content, indent=2, allow_nan=False))
+    typer.echo(json.dumps(content, indent=2, allow_nan=False), _stdout())
+
+
+_KEPT_STDOUT: list[TextIO] = []  # while what others print goes to stderr
+
+
+def _stdout() -> TextIO:
+    return _KEPT_STDOUT[-1] if _KEPT_STDOUT else sys.stdout
+
+
+@contextmanager
+def results_alone() -> Iterator[None]:
+    """Keep stdout for results while the block runs: what a user's agent or plug-in prints goes to stderr."""
+    _KEPT_STDOUT.append(_stdout())
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _KEPT_STDOUT.pop()
 
 
 def tolerate_narrow_streams() -> None:
@@ -109,7 +127,7 @@ class Bars:
     def __init__(self, bars: Progress | None) -> None:
         self._bars = bars
         self._tasks: dict[str, TaskID] = {}
-        self._last_line = ""
+        self._last_label, self._last_done = "", False
 
     def show(
         self, name: str, done: int, total: int, metrics: Mapping[str, float] | None = None, note: str = ""
@@ -120,9 +138,9 @@ class Bars:
         if note:
             self.tell(note)
         if self._bars is None:
-            if label != self._last_line:
+            if label != self._last_label or (done >= total and not self._last_done):
                 say(f"{label}: {done:,} of {total:,}")
-            self._last_line = label
+            self._last_label, self._last_done = label, done >= total
             return
         if name not in self._tasks:
             self._tasks[name] = self._bars.add_task(label, total=total)
@@ -143,7 +161,7 @@ class Bars:
 @contextmanager
 def progress_bars() -> Iterator[Bars]:
     """Bars on stderr while the block runs."""
-    console = _PlainConsole(stderr=True)
+    console = _PlainConsole(sys.stderr)
     if not console.is_terminal:
         yield Bars(None)
         return
@@ -155,8 +173,8 @@ def progress_bars() -> Iterator[Bars]:
 class _PlainConsole(Console):
     """Shows text as it is: no markup in the names of agents and paths, and nothing that commands the terminal."""
 
-    def __init__(self, *, stderr: bool = False, width: int | None = None) -> None:
-        super().__init__(stderr=stderr, width=width, markup=False, emoji=False)
+    def __init__(self, file: TextIO, *, width: int | None = None) -> None:
+        super().__init__(file=file, width=width, markup=False, emoji=False)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         """The pieces of a line or table; those that rich made to style and move keep what they hold."""
@@ -166,4 +184,4 @@ class _PlainConsole(Console):
 
 def result_console() -> Console:
     """Where tables go: stdout, at the terminal's width or 100 columns in a file."""
-    return _PlainConsole(width=None if sys.stdout.isatty() else 100)
+    return _PlainConsole(_stdout(), width=None if _stdout().isatty() else 100)

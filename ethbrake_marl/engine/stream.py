@@ -23,6 +23,7 @@ from ethbrake_marl.physics.episode import first_decision_s, number_of_decisions
 from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.rows import Packed, harm_at, has_obstacle, pack, state_width
 from ethbrake_marl.physics.segment import DONE
+from ethbrake_marl.physics.worlds import read_only
 from ethbrake_marl.scenario import Scenario
 
 _SAMPLED_AT_ONCE = 1024  # training worlds are drawn in blocks of at least this many
@@ -210,10 +211,18 @@ def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
     return packed
 
 
+def is_ours(script: Script) -> bool:
+    """Whether this package made the script; any other gets worlds that it cannot write to, as they are everybody's."""
+    return type(script).__module__.startswith("ethbrake_marl.")
+
+
 def begin_script(script: Script, worlds: Worlds, vehicle: int, rows: Ints) -> None:
     """Tell a script that episodes begin; what one that is not ours raises becomes ``InvalidInput`` naming it."""
     try:
-        script.begin(worlds, vehicle, rows)
+        if is_ours(script):
+            script.begin(worlds, vehicle, rows)
+        else:
+            script.begin(read_only(worlds), vehicle, rows.copy())
     except Exception as error:
         raise _named(error, script, "begin", worlds, vehicle) from error
 
@@ -225,7 +234,7 @@ def ask_script(script: Script, worlds: Worlds, vehicle: int) -> Floats:
     ``InvalidInput`` naming it for whatever a script that is not ours raises.
     """
     try:
-        command = script.act(worlds, vehicle)
+        command = script.act(worlds if is_ours(script) else read_only(worlds), vehicle)
     except Exception as error:
         raise _named(error, script, "act", worlds, vehicle) from error
     given = np.asarray(command)
@@ -243,7 +252,7 @@ def ask_script(script: Script, worlds: Worlds, vehicle: int) -> Floats:
 
 def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
     """The error to raise for what a script raised: its own, where it speaks for itself."""
-    if isinstance(error, EthBrakeError) or type(script).__module__.startswith("ethbrake_marl."):
+    if isinstance(error, EthBrakeError) or is_ours(script):
         return error
     who = f"agent {getattr(script, 'name', type(script).__name__)!r} of vehicle_{vehicle + 1}"
     moment = f"{count_of(worlds.n, 'world')} at {worlds.time_s.min(initial=np.inf):.2f} s"

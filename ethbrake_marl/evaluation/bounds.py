@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.regret import Between, between
 from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.limits.best_harm import world_identity
@@ -67,6 +68,7 @@ class ShippedBounds:
     best_known_total: float | None
     proven: Proven | None
     nothing_proven_because: str | None
+    identity: dict[str, Any]  # hashes of worlds and scenario, versions
 
     def gap(self, best_known: float | None) -> float | None:
         """Best known minus proven harm, as a share of the best known."""
@@ -77,7 +79,8 @@ class ShippedBounds:
     def to_json(self) -> dict[str, Any]:
         """Plain data; what does not exist is null."""
         gaps = {"gap_first": self.gap(self.best_known_first), "gap_total": self.gap(self.best_known_total)}
-        return asdict(self) | gaps
+        own = asdict(self)
+        return {**own.pop("identity"), **own, **gaps}
 
 
 def shipped_bounds() -> Iterator[ShippedBounds]:
@@ -95,7 +98,8 @@ def bounds_of(table: BestHarmTable) -> ShippedBounds:
     scenario = load_scenario(header["scenario"])
     names, seed, episodes = tuple(header["vehicles"]), int(header["list_seed"]), int(header["episodes"])
     task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
-    worlds = scenario.sample(episodes, seed).worlds
+    sample = scenario.sample(episodes, seed)
+    worlds = sample.worlds
     table.check_holds_any(world_identity(worlds, task))
     first, total = (
         float(table.best[harm_count].harm.mean()) if harm_count in table.best else None for harm_count in HARM_COUNTS
@@ -104,7 +108,17 @@ def bounds_of(table: BestHarmTable) -> ShippedBounds:
     if why is None and obstacle_ahead(worlds).any():
         why = "an obstacle stands ahead; no least harm is proven"
     proven = None if why is not None else proven_of_table(worlds, task, table)
-    return ShippedBounds(scenario.name, names, seed, len(table.identity), first, total, proven, why)
+    return ShippedBounds(
+        scenario.name,
+        names,
+        seed,
+        len(table.identity),
+        first,
+        total,
+        proven,
+        why,
+        result_identity("best-harm", scenario, sample),
+    )
 
 
 def shipped_lines(found: Sequence[ShippedBounds]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +20,19 @@ from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.physics import Floats
 
 HARMS = ("first_impact_harm", "total_harm")
+USUAL: Mapping[str, str | None] = {"harm_count": "first", "uncertainty": None}  # settings of agents
 _COMPARED: dict[Kind, tuple[str, ...]] = {"evaluate": HARMS, "equal-time": HARMS, "shield": ("harm",)}  # harms of each
 _LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one with every world
+_MOST_EPISODES = 10**12
 _MOST_HARM = 1e100  # m2/s2; a number that can be squared
 _HASHES = {"worlds_sha256": "another list of worlds", "scenario_sha256": "another scenario"}
-_SAME = {"kind": "another kind of results", **_HASHES, "harm_count": "another harm"}  # the last: where it is told
+_SAME = {  # all but the hashes: where they are told
+    "kind": "another kind of results",
+    "worlds_sha256": _HASHES["worlds_sha256"],
+    "controlled_vehicle": "another driven vehicle",
+    "scenario_sha256": _HASHES["scenario_sha256"],
+    "harm_count": "another harm",
+}
 _NEEDED = {"agent": str, "episodes": int, **dict.fromkeys(_HASHES, str), "policy_sha256": dict, "versions": dict}
 
 
@@ -33,13 +42,16 @@ def results_to_json(
     told: Sequence[Rescored] = (),
     groups: Mapping[str, Sequence[SummaryRow]] | None = None,
     per_world: Path | None = None,
+    settings: Mapping[str, str | None] = USUAL,
 ) -> list[dict[str, Any]]:
     """What a results file holds: one object per row, with what was ``told`` of it under other objectives.
+
+    ``settings`` are those of all agents: the harm that they minimise, what a robust shield does not know.
 
     ``groups``, by name, are rows of the same agents on parts of the worlds (``summarise_by``).
     ``per_world`` is the file with one row per world, written before; its name and hash go into every object.
     """
-    found = [row.to_json() for row in rows]
+    found = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
     if told:
         found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
     for row in found if groups else ():
@@ -72,13 +84,8 @@ class Result:
     def estimate(self, agent: str, harm: str) -> Estimate:
         """The mean of a harm, with its interval."""
         row = self.rows[agent]
-        interval = row.get(f"{harm}_interval")
-        numbers = [row.get(harm), *(interval if isinstance(interval, list) else [])]
-        floats = [float(each) for each in numbers if isinstance(each, int | float) and not isinstance(each, bool)]
-        whole = len(floats) == len(numbers) == (1 if interval is None else 3)
-        if not (whole and all(abs(each) <= _MOST_HARM for each in floats) and row["episodes"] >= len(floats[:2])):
-            raise InvalidInput(f"{self.path}: {agent}: {harm} is no mean with an interval [low, high]")
-        return Estimate(floats[0], None if interval is None else (floats[1], floats[2]))
+        mean, interval = row[harm], row.get(f"{harm}_interval")
+        return Estimate(float(mean), None if interval is None else (float(interval[0]), float(interval[1])))
 
     def harms(self) -> dict[str, dict[int, tuple[float, ...]]]:
         """Those of every world; raises ``InvalidInput`` where the file that holds them is not to be had."""
@@ -115,6 +122,9 @@ class Comparison:
     differences: tuple[Difference, ...]
     unpaired_because: str | None  # None: intervals are paired by world
     left_over: tuple[tuple[str, ...], tuple[str, ...]]  # agents of the first alone, and of the second
+    other_settings: Mapping[
+        str, tuple[str | None, str | None]
+    ]  # of the agents of the first and of the second, likewise
     other_versions: Mapping[str, tuple[str | None, str | None]]  # of the first and of the second, where they differ
 
     def to_json(self) -> dict[str, Any]:
@@ -125,6 +135,7 @@ class Comparison:
             "agents": [difference.to_json() for difference in self.differences],
             "only_in_first": list(self.left_over[0]),
             "only_in_second": list(self.left_over[1]),
+            "other_settings": {name: list(both) for name, both in self.other_settings.items()},
             "other_versions": {name: list(both) for name, both in self.other_versions.items()},
         }
 
@@ -149,9 +160,40 @@ def read_result(path: Path) -> Result:
                     f"{path}: {key} is missing or no {kind.__name__}; a results file of an earlier version has no"
                     " hashes: evaluate again"
                 )
-    if len({tuple(row.get(key) for key in _SAME) for row in rows}) > 1:
+        _check_numbers(path, row)
+    if len({tuple(_told(row, key) for key in _SAME) for row in rows}) > 1:
         raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
-    return Result(path, {_name_of(row): row for row in rows})
+    named = [_name_of(row) for row in rows]
+    if twice := {name for name in named if named.count(name) > 1}:
+        raise InvalidInput(f"{path}: {min(twice)} stands in it twice")
+    return Result(path, dict(zip(named, rows, strict=True)))
+
+
+def _told(row: Mapping[str, Any], key: str) -> str | None:
+    """What a row says of itself, or its parameters do; None for neither."""
+    parameters = row.get("parameters")
+    told = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
+    return None if told is None else str(told)
+
+
+def _check_numbers(path: Path, row: Mapping[str, Any]) -> None:
+    """Refuse what is no number of episodes, and no mean harm with an interval around it."""
+    who = f"{path}: {row['agent']}"
+    if not 1 <= row["episodes"] <= _MOST_EPISODES or isinstance(row["episodes"], bool):
+        raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
+    for harm in _COMPARED[row["kind"]]:
+        if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), row["episodes"]):
+            raise InvalidInput(f"{who}: {harm} is no mean with an interval [low, high] around it")
+
+
+def _is_mean(mean: Any, interval: Any, episodes: int) -> bool:
+    """Whether these are a mean harm and its interval, which no single episode has."""
+    ends = [mean, mean] if interval is None else interval
+    if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and episodes == 1):
+        return False
+    low, high = ends
+    are_numbers = all(type(each) in (int, float) for each in (low, mean, high))
+    return are_numbers and -_MOST_HARM <= low <= mean <= high <= _MOST_HARM and mean >= 0
 
 
 def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
@@ -192,7 +234,7 @@ def compare_results(first: Result, second: Result) -> Comparison:
     different worlds or scenarios, or without a common agent.
     """
     for key, what in _SAME.items():
-        one, other = first.about.get(key), second.about.get(key)
+        one, other = (_told(result.about, key) for result in (first, second))
         if one != other:
             raise InvalidInput(
                 f"{second.path}: is about {what} than {first.path} ({key} {other!s:.12} and {one!s:.12}): no comparison"
@@ -207,7 +249,7 @@ def compare_results(first: Result, second: Result) -> Comparison:
         Difference(agent, _policies(first, second, agent), _differences(first, second, agent, worlds))
         for agent in common
     )
-    return Comparison(differences, because, (left_over[0], left_over[1]), _other_versions(first, second))
+    return Comparison(differences, because, (left_over[0], left_over[1]), *_others(first, second))
 
 
 Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of the first and of the second, world by world
@@ -225,7 +267,17 @@ def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tup
         if len(worlds) != first.rows[agent]["episodes"] or worlds != sorted(other.get(agent, {})):
             return None, f"the rows per world of {agent} are not those of {count_of(len(worlds), 'same world')}"
         found[agent] = tuple(np.array([side[agent][world] for world in worlds]) for side in (one, other))
+        for result, harms in zip((first, second), found[agent], strict=True):
+            _check_means(result, agent, harms)
     return found, None  # type: ignore[return-value]  # two of them each
+
+
+def _check_means(result: Result, agent: str, harms: Floats) -> None:
+    """Refuse means that are not those of the file with every world [n, 2]."""
+    for name, mean in zip(HARMS, harms.mean(axis=0), strict=True):
+        told = result.rows[agent].get(name)
+        if told is not None and not math.isclose(told, mean, rel_tol=1e-9, abs_tol=1e-9):
+            raise InvalidInput(f"{result.path}: {agent}: {name} = {told:g}, but the mean of its worlds is {mean:g}")
 
 
 def _differences(first: Result, second: Result, agent: str, worlds: Worlds | None) -> dict[str, Estimate]:
@@ -247,7 +299,11 @@ def _policies(first: Result, second: Result, agent: str) -> Literal["same", "oth
     return "same" if one == other else "other"
 
 
-def _other_versions(first: Result, second: Result) -> dict[str, tuple[str | None, str | None]]:
-    one, other = first.about["versions"], second.about["versions"]
-    names = dict.fromkeys([*one, *other])
-    return {name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)}
+def _others(first: Result, second: Result) -> list[dict[str, tuple[str | None, str | None]]]:
+    """Settings of the agents, and versions, that are not the same in both."""
+    found = []
+    for key in ("agent_settings", "versions"):
+        one, other = (each if isinstance(each := result.about.get(key), dict) else {} for result in (first, second))
+        names = dict.fromkeys([*one, *other])
+        found.append({name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)})
+    return found

@@ -19,7 +19,7 @@ from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.evaluation.per_world import per_world_columns, write_output, write_per_world_csv
 from ethbrake_marl.objectives import Declared
 
-PARQUET = ".parquet"
+CSV, PARQUET = ".csv", ".parquet"
 COLUMNS = "columns"
 LIBRARIES = ("pandas", "polars")  # in the order of preference
 _MOST_HARM = 1e100  # m2/s2; a number that can be squared
@@ -57,8 +57,9 @@ def write_per_world(
 ) -> None:
     """Write one row per agent and world: Parquet where the name ends in ``.parquet``, else CSV.
 
-    Raises as ``write_per_world_csv``, and as ``check_parquet``.
+    Raises as ``write_per_world_csv``, and as ``check_per_world``.
     """
+    check_per_world(path)
     if Path(path).suffix.lower() != PARQUET:
         write_per_world_csv(path, evaluation, objectives=objectives, force=force)
         return
@@ -70,9 +71,15 @@ def write_per_world(
     write_output(path, buffer.getvalue(), force=force)
 
 
-def check_parquet(path: str | Path) -> None:
-    """Raise ``MissingExtra`` for a Parquet file where pyarrow is not installed; before work whose result goes there."""
-    if Path(path).suffix.lower() == PARQUET:
+def check_per_world(path: str | Path) -> None:
+    """Refuse a file that ``write_per_world`` cannot write, before work whose result goes there.
+
+    Raises ``InvalidInput`` for another ending than .csv or .parquet, ``MissingExtra`` without pyarrow for Parquet.
+    """
+    ending = Path(path).suffix.lower()
+    if ending not in (CSV, PARQUET):
+        raise InvalidInput(f"{path}: must end in {CSV} or {PARQUET}")
+    if ending == PARQUET:
         need("pyarrow")
 
 

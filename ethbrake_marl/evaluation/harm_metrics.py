@@ -10,7 +10,7 @@ import numpy as np
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error
 from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance, make_worlds
-from ethbrake_marl.scenario.registered_features import read_only
+from ethbrake_marl.physics.worlds import read_only
 
 COLUMN = "metric_"  # before the name, in JSON and in files with every world
 _NAME = re.compile(r"(?!.*_[0-9]+\Z)[a-z][a-z0-9_]{0,63}")  # x_2 is that of the second vehicle

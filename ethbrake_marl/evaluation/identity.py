@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.policy_agent import PolicyAgent
 from ethbrake_marl.agents.protocol import AgentAround
 from ethbrake_marl.files.plugins import files_run
 from ethbrake_marl.physics import Ints, Worlds
@@ -66,12 +67,15 @@ def scenario_sha256(scenario: Scenario) -> str:
 
 
 def policy_sha256(agent: object) -> str | None:
-    """The hash in the manifest of the policy that an agent drives by, inside whatever is around it; None without one.
+    """The hash of the policy that an agent drives by, inside whatever is around it; None without one.
 
-    It binds names, network and weights (``Manifest.manifest_sha256``).
+    Of a bundle it is that in its manifest, which binds names, network and weights (``Manifest.manifest_sha256``); of
+    another library's, that of its weights (``agents.foreign.weights_sha256``).
     """
     while isinstance(agent, AgentAround | LearnedAgent):
         agent = agent.policy
+    if isinstance(agent, PolicyAgent):
+        return agent.weights_sha256()
     return agent.manifest.manifest_sha256 if isinstance(agent, Policy) else None
 
 

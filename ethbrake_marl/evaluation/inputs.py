@@ -16,7 +16,7 @@ from ethbrake_marl.agents.rollout import script_agents, set_others
 from ethbrake_marl.agents.spelling import AgentSpec, parse_spec
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.engine.stream import ask_script, begin_script
-from ethbrake_marl.errors import InvalidInput, OldSpelling, check_one_learner, unknown_name
+from ethbrake_marl.errors import InvalidInput, OldSpelling, check_one_learner, naming_agent, unknown_name
 from ethbrake_marl.files.overrides import Override, changed_parts
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Worlds
@@ -100,12 +100,13 @@ def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenari
 
     Scripts that need no state are tried on all worlds, which takes no time; all others on the first.
     """
-    for agent in agents.values():
+    for name, agent in agents.items():
         team = team_of(agent, scenario.learners)
         scripts = script_agents(scenario, except_for=team.drivers)
         for vehicle, driver in team.drivers.items():
             set_others(driver, vehicle, scripts)
-            _try_out(driver, worlds if getattr(driver, "state_free", False) else worlds.take([0]), vehicle)
+            with naming_agent(name):
+                _try_out(driver, worlds if getattr(driver, "state_free", False) else worlds.take([0]), vehicle)
 
 
 def make_lineup(

@@ -17,7 +17,14 @@ from ethbrake_marl.agents.protocol import Agent, check_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.engine.stream import check_alert
-from ethbrake_marl.errors import InvalidInput, PhysicsError, check_one_learner, check_whole_number, unknown_name
+from ethbrake_marl.errors import (
+    InvalidInput,
+    PhysicsError,
+    check_one_learner,
+    check_whole_number,
+    naming_agent,
+    unknown_name,
+)
 from ethbrake_marl.evaluation.aftermath import SampledHarm, ShovedFront
 from ethbrake_marl.evaluation.harm_metrics import ImpactWatch
 from ethbrake_marl.evaluation.identity import policy_sha256
@@ -74,7 +81,8 @@ def evaluate(
         chunk_of = _Chunk(sample.worlds, agent, driven, scenario, aftermath)
         for first in range(0, sample.worlds.n, chunk):
             rows = np.arange(first, min(first + chunk, sample.worlds.n))
-            outcome, kept, failed = leaving_out_failed(chunk_of.roll_out, rows)
+            with naming_agent(name):
+                outcome, kept, failed = leaving_out_failed(chunk_of.roll_out, rows)
             lost = {row: LeftOut(int(sample.index[row]), seed, name, why) for row, why in failed.items()} | lost
             if outcome is not None:
                 parts[name].append(_Part(outcome, kept))

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import bootstrap, trim_mean
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.statistics import CONFIDENCE, Estimate
+from ethbrake_marl.evaluation.statistics import CONFIDENCE, Estimate, wilson
 from ethbrake_marl.physics import Floats
 
 RESAMPLES = 10_000
@@ -81,6 +81,20 @@ def mean_over_seeds(
     return paired_over_seeds(
         given, np.zeros((1, given.shape[-1])), confidence=confidence, resamples=resamples, seed=seed
     )
+
+
+def rate_over_seeds(happened: ArrayLike, *, seed: int = 0) -> Estimate:
+    """Share of the episodes [seeds, worlds] in which something happened, with an interval as in ``mean_over_seeds``.
+
+    That is no interval where it happened nearly always or never: draws of such worlds are all alike. So it reaches at
+    least as far as Wilson's of the share over the worlds.
+    """
+    given = np.atleast_2d(np.asarray(happened, np.float64))
+    found, worlds = mean_over_seeds(given, seed=seed), given.shape[1]
+    share = min(found.value, 1.0)  # a mean of ones may be rounded up
+    low, high = wilson(share, worlds)
+    ends = found.interval or (low, high)
+    return Estimate(share, (max(min(low, ends[0]), 0.0), min(max(high, ends[1]), 1.0)))
 
 
 def share_over_seeds(

@@ -30,10 +30,10 @@ class Estimate:
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
         """``24.19 [23.85, 24.53]``: value and interval, each times ``scale``."""
-        value = f"{scale * self.value:.{digits}f}{unit}"
+        value = f"{scale * self.value:z.{digits}f}{unit}"
         if self.interval is None:
             return value
-        low, high = (f"{scale * end:.{digits}f}" for end in self.interval)
+        low, high = (f"{scale * end:z.{digits}f}" for end in self.interval)
         return f"{value} [{low}, {high}]"
 
     def to_json(self) -> dict[str, Any]:
@@ -61,13 +61,19 @@ def rate(successes: int, count: int, *, confidence: float = CONFIDENCE) -> Estim
     """
     if not (count >= 1 and 0 <= successes <= count):
         raise InvalidInput(f"rate: {successes} of {count}: must be 0 <= successes <= count, and count at least 1")
-    p, z = successes / count, _normal_quantile(confidence)
+    p = successes / count
+    return Estimate(p, wilson(p, count, confidence=confidence))
+
+
+def wilson(p: float, count: int, *, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Wilson's score interval of a share ``p`` of ``count`` draws, which need not be a whole number of them."""
+    z = _normal_quantile(confidence)
     shrink = 1.0 + z * z / count
     centre = (p + z * z / (2.0 * count)) / shrink
     half = z / shrink * math.sqrt(p * (1.0 - p) / count + z * z / (4.0 * count * count))
-    low = 0.0 if successes == 0 else max(centre - half, 0.0)
-    high = 1.0 if successes == count else min(centre + half, 1.0)
-    return Estimate(p, (low, high))
+    low = 0.0 if p == 0.0 else max(centre - half, 0.0)
+    high = 1.0 if p == 1.0 else min(centre + half, 1.0)
+    return low, high
 
 
 def mean(values: Floats, *, confidence: float = CONFIDENCE) -> Estimate:

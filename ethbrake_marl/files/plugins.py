@@ -42,6 +42,7 @@ class _RunFile:
 
 _RUN: dict[Path, _RunFile] = {}
 _BEING_RUN: set[Path] = set()
+_READ: dict[str, set[str]] = {}
 _LOADED: dict[str, Plugin] = {}  # by file, or by the entry point's name
 
 
@@ -59,6 +60,8 @@ def load_plugin(source: str | os.PathLike[str]) -> None:
         _load_entry_point(named)
         return
     path = Path(named)
+    if path.suffix != ".py":
+        raise InvalidInput(f"plug-in {named!r}: must be a Python file (.py), or the name of an installed plug-in")
     run = _run_file(path, f"plug-in {named!r}")
     _LOADED.setdefault(str(path.resolve()), Plugin(path.name, named, run.sha256))
 
@@ -79,9 +82,19 @@ def loaded_plugins() -> tuple[Plugin, ...]:
     return tuple(_LOADED.values())
 
 
+def note_file(path: str) -> None:
+    """Remember the SHA-256 of a file that an agent of the user reads, such as weights; nothing for what is none."""
+    if Path(path).is_file():
+        with Path(path).open("rb") as file:
+            _READ.setdefault(Path(path).name, set()).add(hashlib.file_digest(file, "sha256").hexdigest())
+
+
 def files_run() -> dict[str, str]:
-    """Name -> SHA-256 of every plug-in and agent file of this process; of all of that name, where there are several."""
-    found: dict[str, set[str]] = {}
+    """Name -> SHA-256 of every plug-in and agent file of this process, and of every file that was named for an agent.
+
+    Of all of that name, where there are several.
+    """
+    found = {name: set(several) for name, several in _READ.items()}
     for path, file in _RUN.items():
         found.setdefault(path.name, set()).add(file.sha256)
     for plugin in loaded_plugins():
@@ -162,7 +175,7 @@ def _run(content: bytes, path: Path, sha256: str, what: str) -> ModuleType:
     _BEING_RUN.add(path)
     sys.modules[module.__name__] = module
     try:
-        exec(compile(content, str(path), "exec"), module.__dict__)
+        exec(compile(content, str(path), "exec", dont_inherit=True), module.__dict__)
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
         raise InvalidInput(f"{what}, {describe_error(error, str(path))}") from error

@@ -30,6 +30,7 @@ from ethbrake_marl.physics.rows import (
     unpack,
     vehicles_in,
 )
+from ethbrake_marl.physics.worlds import read_only
 from ethbrake_marl.scenario.features import (
     CONTACT_FEATURES,
     NEIGHBOUR_FEATURES,
@@ -39,7 +40,7 @@ from ethbrake_marl.scenario.features import (
     RegisteredFeature,
     registered_in,
 )
-from ethbrake_marl.scenario.registered_features import checked_values, read_only
+from ethbrake_marl.scenario.registered_features import checked_values
 
 Observations = NDArray[np.float32]
 

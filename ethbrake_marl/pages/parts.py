@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ class Block(NamedTuple):
 
 
 Row = Sequence[object] | Block
+_AFTER_SIGN = re.compile(r"(?<=[:+@,/])(?=.)")
 
 
 def table(head: Sequence[object], rows: Iterable[Row], *, caption: str = "") -> Part:
@@ -63,7 +65,14 @@ def _row(row: Row, columns: int) -> Markup:
         )
     first, *rest = row
     cells = Markup("").join(_cell(each) for each in rest)
-    return Markup('<tr><th scope="row">{}</th>{}</tr>').format(_text(first), cells)
+    return Markup('<tr><th scope="row">{}</th>{}</tr>').format(_name(first), cells)
+
+
+def _name(value: object) -> Markup:
+    """The heading of a row; a long name such as e_v2x_bm:pairwise is broken after a sign before it is inside a word."""
+    if isinstance(value, Markup):
+        return value
+    return Markup("<wbr>").join(_AFTER_SIGN.split(shown(value)))
 
 
 def _cell(value: object) -> Markup:

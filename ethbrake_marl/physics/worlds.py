@@ -105,6 +105,9 @@ class Worlds:
         )
 
 
+_OF_WORLDS = tuple(f.name for f in fields(Worlds))[1:]
+
+
 def _span(values: Floats) -> str:
     """The least and the largest of the values, or the one that all have; ``none`` where there are none."""
     if not values.size:
@@ -155,7 +158,7 @@ def _is_view(vehicles: Vehicles) -> bool:
 def concatenate(parts: Sequence[Worlds]) -> Worlds:
     """Join worlds with the same number of vehicles into one batch."""
     vehicles = _combined(lambda *columns: np.concatenate(columns), *(w.vehicles for w in parts))
-    return Worlds(vehicles, *(np.concatenate([getattr(w, f.name) for w in parts]) for f in fields(Worlds)[1:]))
+    return Worlds(vehicles, *(np.concatenate([getattr(w, name) for w in parts]) for name in _OF_WORLDS))
 
 
 def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
@@ -167,10 +170,23 @@ def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles
     return vehicles_at_once(*columns) if at_once else Vehicles(*columns)
 
 
+def read_only(worlds: Worlds) -> Worlds:
+    """The same worlds as arrays that cannot be written to; those given stay as they are."""
+    vehicles = _combined(unwritable, worlds.vehicles)
+    return Worlds(vehicles, *(unwritable(getattr(worlds, name)) for name in _OF_WORLDS))
+
+
+def unwritable(array: NDArray[Any]) -> NDArray[Any]:
+    """The same array, which cannot be written to; the one given can."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
 def assign(worlds: Worlds, rows: Ints, fresh: Worlds) -> Worlds:
     """The batch with ``rows`` replaced by the worlds of ``fresh`` (len(rows) of them); nothing is changed in place."""
     vehicles = _combined(lambda whole, part: _assigned(whole, rows, part), worlds.vehicles, fresh.vehicles)
-    state = (_assigned(getattr(worlds, f.name), rows, getattr(fresh, f.name)) for f in fields(Worlds)[1:])
+    state = (_assigned(getattr(worlds, name), rows, getattr(fresh, name)) for name in _OF_WORLDS)
     return Worlds(vehicles, *state)
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.physics import Floats, Worlds, make_worlds
+from ethbrake_marl.physics.worlds import read_only
 from ethbrake_marl.scenario.features import (
     FEATURES,
     MOST_NEIGHBOURS,
@@ -93,15 +94,6 @@ def checked_values(
             f" {worlds.time_s[world]:g} s{step}; must be finite"
         )
     return entry.scaled(told)
-
-
-def read_only(worlds: Worlds) -> Worlds:
-    """The same worlds, whose arrays can no longer be written to."""
-    for part in (worlds, worlds.vehicles):
-        for field in fields(part):
-            if isinstance(array := getattr(part, field.name), np.ndarray):
-                array.flags.writeable = False
-    return worlds
 
 
 def _taken() -> set[str]:

@@ -133,6 +133,12 @@ class Scenario(ScenarioFields):
         check_whole(self)
         return self
 
+    def __repr__(self) -> str:
+        learners = ", ".join(self.vehicle_names[i] for i in self.learners) or "nobody"
+        return f"Scenario({self.name!r}: {self.vehicles} vehicles, learning: {learners})"
+
+    __str__ = __repr__
+
     def _repr_html_(self) -> str:
         """What it declares, for a notebook."""
         told = {key: value for key, value in self.declared().items() if key not in ("name", "title")}

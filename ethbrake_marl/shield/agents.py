@@ -2,7 +2,8 @@
 
 The policy is rolled out in the engine from the alert on; its harm (each impact summed once) is compared with the
 baseline's ``H*`` and the lower one drives the episode. With ``H*`` coupled (realised in the same engine) the hybrid
-is never worse than the baseline, in any world. With the paper's pairwise ``H*``, which treats the two pairs as
+is never worse than the baseline, in any world, as long as the policy drives as it did in that rollout; one that draws
+its actions does not, and needs the step shield. With the paper's pairwise ``H*``, which treats the two pairs as
 independent, that does not hold: the pairwise figure is about half of what the same deceleration realises.
 """
 

@@ -12,7 +12,9 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents import registry
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import AgentFailed, InvalidInput
+from ethbrake_marl.evaluation.identity import policy_sha256
 from ethbrake_marl.policies.onnx import onnx_model
+from ethbrake_marl.shield.agents import StepShieldAgent
 
 SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(12, 7).worlds
@@ -84,6 +86,53 @@ def test_trained_model__behind_every_shield_keeps_the_bound(model, around):
     harm = harms(agent)
     if around != "+episode:pairwise":
         assert (harm <= agent.predicted_harm + 1e-5).all()
+
+
+def test_policy_of_another_library__is_known_by_its_weights():
+    torch = pytest.importorskip("torch")
+    module = torch.nn.Linear(27, 1)
+    agent = eb.policy_agent(module)
+    before = policy_sha256(agent)
+    assert before == policy_sha256(StepShieldAgent(agent, SCENARIO)) == policy_sha256(eb.policy_agent(module))
+    with torch.no_grad():
+        module.bias += 0.1
+    assert policy_sha256(agent) not in (before, None)
+    assert policy_sha256(eb.policy_agent(lambda seen: seen[:, :1])) is None
+
+
+def test_agent_that_fails__is_called_as_its_user_calls_it():
+    def wrong(seen):
+        return np.zeros((len(seen), 2))
+
+    with pytest.raises(InvalidInput, match=r"agent 'mine', world 0, step 1 \(.* s\): gave float64 of shape \(4, 2\)"):
+        eb.evaluate(SCENARIO.sample(4, 1), {"mine": eb.policy_agent(wrong)}, scenario=SCENARIO)
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda seen: (np.zeros((len(seen), 1)), None), "gave a tuple of 2 .* needs initial_state"),
+        (lambda seen: np.ma.masked_array(np.zeros((len(seen), 1)), mask=True), "in which stands nan"),
+    ],
+)
+def test_answer_that_is_no_action__is_told(answer, message):
+    with pytest.raises(InvalidInput, match=message):
+        eb.evaluate(SCENARIO.sample(4, 1), {"mine": eb.policy_agent(answer)}, scenario=SCENARIO)
+
+
+def test_agent_that_fails_once__is_told_with_its_step():
+    calls = []
+
+    def tired(seen):
+        calls.append(len(seen))
+        if len(calls) == 5:
+            raise ZeroDivisionError("once")
+        return np.zeros((len(seen), 1))
+
+    with pytest.raises(
+        InvalidInput, match=r"agent 'tired', steps? \d+.*: observations of shape .*ZeroDivisionError: once"
+    ):
+        eb.evaluate(SCENARIO.sample(4, 1), {"tired": eb.policy_agent(tired)}, scenario=SCENARIO)
 
 
 def test_torch_module__drives_without_gradients_and_is_shared():
@@ -271,7 +320,7 @@ class Nameless:
 
 @pytest.mark.parametrize("around", ["", *AROUND])
 def test_own_agent__without_a_name_or_with_other_parameters_is_told_what_is_wrong(around):
-    with pytest.raises(InvalidInput, match="evaluate: agent 'own': a Nameless is not an agent, it has no name; make_"):
+    with pytest.raises(InvalidInput, match="evaluate: agent 'own': 'Nameless' is no agent: it has no name; make_"):
         eb.evaluate(SCENARIO.sample(3, 7), {"own": Nameless()}, scenario=SCENARIO)
     agent = Nameless()
     agent.name = "own"
@@ -320,7 +369,7 @@ def test_file__makes_an_agent_alone_and_behind_every_shield(file, around):
         ("{file}:", "one from a file is FILE.py:FUNCTION"),
         ("{file}:make_agent+stpe", "did you mean 'step'"),
         ("{file}:make_agent:3", "make_agent has no parameters, so it takes no argument"),
-        ("{file}:wrong", "a int is not an agent"),
+        ("{file}:wrong", "'int' is no agent"),
         ("{file}:raising", r"KeyError: 'weights' \(My\+File.py, line 15\)"),
         ("{file}:nobody", "has no function nobody"),
         ("nowhere/none.py:make_agent", "there is no such file"),

@@ -137,8 +137,11 @@ def test_long_command__a_defect_of_the_scenario_is_found_before_any_work(ethbrak
         (["--agents", "ppo@" + 5000 * "a"], ["cannot be read", "File name too long"]),
         (["--per-world", "nowhere/out.csv"], ["nowhere"]),
         (["--per-world", "/proc/out.csv"], ["/proc/out.csv", "cannot be written"]),
-        (["--per-world", 300 * "a"], ["cannot be written", "File name too long"]),
-        (["--per-world", "/dev/null", "--force"], ["/dev/null", "a device or a pipe"]),
+        (["--per-world", 300 * "a" + ".csv"], ["cannot be written", "File name too long"]),
+        (["--per-world", "x.txt"], ["x.txt", "must end in .csv or .parquet"]),
+        (["--per-world", "/dev/null", "--force"], ["/dev/null", "must end in .csv or .parquet"]),
+        (["--per-world", "same.csv", "--report", "same.csv"], ["same.csv"]),
+        (["--per-world", "same.html", "--report", "same.html"], ["same.html", "must end in"]),
         (["--frobnicate"], ["--frobnicate"]),
     ],
 )
@@ -310,6 +313,6 @@ def test_defect_of_the_program__keeps_its_traceback(ethbrake, monkeypatch):
     def broken() -> None:
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr("ethbrake_marl.cli.app.list_scenarios", broken)
+    monkeypatch.setattr("ethbrake_marl.cli.scenario.list_scenarios", broken)
     with pytest.raises(RuntimeError, match="a defect"):
         ethbrake("scenario", "list")

@@ -19,6 +19,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.compare import compare_results, read_result
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, unpaired_difference
+from ethbrake_marl.files import plugins
 
 
 @pytest.fixture(scope="module")
@@ -115,13 +116,43 @@ def test_read_result__refuses_what_is_no_result(tmp_path: Path, text: str, reaso
 
 @pytest.mark.parametrize(
     "change",
-    [{"total_harm": "x"}, {"total_harm": None}, {"total_harm_interval": [1]}, {"total_harm": 1e300}, {"episodes": 1}],
+    [
+        {"total_harm": "x"},
+        {"total_harm": None},
+        {"total_harm": True},
+        {"total_harm_interval": [1]},
+        {"total_harm_interval": [1e6, 2e6]},
+        {"total_harm_interval": [9, 1]},
+        {"total_harm": 1e300},
+        {"total_harm": 10**400},
+        {"total_harm": -5.0, "total_harm_interval": [-6, 1]},
+        {"episodes": 1},
+        {"episodes": 0},
+        {"episodes": 10**30},
+        {"episodes": True},
+    ],
 )
-def test_compare__refuses_means_that_are_none(results: Path, tmp_path: Path, change: dict[str, Any]) -> None:
+def test_read_result__refuses_means_that_are_none(results: Path, tmp_path: Path, change: dict[str, Any]) -> None:
     rows = [row | change for row in json.loads((results / "alone.json").read_text())]
     (tmp_path / "x.json").write_text(json.dumps(rows))
-    with pytest.raises(InvalidInput, match=r"x\.json: full_brake: .* is no mean with an interval"):
-        compare_results(read_result(results / "alone.json"), read_result(tmp_path / "x.json"))
+    with pytest.raises(InvalidInput, match=r"x\.json: full_brake: .*(is no mean with an interval|episodes = )"):
+        read_result(tmp_path / "x.json")
+
+
+def test_read_result__refuses_an_agent_that_stands_in_it_twice(results: Path, tmp_path: Path) -> None:
+    rows = json.loads((results / "alone.json").read_text())
+    (tmp_path / "x.json").write_text(json.dumps([*rows, rows[0]]))
+    with pytest.raises(InvalidInput, match=r"x\.json: full_brake stands in it twice"):
+        read_result(tmp_path / "x.json")
+
+
+def test_compare__refuses_a_mean_that_is_not_that_of_its_worlds(results: Path, tmp_path: Path) -> None:
+    rows = json.loads((results / "a.csv.json").read_text())
+    rows[0] |= {"first_impact_harm": 3.0, "first_impact_harm_interval": [2.0, 4.0]}
+    (tmp_path / "a.csv.json").write_text(json.dumps(rows))
+    (tmp_path / "a.csv").write_bytes((results / "a.csv").read_bytes())
+    with pytest.raises(InvalidInput, match=r"first_impact_harm = 3, but the mean of its worlds is \d"):
+        compare_results(read_result(results / "a.csv.json"), read_result(tmp_path / "a.csv.json"))
 
 
 def test_unpaired_difference__is_welchs() -> None:
@@ -194,3 +225,41 @@ def test_compare__sees_that_an_agents_file_was_edited(results: Path, tmp_path: P
     assert after.about["versions"]["mine.py"] == f"SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}"
     assert set(compare_results(before, after).other_versions) == {"mine.py"}
     assert compare_results(after, after).other_versions == {}
+
+
+def test_compare__tells_other_settings_of_the_agents_and_another_driven_vehicle(
+    ethbrake: Callable[..., Any], tmp_path: Path
+) -> None:
+    line = ["evaluate", "--scenario", "paper-random", "--episodes", "5", "--json"]
+    ways = {
+        "first": ["--agents", "e_v2x_bm"],
+        "total": ["--agents", "e_v2x_bm", "--harm-count", "total"],
+        "front": ["--agents", "e_v2x_bm", "--vehicle", "vehicle_3"],
+    }
+    for name, more in ways.items():
+        (tmp_path / f"{name}.json").write_text(ethbrake(*line, *more).out)
+    told = ethbrake("compare", tmp_path / "first.json", tmp_path / "total.json")
+    assert told.status == 0 and "note: harm_count first in the first, total in the second" in told.err
+    found = compare_results(read_result(tmp_path / "first.json"), read_result(tmp_path / "total.json"))
+    assert found.to_json()["other_settings"] == {"harm_count": ["first", "total"]}
+    other = ethbrake("compare", tmp_path / "first.json", tmp_path / "front.json")
+    assert other.status == 2 and "is about another driven vehicle than" in other.err
+
+
+def test_weights_of_another_library__have_a_hash_and_a_file_behind_the_at_is_told(
+    ethbrake: Callable[..., Any], tmp_path: Path
+) -> None:
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np, ethbrake_marl as eb\n"
+        "def make(argument, settings):\n"
+        "    share = np.load(settings.policy)[0]\n"
+        "    return eb.policy_agent(lambda seen: np.full((len(seen), 1), share), scenario=settings.scenario)\n"
+    )
+    line = ["evaluate", "--episodes", "5", "--json", "--agents", f"{tmp_path}/mine.py:make@{tmp_path}/w.npy"]
+    rows = []
+    for share in (-1.0, -0.2):
+        np.save(tmp_path / "w.npy", [share])
+        plugins._READ.clear()
+        rows += json.loads(ethbrake(*line).out)
+    one, other = (row["versions"]["w.npy"] for row in rows)
+    assert one.startswith("SHA-256 ") and one != other

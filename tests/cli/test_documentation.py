@@ -10,8 +10,9 @@ import pytest
 from typer.main import get_command
 
 from ethbrake_marl.agents.registry import agent_names
-from ethbrake_marl.cli.app import app, scenario_app
+from ethbrake_marl.cli.app import app
 from ethbrake_marl.cli.recipe import recipe_app
+from ethbrake_marl.cli.scenario import scenario_app
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 CLI = (DOCS / "cli.md").read_text("utf-8")
@@ -79,7 +80,9 @@ def test_tutorial_program__prints_what_stands_below_it(capsys):
     assert now == pytest.approx([float(word) for word in found[2].split()], rel=1e-9)
 
 
-def test_tutorial_scenario__its_two_changed_lines_make_a_valid_file(ethbrake, tmp_path):
+@pytest.fixture
+def rainy(ethbrake, tmp_path) -> Path:
+    """The scenario file of the tutorial, with its two changed lines."""
     assert ethbrake("scenario", "new", "rainy", "--output", tmp_path).status == 0
     path = tmp_path / "rainy.yaml"
     changed = re.search(r"```yaml\n(gaps_m: .*)\n(braking_capacity_mps2: .*)\n```", TUTORIAL)
@@ -90,5 +93,17 @@ def test_tutorial_scenario__its_two_changed_lines_make_a_valid_file(ethbrake, tm
         text, count = re.subn(rf"(?m)^{key}: .*$", line, text)
         assert count == 1
     path.write_text(text)
-    answer = ethbrake("scenario", "validate", path)
+    return path
+
+
+def test_tutorial_scenario__its_two_changed_lines_make_a_valid_file(ethbrake, rainy):
+    answer = ethbrake("scenario", "validate", rainy)
     assert answer.out.strip() in TUTORIAL
+
+
+def test_tutorial_scenario__evaluates_to_the_printed_table(ethbrake, rainy, monkeypatch):
+    command = "evaluate --scenario rainy.yaml --agents full_brake,gentlest_front,e_v2x_bm --episodes 2000"
+    printed = TUTORIAL.partition(f"$ ethbrake {command}\n")[2].partition("\n...")[0].splitlines()
+    monkeypatch.chdir(rainy.parent)
+    told = ethbrake(*command.split()).out.splitlines()
+    assert len(printed) == 9 and [line.rstrip() for line in told[:9]] == printed

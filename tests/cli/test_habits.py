@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -119,3 +120,28 @@ def test_doctor_warm_up__leaves_nothing_to_compile(ethbrake):
     ]
     assert [ethbrake(*command).status for command in commands] == [0, 0, 0]
     assert set(cache_folder().rglob("*.nbc")) == kernels
+
+
+def test_results__stand_alone_on_stdout_whatever_a_file_of_the_users_prints(ethbrake, tmp_path: Path) -> None:
+    (tmp_path / "noise.py").write_text('print("noise of a plug-in")\n')
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np, ethbrake_marl as eb\n"
+        "def act(seen):\n"
+        '    print("noise of a policy")\n'
+        "    return np.full((len(seen), 1), -1.0)\n"
+        "def make(): return eb.policy_agent(act)\n"
+    )
+    files = ["--plugin", tmp_path / "noise.py", "--agents", f"full_brake,{tmp_path}/mine.py:make"]
+    told = ethbrake("evaluate", *files, "--episodes", "3", "--json")
+    assert told.status == 0 and len(json.loads(told.out)) == 2
+    assert "noise of a plug-in" in told.err and "noise of a policy" in told.err
+    table = ethbrake("evaluate", *files, "--episodes", "3")
+    assert "noise" not in table.out and "full_brake" in table.out
+
+
+def test_a_command_of_a_plug_in__prints_where_it_likes(ethbrake, tmp_path: Path) -> None:
+    app.command("my-words")(lambda: print("words"))
+    try:
+        assert ethbrake("my-words").out == "words\n"
+    finally:
+        app.registered_commands.pop()

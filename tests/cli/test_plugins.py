@@ -280,3 +280,13 @@ def test_command__of_the_users_cannot_take_the_place_of_a_built_in_one(ethbrake,
     answer = ethbrake("evaluate", "--episodes", "3")
     assert (answer.status, answer.err.count("\n")) == (2, 1)
     assert "command 'evaluate' is there already; give yours another name: app.command('my-evaluate')" in answer.err
+
+
+def test_plug_in__means_what_python_says_it_means(ethbrake, tmp_path: Path) -> None:
+    file = tmp_path / "ann.py"
+    file.write_text("def f(x: int): pass\nassert f.__annotations__['x'] is int\n")
+    assert ethbrake("evaluate", "--plugin", file, "--episodes", "2", "--agents", "coast").status == 0
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("name: r\n")
+    answer = ethbrake("evaluate", "--plugin", recipe, "--episodes", "2", "--agents", "coast")
+    assert answer.status == 2 and "recipe.yaml': must be a Python file" in answer.err

@@ -223,7 +223,7 @@ def test_evaluate__refuses_worlds_that_are_not_at_the_alert(paper_random: Scenar
         ({"worlds": 5}, "worlds = 5: must be worlds or a sample"),
         ({"scenario": "paper-random"}, "scenario = 'paper-random': must be a Scenario"),
         ({"agents": ["full_brake"]}, r"agents = \['full_brake'\]: must be a mapping"),
-        ({"agents": {"a": "full_brake"}}, "agent 'a': a str is not an agent"),
+        ({"agents": {"a": "full_brake"}}, "agent 'a': 'str' is no agent"),
         ({"chunk": 2.5}, r"chunk = 2\.5: must be a whole number"),
         ({"vehicle": 1.5}, r"vehicle = 1\.5: must be a name or an index"),
     ],

@@ -9,8 +9,10 @@ from ethbrake_marl.evaluation.seed_statistics import (
     interquartile_mean,
     mean_over_seeds,
     paired_over_seeds,
+    rate_over_seeds,
     share_over_seeds,
 )
+from ethbrake_marl.evaluation.statistics import rate
 
 
 @pytest.mark.parametrize(
@@ -119,3 +121,13 @@ def test_resamples__are_as_many_as_asked_for(resamples: int, monkeypatch: pytest
 def test_mean_over_seeds__is_the_mean_with_the_spread_between_seeds() -> None:
     found = mean_over_seeds(np.array([[1.0] * 50, [3.0] * 50]))
     assert (found.value, found.interval) == (2.0, pytest.approx((1.0, 3.0)))
+
+
+def test_rate_over_seeds__is_no_certainty_where_all_worlds_were_alike() -> None:
+    assert rate_over_seeds(np.ones((2, 20), np.bool_)).interval == rate(20, 20).interval
+    assert rate_over_seeds(np.zeros((1, 20), np.bool_)).interval == rate(0, 20).interval
+    assert rate_over_seeds(np.ones((1, 1), np.bool_)).interval == rate(1, 1).interval
+    happened = np.zeros((4, 50), np.bool_)
+    happened[0] = True  # one seed always, three never
+    low, high = rate_over_seeds(happened).interval or (0.0, 0.0)
+    assert low == 0.0 and high > 0.7

@@ -123,6 +123,12 @@ def flat(harm: Any, vehicle: int) -> Any:
     return 1.0
 
 
+def emptied(harm: Any, vehicle: int) -> Any:
+    """Everybody's harm, after a slip that would change the ledger for all who come later."""
+    harm.borne[:] = 0.0
+    return harm.whole
+
+
 def broken(harm: Any, vehicle: int) -> Any:
     """Not a number."""
     return np.full(len(harm.whole), np.nan)
@@ -132,6 +138,7 @@ def test_objective__of_another_shape_or_not_finite_is_named(mine: Any) -> None:
     for name, function, message in (
         ("flat", flat, r"objective 'flat': gave float64 of shape \(\); must be numbers of shape \(1,\)"),
         ("broken", broken, "objective 'broken': is nan for vehicle_1 in world 0; must be finite"),
+        ("emptied", emptied, "objective 'emptied': of vehicle_1: ValueError: .*read-only"),
     ):
         eb.register_objective(name, function)
         env = eb.parallel_env(scenario=SCENARIO, reward={"harm": 1.0, "objective": name})

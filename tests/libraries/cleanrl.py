@@ -14,8 +14,8 @@ LIBRARY = Library(
     version="Gymnasium {}",
     requires=("moviepy==2.2.1",),
     about=(
-        "CleanRL is a folder of files to copy, not a package: `python cleanrl/ppo_continuous_action.py --env- "
-        "id ethbrake_marl:EthBrake-v0 --capture-video`. Its `make_env` needs one more argument, for every "
+        "CleanRL is a folder of files to copy, not a package: `python cleanrl/ppo_continuous_action.py "
+        "--env-id ethbrake_marl:EthBrake-v0 --capture-video`. Its `make_env` needs one more argument, for every "
         "environment, since Gymnasium 1.0 asks for the space in `TransformObservation`. The lines below are "
         "its `make_env` with it; the loop that is run here is a short PPO of that form. What "
         "`NormalizeObservation` has counted belongs to the policy: keep it with the network."

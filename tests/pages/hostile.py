@@ -91,6 +91,10 @@ class Page(HTMLParser):
         self.feed(html)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "wbr":  # where a line may be broken: neither a part of the page nor of the text
+            assert not attrs
+            self.words = self.words.removesuffix(" ")
+            return
         self.tags.append((tag, dict(attrs)))
         if tag not in _VOID:
             self.open.append(tag)

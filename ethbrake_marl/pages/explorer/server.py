@@ -25,6 +25,7 @@ from ethbrake_marl.errors import (
 from ethbrake_marl.files.durable import check_writable
 from ethbrake_marl.files.plain import parse_strict_json
 from ethbrake_marl.pages.explorer.answer import Explored
+from ethbrake_marl.pages.explorer.connection import patient_connection
 from ethbrake_marl.pages.explorer.guard import App, Guard
 from ethbrake_marl.pages.explorer.hand import read_profile
 from ethbrake_marl.pages.explorer.page import explorer_page
@@ -39,7 +40,8 @@ if TYPE_CHECKING:
 
 MOST_BODY = 64 * 1024  # bytes of a question
 MOST_SECONDS = 30.0  # of a search
-PATIENCE_S = 10.0  # until the whole of a question must have come
+PATIENCE_S = 10.0  # until the headers of a question must have come, and then until the rest
+MOST_CONNECTIONS = 512
 _STOPS = 1  # s that questions get when the server ends
 _LAST_WORLD = 10**9
 
@@ -246,10 +248,19 @@ def serve_explorer(setting: Setting, port: int, ready: Callable[[str], None]) ->
         chosen = listening.getsockname()[1]
         app = explorer_app(setting, token, chosen, warm_up=True)
         config = uvicorn.Config(
-            app, http="h11", ws="none", lifespan="off", access_log=False, log_level="error", server_header=False,
-            proxy_headers=False, timeout_keep_alive=30, timeout_graceful_shutdown=_STOPS, limit_concurrency=64,
+            app,
+            http=patient_connection(PATIENCE_S),
+            ws="none",
+            lifespan="off",
+            access_log=False,
+            log_level="error",
+            server_header=False,
+            proxy_headers=False,
+            timeout_keep_alive=30,
+            timeout_graceful_shutdown=_STOPS,
+            limit_concurrency=MOST_CONNECTIONS,
             h11_max_incomplete_event_size=16 * 1024,
-        )  # fmt: skip
+        )
         listening.listen()
         ready(f"http://127.0.0.1:{chosen}/{token}/")
         with suppress(KeyboardInterrupt):

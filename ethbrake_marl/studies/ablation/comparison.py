@@ -9,12 +9,11 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
-
 from ethbrake_marl.evaluation.seed_statistics import (
     interquartile_mean,
     mean_over_seeds,
     paired_over_seeds,
+    rate_over_seeds,
     share_over_seeds,
 )
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
@@ -61,7 +60,7 @@ def _level(one: Measured, searched: int) -> Json:
         "learners": [scenario.vehicle_names[i] for i in scenario.learners],
         "seeds": len(one.reached.collided),
         "worlds": one.reached.collided.shape[1],
-        "collision_rate": mean_over_seeds(one.reached.collided.astype(np.float64)).to_json(),
+        "collision_rate": rate_over_seeds(one.reached.collided).to_json(),
         **{harm_count: _under_count(one, harm_count, searched) for harm_count in HARM_COUNTS},
     }
 
@@ -109,7 +108,7 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
                 after.reached.world[harm_count], before.reached.world[harm_count]
             ).to_json(),
             "vehicles": [paired_over_seeds(new, old).to_json() for new, old in pairs],
-            "worse_off": mean_over_seeds(worse.any(axis=2).astype(np.float64)).to_json(),
+            "worse_off": rate_over_seeds(worse.any(axis=2)).to_json(),
             "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
         }
     return found

@@ -16,7 +16,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import policy_sha256, result_identity
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.seed_statistics import mean_over_seeds, share_over_seeds
+from ethbrake_marl.evaluation.seed_statistics import mean_over_seeds, rate_over_seeds, share_over_seeds
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.recipe import WORDS
@@ -172,7 +172,7 @@ def _of_length(
         share_over_seeds(own, worst, none),
         None if best is None else mean_over_seeds(best),
         None if best is None else share_over_seeds(own[:, known], worst[:, known], best),
-        mean_over_seeds(worse.astype(np.float64)),
+        rate_over_seeds(worse),
         result_identity("generalise", scenario, sample),
         tuple(policy_sha256(agent) for agent in agents),
     )

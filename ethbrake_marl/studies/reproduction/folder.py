@@ -20,6 +20,7 @@ from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.learning.run_folder import read_object
 from ethbrake_marl.studies.reproduction.item import Item, Made, Settings
 from ethbrake_marl.studies.reproduction.items import ITEMS
+from ethbrake_marl.studies.reproduction.verdicts import OUTCOMES, Verdict, summarise_verdicts
 
 Json = dict[str, Any]
 
@@ -144,8 +145,23 @@ def item_json(item: Item, made: Made, more: Mapping[str, Any]) -> Json:
 
 def read_results(folder: ReproductionFolder) -> list[Json]:
     """The results that are there, in the order of the paper; raises ``InvalidInput`` for one that is damaged."""
-    files = [folder.result(item.name) for item in ITEMS]
-    return [checked_result(read_object(file), str(file)) for file in files if file.is_file()]
+    return [read_result(folder, item) for item in ITEMS if folder.result(item.name).is_file()]
+
+
+def read_result(folder: ReproductionFolder, item: Item) -> Json:
+    """The result of an item that was made; raises ``InvalidInput`` for one that is damaged, or another item's."""
+    file = folder.result(item.name)
+    content = checked_result(read_object(file), str(file))
+    if content["name"] != item.name:
+        raise _damaged(f"{file}: name")
+    if any(Path(name).name != name for name in content["data"]):
+        raise _damaged(f"{file}: data")
+    compared = [Verdict(**each) for each in content["comparisons"]]
+    if any(each.outcome not in OUTCOMES for each in compared):
+        raise _damaged(f"{file}: comparisons")
+    if content["verdict"] != summarise_verdicts(compared).to_json():
+        raise _damaged(f"{file}: verdict")
+    return content
 
 
 _TEXT, _TEXTS, _ROWS = TypeAdapter(str), TypeAdapter(list[str]), TypeAdapter(list[list[str]])

@@ -116,6 +116,7 @@ class Item:
     title: str
     what: str  # the paper's figure or table, in a sentence
     make: Callable[[Settings], Made]
+    most_s: float  # processor seconds at the paper's numbers of worlds, and a little more
     trained: tuple[str, ...] = ()  # the groups of trainings that it shows with ``--full``
 
 

@@ -24,6 +24,7 @@ ITEMS = (
         "Learning curves at high delay",
         "Returns of PPO and SAC in training under large communication delays.",
         reproduce_high,
+        10,
         _CURVES,
     ),
     Item(
@@ -32,6 +33,7 @@ ITEMS = (
         "Learning curves at low delay",
         "Returns of PPO and SAC in training under small communication delays.",
         reproduce_low,
+        10,
         _CURVES,
     ),
     Item(
@@ -40,6 +42,7 @@ ITEMS = (
         "Harm over total distance",
         "Harm of the non-ethical strategy, E-V2X-BM, SAC and PPO against the sum of both gaps.",
         reproduce_distance,
+        15,
     ),
     Item(
         "harm-delays",
@@ -47,6 +50,7 @@ ITEMS = (
         "Harm at three delays",
         "Harm of the four strategies at three communication delays, gaps of 7 m.",
         reproduce_delays,
+        15,
     ),
     Item(
         "trajectories",
@@ -54,6 +58,7 @@ ITEMS = (
         "Trajectories of Scenarios 1 and 2",
         "Positions of the three vehicles under PPO and SAC, against the vehicle and against time.",
         reproduce_trajectories,
+        5,
     ),
     Item(
         "accelerations",
@@ -61,6 +66,7 @@ ITEMS = (
         "Acceleration profiles of Scenarios 1 and 2",
         "Commands of Vehicle 2 under PPO and SAC.",
         reproduce_accelerations,
+        5,
     ),
     Item(
         "hybrid-illustration",
@@ -68,6 +74,7 @@ ITEMS = (
         "Illustration of the hybrid",
         "Harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of both, against total distance.",
         reproduce_illustration,
+        20,
         (STOPPED,),
     ),
     Item(
@@ -76,6 +83,7 @@ ITEMS = (
         "E-V2X-BM, DRL and hybrid in 5,000 episodes",
         "Collisions and harm of E-V2X-BM, of a policy that has not converged, and of the hybrid.",
         reproduce_hybrid_table,
+        20,
         (STOPPED,),
     ),
     Item(
@@ -84,6 +92,7 @@ ITEMS = (
         "Four strategies in 10,000 random episodes",
         "Collisions, harm and its decrease of the non-ethical strategy, E-V2X-BM and the hybrids of SAC and PPO.",
         reproduce_random_table,
+        60,
     ),
     Item(
         "gaps",
@@ -91,6 +100,7 @@ ITEMS = (
         "What the paper leaves open",
         "Every quantity that the paper leaves open, our default, and how far the headline moves when it changes.",
         reproduce_gaps,
+        40,
         (OPEN,),
     ),
 )

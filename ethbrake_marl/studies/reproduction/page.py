@@ -12,7 +12,7 @@ from ethbrake_marl.pages.frame import Part, Section, anchors, page, paragraph, s
 from ethbrake_marl.pages.parts import Cell, facts, opened, table
 from ethbrake_marl.pages.vector import kept_drawing
 from ethbrake_marl.studies.reproduction.folder import Json, ReproductionFolder, read_figure
-from ethbrake_marl.studies.reproduction.verdicts import TOLERANCE
+from ethbrake_marl.studies.reproduction.verdicts import OUTCOMES, TOLERANCE
 
 TITLE = "The paper, made again"
 LEAD = (
@@ -62,7 +62,7 @@ def _account(result: Json) -> Part:
     name = result["name"]
     data = [link.format(quote(name, ""), quote(file, ""), shown(f"{name}/{file}")) for file in result["data"]]
     found = {
-        "Verdict": Markup("<strong>{}</strong>").format(shown(result["verdict"]["outcome"])),
+        "Verdict": _outcome(result["verdict"]["outcome"]),
         "Because": result["verdict"]["because"],
         "In the paper's source": Markup(", ").join(labels),
         "Data": Markup(", ").join(data),
@@ -77,7 +77,13 @@ def _figure(folder: ReproductionFolder, name: str, each: Json) -> Part:
 
 def _verdict(verdict: Json) -> Cell:
     """The outcome, and the numbers that it follows from below it."""
-    return Cell(verdict["outcome"], verdict["because"], words=True)
+    return Cell(_outcome(verdict["outcome"]), verdict["because"], words=True)
+
+
+def _outcome(outcome: str) -> Markup:
+    """The word of a verdict, with a sign and a colour where it is one of ours."""
+    kind = outcome.replace(" ", "-") if outcome in OUTCOMES else ""
+    return Markup('<span class="outcome {}">{}</span>').format(kind, shown(outcome))
 
 
 def _rows(rows: Sequence[Sequence[str]]) -> list[list[str | Cell]]:

@@ -8,12 +8,11 @@ from datetime import UTC, datetime
 
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.files.durable import write_file
-from ethbrake_marl.learning.run_folder import read_object
 from ethbrake_marl.studies.reproduction.folder import (
     Json,
     ReproductionFolder,
-    checked_result,
     open_folder,
+    read_result,
     read_results,
     write_item,
 )
@@ -21,14 +20,12 @@ from ethbrake_marl.studies.reproduction.item import FULL, Item, Settings
 from ethbrake_marl.studies.reproduction.page import render_page
 from ethbrake_marl.studies.reproduction.trainings import seconds_left, train_groups, trained_names
 
-_QUICK_S = 200  # processor seconds of all items at the paper's numbers of worlds
-
 
 def tell_cost(items: Sequence[Item], settings: Settings) -> str:
     """What is left to do and about how long it takes, in one line."""
     wanted = _groups(items) if settings.mode == FULL else set()
     training_s = seconds_left(settings.folder, wanted)
-    told = f"to do: {count_of(len(items), 'item')}, at most about {_QUICK_S} s of one core"
+    told = f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
     return f"{told}; trainings before them about {training_s / 60.0:.0f} min of one core" if wanted else told
 
 
@@ -69,10 +66,9 @@ def make_item(folder: ReproductionFolder, item: Item, settings: Settings) -> Jso
 
 def _kept(folder: ReproductionFolder, item: Item, trained: list[str]) -> Json | None:
     """The result that is there already, if the same trainings stand behind it."""
-    file = folder.result(item.name)
-    if not file.is_file():
+    if not folder.result(item.name).is_file():
         return None
-    content = checked_result(read_object(file), str(file))
+    content = read_result(folder, item)
     return content if content.get("trained") == trained else None
 
 

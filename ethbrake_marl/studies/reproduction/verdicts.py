@@ -1,9 +1,10 @@
 """Verdicts on the paper's numbers and statements, computed from ours; nobody writes one by hand.
 
 A number that the paper prints agrees with ours where the two differ by no more than chance between two lists of worlds,
-or by no more than ``TOLERANCE`` of the printed number. It cannot agree where a bound that holds for every strategy lies
-beyond it by more than chance. A statement agrees where every comparison that it makes comes out as it says; where one
-does not but its interval holds 0, it is undecided.
+or by no more than ``TOLERANCE`` of the printed number. Where chance alone makes more than ``WIDE`` of it, it is
+undecided. It cannot agree where a bound that holds for every strategy lies beyond it by more than chance. A statement
+agrees where every comparison that it makes comes out as it says; where one does not but its interval holds 0, it is
+undecided.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ CANNOT: Outcome = "cannot agree"
 UNDECIDED: Outcome = "undecided"
 NOT_RUN: Outcome = "not run"
 TOLERANCE = 0.02  # of the printed number
+WIDE = 0.15  # of the printed number: where chance alone makes more, nothing is shown
 _MOST_NAMED = 2
 _PLURAL = {AGREES: "agree", DIFFERS: "differ", CANNOT: "cannot agree", UNDECIDED: "undecided", NOT_RUN: "not run"}
-_WORST_FIRST: tuple[Outcome, ...] = (CANNOT, DIFFERS, UNDECIDED, NOT_RUN, AGREES)
+OUTCOMES: tuple[Outcome, ...] = (CANNOT, DIFFERS, UNDECIDED, NOT_RUN, AGREES)  # the worst first
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,12 +97,16 @@ def compare_number(
         return Verdict(what, CANNOT, f"{bound.what}: at least {least}, whoever drives; {told}")
     if is_near(printed, ours):
         return Verdict(what, AGREES, told)
+    if abs(ours.value - printed) <= _chance(ours):
+        return Verdict(what, UNDECIDED, f"{told}: too few worlds to tell")
     return Verdict(what, DIFFERS, f"{told} ({_off(printed, ours)}){_nearest(printed, ours, others or {}, show)}")
 
 
 def is_near(printed: float, ours: Estimate) -> bool:
-    """Whether the two differ by no more than chance between two lists, or than ``TOLERANCE``."""
-    return abs(ours.value - printed) <= max(_chance(ours), TOLERANCE * abs(printed))
+    """Whether the two differ by no more than ``TOLERANCE``, or than chance between two lists where that is not wide."""
+    chance = _chance(ours)
+    told = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
+    return abs(ours.value - printed) <= max(told, TOLERANCE * abs(printed))
 
 
 def _chance(estimate: Estimate) -> float:
@@ -195,8 +201,8 @@ def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
     """All of an item in one line: how many came out how, and the first of the worst."""
     if not verdicts:
         return Verdict("all", NOT_RUN, "nothing was compared")
-    worst = min((each.outcome for each in verdicts), key=_WORST_FIRST.index)
-    counted = [(outcome, sum(each.outcome == outcome for each in verdicts)) for outcome in _WORST_FIRST]
+    worst = min((each.outcome for each in verdicts), key=OUTCOMES.index)
+    counted = [(outcome, sum(each.outcome == outcome for each in verdicts)) for outcome in OUTCOMES]
     words = [(n, outcome if n == 1 else _PLURAL[outcome]) for outcome, n in counted if n]
     counts = ", ".join(f"{n} {word}" for n, word in words)
     first = next(each for each in verdicts if each.outcome == worst)

@@ -30,4 +30,4 @@ def made(text: str = "told", figures: tuple[Drawn, ...] = ()) -> Made:
 
 def planted(name: str, make) -> Item:
     """An item of a known name that does something else."""
-    return Item(name, ("label",), "A title", "What it is.", make)
+    return Item(name, ("label",), "A title", "What it is.", make, 3)

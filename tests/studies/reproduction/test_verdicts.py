@@ -27,6 +27,14 @@ def test_compare_number__agrees_within_the_chance_of_two_lists() -> None:
     assert compare_number("harm", 8.6, ours).outcome == "agrees"
 
 
+def test_compare_number__wide_chance_shows_nothing() -> None:
+    few = around(10.0, 2.0)  # chance 2.8
+    verdict = compare_number("harm", 11.4, few)
+    assert (verdict.outcome, verdict.because[-24:]) == ("undecided", ": too few worlds to tell")
+    assert compare_number("harm", 10.1, few).outcome == "agrees"  # within the tolerance all the same
+    assert compare_number("harm", 13.0, few).outcome == "differs"
+
+
 def test_compare_number__agrees_within_the_tolerance_of_the_printed_number() -> None:
     ours = around(0.945, 0.001)
     assert compare_number("rate", 0.95, ours).outcome == "agrees"
@@ -57,7 +65,7 @@ def test_compare_number__a_bound_within_chance_of_the_printed_number_proves_noth
     bound = Bound("worlds", rate(6_256, 10_000))
     assert compare_number("collisions", 0.617, rate(6_500, 10_000), bound=bound).outcome == "differs"
     few = Bound("worlds", rate(63, 100))
-    assert compare_number("collisions", 0.5974, rate(65, 100), bound=few).outcome == "agrees"
+    assert compare_number("collisions", 0.5974, rate(65, 100), bound=few).outcome == "undecided"
 
 
 def test_judge_statement__holds_where_every_interval_is_below_zero() -> None:
