@@ -73,6 +73,22 @@ def test_lost_training__is_harm_that_came_back_and_stays(
         assert ("horizon" in told) == (at_horizon is not None)
 
 
+# As measured every 163,840 decisions (2026-11-21): recipe ppo with contact features and ``horizon_is_end: false``, and
+# recipe ppo for twice its decisions, whose episodes the horizon cuts off more and more often at the same harm.
+COLLAPSED = [91.91, 10.28, 11.56, 12.02, 14.74, 18.90, 25.70, 37.11, 47.96, 70.85]
+STAYED = [
+    91.54, 11.13, 8.73, 7.71, 8.81, 8.77, 8.78, 7.19, 6.97, 6.86, 7.63, 7.01, 7.09, 7.01,
+    7.26, 7.09, 7.43, 6.81, 7.17, 7.12,
+]  # fmt: skip
+CUT_OFF = [0.19, 0.29, *[0.65] * 18]
+
+
+def test_lost_training__in_two_real_trainings() -> None:
+    lost = [lost_training(_harms(COLLAPSED[:k], [1.0] * k), "total_harm") for k in range(len(COLLAPSED) + 1)]
+    assert [k for k, alarm in enumerate(lost) if alarm is not None] == [7, 8, 9, 10]
+    assert not any(lost_training(_harms(STAYED[:k], CUT_OFF[:k]), "total_harm") for k in range(len(STAYED) + 1))
+
+
 def test_lost_training__needs_a_measured_harm() -> None:
     assert lost_training(_harms([90.0, 7.0, 60.0, 60.0]), "first_impact_harm") is None
     assert lost_training([], "total_harm") is None
