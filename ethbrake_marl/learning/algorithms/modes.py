@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ethbrake_marl.learning.recipe import Fraction, Layers, NonNegative, Positive
+
+ROUNDING = 1e-6  # of sums of shares, in updates
 
 
 class Shares(BaseModel):
@@ -62,7 +65,7 @@ def stages_of(plan: ModesPlan, updates: int) -> tuple[Stage, ...]:
     found, done, first = [], 0.0, 0
     for does, network, share in parts:
         done += share
-        end = min(round(done * updates), updates)
+        end = min(math.ceil(done * updates - ROUNDING), updates)
         found.append(Stage(does, network, first, end))
         first = end
     return tuple(found)
