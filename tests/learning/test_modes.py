@@ -37,6 +37,8 @@ MODES = {
     "margin": 5.0,
     "imitation_epochs": 2,
     "gate_states": 32,
+    "gate_memory": 100,
+    "gate_steps": 4,
     "tie_break": 0.05,
     "shares": {"alone": 0.25, "further": 0.25, "gate": 0.25, "together": 0.25},
 }

@@ -42,7 +42,9 @@ class ModesPlan(BaseModel):
     gain: NonNegative  # return by which a template must be better than all networks before to be imitated
     margin: Positive  # return by which a network may be worse than those before in a world of its own
     imitation_epochs: Annotated[int, Field(ge=1, le=1000)]
-    gate_states: Annotated[int, Field(ge=1, le=1_000_000)]  # in each update
+    gate_states: Annotated[int, Field(ge=1, le=1_000_000)]  # in each update, at which networks are compared
+    gate_memory: Annotated[int, Field(ge=1, le=1_000_000)]  # of them that are remembered
+    gate_steps: Annotated[int, Field(ge=1, le=100_000)]  # of its optimiser in each update
     tie_break: NonNegative  # of the harm by the other count, added to minus the return when networks are compared
     shares: Shares
 

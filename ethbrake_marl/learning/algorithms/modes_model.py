@@ -36,6 +36,7 @@ from ethbrake_marl.policies.actor import Float32s
 
 OTHER_COUNT: dict[HarmCount, HarmCount] = {"first": "total", "total": "first"}
 SAME_COST = 1e-9
+SAME_ACTION = 1e-2
 
 
 class NoOtherMode(EthBrakeError, ValueError):
@@ -43,7 +44,15 @@ class NoOtherMode(EthBrakeError, ValueError):
 
 
 class AveragedGate(nn.Module):
-    """A gate that learns (``learning``), and the running average of its weights (``average``), which decides."""
+    """A gate that learns (``learning``), and the running average of its weights (``average``), which decides.
+
+    It remembers the last decisions at which networks were compared: what was seen, and how much more than the best one
+    each of them costs.
+    """
+
+    seen: Tensor  # [M, F]
+    more: Tensor  # [M, K]
+    compared: Tensor  # [1] so far; the newest take the places of the oldest
 
     def __init__(self, inputs: int, networks: int, plan: ModesPlan, shape: ActorShape, rate: Schedule) -> None:
         super().__init__()
@@ -53,6 +62,21 @@ class AveragedGate(nn.Module):
         self.average = nn.Sequential(*layers)
         self.learning = copy.deepcopy(self.average)
         self.optimizer = torch.optim.Adam(self.learning.parameters(), lr=rate(1.0), eps=1e-5)
+        self.register_buffer("seen", torch.zeros(plan.gate_memory, inputs))
+        self.register_buffer("more", torch.zeros(plan.gate_memory, networks))
+        self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
+
+    def remember(self, seen: Float32s, more: Float32s) -> None:
+        """Keep compared decisions."""
+        M, before = len(self.seen), int(self.compared)
+        places = torch.arange(before, before + len(seen)) % M
+        self.seen[places], self.more[places] = torch.from_numpy(seen), torch.from_numpy(more)
+        self.compared += len(seen)
+
+    def recall(self, count: int) -> tuple[Tensor, Tensor]:
+        """Some of the kept ones, [count, F] and [count, K]."""
+        some = torch.randint(min(int(self.compared), len(self.seen)), (count,))
+        return self.seen[some], self.more[some]
 
     def choose(self, observation: Float32s) -> NDArray[np.int64]:
         """Which network acts on each of the observations [rows, F], [rows]."""
@@ -199,40 +223,46 @@ class ModesModel(CounterfactualModel):
                 self._train(self.policy.member(number), Tried(*(array[rows] for array in tried)))
 
     def _compare(self, seen: Float32s, moments: Moment) -> tuple[Float32s, Floats]:
-        """What is seen [B, F] at some visited decisions, and what going on with each network costs there [B, K]."""
+        """What is seen [B, F] at some visited decisions, and what going on with each network costs there [B, K].
+
+        Where all networks would do the same now nothing depends on the choice: the gate is asked again at the next one.
+        """
         assert isinstance(self.env, EthBrakeVecEnv)
-        engine = self.env.engine
-        rows: Ints = np.flatnonzero(moving_rows(moments, engine.scenario.vehicles))
+        engine, members = self.env.engine, [self.policy.member(k).act for k in range(self.plan.networks)]
+        observed = seen.reshape(-1, seen.shape[2])
+        actions = np.stack([act(observed) for act in members])
+        differ = (np.ptp(actions, axis=0) > SAME_ACTION) & moving_rows(moments, engine.scenario.vehicles)
+        rows: Ints = np.flatnonzero(differ)
         rows = rows[torch.randperm(len(rows))[: self.plan.gate_states].numpy()]
         other, then = OTHER_COUNT[engine.reward.harm_count], moments.take(rows)
-        costs = np.empty((len(rows), self.plan.networks))
-        for number in range(self.plan.networks):
-            gained, harm = drive_from(engine, then, self.policy.member(number).act, self.how.gamma, other)
+        costs = np.empty((len(rows), len(members)))
+        for number, act in enumerate(members):
+            gained, harm = drive_from(engine, then, act, self.how.gamma, other)
             costs[:, number] = self.plan.tie_break * harm - gained
         good = np.isfinite(costs).all(axis=1)
-        return seen.reshape(-1, seen.shape[2])[rows[good]], costs[good]
+        return observed[rows[good]], costs[good]
 
     def _train_gate(self, seen: Float32s, costs: Floats) -> None:
         """Teach the gate which network costs least, each decision as much as the others would cost more."""
-        gate, how = self.policy.gate, self.how
+        gate = self.policy.gate
         self._update_learning_rate(gate.optimizer)
-        more = costs - costs.min(axis=1, keepdims=True)
+        more = (costs - costs.min(axis=1, keepdims=True)).astype(np.float32)
         rows = np.flatnonzero(more.max(axis=1) > SAME_COST)
-        if len(rows) == 0:
+        gate.remember(seen[rows], more[rows])
+        if len(rows):
+            regret = np.take_along_axis(more[rows], gate.choose(seen[rows])[:, np.newaxis], axis=1)
+            self.logger.record("gate/regret", float(regret.mean()))
+        if int(gate.compared) == 0:
             return
-        weights = torch.from_numpy((more[rows] / more[rows].mean()).astype(np.float32))
-        best = torch.from_numpy(more[rows].argmin(axis=1))[:, np.newaxis]
-        inputs = torch.from_numpy(seen[rows])
         losses = []
-        for _ in range(how.n_epochs):
-            for batch in torch.split(torch.randperm(len(rows)), how.batch_size):
-                scores = gate.learning(inputs[batch])
-                loss = (weights[batch] * softplus(scores - scores.gather(1, best[batch]))).sum(dim=1).mean()
-                gate.optimizer.zero_grad()
-                loss.backward()  # type: ignore[no-untyped-call]
-                gate.optimizer.step()
-                gate.follow(how.averaging)
-                losses.append(loss.item())
+        for _ in range(self.plan.gate_steps):
+            inputs, costlier = gate.recall(self.how.batch_size)
+            scores = gate.learning(inputs)
+            best = scores.gather(1, costlier.argmin(dim=1, keepdim=True))
+            loss = (costlier * softplus(scores - best)).sum(dim=1).mean()
+            gate.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            gate.optimizer.step()
+            gate.follow(self.how.averaging)
+            losses.append(loss.item())
         self.logger.record("gate/loss", float(np.mean(losses)))
-        wrong = self.policy.gate.choose(seen) != costs.argmin(axis=1)
-        self.logger.record("gate/regret", float(more[wrong, self.policy.gate.choose(seen)[wrong]].sum() / len(more)))
