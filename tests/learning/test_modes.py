@@ -40,6 +40,7 @@ MODES = {
     "gate_memory": 100,
     "gate_steps": 4,
     "tie_break": 0.05,
+    "together_rate": 0.5,
     "shares": {"alone": 0.25, "further": 0.25, "gate": 0.25, "together": 0.25},
 }
 TINY = SHIPPED.replace(

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from ethbrake_marl.learning.recipe import Fraction, Layers, NonNegative, Positive
+from ethbrake_marl.learning.recipe import Fraction, Layers, NonNegative, Positive, Rate
 
 ROUNDING = 1e-6  # of sums of shares, in updates
 
@@ -46,6 +46,7 @@ class ModesPlan(BaseModel):
     gate_memory: Annotated[int, Field(ge=1, le=1_000_000)]  # of them that are remembered
     gate_steps: Annotated[int, Field(ge=1, le=100_000)]  # of its optimiser in each update
     tie_break: NonNegative  # of the harm by the other count, added to minus the return when networks are compared
+    together_rate: Rate  # share of the learning rate in the last stage
     shares: Shares
 
 

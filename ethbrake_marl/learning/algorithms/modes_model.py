@@ -13,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.utils import update_learning_rate
 from torch import Tensor, nn
 from torch.nn.functional import mse_loss, softplus
 
@@ -143,6 +144,7 @@ class ModesModel(CounterfactualModel):
         self.plan = plan
         self._stage: Stage | None = None
         self._own: Moment | None = None  # starts of the worlds of the stage's network
+        self._rate_share = 1.0
         super().__init__(environment, shape, how, **settings)
 
     def _setup_model(self) -> None:
@@ -163,12 +165,19 @@ class ModesModel(CounterfactualModel):
             seen, moments = self._visit(told, member.act if stage.does == "alone" else policy.act)
         told.on_rollout_end()
         self._update_current_progress_remaining(number - stage.first, stage.end - stage.first)
+        self._rate_share = self.plan.together_rate if stage.does == "together" else 1.0
         if stage.does in ("alone", "further"):
             self._train(member, self._try_out(seen, moments, member))
             return
         if stage.does == "together":
             self._train_chosen(self._try_out(seen, moments, policy))
         self._train_gate(*self._compare(seen, moments))
+
+    def _update_learning_rate(self, optimizers: list[torch.optim.Optimizer] | torch.optim.Optimizer) -> None:
+        assert isinstance(optimizers, torch.optim.Optimizer)
+        rate = self._rate_share * self.lr_schedule(self._current_progress_remaining)
+        self.logger.record("train/learning_rate", rate)
+        update_learning_rate(optimizers, rate)
 
     def _enter(self, stage: Stage, number: int) -> None:
         """Prepare a stage. After a resume this finds the same again: it depends on finished networks alone."""
