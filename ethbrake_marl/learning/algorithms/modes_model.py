@@ -209,7 +209,9 @@ class ModesModel(CounterfactualModel):
         generator = torch.Generator().manual_seed(seed)
         for _ in range(self.plan.imitation_epochs):
             for batch in torch.split(torch.randperm(len(wanted), generator=generator), self.how.batch_size):
-                loss = mse_loss(pupil.learning(seen[batch])[:, 0].clamp(-1.0, 1.0), wanted[batch])
+                means, target = pupil.learning(seen[batch])[:, 0], wanted[batch]
+                reached = (target.abs() >= 1.0) & (means * target >= 1.0)  # beyond a bound it means the bound
+                loss = mse_loss(means, torch.where(reached, means.detach(), target))
                 pupil.optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
                 pupil.optimizer.step()
