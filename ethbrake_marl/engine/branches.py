@@ -17,12 +17,14 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.stream import Roster
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
-from ethbrake_marl.physics import Bools, Floats, Ints
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.rows import command_at, gap_at, harm_at, has_news, params_at, previous_at, speed_at
 
 ROUNDING_MPS2 = 1e-5  # a command that differs by less is the same: networks round by the size of their batch
 
 Act = Callable[[Observations], NDArray[np.float32]]  # observations [rows, F] -> actions [rows] in [-1, 1]
+
+Decide = Callable[[Observations, Ints, int], Floats]  # what is seen [m, L, F] in rows [m], steps made -> actions [m, L]
 
 
 class Moment(NamedTuple):
@@ -46,9 +48,23 @@ class Offsets(NamedTuple):
     steps: Ints  # [n] for so many steps, at least 1
 
 
+def no_offsets(n: int) -> Offsets:
+    """Of the first learner in ``n`` rows: its policy drives."""
+    return Offsets(np.zeros(n, np.int64), np.zeros(n), np.zeros(n, np.int64))
+
+
 def moment_of(engine: Engine) -> Moment:
     """The present moment of all rows, in its own memory."""
     return Moment(engine._state.copy(), engine._params.copy(), engine._clock.copy(), engine._wanted.copy())
+
+
+def first_moments(engine: Engine, count: int) -> tuple[Worlds, Moment]:
+    """The first ``count`` worlds of the engine's training stream, at the alert, and at their first decision."""
+    stream = copy.copy(engine._stream)
+    stream.restart(engine.seed)
+    start = stream.take(count)
+    packed = engine._kept(start.packed)
+    return start.alert, Moment(packed.state.copy(), packed.params.copy(), start.clock.copy(), start.wanted.copy())
 
 
 def join_moments(moments: list[Moment]) -> Moment:
@@ -93,29 +109,53 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
     soon as nothing can change any more.
 
     """
-    vehicles, L = np.array(engine.learners, np.int64), len(engine.learners)
-    gained, moved = np.zeros(engine.n), np.zeros(engine.n)
-    whose = vehicles[offsets.learner]
-    running, discount, most = np.flatnonzero(~engine.ended), 1.0, int(offsets.steps.max(initial=0))
-    actions = np.zeros((engine.n, L))
-    number, only_harm = 0, set(engine.reward_terms) <= {"harm"}
+    moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
+
+    def decide(seen: Observations, rows: Ints, number: int) -> Floats:
+        wanted = act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
+        if number < most:
+            _add(wanted, offsets, rows, number, moved)
+        return wanted
+
+    gained = play_on(engine, decide, gamma, at_least=most)
+    return gained[np.arange(engine.n), offsets.learner], moved
+
+
+def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
+    """Play every row to the end of its episode, ``at_least`` so many steps; what each learner gains, [n, L].
+
+    ``decide`` gives the learners' actions. The rest is as for ``play_to_the_end``.
+    """
+    vehicles = np.array(engine.learners, np.int64)
+    gained, actions = np.zeros((engine.n, len(vehicles))), np.zeros((engine.n, len(vehicles)))
+    running, discount, number = np.flatnonzero(~engine.ended), 1.0, 0
+    only_harm = set(engine.reward_terms) <= {"harm"}
     while len(running):
         before = engine._state.take(running, axis=0)
-        seen = engine.observe_all(vehicles, running)
-        wanted = act(seen.reshape(len(running) * L, -1)).astype(np.float64).reshape(len(running), L)
-        if number < most:
-            _add(wanted, offsets, running, number, moved)
-        actions[running] = wanted
+        actions[running] = decide(engine.observe_all(vehicles, running), running, number)
         step = engine.step(actions)
-        gained[running] += discount * step.reward[running, whose[running]]
+        gained[running] += discount * step.reward[running][:, vehicles]
         goes_on = ~engine.ended[running]
-        if only_harm and number >= most:
+        if only_harm and number >= at_least:
             goes_on &= ~_stands_for_good(engine, before, running)
         running = running[goes_on]
         discount *= gamma
         number += 1
     gained[list(engine.roster.failed)] = np.nan
-    return gained, moved
+    return gained
+
+
+def visit(engine: Engine, act: Act) -> tuple[Observations, Moment]:
+    """Play every row to its end by ``act``: what is seen at each decision [m, L, F], and those moments [m]."""
+    seen_then, moments = [], []
+
+    def decide(seen: Observations, rows: Ints, number: int) -> Floats:
+        seen_then.append(seen)
+        moments.append(moment_of(engine).take(rows))
+        return act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
+
+    play_on(engine, decide, 1.0)
+    return np.concatenate(seen_then), join_moments(moments)
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:

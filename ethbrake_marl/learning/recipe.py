@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
@@ -261,9 +261,10 @@ class RecipeWording(Wording):
         """The keys of the part in which ``path`` ends."""
         model: type[BaseModel] = self._model
         for part in path[:-1]:
-            inner = model.model_fields[str(part)].annotation
-            if isinstance(inner, type) and issubclass(inner, BaseModel):
-                model = inner
+            annotation = model.model_fields[str(part)].annotation
+            for inner in (annotation, *get_args(annotation)):  # a part that may be left out is "that part, or None"
+                if isinstance(inner, type) and issubclass(inner, BaseModel):
+                    model = inner
         return setting_names() if model is RewardParams else list(model.model_fields)
 
     def needed(self, path: YamlPath) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.policies.manifest import NetworkSpec
+from ethbrake_marl.policies.manifest import NetworkSpec, actor_names
 
 _PER_LN2 = 1.4426950408889634
 _LN2_HIGH = 0.693147180369123816490  # its last 32 bits are 0: times a small integer it is exact
@@ -55,20 +55,22 @@ def squash(values: NDArray[np.float32]) -> None:
 
 Float32s = NDArray[np.float32]
 
+Layers = list[tuple[Float32s, Float32s]]  # weights and biases, from the first layer to the last
+
 BLOCK_ROWS = 64  # worlds handled together: their activations stay in the first cache
 
 
 class Actor:
-    """The deterministic policy: observation [n, F] float32 -> action [n, A] float32 in [-1, 1]."""
+    """The deterministic policy: observation [n, F] float32 -> action [n, A] float32 in [-1, 1].
+
+    Of several networks only the one that the gate chooses is computed in a row.
+    """
 
     def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s]) -> None:
-        """Take the actor's layers out of ``tensors``, which must fit ``spec`` (see ``tensor_table``)."""
+        """Take the layers out of ``tensors``, which must fit ``spec`` (see ``tensor_table``)."""
         self.spec = spec
-        names = [f"policy.{k}" for k in range(len(spec.policy_hidden))] + ["policy.output"]
-        self._layers = [
-            (np.ascontiguousarray(tensors[f"{name}.weight"]), np.ascontiguousarray(tensors[f"{name}.bias"]))
-            for name in names
-        ]
+        self._networks = [_layers_of(name, len(spec.policy_hidden), tensors) for name in actor_names(spec)]
+        self._gate = _layers_of("gate", len(spec.gate_hidden), tensors) if spec.networks > 1 else []
 
     def __call__(self, observation: Float32s) -> Float32s:
         """Return the action of each row; raises ``InvalidInput`` on a wrong shape, dtype or a non-finite entry."""
@@ -79,21 +81,45 @@ class Actor:
             action[rows] = self._block(np.ascontiguousarray(seen[rows].T)).T
         return action
 
+    def choose(self, observation: Float32s) -> NDArray[np.int64]:
+        """Which of its networks acts in each row, [n] from 0; raises what a call raises."""
+        return self._choose(np.ascontiguousarray(self._check(observation).T))
+
+    def _choose(self, x: Float32s) -> NDArray[np.int64]:
+        """[F, rows] -> [rows]."""
+        if not self._gate:
+            return np.zeros(x.shape[1], np.int64)
+        chosen: NDArray[np.int64] = self._forward(self._gate, x).argmax(axis=0)
+        return chosen
+
     def _block(self, x: Float32s) -> Float32s:
         """[F, rows] -> [A, rows]."""
-        for k, (weight, bias) in enumerate(self._layers):
+        if len(self._networks) == 1:
+            y = self._forward(self._networks[0], x)
+        else:
+            chosen = self._choose(x)
+            y = np.empty((self.spec.action_size, x.shape[1]), dtype=np.float32)
+            for m, layers in enumerate(self._networks):
+                rows = np.flatnonzero(chosen == m)
+                y[:, rows] = self._forward(layers, np.ascontiguousarray(x[:, rows]))
+        if self.spec.output == "clip":
+            return np.clip(y, np.float32(-1.0), np.float32(1.0))
+        squash(y)
+        return y
+
+    def _forward(self, layers: Layers, x: Float32s) -> Float32s:
+        """[F, rows] -> [outputs, rows] of one network."""
+        for weight, bias in layers[:-1]:
             y = np.empty((weight.shape[0], x.shape[1]), dtype=np.float32)
             dense(weight, bias, x, y)
-            if k == len(self._layers) - 1:
-                break
             if self.spec.activation == "relu":
                 x = np.maximum(y, np.float32(0.0))
             else:
                 squash(y)
                 x = y
-        if self.spec.output == "clip":
-            return np.clip(y, np.float32(-1.0), np.float32(1.0))
-        squash(y)
+        weight, bias = layers[-1]
+        y = np.empty((weight.shape[0], x.shape[1]), dtype=np.float32)
+        dense(weight, bias, x, y)
         return y
 
     def _check(self, observation: Float32s) -> Float32s:
@@ -107,6 +133,14 @@ class Actor:
             row, column = np.argwhere(~np.isfinite(observation))[0]
             raise InvalidInput(f"observation[{row}, {column}] = {observation[row, column]}: must be finite")
         return observation
+
+
+def _layers_of(name: str, hidden: int, tensors: Mapping[str, Float32s]) -> Layers:
+    names = [f"{name}.{k}" for k in range(hidden)] + [f"{name}.output"]
+    return [
+        (np.ascontiguousarray(tensors[f"{layer}.weight"]), np.ascontiguousarray(tensors[f"{layer}.bias"]))
+        for layer in names
+    ]
 
 
 @compiled

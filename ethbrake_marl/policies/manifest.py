@@ -31,12 +31,24 @@ Hidden = Annotated[tuple[Width, ...], Field(min_length=1, max_length=8)]
 PerhapsHidden = Annotated[tuple[Width, ...], Field(max_length=8)]
 
 
+def _one(value: int) -> bool:
+    return value == 1
+
+
+def _nothing(value: tuple[Any, ...]) -> bool:
+    return not value
+
+
 class NetworkSpec(BaseModel):
     """An actor, and perhaps a critic, both multilayer perceptrons on the same observation.
 
     The action is ``output(actor(observation))`` in [-1, 1]: ``clip`` cuts the actor's mean at the bounds (PPO's
     Gaussian, whose noise is one number per action), ``tanh`` squashes it (SAC's Gaussian, whose noise is a second
     head of the actor). Without ``value_hidden`` there is no critic: a policy needs none to act.
+
+    With ``networks`` above 1 there are as many actors of this shape, and a gate with ``gate_hidden`` layers that gives
+    each a score: the actor of the highest score acts, the first of equal ones. The gate is asked at each decision and
+    remembers nothing. There is neither noise nor critic then.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -47,6 +59,18 @@ class NetworkSpec(BaseModel):
     value_hidden: PerhapsHidden
     activation: Activation
     output: Output
+    networks: Annotated[int, Field(ge=1, le=16, exclude_if=_one)] = 1
+    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=_nothing)] = ()
+
+    @model_validator(mode="after")
+    def _a_gate_between_several(self) -> NetworkSpec:
+        if (self.networks > 1) != bool(self.gate_hidden):
+            raise ValueError(
+                f"networks = {self.networks} with gate_hidden = {list(self.gate_hidden)}; several need a gate"
+            )
+        if self.networks > 1 and self.value_hidden:
+            raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty beside several networks")
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +84,8 @@ class TensorRow:
 
 def tensor_table(spec: NetworkSpec) -> tuple[TensorRow, ...]:
     """List every tensor of ``spec``, all float32; weights are [outputs, inputs] as in ``y = W x + b``."""
+    if spec.networks > 1:
+        return _mixture_table(spec)
     last = spec.policy_hidden[-1]
     if spec.output == "clip":
         rows = [
@@ -76,6 +102,22 @@ def tensor_table(spec: NetworkSpec) -> tuple[TensorRow, ...]:
     if spec.value_hidden:
         rows += _layers("value", "mlp_extractor.value_net", spec.observation_size, spec.value_hidden)
         rows += _layer("value.output", "value_net", spec.value_hidden[-1], 1)
+    return tuple(rows)
+
+
+def actor_names(spec: NetworkSpec) -> tuple[str, ...]:
+    """How the tensors' names of each actor begin."""
+    return ("policy",) if spec.networks == 1 else tuple(f"network_{m + 1}" for m in range(spec.networks))
+
+
+def _mixture_table(spec: NetworkSpec) -> tuple[TensorRow, ...]:
+    rows: list[TensorRow] = []
+    for m, name in enumerate(actor_names(spec)):
+        inside = f"members.{m}"
+        rows += _layers(name, f"{inside}.mlp_extractor.policy_net", spec.observation_size, spec.policy_hidden)
+        rows += _layer(f"{name}.output", f"{inside}.action_net", spec.policy_hidden[-1], spec.action_size)
+    rows += _layers("gate", "gate.average", spec.observation_size, spec.gate_hidden)
+    rows += _layer("gate.output", f"gate.average.{2 * len(spec.gate_hidden)}", spec.gate_hidden[-1], spec.networks)
     return tuple(rows)
 
 
@@ -118,10 +160,6 @@ class FeatureDefinition(_Strict):
     tried: Annotated[tuple[float, ...], Field(max_length=64)]  # what it gave in a few worlds
 
 
-def _empty(value: tuple[FeatureDefinition, ...]) -> bool:
-    return not value
-
-
 class ObservationSchema(_Strict):
     """What the policy sees: neighbours on each side, feature names in order, and a hash of how each is scaled."""
 
@@ -129,7 +167,7 @@ class ObservationSchema(_Strict):
     rear: Neighbours
     features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]
     scaling_sha256: Sha256
-    registered: Annotated[tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=_empty)] = ()
+    registered: Annotated[tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=_nothing)] = ()
 
     @property
     def spec(self) -> ObservationSpec:
@@ -138,10 +176,13 @@ class ObservationSchema(_Strict):
 
 
 class Manifest(_Strict):
-    """Everything about a policy but its tensors; ``action`` is a fraction of the own capacity, -1 = full braking."""
+    """Everything about a policy but its tensors; ``action`` is a fraction of the own capacity, -1 = full braking.
+
+    Format 3 is for policies of several networks; one network is written as ever, for earlier versions too.
+    """
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
-    format_version: Literal[2] = 2
+    format_version: Literal[2, 3] = 2
     algorithm: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
     network: NetworkSpec
     observation: ObservationSchema
@@ -160,6 +201,15 @@ class Manifest(_Strict):
         """The observation as the environment builds it; raises ``UnknownName``."""
         spec, step = self.observation.spec, self.scenario.get("time_step_s")
         return spec.at_steps_of(float(step)) if isinstance(step, int | float) else spec
+
+    @model_validator(mode="after")
+    def _format_of_the_network(self) -> Manifest:
+        if self.format_version != format_of(self.network):
+            raise ValueError(
+                f"format_version: {self.format_version} for {self.network.networks} networks; must be"
+                f" {format_of(self.network)}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _one_input_per_feature(self) -> Manifest:
@@ -190,6 +240,11 @@ class Manifest(_Strict):
             if isinstance(roles, dict) and roles.get(name) != "learner":
                 raise ValueError(f"learners: {name}: does not learn in the scenario's roles")
         return self
+
+
+def format_of(network: NetworkSpec) -> Literal[2, 3]:
+    """The format of a bundle with this network."""
+    return 2 if network.networks == 1 else 3
 
 
 def content_sha256(content: Mapping[str, Any]) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.errors import naming_extras
+from ethbrake_marl.policies.manifest import actor_names
 from ethbrake_marl.policies.policy import Policy
 
 OPSET = 17
@@ -54,20 +55,32 @@ class _Writer:
         return name
 
     def actor(self, policy: Policy) -> str:
-        """The layers, and the output function that gives ``action``."""
-        network, tensors = policy.manifest.network, policy.tensors
-        names = [f"policy.{k}" for k in range(len(network.policy_hidden))] + ["policy.output"]
-        x = "observation"
-        for name in names:
-            weight, bias = (self.constant(f"{name}.{part}", tensors[f"{name}.{part}"]) for part in ("weight", "bias"))
-            x = self.node("Gemm", [x, weight, bias], transB=1)
-            if name != "policy.output":
-                x = self.node("Relu" if network.activation == "relu" else "Tanh", [x])
+        """The network that the gate chooses, and the output function that gives ``action``."""
+        network = policy.manifest.network
+        hidden, names = len(network.policy_hidden), actor_names(network)
+        outputs = [self.layers(policy, name, hidden) for name in names]
+        x = outputs[0]
+        if len(outputs) > 1:
+            scores = self.layers(policy, "gate", len(network.gate_hidden))
+            chosen = self.node("ArgMax", [scores], axis=1, keepdims=1)
+            x = self.node("GatherElements", [self.node("Concat", outputs, axis=1), chosen], axis=1)
         if network.output == "tanh":
             return self.node("Tanh", [x], output="action")
         low = self.constant("lowest", np.array(-1.0, np.float32))
         high = self.constant("highest", np.array(1.0, np.float32))
         return self.node("Clip", [x, low, high], output="action")
+
+    def layers(self, policy: Policy, network: str, hidden: int) -> str:
+        """One network of the policy, from the observation on."""
+        x, activation = "observation", policy.manifest.network.activation
+        for name in [f"{network}.{k}" for k in range(hidden)] + [f"{network}.output"]:
+            weight, bias = (
+                self.constant(f"{name}.{part}", policy.tensors[f"{name}.{part}"]) for part in ("weight", "bias")
+            )
+            x = self.node("Gemm", [x, weight, bias], transB=1)
+            if not name.endswith("output"):
+                x = self.node("Relu" if activation == "relu" else "Tanh", [x])
+        return x
 
     def feature(self, name: str, column: int, scale: float) -> str:
         """One feature in its unit, [n, 1]."""

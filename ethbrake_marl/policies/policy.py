@@ -25,7 +25,7 @@ from ethbrake_marl.files.messages import first_mistake
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.policies.actor import Actor, Float32s
-from ethbrake_marl.policies.manifest import Manifest, content_sha256, tensor_table
+from ethbrake_marl.policies.manifest import Manifest, content_sha256, format_of, tensor_table
 from ethbrake_marl.policies.observed import check_observed
 
 MANIFEST = "manifest.json"
@@ -81,12 +81,13 @@ class Policy:
 
 
 def make_policy(tensors: Mapping[str, Float32s], **manifest: Any) -> Policy:
-    """Build a policy from ``tensors`` and the fields of ``Manifest`` (all but the hashes, which are computed).
+    """Build a policy from ``tensors`` and the fields of ``Manifest`` (all but hashes and format, which follow).
 
     Raises ``InvalidInput`` naming the tensor or field that does not fit.
     """
     data = _serialise(tensors)
     try:
+        manifest["format_version"] = format_of(manifest["network"])
         draft = Manifest(**manifest, weights_sha256=hashlib.sha256(data).hexdigest(), manifest_sha256="0" * 64)
         own = content_sha256(draft.model_dump(mode="json"))
         checked = draft.model_copy(update={"manifest_sha256": own})

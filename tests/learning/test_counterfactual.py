@@ -133,8 +133,8 @@ def test_training__numbers_that_are_not_finite_stop_it(tmp_path: Path, monkeypat
     real = CounterfactualModel._try_out
     calls = []
 
-    def broken(self: CounterfactualModel, seen: Any, moments: Any) -> Tried:
-        tried = real(self, seen, moments)
+    def broken(self: CounterfactualModel, seen: Any, moments: Any, actor: Any) -> Tried:
+        tried = real(self, seen, moments, actor)
         calls.append(1)
         return tried._replace(mean=tried.mean * np.float32(np.nan)) if len(calls) == 3 else tried
 

@@ -4,13 +4,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.learning.algorithms.modes import ModesPlan
 from ethbrake_marl.learning.algorithms.protocol import Algorithm
 from ethbrake_marl.learning.recipe import ActorShape, Fraction, OffsetRange, Positive, Rate, TrainingRecipe
 from ethbrake_marl.learning.training import Training
@@ -20,11 +21,18 @@ from ethbrake_marl.policies.shipped import PolicyKind, load_named_policy
 from ethbrake_marl.scenario.checks import refuse
 
 if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from torch.optim import Optimizer
+
     from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
     from ethbrake_marl.learning.algorithms.counterfactual_model import CounterfactualModel
 
 MOMENTS_LIMIT = 2**22  # decisions held in memory between two updates
 _KINDS: dict[str, PolicyKind] = {name: name for name in get_args(PolicyKind)}
+
+
+def _none(value: object) -> bool:
+    return value is None
 
 
 Steps = Annotated[int, Field(ge=1, le=1000)]
@@ -49,6 +57,7 @@ class CounterfactualRecipe(TrainingRecipe):
     batch_size: Annotated[int, Field(ge=2)]
     averaging: Fraction
     network: ActorShape
+    modes: Annotated[ModesPlan | None, Field(exclude_if=_none)] = None  # several networks and a gate
 
     @model_validator(mode="after")
     def _counts_to_the_end(self) -> CounterfactualRecipe:
@@ -68,8 +77,16 @@ class CounterfactualRecipe(TrainingRecipe):
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """The actor alone."""
-        return self.network.spec(observation_size)
+        """The actor alone, or several and a gate."""
+        spec = self.network.spec(observation_size)
+        if self.modes is None:
+            return spec
+        return NetworkSpec(**spec.model_dump() | {"networks": self.modes.networks, "gate_hidden": self.modes.gate})
+
+    def check_learners(self, learners: int) -> None:
+        """Several networks are for one learner: a mode of several would have to be chosen by all of them at once."""
+        if self.modes is not None and learners != 1:
+            raise InvalidInput(f"recipe {self.name!r}: modes: are for one learner, not for {learners}; leave modes out")
 
     @property
     def rounds(self) -> int:
@@ -84,6 +101,7 @@ class Counterfactual(Algorithm):
         """The model, from the policy of ``start`` if the recipe names one."""
         from ethbrake_marl.engine.branches import branch, moment_of
         from ethbrake_marl.learning.algorithms.counterfactual_model import CounterfactualModel, TryingOut
+        from ethbrake_marl.learning.algorithms.modes_model import ModesModel
 
         recipe = training.recipe
         assert isinstance(recipe, CounterfactualRecipe)
@@ -101,12 +119,27 @@ class Counterfactual(Algorithm):
             recipe.batch_size,
             recipe.averaging,
         )
-        model = CounterfactualModel(
-            environment, recipe.network, how, learning_rate=recipe.learning_rate.at, seed=recipe.seed
-        )
+        settings: dict[str, Any] = {"learning_rate": recipe.learning_rate.at, "seed": recipe.seed}
+        model: CounterfactualModel
+        if recipe.modes is None:
+            model = CounterfactualModel(environment, recipe.network, how, **settings)
+            first = model.policy
+        else:
+            model = ModesModel(environment, recipe.network, how, recipe.modes, **settings)
+            first = model.policy.member(0)
         if recipe.start is not None:
-            model.policy.take_over(widened(starting_policy(recipe.start, training), training))
+            first.take_over(widened(starting_policy(recipe.start, training), training))
         return model
+
+    def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
+        """The optimiser of the actor, or that of each network and of the gate."""
+        from ethbrake_marl.learning.algorithms.modes_model import ModesModel
+
+        if not isinstance(model, ModesModel):
+            return {"policy": model.policy.optimizer}
+        policy = model.policy
+        members = {f"network_{k + 1}": policy.member(k).optimizer for k in range(model.plan.networks)}
+        return {**members, "gate": policy.gate.optimizer}
 
 
 def starting_policy(start: str, training: Training) -> Policy:
@@ -122,6 +155,8 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
     """
     recipe, wanted = training.recipe, training.recipe.network_spec(training.observation.size)
     found = policy.manifest.network
+    if found.networks > 1:
+        raise InvalidInput(f"recipe {recipe.name!r}: start: has {found.networks} networks; give a policy of one")
     same = ("policy_hidden", "activation", "output")
     for name in same:
         if getattr(found, name) != getattr(wanted, name):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import MaybeCallback, PyTorchObs, Schedule
 from torch import Tensor, nn
 
-from ethbrake_marl.engine.branches import Moment, Offsets, branch, join_moments, moment_of, play_to_the_end
+from ethbrake_marl.engine.branches import Act, Moment, Offsets, branch, join_moments, moment_of, play_to_the_end
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS
 from ethbrake_marl.learning.recipe import ActorShape
@@ -127,6 +127,16 @@ class TryingOut(NamedTuple):
     averaging: float
 
 
+class Actor(Protocol):
+    """What is tried out; its actions are its means, cut at -1 and 1."""
+
+    def means(self, observation: Float32s) -> Float32s:
+        """Of observations [rows, F], [rows]."""
+
+    def act(self, observation: Float32s) -> Float32s:
+        """Actions [rows] in [-1, 1]."""
+
+
 class CounterfactualModel(BaseAlgorithm):
     """Visits decisions by its deterministic actor, tries some of them in two ways, and learns from the difference."""
 
@@ -163,14 +173,19 @@ class CounterfactualModel(BaseAlgorithm):
         told.on_training_start(locals(), globals())
         while self.num_timesteps < total:
             told.on_rollout_start()
-            seen, moments = self._visit(told)
-            told.on_rollout_end()
-            self._update_current_progress_remaining(self.num_timesteps, total)
-            self._train(self._try_out(seen, moments))
+            self._update(told, total)
         told.on_training_end()
         return self
 
-    def _visit(self, told: BaseCallback) -> tuple[Float32s, Moment]:
+    def _update(self, told: BaseCallback, total: int) -> None:
+        """One round of collecting and learning."""
+        actor = self.policy
+        seen, moments = self._visit(told, actor.act)
+        told.on_rollout_end()
+        self._update_current_progress_remaining(self.num_timesteps, total)
+        self._train(actor, self._try_out(seen, moments, actor))
+
+    def _visit(self, told: BaseCallback, act: Act) -> tuple[Float32s, Moment]:
         """Drive on for ``n_steps``; what was seen [n_steps, rows, F], and the worlds' moments, step by step."""
         assert isinstance(self.env, EthBrakeVecEnv)
         seen, moments = [], []
@@ -178,7 +193,7 @@ class CounterfactualModel(BaseAlgorithm):
             observations: Any = self._last_obs
             seen.append(observations)
             moments.append(moment_of(self.env.engine))
-            new_obs, rewards, dones, infos = self.env.step(self.policy.act(observations)[:, np.newaxis])
+            new_obs, rewards, dones, infos = self.env.step(act(observations)[:, np.newaxis])
             self.num_timesteps += self.env.num_envs
             self._update_info_buffer(infos, dones)
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
@@ -186,7 +201,7 @@ class CounterfactualModel(BaseAlgorithm):
             told.on_step()
         return np.stack(seen), join_moments(moments)
 
-    def _try_out(self, seen: Float32s, moments: Moment) -> Tried:
+    def _try_out(self, seen: Float32s, moments: Moment, actor: Actor) -> Tried:
         """Try some of the visited decisions with more and with less, each to the end of its episode."""
         assert isinstance(self.env, EthBrakeVecEnv)
         how, learners = self.how, len(self.env.engine.learners)
@@ -198,27 +213,27 @@ class CounterfactualModel(BaseAlgorithm):
         worlds: Ints = np.tile(rows // learners, 2)
         engine = branch(self.env.engine, moments.take(worlds))
         offsets = Offsets(np.tile(rows % learners, 2), both, np.tile(holds, 2))
-        gained, moved = play_to_the_end(engine, self.policy.act, offsets, how.gamma)
+        gained, moved = play_to_the_end(engine, actor.act, offsets, how.gamma)
         gradient = np.clip(_difference(gained) / _difference(moved), -how.gradient_limit, how.gradient_limit)
         good = np.isfinite(gradient)
         observed = seen.reshape(-1, seen.shape[2])[rows[good]]
-        return Tried(observed, self.policy.means(observed), gradient[good].astype(np.float32))
+        return Tried(observed, actor.means(observed), gradient[good].astype(np.float32))
 
-    def _train(self, tried: Tried) -> None:
+    def _train(self, actor: AveragedActor, tried: Tried) -> None:
         """Regress the actor on actions that are better, within the trust radius; log what that was."""
-        how, policy = self.how, self.policy
-        self._update_learning_rate(policy.optimizer)
+        how = self.how
+        self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, how.trust_radius, how.anchor)
         seen, wanted, weights = (torch.from_numpy(array) for array in (tried.seen, target, weight))
         losses = []
         for _ in range(how.n_epochs):
             for batch in torch.split(torch.randperm(len(wanted)), how.batch_size):
-                means = policy.learning(seen[batch])[:, 0]
+                means = actor.learning(seen[batch])[:, 0]
                 loss = (weights[batch] * (means - wanted[batch]) ** 2).mean()
-                policy.optimizer.zero_grad()
+                actor.optimizer.zero_grad()
                 loss.backward()
-                policy.optimizer.step()
-                policy.follow(how.averaging)
+                actor.optimizer.step()
+                actor.follow(how.averaging)
                 losses.append(loss.item())
         self._n_updates += how.n_epochs
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
