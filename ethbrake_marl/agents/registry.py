@@ -128,6 +128,12 @@ _ENTRIES: dict[str, Entry] = {
     "counterfactual": Entry(
         "counterfactual@PATH", "a policy trained by counterfactuals: a run or a bundle", (Source.MESSAGES,), _POLICIES
     ),
+    "policy": Entry(
+        "policy@PATH",
+        "a policy, whatever trained it: a run, a bundle, or shipped, the best for scenario and harm",
+        (Source.MESSAGES,),
+        _POLICIES,
+    ),
     "universal": Entry("universal@shipped", "the shipped policy for all parameters", (Source.MESSAGES,), _POLICIES),
     "team": Entry("team@RUN", "the learners of a run, each as it was trained", (Source.MESSAGES,), _POLICIES),
 }

@@ -1,4 +1,4 @@
-"""Trained policies as agents: ``ppo@PATH``, ``sac@PATH``, ``counterfactual@PATH``, ``universal@shipped``, ``team@RUN``.
+"""Trained policies as agents: ``ppo@PATH``, ``policy@PATH``, whatever trained it, ``universal@shipped``, ``team@RUN``.
 
 Needs no torch.
 """

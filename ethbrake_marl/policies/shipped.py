@@ -6,6 +6,7 @@ is and where it is bad.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +18,8 @@ from ethbrake_marl.scenario import Scenario
 SHIPPED = "shipped"
 BUNDLE, CARD = "policy", "card.md"
 
-PolicyKind = Literal["ppo", "sac", "counterfactual", "universal"]
+PolicyKind = Literal["ppo", "sac", "counterfactual", "universal", "policy"]
+_BEST_FIRST: tuple[PolicyKind, ...] = ("counterfactual", "ppo", "sac", "universal")  # of ``policy``, where several are
 
 _FOLDER = Path(__file__).resolve().parents[1] / "_policies"
 
@@ -31,10 +33,13 @@ def shipped_name(kind: PolicyKind, scenario: str | None, harm_count: HarmCount) 
     """Name of the policy of this kind for ``scenario``, of those trained for ``harm_count`` if there is one.
 
     ``universal`` is for all scenarios, ``ppo`` and ``sac`` are for the one that they were trained on, ``ppo-SCENARIO``
-    and ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. Raises
-    ``InvalidInput`` listing what ships.
+    and ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. ``policy`` is
+    the best of all kinds. Raises ``InvalidInput`` listing what ships.
     """
     names = shipped_policies()
+    for each in _BEST_FIRST if kind == "policy" else ():
+        with suppress(InvalidInput):
+            return shipped_name(each, scenario, harm_count)
     plain = [kind] if kind == "universal" or scenario is None else [f"{kind}-{scenario}", kind]
     for stem in plain:
         for name in (f"{stem}-total", stem) if harm_count == "total" else (stem,):

@@ -37,6 +37,8 @@ def test_shipped_name__is_by_kind_scenario_and_count(folder: Path) -> None:
     assert shipped_name("ppo", "paper-distance", "total") == "ppo-paper-distance"  # better than none
     assert shipped_name("universal", "paper-delay-low", "first") == "universal"
     assert shipped_name("ppo", None, "total") == "ppo-total"
+    assert shipped_name("policy", "paper-random", "total") == "ppo-total"
+    assert shipped_name("policy", "paper-delay-low", "first") == "universal"
     assert card("universal") == "# universal\n"
 
 
@@ -98,6 +100,26 @@ def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_sh
     alone, shielded = (result.outcome(spec).ledger.world_harm(harm_count) for spec in lineup)
     assert shielded.mean() <= alone.mean()
     assert (shielded <= result.outcome("ppo@shipped+episode").predicted_harm + 1e-9).all()
+
+
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
+@pytest.mark.parametrize("test", list(TESTS))
+def test_policy_shipped__is_the_best_that_ships(test: str, harm_count: HarmCount) -> None:
+    """By the mean harm in 2,000 worlds, within a hundredth of the best of all that can drive there."""
+    scenario = load_scenario(test)
+    each = [
+        f"ppo@shipped/{name}" if name.startswith("ppo") else f"policy@shipped/{name}" for name in shipped_policies()
+    ]
+    lineup = make_lineup(["policy@shipped", *each], scenario, harm_count=harm_count)
+    result = evaluate(scenario.sample(2_000, 21), lineup, scenario=scenario, seed=21, aftermath=False)
+    harm = {spec: result.outcome(spec).ledger.world_harm(harm_count).mean() for spec in lineup}
+    assert harm["policy@shipped"] <= 1.01 * min(harm.values())
+
+
+def test_policy__whatever_trained_it(folder: Path, policy: Policy) -> None:
+    assert make_lineup(["policy@shipped/ppo"], SCENARIO)["policy@shipped/ppo"].name == "policy@shipped/ppo"
+    with pytest.raises(InvalidInput, match="policy@PATH, where PATH is a run or a policy bundle"):
+        make_lineup(["policy"], SCENARIO)
 
 
 # Of each list of 10,000 (seed 7) the worlds in which a shipped policy, refined, was furthest below an earlier table.
