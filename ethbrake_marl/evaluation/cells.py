@@ -84,6 +84,11 @@ def table_columns(rows: Sequence[SummaryRow]) -> tuple[str, ...]:
     return (*COLUMNS, *(metric_headings(rows[0].metrics).values() if rows else ()))
 
 
+def filled_columns(lines: Sequence[Line], columns: Sequence[int]) -> tuple[int, ...]:
+    """Those of the columns in which some line has a value; all of them for no lines."""
+    return tuple(k for k in columns if not lines or any(line.cells[k].value != NONE for line in lines))
+
+
 def table_meanings(rows: Sequence[SummaryRow]) -> dict[str, str]:
     """What the columns mean, those of registered harm metrics last."""
     return MEANINGS | (metric_meanings(rows[0].metrics) if rows else {})

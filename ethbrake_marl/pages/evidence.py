@@ -16,7 +16,7 @@ from ethbrake_marl.evaluation.regret import Regrets, assess
 from ethbrake_marl.evaluation.shield_modes import ModeRow, compare_behind_shields
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate
 from ethbrake_marl.figures.report import harm_in_parts, regret_distribution
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.pages.chosen import worst_rows
 from ethbrake_marl.pages.frame import Part, Section, paragraph
@@ -33,17 +33,24 @@ _NONE = "–"
 def worst_section(evaluation: Evaluation, focus: str, watched: Collection[int]) -> Section:
     """The ten worlds in which an agent did worst; those that the page plays have a button."""
     regrets, outcome = assess(evaluation), evaluation.outcome(focus)
-    head = ["World", "First-impact harm", "Total harm", "Best known, first", "Best known, total", "Contact", "Impacts"]
+    known = [] if regrets is None else ["Best known, first", "Best known, total", "Contact"]
+    head = ["World", "First-impact harm", "Total harm", *known, "Impacts"]
     rows: list[Row] = []
     for k in worst_rows(evaluation, focus).tolist():
         number = int(evaluation.index[k])
-        best = (_NONE,) * 2 if regrets is None else (f"{regrets.best(c)[k]:.2f}" for c in ("first", "total"))
-        contact = _NONE if regrets is None else "avoidable" if regrets.limits.proof.avoidable[k] else "unavoidable"
+        best: list[str] = []
+        if regrets is not None:
+            best += [f"{regrets.best(count)[k]:.2f}" for count in HARM_COUNTS]
+            best.append("avoidable" if regrets.limits.proof.avoidable[k] else "unavoidable")
         button = Markup('{} <button type="button" data-watch="{}">Watch</button>').format(number, number)
         harms = (f"{outcome.first_impact_harm[k]:.2f}", f"{outcome.total_harm[k]:.2f}")
         world = button if number in watched else number
-        rows.append([world, *harms, *best, contact, int(outcome.impacts[k])])
-    why = "by total harm" if regrets is None else "by total harm above the best known"
+        rows.append([world, *harms, *best, int(outcome.impacts[k])])
+    why = (
+        "by total harm, as nothing is proven of these worlds"
+        if regrets is None
+        else "by total harm above the best known"
+    )
     if not rows:
         return Section("Worst ten worlds", [f"{focus} did no harm above the best known in any of these worlds."])
     return Section(

@@ -192,6 +192,7 @@ class Player {
         make("span", { "data-total": now.total }, `${plain(now.total, 2)} total`),
         make("span", { class: "unit" }, "m²/s²"),
       );
+      if (!episode.rest) head.append(make("span", { class: "unit", "data-cut": "" }, `not at rest at the horizon, ${plain(episode.end, 2)} s`));
       const guarded = steppedInAt(episode, this.time) ? "shield steps in" : "shielded";
       if (episode.stepped.length) head.append(make("span", { class: "shield" }, guarded));
       readout.replaceChildren(

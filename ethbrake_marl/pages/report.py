@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.cells import Line, our_lines, paper_blocks, table_columns, table_meanings
+from ethbrake_marl.evaluation.cells import Line, filled_columns, our_lines, paper_blocks, table_columns, table_meanings
 from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
@@ -18,6 +18,7 @@ from ethbrake_marl.evaluation.text import identity_lines, knowledge_lines, left_
 from ethbrake_marl.figures.report import harm_by_agent
 from ethbrake_marl.figures.style import Figure
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.pages.chosen import choose_shown, play_chosen
 from ethbrake_marl.pages.evidence import ShieldEvidence, avoidable_section, shield_section, worst_section
 from ethbrake_marl.pages.frame import Part, Section, page, paragraph
@@ -118,20 +119,43 @@ def _results(report: Report) -> Section:
             )
         )
     columns = table_columns(rows)
-    shown = (*_HEADLINE, *range(len(table_columns(())), len(columns)))
-    lines: list[Row] = [_row(line, shown) for line in our_lines(rows)]
     blocks = paper_blocks(rows)
+    shown = filled_columns(_all_lines(rows), (*_HEADLINE, *range(len(table_columns(())), len(columns))))
+    lines: list[Row] = [_row(line, shown) for line in our_lines(rows)]
     for name, paper in blocks:
         lines += [Block(f"The paper's {name}, as printed"), *(_row(line, shown) for line in paper)]
     body.append(table(["Agent", *(columns[k] for k in shown)], lines, caption="Means with 95 % intervals"))
     if rows:
         body.append(paragraph(f"{parameter_line(rows[0].parameters)}. Harm in m²/s².", "quiet"))
+    body += [paragraph(text, "quiet") for text in _empty_lines(report)]
     body += [paragraph(text, "note") for text in left_out_lines(rows)]
     body += [paragraph(f"The limit: {text}", "quiet") for text in limit_lines(rows)]
     body += [paragraph(f"Who knows what: {text}", "note") for text in knowledge_lines(rows)]
     body += [paragraph(f"The paper's {name}: {PAPER_PARAMETERS[name]}.", "quiet") for name, _ in blocks]
     body += [paragraph(PAPER_NOTE, "note")] if blocks else []
     return Section("Results", body)
+
+
+def _empty_lines(report: Report) -> list[str]:
+    """Which columns of the tables hold nothing, and why where that is known, as a sentence; none where all do."""
+    names = _empty(report.rows, _all_lines(report.rows))
+    if not names:
+        return []
+    limits = report.evaluation.limits if report.evaluation is not None else None
+    because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
+    return [f"Columns without a value in any row are left out: {'; '.join(names)}.{because}"]
+
+
+def _all_lines(rows: Sequence[SummaryRow]) -> list[Line]:
+    """Our lines and the paper's."""
+    return [*our_lines(rows), *(line for _, paper in paper_blocks(rows) for line in paper)]
+
+
+def _empty(rows: Sequence[SummaryRow], lines: Sequence[Line]) -> list[str]:
+    """Columns of the table of these rows in which none of the lines has a value."""
+    columns = table_columns(rows)
+    filled = filled_columns(lines, range(len(columns)))
+    return [name for k, name in enumerate(columns) if k not in filled]
 
 
 def _row(line: Line, columns: Sequence[int]) -> Row:
@@ -145,7 +169,18 @@ def _episodes(report: Report) -> list[Section]:
     told = f"{shown} of the {every:,} worlds" if shown < every else f"All {shown} worlds"
     notes = [paragraph(text, "note") for text in _unrepeated(report.played, report.evaluation)]
     played = player(report.played, report.evaluation.vehicles, focus=report.focus)
-    return [Section("Episodes", [f"{told}, from the alert to rest.", *notes, played])]
+    return [Section("Episodes", [f"{told}, {_until(report.played, report.evaluation)}", *notes, played])]
+
+
+def _until(played: Sequence[Played], evaluation: Evaluation) -> str:
+    """Where the episodes end, as the end of a sentence."""
+    moving = sum(not all(motion.at_rest for motion in world.motions.values()) for world in played)
+    if not moving:
+        return "from the alert to rest."
+    return (
+        f"from the alert to rest, or to the horizon of {evaluation.scenario.horizon_s:g} s: in"
+        f" {count_of(moving, 'world')} the line of some agent was not at rest then, and the player says whose."
+    )
 
 
 def _unrepeated(played: Sequence[Played], evaluation: Evaluation) -> list[str]:
@@ -167,8 +202,12 @@ def _unrepeated(played: Sequence[Played], evaluation: Evaluation) -> list[str]:
 
 def _other_test(test: ReportTest) -> Section:
     columns = table_columns(test.rows)
-    lines = [_row(line, range(len(columns))) for line in our_lines(test.rows)]
-    body: list[str | Part] = [test.description, table(["Agent", *columns], lines, caption=test.title)]
+    filled = filled_columns(our_lines(test.rows), range(len(columns)))
+    lines = [_row(line, filled) for line in our_lines(test.rows)]
+    head = ["Agent", *(columns[k] for k in filled)]
+    body: list[str | Part] = [test.description, table(head, lines, caption=test.title)]
+    if empty := _empty(test.rows, our_lines(test.rows)):
+        body.append(paragraph(f"Columns without a value in any row are left out: {'; '.join(empty)}.", "quiet"))
     if test.rows:
         told = [f"{parameter_line(test.rows[0].parameters)}.", *limit_lines(test.rows), *identity_lines(test.rows)]
         body += [paragraph(text, "quiet") for text in told]
@@ -176,13 +215,22 @@ def _other_test(test: ReportTest) -> Section:
 
 
 def _measures(report: Report) -> Section:
-    lines = [[line.agent, Cell(line.knows, words=True), *_row(line, _OTHERS)[1:]] for line in our_lines(report.rows)]
-    head = ["Agent", "Knows", *(table_columns(())[k] for k in _OTHERS)]
+    filled = filled_columns(our_lines(report.rows), _OTHERS)
+    lines = [[line.agent, Cell(line.knows, words=True), *_row(line, filled)[1:]] for line in our_lines(report.rows)]
+    head = ["Agent", "Knows", *(table_columns(())[k] for k in filled)]
     return Section("Other measures", [table(head, lines, caption="In the same worlds")])
 
 
 def _reading(report: Report) -> Section:
-    return Section("How to read the tables", [facts(table_meanings(report.rows))])
+    empty = set(_empty(report.rows, _all_lines(report.rows)))
+    empty = empty.intersection(*(_empty(test.rows, our_lines(test.rows)) for test in report.tests))
+    columns = table_columns(report.rows)
+    told = {}
+    for name, meaning in table_meanings(report.rows).items():
+        about = {column for column in columns if column.startswith(name)}
+        if not about or about - empty:
+            told[name] = meaning
+    return Section("How to read the tables", [facts(told)])
 
 
 def _settings(report: Report) -> list[Section]:

@@ -163,6 +163,51 @@ def test_world_that_cannot_be__is_told_and_left_again(open_explorer: Open) -> No
     assert "Answered" in page.inner_text("[data-part=state]")
 
 
+def test_page__says_what_is_wrong_with_an_input_it_cannot_use(open_explorer: Open) -> None:
+    page = open_explorer()
+    state, number = page.locator("[data-part=state]"), page.locator("[data-part=number]")
+    number.fill("-3")
+    number.press("Enter")
+    assert "from 0 to" in state.inner_text() and page.locator("body.stale").count() == 1
+    number.fill("1")
+    number.press("Enter")
+    wait_until(page, f"{IDLE} && !document.body.classList.contains('stale')")
+    assert "from 0 to" not in state.inner_text()
+    page.get_by_label("Speed, Vehicle 1 in m/s", exact=True).fill("")
+    assert "must be a number" in state.inner_text() and page.locator("body.stale").count() == 1
+
+
+def test_save__of_a_name_that_cannot_be_says_so(open_explorer: Open) -> None:
+    page = open_explorer()
+    name, said = page.locator("[data-part=name]"), page.locator("[data-part=saved]")
+    name.fill("once")
+    name.press("Enter")
+    wait_until(page, "document.querySelector('[data-part=saved]').textContent === 'Saved: once.yaml'")
+    name.fill("Near Miss!")
+    assert said.inner_text() == ""
+    name.press("Enter")
+    assert "small letters" in said.inner_text() and "wrong" in (said.get_attribute("class") or "")
+
+
+def test_best_known__is_one_profile_in_card_row_and_road(open_explorer: Open) -> None:
+    page = open_explorer()
+    wait_until(page, f"!!{EXPLORER}.best")
+    for first, total in ((0.1, 0.1), (-0.1, -0.1), (0.0, 0.1), (0.0, -0.1)):  # of the search, beside the best agent
+        page.evaluate(
+            f"(([first, total]) => {{ const e = {EXPLORER}; clearTimeout(e.settled); e.own ??= e.found.outcomes"
+            ".reduce((a, b) => (b.first < a.first || (b.first === a.first && b.total < a.total) ? b : a));"
+            " Object.assign(e.best, { first: e.own.first + first, total: e.own.total + total, impacts: 77 }); e.show();"
+            f" }})({[first, total]})"
+        )
+        searched = (first, total) < (0.0, 0.0)
+        card = page.locator(".cards").inner_text()
+        assert ("a search of" in card) == searched, (first, total)
+        row = harms(page)["best known"]
+        assert (row[0] == 77) == searched
+        own = page.evaluate(f"[{EXPLORER}.own.agent, {EXPLORER}.own.impacts]")
+        assert searched or (own[0] in card and row[0] == own[1])
+
+
 def test_best_known__comes_when_the_sliders_rest(open_explorer: Open) -> None:
     page = open_explorer()
     wait_until(page, f"!!{EXPLORER}.best")

@@ -114,6 +114,14 @@ def test_player__gap_of_the_first_vehicle_is_that_to_an_obstacle(open_page: Open
     assert told.endswith(f"gap ahead {60.0 - front:.2f} m")
 
 
+def test_player__says_which_episode_the_horizon_cut_off(open_page: Open, report_file: Path) -> None:
+    page = open_page(report_file)
+    page.evaluate(f"{PLAYER}.episodes().forEach((each, k) => {{ each.rest = k !== 1; }}); {PLAYER}.build()")
+    end = page.evaluate(f"{PLAYER}.episodes()[1].end")
+    told = page.locator(".head").all_inner_texts()
+    assert [f"not at rest at the horizon, {end:.2f} s" in text for text in told] == [False, True, False]
+
+
 def test_player__plays_in_real_time_and_pauses(open_page: Open, report_file: Path) -> None:
     page = open_page(report_file)
     page.get_by_role("button", name="Play").click()

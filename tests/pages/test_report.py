@@ -27,6 +27,7 @@ from tests.pages.hostile import HOSTILE, UNSEEN, Page
 
 EXTERNAL = re.compile(r"""(https?:)?//|@import|<(link|iframe|object|embed|base)\b""", re.IGNORECASE)
 PAIR_AGENTS = ("full_brake", "constant:4")
+COASTING = {"coast": make_agent("coast")}
 
 
 @pytest.fixture(scope="module")
@@ -235,6 +236,24 @@ def test_report__of_another_scenario_leaves_the_papers_rows_out(pair: Scenario) 
     assert "9.00" in text
     assert "as printed" not in text
     assert "5.6202" not in text
+
+
+def test_report__leaves_out_columns_without_a_value_and_says_so(pair: Scenario) -> None:
+    result = evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair)
+    page = Page(render_report(Report("t", summarise(result), result, play_for_report(result, COASTING, "coast"))))
+    assert "left out: Decrease, first-impact; Decrease, total; Predicted harm" in page.text
+    assert page.text.count("Decrease, total") == page.text.count("Predicted harm") == 1
+    assert "1 − harm / harm of full braking" not in page.text
+    assert "First-impact harm" in page.text and "Squared closing speed" in page.text
+
+
+def test_report__says_where_the_horizon_cut_episodes_off(pair: Scenario, html: str) -> None:
+    short = pair.replace(horizon_s=1.0)
+    result = evaluate(short.sample(2, 0), COASTING, scenario=short)
+    text = Page(render_report(Report("t", summarise(result), result, play_for_report(result, COASTING, "coast")))).text
+    moving = 2 - int(result.outcome("coast").at_rest.sum())
+    assert moving and f"to the horizon of 1 s: in {moving} worlds the line of some agent" in text
+    assert "from the alert to rest." in html
 
 
 def test_write_report__overwrites_only_by_force(tmp_path: Path, pair: Scenario) -> None:

@@ -3,7 +3,8 @@
 const SETTLED_MS = 250; // without a move, until the best profile is searched
 const SEARCH_S = 0.5;
 const SLOW_MS = 500; // of the first answer: then physics is being compiled
-const LEAST = 1e-9; // m²/s²: harms closer than this are one harm
+const MOST_WORLD = 1e9;
+const NAME = "Name: small letters, digits, - and _, the first a letter or digit, at most 64";
 
 // A player whose one world changes.
 class LivePlayer extends Player {
@@ -54,7 +55,10 @@ class Explorer {
       const driven = name === `Vehicle ${this.data.driven[0] + 1}`;
       const row = { field, index, range, number };
       range.addEventListener("input", () => this.set(row, Number(range.value), number));
-      number.addEventListener("input", () => number.value !== "" && this.set(row, Number(number.value), range));
+      number.addEventListener("input", () => {
+        if (number.value === "") this.refuse(`${called}: must be a number.`);
+        else this.set(row, Number(number.value), range);
+      });
       this.rows.push(row);
       this.put(row);
       box.append(make("div", { class: driven ? "slider driven" : "slider" }, make("span", {}, name), range, number));
@@ -89,11 +93,13 @@ class Explorer {
 
   listen() {
     const on = (part, kind, act) => this.find(part).addEventListener(kind, act);
-    on("number", "change", () => this.draw(Number(this.find("number").value)));
+    on("number", "change", () => this.draw(this.find("number").valueAsNumber));
+    on("name", "input", () => this.say("", false, "saved")); // what was said is of another name
+    on("name", "invalid", () => this.say(`${NAME}.`, true, "saved"));
     on("from", "change", () => this.begin(this.find("from").value));
     on("rival", "change", () => this.show());
     const click = (what, act) => document.querySelector(`[data-explorer] [data-do="${what}"]`).addEventListener("click", act);
-    click("before", () => this.draw(Number(this.find("number").value) - 1));
+    click("before", () => this.draw(Math.max(Number(this.find("number").value) - 1, 0)));
     click("after", () => this.draw(Number(this.find("number").value) + 1));
     click("longer", () => this.search(10));
     document.querySelector("form[data-explorer]").addEventListener("submit", (event) => {
@@ -106,6 +112,13 @@ class Explorer {
     const line = this.find(part);
     line.textContent = text;
     line.classList.toggle("wrong", wrong);
+  }
+
+  // Say what is wrong with an input, and that what is shown is of another world.
+  refuse(text) {
+    clearTimeout(this.settled);
+    this.say(text, true);
+    document.body.classList.add("stale");
   }
 
   async ask(what, question) {
@@ -129,10 +142,10 @@ class Explorer {
       const begun = performance.now();
       const question = { world: structuredClone(this.state), profile: this.editor.commands.slice() };
       const found = await this.ask("answer", question);
+      document.body.classList.remove("stale");
       if (found.superseded) this.wanted = true; // by another window
-      else if (found.wrong) this.say(found.wrong, true);
+      else if (found.wrong) this.refuse(found.wrong);
       else this.take(found, question, performance.now() - begun);
-      document.body.classList.toggle("stale", Boolean(found.wrong)); // what is shown is of another world
     }
     this.busy = false;
     if (!document.body.classList.contains("stale")) this.settled = setTimeout(() => this.search(SEARCH_S), SETTLED_MS);
@@ -163,17 +176,22 @@ class Explorer {
     this.show();
   }
 
-  // The best of the search and of all who drove here.
+  // The best of the search and of all who drove here, by the harm that is minimised, then by the other.
   bestKnown() {
-    const count = this.data.harm_count;
-    const all = [...this.found.outcomes, ...(this.best ? [this.best] : [])];
-    return all.reduce((a, b) => (b[count] < a[count] - LEAST ? b : a));
+    const counts = this.data.harm_count === "first" ? ["first", "total"] : ["total", "first"];
+    const driven = this.found.outcomes.map((each, k) => ({ ...each, by: k, episode: this.found.world.episodes[k] }));
+    const less = (a, b) => {
+      const apart = counts.find((count) => Math.abs(a[count] - b[count]) > LEAST);
+      return apart !== undefined && a[apart] < b[apart];
+    };
+    return [...driven, ...(this.best ? [this.best] : [])].reduce((a, b) => (less(b, a) ? b : a));
   }
 
   show() {
     if (!this.found) return;
     const { world, outcomes, grid } = this.found;
-    const episodes = [...world.episodes, ...(this.best ? [this.best.episode] : [])];
+    const best = this.bestKnown();
+    const episodes = [...world.episodes, ...(this.best ? [{ ...best.episode }] : [])];
     for (const episode of episodes) if (typeof episode.pieces === "string") episode.pieces = decodePieces(episode.pieces, this.data.vehicles);
     const shown = { ...world, episodes };
     if (!this.player) {
@@ -184,16 +202,16 @@ class Explorer {
     const rival = world.episodes[Number(this.find("rival").value)];
     const until = Math.max(...[rival, world.episodes[outcomes.length - 1]].map(restOf)) + 0.3;
     this.editor.fit(grid, until, ghostOf(rival, this.data));
-    this.showHarms();
-    this.find("cards").replaceChildren(...cardsOf(this.found, this.bestKnown(), this.data.harm_count));
-    this.find("score").replaceChildren(...scoreOf(outcomes, this.bestKnown(), Number(this.find("rival").value), this.data));
+    this.showHarms(best);
+    this.find("cards").replaceChildren(...cardsOf(this.found, best, this.data.harm_count));
+    this.find("score").replaceChildren(...scoreOf(outcomes, best, Number(this.find("rival").value), this.data));
   }
 
-  showHarms() {
+  showHarms(best) {
     const { outcomes, constant } = this.found;
     const rows = outcomes.map((each, k) => [each, k === outcomes.length - 1 ? "hand" : ""]);
     if (constant.first !== undefined) rows.push([{ agent: `H*: constant ${plain(constant.deceleration_mps2, 2)} m/s²`, ...constant }, ""]);
-    if (this.best) rows.push([this.best, "best"]);
+    if (this.best) rows.push([{ ...best, agent: "best known" }, "best"]);
     const most = Math.max(...rows.map(([each]) => Math.max(each.first, each.total)), LEAST);
     const cell = (value) => {
       const bar = make("span", { class: "bar" });
@@ -205,9 +223,11 @@ class Explorer {
         make("th", { scope: "row" }, each.agent), make("td", {}, each.impacts === undefined ? "–" : String(each.impacts)), cell(each.first), cell(each.total))));
   }
 
-  async begin(from) {
+  async begin(chosen) {
+    const best = chosen === "best" && this.found ? this.bestKnown() : null;
+    const from = best && best.by < this.data.agents.length ? String(best.by) : chosen;
     if (from === "best") {
-      if (this.best) this.editor.take(this.best.commands);
+      if (best?.commands) this.editor.take(best.commands); // else it is by hand already
     } else if (from === "constant") this.editor.take([-(this.found?.constant.deceleration_mps2 ?? 0)]);
     else if (from !== "") {
       const found = await this.ask("profile", { world: this.state, agent: this.data.named[Number(from)] });
@@ -219,10 +239,13 @@ class Explorer {
   }
 
   async draw(number) {
-    if (!(number >= 0)) return;
+    if (!Number.isInteger(number) || number < 0 || number > MOST_WORLD) {
+      this.refuse("World: must be a whole number from 0 to 1,000,000,000.");
+      return;
+    }
     const found = await this.ask("world", { number });
     if (found.wrong) {
-      this.say(found.wrong, true);
+      this.refuse(found.wrong);
       return;
     }
     this.find("number").value = number;
@@ -232,6 +255,7 @@ class Explorer {
   }
 
   async save(kind) {
+    this.say("", false, "saved");
     const found = await this.ask("save", { world: this.state, name: this.find("name").value, kind });
     this.say(found.wrong ?? `Saved: ${found.file}`, Boolean(found.wrong), "saved");
   }
@@ -240,40 +264,6 @@ class Explorer {
 // What the driven vehicle of an episode did, as a path: its acceleration, step by step.
 function ghostOf(episode, data) {
   return (x, y, until) => curves(episode, until, x, { gap: () => 0, speed: () => 0, acceleration: y }, data.vehicles).acceleration[data.driven[0]];
-}
-
-function card(kind, title, value, text) {
-  return make("div", { class: `card ${kind}` }, make("h3", {}, title), make("strong", {}, value), make("p", {}, text));
-}
-
-function cardsOf({ verdict, constant }, best, count) {
-  const unit = "m²/s²";
-  const proven = verdict.proven_harm === null ? "No harm is proven here." : verdict.proven_harm > 0 ? `Proven: no command does less than ${plain(verdict.proven_harm, 2)} ${unit}.` : "No harm is proven.";
-  const words = { true: "Avoidable", false: "Unavoidable", null: "Not decided" }[String(verdict.avoidable)];
-  const why = verdict.avoidable ? "Some command avoids all contact." : `${verdict.why[0].toUpperCase()}${verdict.why.slice(1)}. ${proven}`;
-  const cards = [card(verdict.avoidable ? "good" : "bad", "Contact", words, why)];
-  if (constant.first === undefined) cards.push(card("", "H*, best constant deceleration", "–", constant.why));
-  else cards.push(card("", "H*, best constant deceleration", `${plain(constant[count], 2)} ${unit}`, `at ${plain(constant.deceleration_mps2, 2)} m/s², held from the first decision on`));
-  const least = verdict.proven_harm > 0 && best[count] - verdict.proven_harm < 1e-3 ? "; proven: nothing does less" : "";
-  const who = best.candidates ? `a search of ${best.candidates.toLocaleString("en")} candidates` : best.agent === "by hand" ? "by your hand" : `by ${best.agent}`;
-  cards.push(card("good", "Best known", `${plain(best[count], 2)} ${unit}`, who + least));
-  return cards;
-}
-
-function scoreOf(outcomes, best, rival, data) {
-  const count = data.harm_count;
-  const you = outcomes[outcomes.length - 1];
-  const other = outcomes[rival];
-  const worst = outcomes[data.worst];
-  const by = other[count] - you[count];
-  const won = by > LEAST;
-  const first = won ? `You beat ${other.agent} by ${plain(by, 2)} m²/s². ` : Math.abs(by) <= LEAST ? `You do as well as ${other.agent}. ` : `${other.agent} does ${plain(-by, 2)} m²/s² less harm than you. `;
-  const room = worst[count] - best[count];
-  const share = (100 * (worst[count] - you[count])) / room;
-  let saved = `Compared with ${worst.agent} you save ${plain(share, 0)} % of what the best known saves.`;
-  if (room <= LEAST) saved = `${worst.agent} does as well as the best known: nothing is left to be saved.`;
-  else if (share < 0) saved = `That is more than ${worst.agent} does.`;
-  return [make("span", { class: won ? "won" : "" }, first), `Your harm: ${plain(you.first, 2)} first-impact, ${plain(you.total, 2)} total. ${saved}`];
 }
 
 const explorerData = document.getElementById("explorer_data");

@@ -13,7 +13,7 @@ from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
 
 _STYLES = ("explorer/explorer.css",)
-_SCRIPTS = ("explorer/profile.js", "explorer/explorer.js")
+_SCRIPTS = ("explorer/profile.js", "explorer/cards.js", "explorer/explorer.js")
 
 
 class Page(NamedTuple):
