@@ -40,6 +40,7 @@ STATED = {  # every agent there is: all of the registry, and what ``make_lineup`
     "best_harm:100": (MODEL,),
     "ppo@shipped/ppo": (MESSAGES,),
     "sac@shipped/sac": (MESSAGES,),
+    "policy@shipped": (MESSAGES,),
     "universal@shipped": (MESSAGES,),
     "ppo@shipped/ppo+refined": (MESSAGES, MODEL),
     "ppo@shipped/ppo+episode": (MESSAGES, MODEL),
