@@ -177,7 +177,9 @@ def test_make_agent__suggests_the_name_that_was_meant():
 
 def test_agent_names__are_those_that_ship():
     scripts = ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front", "planner")
-    assert agent_names() == tuple(sorted((*scripts, "best_harm", "ppo", "sac", "counterfactual", "policy", "universal", "team")))
+    assert agent_names() == tuple(
+        sorted((*scripts, "best_harm", "ppo", "sac", "counterfactual", "policy", "universal", "team"))
+    )
     for entry in agent_entries():
         assert callable(entry.load()) and entry.about and entry.knows
 

@@ -85,8 +85,8 @@ def test_run__the_other_two_tests_stand_beside_the_main_one(finished_run):
     page = (finished_run / "report.html").read_text()
     assert "<h1>ethbrake run: paper-random (the main test of three)</h1>" in page
     assert all(f">{test}</h2>" in page for test in tests)
-    for heading in ("Vehicle 1 shoved (m)", "Sampled harm"):
-        assert page.count(f">{heading}</th>") == 3
+    assert page.count(">Vehicle 1 shoved (m)</th>") == 3
+    assert page.count(">Sampled harm</th>") == 2  # nobody samples where an obstacle stands ahead
     for test in tests:
         scenario = load_scenario(test)
         (row,) = summarise(

@@ -139,7 +139,8 @@ def test_visit__every_decision_of_every_episode() -> None:
 
 def test_gate__learns_what_costs_least_and_what_matters_most() -> None:
     """Two kinds of decisions look alike; the gate is right where being wrong costs more."""
-    model, _ = _model(learning_rate={"start": 1e-2, "end": 1e-2}, averaging=0.5)
+    modes = {**MODES, "gate_memory": 1000, "gate_steps": 20}
+    model, _ = _model(learning_rate={"start": 1e-2, "end": 1e-2}, averaging=0.9, batch_size=128, modes=modes)
     model.set_logger(Logger(None, []))
     seen = np.zeros((300, 27), np.float32)
     seen[100:, 0] = 1.0

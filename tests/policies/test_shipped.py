@@ -122,6 +122,18 @@ def test_policy__whatever_trained_it(folder: Path, policy: Policy) -> None:
         make_lineup(["policy"], SCENARIO)
 
 
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
+def test_shipped__counterfactual_does_less_harm_than_ppo(harm_count: HarmCount) -> None:
+    """On worlds that are no training's: several networks and a gate, trained for this count."""
+    name = shipped_name("counterfactual", "paper-random", harm_count)
+    manifest = load_named_policy(f"shipped/{name}").manifest
+    assert manifest.reward["harm_count"] == harm_count and manifest.network.networks == 2
+    lineup = make_lineup(["ppo@shipped", "counterfactual@shipped"], SCENARIO, harm_count=harm_count)
+    result = evaluate(SCENARIO.sample(600, 9), lineup, scenario=SCENARIO, seed=9, aftermath=False)
+    ppo, counterfactual = (result.outcome(spec).ledger.world_harm(harm_count).mean() for spec in lineup)
+    assert counterfactual < 0.98 * ppo
+
+
 # Of each list of 10,000 (seed 7) the worlds in which a shipped policy, refined, was furthest below an earlier table.
 LOWERED = {
     "paper-random": (["ppo", "sac"], [400, 1058, 1261, 2987, 4300, 4408, 5872, 5976, 8752]),
