@@ -15,14 +15,15 @@ from ethbrake_marl.studies.reproduction.episodes import kept_player
 from ethbrake_marl.studies.reproduction.folder import Json, ReproductionFolder, read_figure
 from ethbrake_marl.studies.reproduction.item import FULL, MOST_EPISODES
 from ethbrake_marl.studies.reproduction.items import ITEMS
-from ethbrake_marl.studies.reproduction.verdicts import OUTCOMES, TOLERANCE
+from ethbrake_marl.studies.reproduction.verdicts import OUTCOMES, TOLERANCE, WIDE
 
 TITLE = "The paper, made again"
 _LEAD = (
     " of How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning, with the"
     " paper's numbers and statements. Every verdict is computed: a number agrees where it is within the chance between"
-    f" two lists of worlds or {100.0 * TOLERANCE:g} % of what is printed, and cannot agree where a bound that holds for"
-    " every strategy excludes it. Statements are those of the paper's text; its figures hold no printed numbers."
+    f" two lists of worlds or {100.0 * TOLERANCE:g} % of what is printed, is undecided where that chance alone makes"
+    f" more than {100.0 * WIDE:g} %, and cannot agree where a bound that holds for every strategy excludes it."
+    " Statements are those of the paper's text; its figures hold no printed numbers."
 )
 _OVERVIEW = "Overview"
 _LOAD = r", load [0-9.]+"  # of the machine, which differs from item to item
