@@ -84,7 +84,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.evaluation import record_episode as record_episode
     from ethbrake_marl.evaluation import summarise as summarise
     from ethbrake_marl.evaluation.compare import compare_results as compare_results
-    from ethbrake_marl.evaluation.compare import read_result as read_result
+    from ethbrake_marl.evaluation.results_file import read_result as read_result
     from ethbrake_marl.evaluation.dataset.write import write_dataset as write_dataset
     from ethbrake_marl.evaluation.groups import summarise_by as summarise_by
 

@@ -30,7 +30,6 @@ from ethbrake_marl.evaluation import (
     rich_table,
     summarise,
 )
-from ethbrake_marl.evaluation.compare import results_to_json
 from ethbrake_marl.evaluation.frame import check_per_world, write_per_world
 from ethbrake_marl.evaluation.groups import check_group, summarise_by
 from ethbrake_marl.evaluation.inputs import (
@@ -47,6 +46,7 @@ from ethbrake_marl.evaluation.inputs import (
 )
 from ethbrake_marl.evaluation.paper import TESTS
 from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.evaluation.results_file import results_to_json
 from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table, modes_to_json
 from ethbrake_marl.evaluation.text import metrics_table
 from ethbrake_marl.harm import HarmCount

@@ -22,9 +22,9 @@ from ethbrake_marl.cli.options import (
 from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, say, write_json
 from ethbrake_marl.cli.train import KEPT, end_of_training
-from ethbrake_marl.evaluation.compare import results_to_json
 from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, load_driven
 from ethbrake_marl.evaluation.per_world import PER_WORLD
+from ethbrake_marl.evaluation.results_file import results_to_json
 from ethbrake_marl.learning.recipe import load_recipe
 
 

@@ -1,104 +1,18 @@
-"""Results as files, and two of them compared: the same worlds of the same scenario, or no comparison."""
+"""Two results compared: the same worlds of the same scenario, or no comparison."""
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, count_of, unknown_name
-from ethbrake_marl.evaluation.frame import read_harms
-from ethbrake_marl.evaluation.identity import Kind
+from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.evaluation.results_file import HARMS, SAME, Result, told_of
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, paired_difference, unpaired_difference
-from ethbrake_marl.evaluation.table import Rescored, SummaryRow
-from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.physics import Floats
-
-HARMS = ("first_impact_harm", "total_harm")
-USUAL: Mapping[str, str | None] = {"harm_count": "first", "uncertainty": None}  # settings of agents
-_COMPARED: dict[Kind, tuple[str, ...]] = {"evaluate": HARMS, "equal-time": HARMS, "shield": ("harm",)}  # harms of each
-_LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one with every world
-_MOST_EPISODES = 10**12
-_MOST_HARM = 1e100  # m2/s2; a number that can be squared
-_HASHES = {"worlds_sha256": "another list of worlds", "scenario_sha256": "another scenario"}
-_SAME = {  # all but the hashes: where they are told
-    "kind": "another kind of results",
-    "worlds_sha256": _HASHES["worlds_sha256"],
-    "controlled_vehicle": "another driven vehicle",
-    "scenario_sha256": _HASHES["scenario_sha256"],
-    "harm_count": "another harm",
-}
-_NEEDED = {"agent": str, "episodes": int, **dict.fromkeys(_HASHES, str), "policy_sha256": dict, "versions": dict}
-
-
-def results_to_json(
-    rows: Sequence[SummaryRow],
-    *,
-    told: Sequence[Rescored] = (),
-    groups: Mapping[str, Sequence[SummaryRow]] | None = None,
-    per_world: Path | None = None,
-    settings: Mapping[str, str | None] = USUAL,
-) -> list[dict[str, Any]]:
-    """What a results file holds: one object per row, with what was ``told`` of it under other objectives.
-
-    ``settings`` are those of all agents: the harm that they minimise, what a robust shield does not know.
-
-    ``groups``, by name, are rows of the same agents on parts of the worlds (``summarise_by``).
-    ``per_world`` is the file with one row per world, written before; its name and hash go into every object.
-    """
-    found = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
-    if told:
-        found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
-    for row in found if groups else ():
-        row["groups"] = {
-            name: each.to_json() for name, part in (groups or {}).items() for each in part if each.agent == row["agent"]
-        }
-    if per_world is None:
-        return found
-    beside = {"file": per_world.name, "sha256": hashlib.sha256(per_world.read_bytes()).hexdigest()}
-    return [row | {"per_world": beside} for row in found]
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """One results file."""
-
-    path: Path
-    rows: Mapping[str, Mapping[str, Any]]  # by agent; of ``ethbrake shield`` by agent and mode
-
-    @property
-    def harm_names(self) -> tuple[str, ...]:
-        """The harms that its rows tell."""
-        return _COMPARED[self.about["kind"]]
-
-    @property
-    def about(self) -> Mapping[str, Any]:
-        """Any of the rows: what they say of the worlds is the same in all."""
-        return next(iter(self.rows.values()))
-
-    def estimate(self, agent: str, harm: str) -> Estimate:
-        """The mean of a harm, with its interval."""
-        row = self.rows[agent]
-        mean, interval = row[harm], row.get(f"{harm}_interval")
-        return Estimate(float(mean), None if interval is None else (float(interval[0]), float(interval[1])))
-
-    def harms(self) -> dict[str, dict[int, tuple[float, ...]]]:
-        """Those of every world; raises ``InvalidInput`` where the file that holds them is not to be had."""
-        beside = self.about.get("per_world")
-        if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
-            raise InvalidInput(f"{self.path} has none (--per-world)")
-        file = self.path.parent / Path(beside["file"]).name
-        if not file.is_file():
-            raise InvalidInput(f"{file} is not there")
-        data = read_plain(file, _MOST_BYTES)
-        if hashlib.sha256(data).hexdigest() != beside.get("sha256"):
-            raise InvalidInput(f"{file} is not the one that was written with {self.path}")
-        return read_harms(file, data)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,101 +54,14 @@ class Comparison:
         }
 
 
-def read_result(path: Path) -> Result:
-    """Read what ``evaluate``, ``shield`` or ``equal-time`` printed with ``--json``, or ``ethbrake run`` wrote.
-
-    Raises ``InvalidInput`` for anything else, also for other kinds of results, in which no agents stand beside each
-    other, and for a result without hashes, as earlier versions wrote them.
-    """
-    try:
-        content = parse_strict_json(read_plain(path, _LIMIT_BYTES))
-    except ValueError as error:
-        if isinstance(error, EthBrakeError):
-            raise
-        raise InvalidInput(f"{path}: is no JSON, or was not written to its end: {error}") from None
-    rows = _rows_of(path, content)
-    for row in rows:
-        for key, kind in _NEEDED.items():
-            if not isinstance(row.get(key), kind):
-                raise InvalidInput(
-                    f"{path}: {key} is missing or no {kind.__name__}; a results file of an earlier version has no"
-                    " hashes: evaluate again"
-                )
-        _check_numbers(path, row)
-    if len({tuple(_told(row, key) for key in _SAME) for row in rows}) > 1:
-        raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
-    named = [_name_of(row) for row in rows]
-    if twice := {name for name in named if named.count(name) > 1}:
-        raise InvalidInput(f"{path}: {min(twice)} stands in it twice")
-    return Result(path, dict(zip(named, rows, strict=True)))
-
-
-def _told(row: Mapping[str, Any], key: str) -> str | None:
-    """What a row says of itself, or its parameters do; None for neither."""
-    parameters = row.get("parameters")
-    told = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
-    return None if told is None else str(told)
-
-
-def _check_numbers(path: Path, row: Mapping[str, Any]) -> None:
-    """Refuse what is no number of episodes, and no mean harm with an interval around it."""
-    who = f"{path}: {row['agent']}"
-    if not 1 <= row["episodes"] <= _MOST_EPISODES or isinstance(row["episodes"], bool):
-        raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
-    for harm in _COMPARED[row["kind"]]:
-        if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), row["episodes"]):
-            raise InvalidInput(f"{who}: {harm} is no mean with an interval [low, high] around it")
-
-
-def _is_mean(mean: Any, interval: Any, episodes: int) -> bool:
-    """Whether these are a mean harm and its interval, which no single episode has."""
-    ends = [mean, mean] if interval is None else interval
-    if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and episodes == 1):
-        return False
-    low, high = ends
-    are_numbers = all(type(each) in (int, float) for each in (low, mean, high))
-    return are_numbers and -_MOST_HARM <= low <= mean <= high <= _MOST_HARM and mean >= 0
-
-
-def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
-    """The objects of a results file, one for each agent; ``InvalidInput`` where it is none, or of a kind without."""
-    several = [content] if isinstance(content, dict) else content
-    if not isinstance(several, list) or not several or not all(isinstance(row, dict) for row in several):
-        raise InvalidInput(f"{path}: is no results file, as ethbrake evaluate --json prints one")
-    for row in several:
-        kind = row.get("kind")
-        if not isinstance(kind, str):
-            raise InvalidInput(
-                f"{path}: is no results file, as ethbrake evaluate --json prints one, or of an earlier version (kind is"
-                " missing): evaluate again"
-            )
-        if kind not in get_args(Kind):
-            raise InvalidInput(f"{path}: {unknown_name('kind of results', kind, get_args(Kind))}")
-        if kind not in _COMPARED:
-            raise InvalidInput(
-                f"{path}: results of ethbrake {kind} cannot be compared; those of {', '.join(_COMPARED)} can"
-            )
-    if not isinstance(content, dict):
-        return several
-    about = {key: value for key, value in content.items() if key != "agents"}
-    agents = content.get("agents")
-    if not isinstance(agents, list) or not agents or not all(isinstance(row, dict) for row in agents):
-        raise InvalidInput(f"{path}: agents is missing or no list of objects: it is not whole")
-    return [row | about for row in agents]
-
-
-def _name_of(row: Mapping[str, Any]) -> str:
-    return f"{row['agent']} ({row['mode']})" if row["kind"] == "shield" and "mode" in row else str(row["agent"])
-
-
 def compare_results(first: Result, second: Result) -> Comparison:
     """What agents of the same name did in both, the second minus the first.
 
     Paired by world where both have every world beside them. Raises ``InvalidInput`` for results of different kinds, on
     different worlds or scenarios, or without a common agent.
     """
-    for key, what in _SAME.items():
-        one, other = (_told(result.about, key) for result in (first, second))
+    for key, what in SAME.items():
+        one, other = (told_of(result.about, key) for result in (first, second))
         if one != other:
             raise InvalidInput(
                 f"{second.path}: is about {what} than {first.path} ({key} {other!s:.12} and {one!s:.12}): no comparison"

@@ -13,9 +13,9 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, record_episode, write_per_world_csv
-from ethbrake_marl.evaluation.compare import results_to_json
 from ethbrake_marl.evaluation.paper import MAIN_TEST, TESTS
 from ethbrake_marl.evaluation.per_world import PER_WORLD, write_output
+from ethbrake_marl.evaluation.results_file import results_to_json
 from ethbrake_marl.evaluation.table import BASELINE
 from ethbrake_marl.figures.episode import trajectories
 from ethbrake_marl.figures.run import harm_against_total_gap, learning_curve
