@@ -164,14 +164,17 @@ def find_python(version: str) -> str:
 
 
 def of_ci() -> list[tuple[str, str]]:
-    """Kinds and Pythons of continuous integration: the core with every Python found, the tests with this one."""
+    """Kinds and Pythons of continuous integration: the core with every Python found, the tests with this one.
+
+    The tests at the lowest versions come first, as time may end: nobody uses those by chance, as most do the newest.
+    """
     chosen = []
     for version in PYTHONS:
         try:
             chosen += [(kind, find_python(version)) for kind in KINDS if kind.endswith("-light")]
         except NotInstalled as reason:
             print(f"skipped Python {version}: {reason}", flush=True)
-    return [*chosen, *((kind, sys.executable) for kind in RESOLUTIONS)]
+    return [("lowest", sys.executable), *chosen, ("highest", sys.executable)]
 
 
 def main() -> int:
