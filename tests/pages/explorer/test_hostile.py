@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -202,18 +204,18 @@ def test_newest_question_wins(client: Client, state: dict[str, Any], monkeypatch
         for k in range(3):
             body = json.dumps({"world": state | {"restitution": 0.1 * k}, "profile": [0.0]}).encode()
             questions.append(asyncio.create_task(client.asked("POST", PAGE + "answer", body)))
+            await asyncio.to_thread(begun.wait, 20)  # the first; the others find it at work
             await asyncio.sleep(0.02)
         return await asyncio.gather(*questions)
 
     from ethbrake_marl.pages.explorer.answer import Explored
 
     client.ask("answer", {"world": state, "profile": [0.0]})  # the warm-up is over
-    slow = Explored.answer
+    slow, begun = Explored.answer, threading.Event()
 
     def slower(self: Explored, world: Any, profile: Any) -> Any:
-        import time
-
-        time.sleep(0.3)
+        begun.set()
+        time.sleep(0.5)
         return slow(self, world, profile)
 
     monkeypatch.setattr(Explored, "answer", slower)
