@@ -202,7 +202,7 @@ def _show(
         **_own_parts(config),
     }
     manifest = trained.policy.manifest
-    which = f"{manifest.algorithm.upper()} after {manifest.steps:,} steps (least harm on its own list)"
+    which = f"Policy by {manifest.algorithm}, after {manifest.steps:,} steps (least harm on its own list)"
     summary = f"{which}, alone and behind its shield, against the baselines."
     if evaluation.scenario.name in TESTS and beside:
         summary += f" {TESTS[evaluation.scenario.name]} The other two tests stand below."
