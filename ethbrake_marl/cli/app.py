@@ -19,6 +19,7 @@ from ethbrake_marl.cli.doctor import doctor_command
 from ethbrake_marl.cli.equal_time import equal_time_command
 from ethbrake_marl.cli.evaluate import agents_command, evaluate_command, shield_command
 from ethbrake_marl.cli.explore import explore_command
+from ethbrake_marl.cli.falsify import falsify_command
 from ethbrake_marl.cli.options import VersionOption, rename_old_options
 from ethbrake_marl.cli.parts import CommandWithParts
 from ethbrake_marl.cli.picture import picture_app
@@ -82,6 +83,11 @@ app.command(
     cls=CommandWithParts,
     epilog="Example: ethbrake evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000",
 )(evaluate_command)
+app.command(
+    "falsify",
+    cls=CommandWithParts,
+    epilog="Example: ethbrake falsify --agent ppo@shipped --against e_v2x_bm --output worst.yaml",
+)(falsify_command)
 app.command("compare", epilog="Example: ethbrake compare before.csv.json after.csv.json")(compare_command)
 app.command("agents", epilog="Example: ethbrake agents")(agents_command)
 app.command("shield", epilog="Example: ethbrake shield --agents ppo@shipped,full_brake --episodes 500")(shield_command)

@@ -17,6 +17,7 @@ from ethbrake_marl.agents.spelling import AgentSpec, parse_spec
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.engine.stream import ask_script, begin_script
 from ethbrake_marl.errors import InvalidInput, OldSpelling, check_one_learner, naming_agent, unknown_name
+from ethbrake_marl.evaluation.named_worlds import read_named_worlds
 from ethbrake_marl.files.overrides import Override, changed_parts
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Worlds
@@ -174,7 +175,10 @@ def choose_worlds(
         raise InvalidInput(
             f"{initial_states}: gives the worlds, and a number of episodes or a seed draws them; use one"
         )
-    worlds = read_initial_states(initial_states, scenario)
+    if initial_states.suffix.lower() in (".yaml", ".yml"):
+        worlds = read_named_worlds(initial_states).worlds_of(scenario, str(initial_states))
+    else:
+        worlds = read_initial_states(initial_states, scenario)
     return Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0), None
 
 

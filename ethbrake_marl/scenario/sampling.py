@@ -207,11 +207,16 @@ def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, i
         u = uniform_numbers(seed, channel, attempt, first, last - first + 1, width, of=of)
         return u if len(u) == len(index) else u[index - first]
 
+    return make_sample(scenario, numbers, index)
+
+
+def make_sample(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
+    """The worlds that ``numbers(width, of)`` describe: uniform numbers [n, width] of a stream, ``()`` the first one."""
     line, typed = scenario.types_of_line, None
     if line is not None:
         u = numbers(PER_TYPE * scenario.vehicles, TYPES)
         typed = line.draw(u.reshape(len(u), scenario.vehicles, PER_TYPE))
-    drawn = drawn_quantities(scenario, numbers(BLOCK * scenario.vehicles), typed)
+    drawn = drawn_quantities(scenario, numbers(BLOCK * scenario.vehicles, ()), typed)
     obstacle_gap_m = obstacle_gap(
         scenario, drawn, lambda key: values(scenario.quantities(key)[0], numbers(OBSTACLE_WIDTH, OBSTACLE)[:, 0])
     )

@@ -1,0 +1,88 @@
+"""`ethbrake falsify`: what it finds, writes, and drives again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ethbrake_marl.evaluation.named_worlds import named_worlds_text, read_named_worlds
+from tests.cli.conftest import Command
+
+FOUND = ("falsify", "--agent", "coast", "--against", "full_brake", "--budget", "300", "--keep", "4")
+
+
+@pytest.fixture
+def file(ethbrake: Command, tmp_path: Path) -> Path:
+    """Four worlds in which coasting is worst."""
+    path = tmp_path / "worst.yaml"
+    assert ethbrake(*FOUND, "--output", path).status == 0
+    return path
+
+
+def test_falsify__writes_worlds_that_evaluate_takes_and_that_read_back(ethbrake: Command, file: Path) -> None:
+    kept = read_named_worlds(file)
+    assert [world.name for world in kept.worlds] == ["regret-1", "regret-2", "regret-3", "regret-4"]
+    assert named_worlds_text(kept) == file.read_text("utf-8")
+    answer = ethbrake("evaluate", "--initial-states", file, "--agents", "coast,full_brake", "--json")
+    rows = json.loads(answer.out)
+    regret = rows[0]["first_impact_harm"] - rows[1]["first_impact_harm"]
+    assert regret == pytest.approx(sum(world.score for world in kept.worlds) / 4)
+
+
+def test_falsify_again__says_who_is_worse(ethbrake: Command, file: Path) -> None:
+    same = ethbrake("falsify", "--again", file)
+    assert same.status == 0 and "coast is worse in 0 of 4 worlds" in same.err
+    better = ethbrake("falsify", "--again", file, "--agent", "e_v2x_bm", "--json")
+    assert better.status == 0 and not any(row["worse"] for row in json.loads(better.out)["worlds"])
+    worse = ethbrake("falsify", "--again", file, "--agent", "constant:-6")
+    assert worse.status == 1 and "constant:-6 is worse in 4 of 4 worlds" in worse.err
+
+
+def test_falsify__tells_the_command_that_finds_the_same(ethbrake: Command, file: Path) -> None:
+    again = ethbrake(*FOUND, "--json")
+    told = json.loads(again.out)
+    assert told["worlds"] == [world.model_dump(exclude_none=True) for world in read_named_worlds(file).worlds]
+    assert told["found_by"].startswith("ethbrake falsify --agent coast --measure regret --against full_brake")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("scenario: paper-random", "scenario: paper-distance"), "which 'paper-distance' is not, or is no longer"),
+        (("harm_count: first", "harm_count: second"), "line 8: harm_count: "),
+        (("    score: ", "    skore: "), "worlds.0.score: Field required"),
+        (("name: regret-2", "name: regret-1"), "world 'regret-1' is given twice"),
+        (("gap_2_m", "gap_3_m"), "gap_3_m"),
+        (("version: 1", "version: 2"), "line 2: version"),
+    ],
+)
+def test_falsify_again__refuses_a_file_that_is_damaged(
+    ethbrake: Command, file: Path, change: tuple[str, str], said: str
+) -> None:
+    file.write_text(file.read_text("utf-8").replace(*change), "utf-8")
+    answer = ethbrake("falsify", "--again", file)
+    assert answer.status == 2 and said in answer.err
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--output", "worst.txt"), "must end in .yaml"),
+        (("--measure", "bound"), "tells no bound"),
+        (("--measure", "difference"), "say which is the other one"),
+        (("--measure", "hram"), "hram"),
+        (("--agent", "ppo@nowhere"), "nowhere"),
+        (("--scenario", "mixture-delays"), "is a mixture"),
+        (("--budget", "0"), "budget"),
+    ],
+)
+def test_falsify__refuses(ethbrake: Command, options: tuple[str, ...], said: str) -> None:
+    answer = ethbrake("falsify", "--agent", "coast", "--budget", "10", *options)
+    assert answer.status == 2 and said in answer.err
+
+
+def test_falsify__keeps_a_file_that_is_there(ethbrake: Command, file: Path) -> None:
+    before = file.read_bytes()
+    assert ethbrake(*FOUND, "--output", file).status == 2 and file.read_bytes() == before

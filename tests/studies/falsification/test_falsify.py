@@ -1,0 +1,113 @@
+"""Planted weaknesses are found, and sooner than at random."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import HARM_COUNTS
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario.ranges import ranges_of
+from ethbrake_marl.studies.falsification.falsify import falsify
+from ethbrake_marl.studies.falsification.measures import Measure, MeasureName, make_measure
+from tests.studies.falsification.holed import Holed, in_hole
+
+SCENARIO = load_scenario("paper-random")
+
+
+def _measure(name: MeasureName) -> Measure:
+    return Measure(name, {"holed": Holed(), "full_brake": eb.make_agent("full_brake")}, SCENARIO, "first")
+
+
+@pytest.mark.parametrize("name", ["regret", "difference"])
+def test_falsify__finds_a_hole_in_a_thousandth_of_the_worlds(name: MeasureName) -> None:
+    found = falsify(_measure(name), 4_000, 0)
+    assert in_hole(found.sample.worlds).all() and found.sample.worlds.n >= 3
+    assert (np.diff(found.measured.score) <= 0.0).all() and found.measured.score[-1] > 0.0
+    at_random = falsify(_measure(name), 4_000, 0, adaptive=False)
+    assert found.share_above > 20.0 * at_random.share_above
+    assert found.measured.score[0] > 0.98 * at_random.measured.score[0]
+
+
+def test_falsify__keeps_nothing_where_nothing_is_wrong() -> None:
+    same = Measure(
+        "difference", {"a": eb.make_agent("full_brake"), "b": eb.make_agent("full_brake")}, SCENARIO, "first"
+    )
+    found = falsify(same, 300, 0)
+    assert found.sample.worlds.n == 0 and found.first_above is None and found.share_above == 0.0
+
+
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
+def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count: eb.HarmCount) -> None:
+    measure = make_measure("bound", "coast+step", None, SCENARIO, harm_count)
+    found = falsify(measure, 512, 1)
+    assert found.measured.score.max() <= 1e-9 and found.sample.worlds.n > 3
+    assert np.array_equal(found.measured.score, found.measured.harm - found.measured.reference)
+
+
+def test_ranges__cover_what_a_scenario_draws() -> None:
+    ranges = ranges_of(SCENARIO)
+    assert len(ranges.names) == 5
+    sample, accepted = ranges.sample(np.full((1, 5), 0.5))
+    assert sample.worlds.gaps_m.tolist() == [[7.5, 7.5]] and sample.worlds.speeds_mps.tolist() == [[20.0, 20.0, 20.0]]
+    assert accepted.all()
+
+
+@pytest.mark.parametrize(
+    "name", ["stress-wide", "realistic-mixed", "realistic-motorway", "cooperation-4-all", "cooperation-2-five"]
+)
+def test_ranges__points_are_as_likely_as_a_list(name: str) -> None:
+    """Worlds of even points have the means of a list, in every quantity."""
+    scenario = load_scenario(name).replace(early_impacts="keep")
+    ranges = ranges_of(scenario)
+    points = np.random.default_rng(0).random((5_000, len(ranges.names)))
+    found, listed = ranges.sample(points)[0].worlds, scenario.sample(5_000, 7).worlds
+    for one, other in (
+        (found.gaps_m, listed.gaps_m),
+        (found.speeds_mps, listed.speeds_mps),
+        (found.vehicles.mass_t, listed.vehicles.mass_t),
+        (found.vehicles.latency_s, listed.vehicles.latency_s),
+        (found.vehicles.braking_capacity_mps2, listed.vehicles.braking_capacity_mps2),
+    ):
+        assert np.allclose(one.mean(axis=0), other.mean(axis=0), atol=0.1 * other.std() + 1e-12)
+        assert np.allclose(one.std(axis=0), other.std(axis=0), rtol=0.15, atol=1e-12)
+
+
+def test_ranges__a_refused_world_does_not_count() -> None:
+    scenario = load_scenario("stress-wide")
+    points = np.random.default_rng(0).random((2_000, len(ranges_of(scenario).names)))
+    _, accepted = ranges_of(scenario).sample(points)
+    assert 0.9 < accepted.mean() < 0.99
+
+
+@pytest.mark.parametrize(
+    ("scenario", "said"),
+    [
+        (load_scenario("mixture-delays"), "is a mixture; take one of its scenarios: paper-delay-low"),
+        (load_scenario("cooperation-2-blocked"), "v2x: draws delays and losses"),
+        (load_scenario("paper-scenario-1"), "draws nothing: all its worlds are the same"),
+    ],
+)
+def test_ranges__refuses_what_cannot_be_given_world_by_world(scenario: Scenario, said: str) -> None:
+    with pytest.raises(InvalidInput, match=said):
+        ranges_of(scenario)
+
+
+@pytest.mark.parametrize(
+    ("name", "agent", "against", "said"),
+    [
+        ("harm", "full_brake", "coast", "compares with nobody"),
+        ("difference", "full_brake", None, "compares two agents"),
+        ("regret", "full_brake", "full_brake", "given twice"),
+    ],
+)
+def test_make_measure__refuses(name: MeasureName, agent: str, against: str | None, said: str) -> None:
+    with pytest.raises(InvalidInput, match=said):
+        make_measure(name, agent, against, SCENARIO, "first")
+
+
+def test_falsify__bound_needs_a_shield() -> None:
+    with pytest.raises(InvalidInput, match="tells no bound; --measure bound is for an agent behind a shield"):
+        falsify(make_measure("bound", "full_brake", None, SCENARIO, "first"), 10, 0)
