@@ -1,7 +1,7 @@
 """Symbolic execution: run a function on symbols, along every path that its comparisons can take.
 
-The function is the package's own, with compilation switched off, so what is proven of it is proven of the code, over the
-real numbers. Rounding is not part of it.
+The function is the package's own, with compilation switched off, so what is proven of it is proven of the code, over
+the real numbers. Rounding is not part of it.
 """
 
 from __future__ import annotations

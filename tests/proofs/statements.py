@@ -6,6 +6,7 @@ Every statement is about real numbers, for all values that its assumptions allow
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from types import ModuleType
@@ -139,7 +140,7 @@ def plastic() -> int:
         for end in found:
             after = end.result
             prove(end, _sum(mass, after) == _sum(mass, speed), f"momentum of {vehicles}")
-            for ahead, behind in zip(after, after[1:], strict=False):
+            for ahead, behind in itertools.pairwise(after):
                 prove(end, exact(behind) <= exact(ahead), f"order of {vehicles}")
         count += len(found)
     return count
