@@ -1,0 +1,94 @@
+"""Bugs that the proofs must not let pass: each, in a copy of a function, leaves one statement unproven."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import NamedTuple
+
+from ethbrake_marl.physics import events, impact
+from ethbrake_marl.shield import certify_kernel
+from tests.proofs import statements
+from tests.proofs.statements import Statement
+
+
+class Bug(NamedTuple):
+    """``old``, which stands in the function once, replaced by ``new``; and the statement that fails then."""
+
+    module: ModuleType
+    function: str
+    old: str
+    new: str
+    breaks: Statement
+
+
+BUGS = {
+    "the earlier root of a contact": Bug(
+        events, "contact", "return (speed - closing) / pressing, speed", "return -closing / pressing, speed",
+        statements.contact,
+    ),
+    "a contact missed where the gap opens first": Bug(
+        events, "contact", "if pressing > 0.0:", "if pressing > 0.0 and gap < 1.0:", statements.contact
+    ),
+    "the way while nothing is in force is forgotten": Bug(
+        events, "solo_motion", "way = speed * onset", "way = 0.0", statements.stopping
+    ),
+    "restitution of what moves, not of what is left over": Bug(
+        impact, "resolve_cluster", "pooled + bounce * (pooled - table[SPEED, i])",
+        "pooled + bounce * (pooled + table[SPEED, i])", statements.two,
+    ),
+    "blocks pooled without their masses": Bug(
+        impact, "pool", "table[BLOCK_LOW, count] / mass", "table[BLOCK_LOW, count] / 2.0", statements.energy
+    ),
+    "a plastic impact is not put in order": Bug(
+        impact, "resolve_cluster", "bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0",
+        "bounce = restitution", statements.plastic,
+    ),
+    "the budget may rise": Bug(
+        certify_kernel, "decide_world", "    if value <= budget:\n        plan[step]",
+        "    if value <= 2.0 * budget:\n        plan[step]", statements.decision,
+    ),
+    "the plan that was certified with a proposal is not kept": Bug(
+        certify_kernel, "decide_world", "            plan[:] = room[0]", "            pass", statements.decision
+    ),
+    "a constant counts without being certified": Bug(
+        certify_kernel, "better_plan", "certified = worst_of_plan(world, states, ended, step, trial, most)",
+        "certified = least", statements.decision,
+    ),
+    "the bound of the plan is told for the proposal": Bug(
+        certify_kernel, "decide_world", "proposal, reason, value, budget - value",
+        "proposal, reason, certified, budget - value", statements.decision,
+    ),
+}  # fmt: skip
+
+
+@contextmanager
+def planted(bug: Bug) -> Iterator[None]:
+    """The module with the bug in it."""
+    before = getattr(bug.module, bug.function)
+    source = inspect.getsource(before)
+    assert source.count(bug.old) == 1, (
+        f"{bug.function}: {bug.old!r} stands there {source.count(bug.old)} times, not once"
+    )
+    try:
+        exec(compile(source.replace(bug.old, bug.new), bug.function, "exec"), vars(bug.module))
+        yield
+    finally:
+        setattr(bug.module, bug.function, before)
+
+
+def misses() -> list[str]:
+    """The bugs with which their statement is proven all the same."""
+    missed = []
+    for name, bug in BUGS.items():
+        with planted(bug):
+            try:
+                bug.breaks()
+            except AssertionError as error:
+                print(f"{name}: {error}", file=sys.stderr, flush=True)
+            else:
+                missed.append(name)
+    return missed

@@ -1,0 +1,259 @@
+"""What is proven, each as a function that raises ``AssertionError`` where the solver does not prove it.
+
+Every statement is about real numbers, for all values that its assumptions allow. Compilation must be switched off
+(``NUMBA_DISABLE_JIT=1``), so that the functions run as Python.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import z3
+
+from ethbrake_marl.physics import events, impact
+from ethbrake_marl.shield import certify_kernel
+from tests.proofs.paths import Condition, Ended, Symbol, SymbolicMath, exact, holds_always, paths, symbols
+
+Statement = Callable[[], int]  # the number of paths it was proven along
+STATEMENTS: dict[str, Statement] = {}
+
+BOUNCING, PLASTIC = 1.0, 0.01  # m/s, closing speeds above and below ``PLASTIC_SPEED_MPS``
+HORIZON = 3  # decisions that are left in the statements about the shield
+
+
+def states(text: str) -> Callable[[Statement], Statement]:
+    """Register a statement."""
+
+    def register(statement: Statement) -> Statement:
+        STATEMENTS[text] = statement
+        return statement
+
+    return register
+
+
+def prove(end: Ended, statement: Any, what: str, *assumed: Any) -> None:
+    """Demand that a statement follows at the end of a path."""
+    assert holds_always([*end.known, *assumed], statement), f"not proven: {what}"
+
+
+@states(
+    "a pair's contact: found where its gap closes, never earlier, never missed; the closing speed there is the root"
+)
+def contact() -> int:
+    """``events.contact`` against ``events.drift``, the gap as a function of time."""
+    gap, closing, pressing, when = symbols("gap closing pressing when")
+    found = list(_run(events, lambda: events.contact(gap, closing, pressing), [exact(gap) >= 0]))
+    after = exact(events.drift(gap, closing, pressing, when))
+    for end in found:
+        time, speed = end.result
+        if isinstance(time, float):
+            assert time == math.inf
+            prove(end, after >= 0, "never closes", exact(when) >= 0)
+            continue
+        prove(end, exact(time) >= 0, "not in the past")
+        prove(end, exact(events.drift(gap, closing, pressing, time)) == 0, "the gap is closed then")
+        prove(end, after > 0, "it is open before", exact(when) > 0, exact(when) < exact(time))
+        prove(end, exact(speed) == exact(closing + pressing * time), "the speed is the one then")
+        prove(end, exact(speed) >= 0, "and it approaches")
+    return len(found)
+
+
+@states("a vehicle that brakes stands after v tau + v^2 / (2 a), and never drives backwards")
+def stopping() -> int:
+    """``events.solo_motion`` against ``events.stopping_distance``."""
+    speed, capacity, latency, limit, time = symbols("speed capacity latency limit time")
+    known = [exact(speed) >= 0, exact(capacity) > 0, exact(latency) >= 0, exact(time) >= 0, exact(limit) >= 0]
+    found = list(_run(events, lambda: events.solo_motion(speed, -capacity, latency, limit, time), known))
+    whole = exact(speed * latency + speed * speed / (2.0 * capacity))
+    for end in found:
+        after, way, _ = end.result
+        prove(end, exact(after) >= 0, "forwards")
+        prove(end, z3.And(exact(way) >= 0, exact(way) <= whole), "no farther than its stopping distance")
+        prove(end, exact(way) == whole, "exactly that once it stands", exact(after) == 0, exact(speed) > 0)
+    return len(found)
+
+
+def _cluster(vehicles: int, closing: float) -> tuple[list[Symbol], list[Symbol], Symbol, list[Ended]]:
+    """Masses, speeds, restitution, and every path of one impact of so many touching vehicles; results: speeds after."""
+    mass = symbols(" ".join(f"m{i}" for i in range(vehicles)))
+    speed = symbols(" ".join(f"v{i}" for i in range(vehicles)))
+    (restitution,) = symbols("e")
+    known = [exact(m) > 0 for m in mass] + [exact(restitution) >= 0, exact(restitution) <= 1]
+
+    def resolve() -> list[Symbol]:
+        table = np.zeros((impact.IMPACT_ROWS, vehicles), dtype=object)
+        table[impact.MASS], table[impact.SPEED] = mass, speed
+        table[impact.CLOSING, : vehicles - 1] = closing
+        impact.resolve_cluster(table, restitution, 0, vehicles - 1)
+        return list(table[impact.SPEED])
+
+    return mass, speed, restitution, list(_run(impact, resolve, known))
+
+
+def _sum(*columns: list[Symbol]) -> Any:
+    """The sum over vehicles of the product of these."""
+    return sum(math.prod((exact(x) for x in row), start=exact(1)) for row in zip(*columns, strict=True))
+
+
+@states("an impact of two: momentum is kept, they part with e times the closing speed, as in the paper's equation")
+def two() -> int:
+    """``impact.resolve_cluster`` of two vehicles, against Newton's law."""
+    mass, speed, restitution, found = _cluster(2, BOUNCING)
+    approaching = exact(speed[1]) > exact(speed[0])
+    for end in found:
+        after = end.result
+        prove(end, _sum(mass, after) == _sum(mass, speed), "momentum")
+        parting = exact(after[0] - after[1]) == exact(restitution * (speed[1] - speed[0]))
+        prove(end, parting, "restitution", approaching)
+        kept = z3.And(exact(after[0]) == exact(speed[0]), exact(after[1]) == exact(speed[1]))
+        prove(end, kept, "who does not approach is left alone", z3.Not(approaching))
+    return len(found)
+
+
+@states("an impact of two or three: momentum is kept, and just (1 - e^2) of the energy of what is pooled is lost")
+def energy() -> int:
+    """The energy by an identity, from which the inequality follows: masses are positive and e is at most 1."""
+    count = 0
+    for vehicles in (2, 3):
+        mass, speed, restitution, found = _cluster(vehicles, BOUNCING)
+        for end in found:
+            after = end.result
+            prove(end, _sum(mass, after) == _sum(mass, speed), f"momentum of {vehicles}")
+            moved = [(u - v) / (1.0 + restitution) for u, v in zip(after, speed, strict=True)]
+            lost = exact(1.0 - restitution * restitution) * _sum(mass, moved, moved)
+            prove(end, _sum(mass, speed, speed) - _sum(mass, after, after) == lost, f"energy of {vehicles}")
+        count += len(found)
+    return count
+
+
+@states("a plastic impact of two or three: momentum is kept, and no pair approaches any more")
+def plastic() -> int:
+    """Below the plastic speed nobody bounces, and the line is in order afterwards."""
+    count = 0
+    for vehicles in (2, 3):
+        mass, speed, _, found = _cluster(vehicles, PLASTIC)
+        for end in found:
+            after = end.result
+            prove(end, _sum(mass, after) == _sum(mass, speed), f"momentum of {vehicles}")
+            for ahead, behind in itertools.pairwise(after):
+                prove(end, exact(behind) <= exact(ahead), f"order of {vehicles}")
+        count += len(found)
+    return count
+
+
+@states("a free body's acceleration is the nearest to zero that its forces allow")
+def settling() -> int:
+    """``events.settle`` on any range of forces."""
+    low, high, other = symbols("low high other")
+    found = list(_run(events, lambda: events.settle(low, high), [exact(low) <= exact(high)]))
+    for end in found:
+        value = exact(end.result)
+        prove(end, z3.And(value >= exact(low), value <= exact(high)), "within the range")
+        allowed = [exact(other) >= exact(low), exact(other) <= exact(high)]
+        prove(end, value * value <= exact(other) * exact(other), "nearest to zero", *allowed)
+    return len(found)
+
+
+class _Line:
+    """A world as the shield sees it: what each action leads to, and the harm of each sequence of actions, unknown."""
+
+    def __init__(self) -> None:
+        number = z3.RealSort()
+        self.harm = z3.Function("harm", *[number] * HORIZON, number)  # of the whole episode
+        self.so_far = z3.Function("so_far", number, number)  # after the first action
+        self.going = z3.Function("going", number, z3.IntSort())  # after the first action: -1, 0 or 1
+        self.plan = symbols(" ".join(f"plan{k}" for k in range(HORIZON)))
+        self.proposed, self.budget, self.certified = symbols("proposed budget certified")
+        self.fresh = 0
+
+    def known(self) -> list[Any]:
+        """The invariant: the plan's harm is certified, and within the budget; its first step does not fail."""
+        plan = [exact(each) for each in self.plan]
+        return [
+            self.harm(*plan) == exact(self.certified),
+            exact(self.certified) <= exact(self.budget),
+            exact(self.certified) >= 0,
+            self.going(plan[0]) >= 0,
+            z3.Implies(self.going(plan[0]) == 0, self.so_far(plan[0]) == exact(self.certified)),
+        ]
+
+    def take_steps(self, _: Any, __: Any, ___: Any, ____: int, action: Any, after: Any, _____: Any) -> int:
+        """The step of one action: it fails, ends the episode, or leaves it going; the same each time it is asked."""
+        after[0] = action
+        going = self.going(exact(action))
+        if Condition(going < 0):
+            return -1
+        return 0 if Condition(going == 0) else 1
+
+    def worst_so_far(self, _: Any, after: Any) -> Any:
+        """Harm after the action."""
+        return Symbol(self.so_far(exact(after[0])))
+
+    def worst_of_plan(self, _: Any, after: Any, __: Any, step: int, plan: Any, most: Any) -> Any:
+        """Harm of the action and then the plan; infinite above ``most``."""
+        harm = self.harm(exact(after[0]), *(exact(each) for each in plan[step:]))
+        if isinstance(most, float) and most == math.inf:
+            return Symbol(harm)
+        return Symbol(harm) if Condition(harm <= exact(most)) else math.inf
+
+    def best_constant(self, *_: Any) -> tuple[Symbol, Symbol]:
+        """Some constant, and what a search says of it, which need not be true."""
+        self.fresh += 1
+        constant, least = symbols(f"constant{self.fresh} least{self.fresh}")
+        return constant, least
+
+
+@states(
+    "a decision of the step shield: what is applied and the plan after it have the bound, which is within the budget"
+)
+def decision() -> int:
+    """The induction step, of ``decide_world`` and ``better_plan`` themselves, for a proposal and for none.
+
+    What the physics does is an unknown function of the actions: the same for the same actions, which is all it needs.
+    """
+    count = 0
+    for usable in (True, False):
+        line = _Line()
+
+        def decide(line: _Line = line, usable: bool = usable) -> tuple[Any, Any, Any]:
+            line.fresh = 0
+            plan, room = np.array(line.plan, object), np.zeros((2, HORIZON), object)
+            after, out = np.zeros(1, object), np.zeros(4, object)
+            proposed = line.proposed if usable else math.nan
+            good = certify_kernel.decide_world(
+                None, None, np.zeros(1, bool), 0, proposed, line.budget, line.certified, np.zeros(1), plan, room,
+                after, np.zeros(1, bool), out,
+            )  # fmt: skip
+            return good, plan, out
+
+        found = list(_run(certify_kernel, decide, line.known(), line))
+        for end in found:
+            good, plan, out = end.result
+            assert good
+            applied, bound = exact(out[0]), exact(out[2])
+            prove(end, bound <= exact(line.budget), "the bound is within the budget")
+            rest = [exact(each) for each in plan[1:]]
+            goes_on = line.going(applied) > 0
+            prove(end, line.harm(applied, *rest) == bound, "the plan that is kept has the bound", goes_on)
+            prove(end, line.so_far(applied) == bound, "so has the harm, if the episode is over", z3.Not(goes_on))
+        count += len(found)
+    return count
+
+
+def _run(module: ModuleType, function: Callable[[], Any], known: list[Any], line: _Line | None = None) -> Any:
+    """The paths of a function of ``module``, with symbolic roots, and ``line`` in the place of the physics."""
+    names = ("take_steps", "worst_so_far", "worst_of_plan", "best_constant") if line else ()
+    before = {name: getattr(module, name) for name in (*names, "math")}
+    try:
+        module.math = SymbolicMath  # type: ignore[attr-defined]
+        for name in names:
+            setattr(module, name, getattr(line, name))
+        yield from paths(function, known)
+    finally:
+        for name, value in before.items():
+            setattr(module, name, value)
