@@ -66,6 +66,13 @@ def test_lineup__takes_what_ships(folder: Path, policy: Policy) -> None:
     assert np.array_equal(alone, eb.make_agent("universal@shipped").act(worlds, 1))
 
 
+def test_team__is_what_ships_for_the_scenario(folder: Path) -> None:
+    pair = SCENARIO.with_learners(["vehicle_2", "vehicle_3"])
+    worlds = pair.sample(5, 1).worlds
+    team, policy = (eb.make_agent(f"{name}@shipped", scenario=pair) for name in ("team", "policy"))
+    assert team.name == "team@shipped" and np.array_equal(team.act(worlds, 2), policy.act(worlds, 2))
+
+
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
