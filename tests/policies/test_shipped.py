@@ -123,6 +123,33 @@ def test_policy_shipped__is_the_best_that_ships(test: str, harm_count: HarmCount
     assert harm["policy@shipped"] <= 1.01 * min(harm.values())
 
 
+@pytest.mark.parametrize(
+    ("level", "share_of_full_braking", "collisions"),
+    [
+        ("cooperation-1-front", 0.60, 0.80),
+        ("cooperation-2-paper", 0.33, 0.70),
+        ("cooperation-2-blocked", 0.52, 0.87),
+        ("cooperation-3-pair", 0.33, 0.70),
+        ("cooperation-4-all", 0.03, 0.15),
+    ],
+)
+def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
+    level: str, share_of_full_braking: float, collisions: float
+) -> None:
+    """At least as well as docs/cooperation.md says, by and large: level 3 collides no more often than level 2."""
+    scenario = load_scenario(level)
+    assert shipped_name("policy", level, "total") == f"counterfactual-{level}"
+    assert load_named_policy(f"shipped/counterfactual-{level}").manifest.learners == tuple(
+        scenario.vehicle_names[i] for i in scenario.learners
+    )
+    lineup = make_lineup(["full_brake", "policy@shipped", "team@shipped"], scenario)
+    result = evaluate(scenario.sample(300, 7), lineup, scenario=scenario, seed=7, aftermath=False)
+    braking, policy, team = (result.outcome(spec) for spec in lineup)
+    assert policy.first_impact_harm.mean() <= share_of_full_braking * braking.first_impact_harm.mean()
+    assert policy.collided.mean() <= collisions
+    assert np.array_equal(policy.first_impact_harm, team.first_impact_harm)
+
+
 def test_policy__whatever_trained_it(folder: Path, policy: Policy) -> None:
     assert make_lineup(["policy@shipped/ppo"], SCENARIO)["policy@shipped/ppo"].name == "policy@shipped/ppo"
     with pytest.raises(InvalidInput, match="policy@PATH, where PATH is a run or a policy bundle"):
