@@ -112,10 +112,12 @@ def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_sh
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
 @pytest.mark.parametrize("test", list(TESTS))
 def test_policy_shipped__is_the_best_that_ships(test: str, harm_count: HarmCount) -> None:
-    """By the mean harm in 2,000 worlds, within a hundredth of the best of all that can drive there."""
+    """By the mean harm in 2,000 worlds, within a hundredth of the best of all but those of levels of cooperation."""
     scenario = load_scenario(test)
     each = [
-        f"ppo@shipped/{name}" if name.startswith("ppo") else f"policy@shipped/{name}" for name in shipped_policies()
+        f"ppo@shipped/{name}" if name.startswith("ppo") else f"policy@shipped/{name}"
+        for name in shipped_policies()
+        if "cooperation" not in name
     ]
     lineup = make_lineup(["policy@shipped", *each], scenario, harm_count=harm_count)
     result = evaluate(scenario.sample(2_000, 21), lineup, scenario=scenario, seed=21, aftermath=False)
