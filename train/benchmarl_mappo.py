@@ -31,7 +31,7 @@ def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> No
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="cooperation-3-pair", help="a shipped scenario, or a YAML file")
-    parser.add_argument("--recipe", default="cooperation", help="a shipped PPO recipe, or a YAML file")
+    parser.add_argument("--recipe", default="cooperation-ppo", help="a shipped PPO recipe, or a YAML file")
     parser.add_argument("--steps", type=int, default=200_000, help="decisions of learners")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/mappo"), help="new folder")

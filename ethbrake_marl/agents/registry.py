@@ -135,7 +135,9 @@ _ENTRIES: dict[str, Entry] = {
         _POLICIES,
     ),
     "universal": Entry("universal@shipped", "the shipped policy for all parameters", (Source.MESSAGES,), _POLICIES),
-    "team": Entry("team@RUN", "the learners of a run, each as it was trained", (Source.MESSAGES,), _POLICIES),
+    "team": Entry(
+        "team@RUN", "the learners of a run, each as it was trained, or shipped", (Source.MESSAGES,), _POLICIES
+    ),
 }
 
 _WRAPPERS: dict[str, Entry] = {

@@ -32,7 +32,7 @@ def ablate_command(
     scheme: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="How several learners are trained.", show_default="the recipe's; else independent"
+            metavar="NAME", help="How several learners are trained.", show_default="the recipe's; else shared"
         ),
     ] = None,
     seeds: Annotated[int | None, typer.Option(help="Trainings of each, seeds 0, 1, ...", show_default="5")] = None,

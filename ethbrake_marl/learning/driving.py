@@ -15,15 +15,15 @@ from ethbrake_marl.learning.team_file import is_team, load_driver, load_team
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import SHIPPED, PolicyKind, load_named_policy
 
-_KINDS: dict[str, PolicyKind] = {name: name for name in get_args(PolicyKind)}
+_KINDS: dict[str, PolicyKind] = {name: name for name in get_args(PolicyKind)} | {"team": "policy"}
 
 
 def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
     """The policy of a run or a bundle, or the team of a run in which each learner has its own.
 
     ``PATH`` may be ``shipped``, the policy that comes with the package for this scenario and harm count, or
-    ``shipped/NAME``; ``universal@shipped`` is for all scenarios. Raises ``InvalidInput`` for a policy of another
-    algorithm, and what loading it raises.
+    ``shipped/NAME``; ``universal@shipped`` is for all scenarios, ``team@shipped`` is ``policy@shipped``. Raises
+    ``InvalidInput`` for a policy of another algorithm, and what loading it raises.
     """
     spec, path = settings.spec, settings.policy
     name = spec.partition("@")[0]
@@ -32,7 +32,8 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
             f"agent {spec!r}: a policy is needed: {name}@PATH, where PATH is a run or a policy bundle, for instance"
             f" {name}@runs/my-run, or {name}@{SHIPPED}"
         )
-    if name == "team" or (name != "universal" and is_team(path)):
+    ships = path.partition("/")[0] == SHIPPED  # one policy for all learners
+    if not ships and (name == "team" or (name != "universal" and is_team(path))):
         scenario = settings.needed_scenario()
         team = load_team(path, scenario, spec)
         _check_algorithm(name, path, load_driver(path, scenario.vehicle_names[min(team.drivers)]))

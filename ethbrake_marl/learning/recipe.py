@@ -28,6 +28,10 @@ Rate = Annotated[float, Field(gt=0.0, le=1.0)]
 Layers = Annotated[tuple[Width, ...], Field(strict=False, min_length=1, max_length=8)]
 
 
+def _none(value: Any) -> bool:
+    return value is None
+
+
 class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
@@ -89,6 +93,7 @@ class ActorShape(_Part):
 
     policy: Layers
     activation: Activation = "relu"
+    initial_action: Annotated[float | None, Field(ge=-1.0, le=1.0, exclude_if=_none)] = None  # at first; None: 0
 
     def spec(self, observation_size: int) -> NetworkSpec:
         """What a bundle holds."""
@@ -122,10 +127,6 @@ class EvaluationPlan(_Part):
     every_updates: Annotated[int, Field(ge=1)]
     worlds: Annotated[int, Field(ge=1, le=1_000_000)]
     seed: Annotated[int, Field(ge=0)]
-
-
-def _none(value: Any) -> bool:
-    return value is None
 
 
 class TrainingRecipe(_Part):

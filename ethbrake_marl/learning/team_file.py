@@ -95,7 +95,7 @@ def load_team(path: str | os.PathLike[str], scenario: str | Path | Scenario, nam
             f"{path}: is a team for a line of {team.vehicles} vehicles, scenario {scenario.name!r} has"
             f" {scenario.vehicles}; "
             + (
-                f"its one policy can drive other lines: ppo@{path}"
+                f"its one policy can drive other lines: policy@{path}"
                 if shared
                 else "only a shared policy can drive others"
             )

@@ -16,7 +16,7 @@ pytest.importorskip("benchmarl", reason="needs the extra marl")
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
 
 PAIR = eb.load_scenario("cooperation-3-pair")
-RECIPE = load_recipe("cooperation").replace(
+RECIPE = load_recipe("cooperation-ppo").replace(
     n_envs=16, n_steps=16, batch_size=128, network={"policy": [16, 16], "value": [16, 16]}
 )
 
@@ -79,7 +79,7 @@ def test_policy_of__acts_as_benchmarls_own_policy_does(tmp_path: Path) -> None:
 def test_mappo__learns_to_beat_full_braking(tmp_path: Path) -> None:
     from ethbrake_marl.learning.benchmarl import train_mappo
 
-    train_mappo(load_recipe("cooperation").replace(total_steps=300_000), PAIR, tmp_path / "run")
+    train_mappo(load_recipe("cooperation-ppo").replace(total_steps=300_000), PAIR, tmp_path / "run")
     agents = {"full_brake": eb.make_agent("full_brake"), "team": load_team(tmp_path / "run", PAIR)}
     result = eb.evaluate(PAIR.sample(1000, 7), agents, scenario=PAIR)
     harm = {name: result.outcome(name).first_impact_harm.mean() for name in agents}

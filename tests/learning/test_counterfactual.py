@@ -129,6 +129,17 @@ def test_training__gets_better_from_scratch(tmp_path: Path) -> None:
     assert last < 0.7 * first
 
 
+def test_training__begins_near_an_action(tmp_path: Path) -> None:
+    """Where the recipe says so: -0.9 is nearly full braking. A recipe without it is the training that it always was."""
+    recipe = TINY.replace(network={"policy": [8], "initial_action": -0.9}, learning_rate={"start": 1e-12, "end": 1e-12})
+    policy = train(recipe.replace(total_steps=1), SCENARIO, tmp_path / "run").policy
+    seen = np.random.default_rng(0).uniform(0, 1, (50, policy.manifest.network.observation_size)).astype(np.float32)
+    np.testing.assert_allclose(policy(seen), -0.9, atol=0.1)
+    assert "initial_action" not in TINY.model_dump()["network"]
+    with pytest.raises(InvalidInput, match=r"initial_action = -1\.5"):
+        TINY.replace(network={"policy": [8], "initial_action": -1.5})
+
+
 def test_training__numbers_that_are_not_finite_stop_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = CounterfactualModel._try_out
     calls = []

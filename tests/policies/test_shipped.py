@@ -66,6 +66,13 @@ def test_lineup__takes_what_ships(folder: Path, policy: Policy) -> None:
     assert np.array_equal(alone, eb.make_agent("universal@shipped").act(worlds, 1))
 
 
+def test_team__is_what_ships_for_the_scenario(folder: Path) -> None:
+    pair = SCENARIO.with_learners(["vehicle_2", "vehicle_3"])
+    worlds = pair.sample(5, 1).worlds
+    team, policy = (eb.make_agent(f"{name}@shipped", scenario=pair) for name in ("team", "policy"))
+    assert team.name == "team@shipped" and np.array_equal(team.act(worlds, 2), policy.act(worlds, 2))
+
+
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
@@ -105,15 +112,44 @@ def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_sh
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
 @pytest.mark.parametrize("test", list(TESTS))
 def test_policy_shipped__is_the_best_that_ships(test: str, harm_count: HarmCount) -> None:
-    """By the mean harm in 2,000 worlds, within a hundredth of the best of all that can drive there."""
+    """By the mean harm in 2,000 worlds, within a hundredth of the best of all but those of levels of cooperation."""
     scenario = load_scenario(test)
     each = [
-        f"ppo@shipped/{name}" if name.startswith("ppo") else f"policy@shipped/{name}" for name in shipped_policies()
+        f"ppo@shipped/{name}" if name.startswith("ppo") else f"policy@shipped/{name}"
+        for name in shipped_policies()
+        if "cooperation" not in name
     ]
     lineup = make_lineup(["policy@shipped", *each], scenario, harm_count=harm_count)
     result = evaluate(scenario.sample(2_000, 21), lineup, scenario=scenario, seed=21, aftermath=False)
     harm = {spec: result.outcome(spec).ledger.world_harm(harm_count).mean() for spec in lineup}
     assert harm["policy@shipped"] <= 1.01 * min(harm.values())
+
+
+@pytest.mark.parametrize(
+    ("level", "share_of_full_braking", "collisions"),
+    [
+        ("cooperation-1-front", 0.60, 0.80),
+        ("cooperation-2-paper", 0.33, 0.70),
+        ("cooperation-2-blocked", 0.52, 0.87),
+        ("cooperation-3-pair", 0.33, 0.70),
+        ("cooperation-4-all", 0.03, 0.15),
+    ],
+)
+def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
+    level: str, share_of_full_braking: float, collisions: float
+) -> None:
+    """At least as well as docs/cooperation.md says, by and large: level 3 collides no more often than level 2."""
+    scenario = load_scenario(level)
+    assert shipped_name("policy", level, "total") == f"counterfactual-{level}"
+    assert load_named_policy(f"shipped/counterfactual-{level}").manifest.learners == tuple(
+        scenario.vehicle_names[i] for i in scenario.learners
+    )
+    lineup = make_lineup(["full_brake", "policy@shipped", "team@shipped"], scenario)
+    result = evaluate(scenario.sample(300, 7), lineup, scenario=scenario, seed=7, aftermath=False)
+    braking, policy, team = (result.outcome(spec) for spec in lineup)
+    assert policy.first_impact_harm.mean() <= share_of_full_braking * braking.first_impact_harm.mean()
+    assert policy.collided.mean() <= collisions
+    assert np.array_equal(policy.first_impact_harm, team.first_impact_harm)
 
 
 def test_policy__whatever_trained_it(folder: Path, policy: Policy) -> None:

@@ -46,7 +46,7 @@ class AveragedActor(BasePolicy):
             nn.init.orthogonal_(layer.weight, math.sqrt(2.0))
             nn.init.zeros_(layer.bias)
         nn.init.orthogonal_(self.action_net.weight, 0.01)
-        nn.init.zeros_(self.action_net.bias)
+        nn.init.constant_(self.action_net.bias, shape.initial_action or 0.0)
         self.log_std = nn.Parameter(torch.full((1,), LOG_NOISE), requires_grad=False)
         last = nn.Linear(shape.policy[-1], 1)
         self.learning = nn.Sequential(*create_mlp(inputs, -1, list(shape.policy), activation), last)

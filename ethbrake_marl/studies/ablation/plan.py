@@ -192,8 +192,8 @@ class Plan:
 
 
 def with_scheme(recipe: TrainingRecipe, scheme: Scheme | None) -> TrainingRecipe:
-    """The recipe with this scheme for several learners; None: its own, else independent."""
-    return recipe.replace(scheme=scheme or recipe.scheme or "independent")
+    """The recipe with this scheme for several learners; None: its own, else shared."""
+    return recipe.replace(scheme=scheme or recipe.scheme or "shared")
 
 
 def _algorithm(recipe: TrainingRecipe) -> str:

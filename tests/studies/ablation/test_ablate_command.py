@@ -209,9 +209,9 @@ def planned(recipe: TrainingRecipe, scheme: Scheme | None) -> list[Training]:
 def test_plan__one_learner_is_trained_alone_whatever_the_scheme(tiny):
     recipe = load_recipe(str(tiny))
     alone, pair = planned(recipe, None)
-    assert (alone.recipe.scheme, pair.recipe.scheme) == (None, "independent")
+    assert (alone.recipe.scheme, pair.recipe.scheme) == (None, "shared")
     assert (alone.recipe.total_steps, pair.recipe.total_steps) == (300, 600)
-    assert pair.folder.name == "cooperation-3-pair-tiny-independent-seed0"
+    assert pair.folder.name == "cooperation-3-pair-tiny-shared-seed0"
     again, shared = planned(recipe, "shared")
     assert (again.recipe, again.folder) == (alone.recipe, alone.folder)
     assert (

@@ -52,7 +52,9 @@ def test_page__its_example_of_a_training_runs(tmp_path, monkeypatch):
     (block,) = (b for b in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "result = eb.train(" in b)
     names: dict[str, object] = {}
     exec(
-        block.replace('("cooperation")', '("cooperation").replace(total_steps=1, n_envs=8)').replace("1000", "20"),
+        block.replace('("cooperation-ppo")', '("cooperation-ppo").replace(total_steps=1, n_envs=8)').replace(
+            "1000", "20"
+        ),
         names,
     )
     assert names["harm"].shape == (20,)
