@@ -184,9 +184,9 @@ def test_contact__needs_the_time_step():
     assert choose_observation(["own"], 0.1).time_step_s is None  # nothing that depends on it
 
 
-def contact_policy(scenario):
+def contact_policy(scenario, group="contact"):
     """An untrained policy that observes contacts."""
-    spec = choose_observation(["own", "contact"])
+    spec = choose_observation(["own", group])
     network = NetworkSpec(
         observation_size=spec.size, action_size=1, policy_hidden=(4,), value_hidden=(), activation="relu", output="clip"
     )
@@ -209,6 +209,10 @@ def test_policy__observes_contacts_at_the_steps_of_its_training():
     assert np.isfinite(outcome.total_harm).all()
     with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
         contact_policy({})
+    with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
+        contact_policy({}, "contact_far")
+    far = contact_policy(SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"), "contact_far")
+    assert far.observation == choose_observation(["own", "contact_far"], 0.05)
 
 
 def test_contact__failed_forecast_names_its_world(monkeypatch):
