@@ -184,9 +184,9 @@ def test_contact__needs_the_time_step():
     assert choose_observation(["own"], 0.1).time_step_s is None  # nothing that depends on it
 
 
-def contact_policy(scenario):
+def contact_policy(scenario, group="contact"):
     """An untrained policy that observes contacts."""
-    spec = choose_observation(["own", "contact"])
+    spec = choose_observation(["own", group])
     network = NetworkSpec(
         observation_size=spec.size, action_size=1, policy_hidden=(4,), value_hidden=(), activation="relu", output="clip"
     )
@@ -209,6 +209,10 @@ def test_policy__observes_contacts_at_the_steps_of_its_training():
     assert np.isfinite(outcome.total_harm).all()
     with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
         contact_policy({})
+    with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
+        contact_policy({}, "contact_far")
+    far = contact_policy(SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"), "contact_far")
+    assert far.observation == choose_observation(["own", "contact_far"], 0.05)
 
 
 def test_contact__failed_forecast_names_its_world(monkeypatch):
@@ -219,3 +223,26 @@ def test_contact__failed_forecast_names_its_world(monkeypatch):
     worlds = SCENARIO.sample(3, 1).worlds
     with pytest.raises(PhysicsError, match="world 1: a forecast of contacts could not look 10 s ahead"):
         observe(worlds, 1, CONTACT)
+
+
+def test_contact_far__tells_what_the_others_cut_off():
+    """The times up to 10 s, and the square roots of the harms, of the same forecasts; the others stay as they are."""
+    wide = eb.load_scenario("stress-wide").sample(300, 3).worlds
+    worlds = advance(wide, np.zeros((300, 3)), until_s=0.4)[0]
+    both = choose_observation(["own", "contact", "contact_far"], STEP_S)
+    seen = dict(zip([f.name for f in both.features], observe(worlds, 1, both).T, strict=True))
+    alone = observe(worlds, 1, choose_observation(["contact_far"], STEP_S))
+    assert alone.shape == (300, 12) and alone.tobytes() == observe(worlds, 1, both)[:, -12:].tobytes()
+    for name, values in zip([f.name for f in CONTACT.features], observe(worlds, 1, CONTACT).T, strict=True):
+        assert values.tobytes() == seen[name].tobytes()
+    hard = 0
+    for command in ("brake", "coast", "drive"):
+        for far, near in (("front_time", "front_time"), ("rear_time", "rear_time")):
+            found, cut = seen[f"contact_far.{command}_{far}"] * 5.0, seen[f"contact.{command}_{near}"] * 2.0
+            np.testing.assert_allclose(np.minimum(found, 4.0), cut, rtol=1e-6)
+            assert (found <= 10.0).all()
+        for far, near in (("first_impact_speed", "first_impact_harm"), ("total_speed", "total_harm")):
+            found, cut = (seen[f"contact_far.{command}_{far}"] * 10.0) ** 2, seen[f"contact.{command}_{near}"] * 50.0
+            np.testing.assert_allclose(np.minimum(found, 200.0), cut, rtol=1e-5, atol=1e-4)
+            hard += int((found > 200.0).sum())
+    assert hard > 30

@@ -31,11 +31,13 @@ from ethbrake_marl.physics.rows import (
     vehicles_in,
 )
 from ethbrake_marl.physics.segment import COMMAND, DONE, FIRST_HARM, HIT, LIMIT, ONSET, TABLE_ROWS, TOTAL_HARM
-from ethbrake_marl.scenario.features import CONTACT_COMMANDS, CONTACT_FEATURES, CONTACT_SIDES
+from ethbrake_marl.scenario.features import CONTACT_COMMANDS, CONTACT_FAR_FEATURES, CONTACT_FEATURES, CONTACT_SIDES
 
 FORECAST_S = 10.0  # how far the forecasts look; also the time to an impact that never comes
 _OF_PAIR, _HARMS = 4, 2  # numbers of each pair; of the line
 _OF_COMMAND = len(CONTACT_SIDES) * _OF_PAIR + _HARMS
+_NEAR = len(CONTACT_COMMANDS) * _OF_COMMAND  # columns of contact; behind them are those of contact_far
+_FAR = len(CONTACT_SIDES) + _HARMS  # numbers of contact_far for each command
 
 
 class Contacts(NamedTuple):
@@ -43,28 +45,33 @@ class Contacts(NamedTuple):
 
     time_step_s: float  # between two decisions
     commands: Ints  # those to forecast, as places in CONTACT_COMMANDS
-    features: Floats  # [3, 30] 1 / scale, low, high of every contact feature
+    features: Floats  # [3, 30], with far [3, 42]: 1 / scale, low, high of every contact feature
 
 
-def contacts_of(names: set[str], time_step_s: float | None) -> Contacts:
-    """What to forecast for these contact features (names in the group); raises ``InvalidInput`` without a time step."""
+def contacts_of(names: set[str], time_step_s: float | None, *, far: bool = False) -> Contacts:
+    """What to forecast for these contact features (names in their groups); ``far``: contact_far too.
+
+    Raises ``InvalidInput`` without a time step.
+    """
     if time_step_s is None:
         raise InvalidInput(
             "observation: contact features need the time between two decisions; give it as time_step_s, for instance"
             " eb.choose_observation([...], time_step_s=scenario.time_step_s)"
         )
     wanted = [c for c, command in enumerate(CONTACT_COMMANDS) if any(n.startswith(f"{command}_") for n in names)]
-    scaling = [[1.0 / f.scale for f in CONTACT_FEATURES], [f.low for f in CONTACT_FEATURES]]
-    scaling.append([f.high for f in CONTACT_FEATURES])
+    features = CONTACT_FEATURES + CONTACT_FAR_FEATURES if far else CONTACT_FEATURES
+    scaling = [[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]]
     return Contacts(time_step_s, np.array(wanted, np.int64), np.array(scaling))
 
 
 def observe_contacts(state: Floats, params: Floats, vehicles: Ints, contacts: Contacts) -> NDArray[np.float32]:
-    """All contact features of several vehicles in worlds given as rows of ``physics.rows``, scaled, [n, vehicles, 30].
+    """All contact features of several vehicles in worlds given as rows of ``physics.rows``, scaled, [n, vehicles, C].
+
+    C is 30, and 42 with those of contact_far.
 
     Those of commands that are not wanted are 0. Raises ``PhysicsError`` naming the worlds in which a forecast failed.
     """
-    found = np.zeros((len(state), len(vehicles), len(CONTACT_FEATURES)), np.float32)
+    found = np.zeros((len(state), len(vehicles), contacts.features.shape[1]), np.float32)
     failed = np.zeros(len(state), np.bool_)
     _observe_contacts(state, params, vehicles, *contacts, found, failed)
     if failed.any():
@@ -82,7 +89,7 @@ def _observe_contacts(
     N = vehicles_in(state)
     at = 1 if state.shape[1] > state_width(N) else 0  # vehicle i stands in column at + i, behind an obstacle
     line, table = np.zeros((TABLE_ROWS, N + at)), np.zeros((TABLE_ROWS, N + at))
-    found, value = np.zeros((CONTACT_ROWS, N + at)), np.zeros(_OF_COMMAND)
+    found, value = np.zeros((CONTACT_ROWS, N + at)), np.zeros(_OF_COMMAND + _FAR)
     braking, driving = params_at(0, N), params_at(1, N)
     for k in range(out.shape[0]):
         for o in range(observers.shape[0]):
@@ -101,8 +108,8 @@ def _observe_contacts(
                     failed[k] = True
                     break
                 _tell(table, found, at + i, first, last, time_step, value)
-                for f in range(_OF_COMMAND):
-                    column = c * _OF_COMMAND + f
+                for f in range(_OF_COMMAND + _FAR if out.shape[2] > _NEAR else _OF_COMMAND):
+                    column = c * _OF_COMMAND + f if f < _OF_COMMAND else _NEAR + c * _FAR + f - _OF_COMMAND
                     scaled = value[f] * features[0, column]
                     out[k, o, column] = min(max(scaled, features[1, column]), features[2, column])
 
@@ -173,3 +180,5 @@ def _tell(table: Floats, found: Floats, own: int, first: int, last: int, time_st
         total_harm += table[TOTAL_HARM, p]
     value[2 * _OF_PAIR] = first_harm
     value[2 * _OF_PAIR + 1] = total_harm
+    value[_OF_COMMAND], value[_OF_COMMAND + 1] = value[0], value[_OF_PAIR]
+    value[_OF_COMMAND + 2], value[_OF_COMMAND + 3] = math.sqrt(first_harm), math.sqrt(total_harm)

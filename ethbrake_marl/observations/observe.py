@@ -32,6 +32,7 @@ from ethbrake_marl.physics.rows import (
 )
 from ethbrake_marl.physics.worlds import read_only
 from ethbrake_marl.scenario.features import (
+    CONTACT_FAR_FEATURES,
     CONTACT_FEATURES,
     NEIGHBOUR_FEATURES,
     OBSTACLE_FEATURES,
@@ -94,7 +95,7 @@ def plan_of(spec: ObservationSpec) -> Plan:
 @cache
 def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature], ...]) -> Plan:
     whole, entries = spec.whole, dict(registered)
-    usual = whole[: len(whole) - spec.contact * len(CONTACT_FEATURES)]
+    usual = whole[: len(whole) - spec.contact * len(CONTACT_FEATURES) - spec.far * len(CONTACT_FAR_FEATURES)]
     scaling = Scaling(
         np.array([offset for _, offset in spec.sides], np.int64),
         spec.role,
@@ -116,7 +117,8 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
 
 def _contacts(spec: ObservationSpec) -> Contacts:
     inside = (name.partition(".") for name in spec.chosen or (feature.name for feature in spec.whole))
-    return contacts_of({own for group, _, own in inside if group == "contact"}, spec.time_step_s)
+    names = {own for group, _, own in inside if group in ("contact", "contact_far")}
+    return contacts_of(names, spec.time_step_s, far=spec.far)
 
 
 def observe_packed(

@@ -12,6 +12,7 @@ import numpy as np
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.scenario.features import (
+    CONTACT_FAR_FEATURES,
     CONTACT_FEATURES,
     MOST_NEIGHBOURS,
     NEIGHBOUR_FEATURES,
@@ -45,7 +46,7 @@ class ObservationSpec:
     role: bool = False  # ROLE_FEATURES
     obstacle: bool = False  # OBSTACLE_FEATURES
     chosen: tuple[str, ...] = ()  # full names; the other fields say how far these look
-    contact: bool = False  # CONTACT_FEATURES
+    contact: bool = False  # CONTACT_FEATURES; those of contact_far must be chosen
     time_step_s: float | None = None  # between two decisions; contact features need it, others do not look at it
 
     def __post_init__(self) -> None:
@@ -80,11 +81,17 @@ class ObservationSpec:
         groups += [("role", ROLE_FEATURES)] if self.role else []
         groups += [("obstacle", OBSTACLE_FEATURES)] if self.obstacle else []
         groups += [("contact", CONTACT_FEATURES)] if self.contact else []
+        groups += [("contact_far", CONTACT_FAR_FEATURES)] if self.far else []
         return tuple(
             Feature(f"{prefix}.{f.name}", f.unit, f.scale, f.low, f.high, f.meaning)
             for prefix, group in groups
             for f in group
         )
+
+    @property
+    def far(self) -> bool:
+        """Whether any of CONTACT_FAR_FEATURES is chosen."""
+        return any(name.startswith("contact_far.") for name in self.chosen)
 
     @property
     def size(self) -> int:
@@ -141,7 +148,7 @@ def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
-    return front, rear, "role" in groups, "obstacle" in groups, "contact" in groups
+    return front, rear, "role" in groups, "obstacle" in groups, bool(groups & {"contact", "contact_far"})
 
 
 def observation_for(scenario: Scenario) -> ObservationSpec:

@@ -220,7 +220,7 @@ class Manifest(_Strict):
 
     @model_validator(mode="after")
     def _a_time_step_for_contacts(self) -> Manifest:
-        if any(name.startswith("contact.") for name in self.observation.features):
+        if any(name.startswith(("contact.", "contact_far.")) for name in self.observation.features):
             step = self.scenario.get("time_step_s")
             if isinstance(step, bool) or not isinstance(step, int | float) or not step > 0.0:
                 raise ValueError(f"scenario: time_step_s = {step!r}; contact features need a number above 0")

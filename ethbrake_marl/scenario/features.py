@@ -98,9 +98,27 @@ def _contact_features(command: str) -> tuple[Feature, ...]:
     )
 
 
-CONTACT_FEATURES = tuple(feature for command in CONTACT_COMMANDS for feature in _contact_features(command))
+def _far_features(command: str) -> tuple[Feature, ...]:
+    """What the same forecast tells of what is late or hard: beyond the bounds of the features above."""
+    held = {"brake": "braking fully", "coast": "coasting", "drive": "driving fully"}[command]
+    return (
+        Feature(f"{command}_front_time", "s", 5.0, 0.0, 2.0, f"{held}: time to the first impact in front"),
+        Feature(f"{command}_rear_time", "s", 5.0, 0.0, 2.0, f"{held}: time to the first impact behind"),
+        Feature(f"{command}_first_impact_speed", "m/s", 10.0, 0.0, 6.0, "square root of the first-impact harm"),
+        Feature(f"{command}_total_speed", "m/s", 10.0, 0.0, 6.0, "square root of the total harm"),
+    )
 
-_BUILT_IN = {"own": OWN_FEATURES, "role": ROLE_FEATURES, "obstacle": OBSTACLE_FEATURES, "contact": CONTACT_FEATURES}
+
+CONTACT_FEATURES = tuple(feature for command in CONTACT_COMMANDS for feature in _contact_features(command))
+CONTACT_FAR_FEATURES = tuple(feature for command in CONTACT_COMMANDS for feature in _far_features(command))
+
+_BUILT_IN = {
+    "own": OWN_FEATURES,
+    "role": ROLE_FEATURES,
+    "obstacle": OBSTACLE_FEATURES,
+    "contact": CONTACT_FEATURES,
+    "contact_far": CONTACT_FAR_FEATURES,
+}
 _SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 
@@ -182,7 +200,7 @@ def built_in_names() -> set[str]:
 
 def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
     """What an ``observation:`` may list: groups, then single features, of these neighbours."""
-    groups = ["own", *sides, "role", "obstacle", "contact"]
+    groups = ["own", *sides, "role", "obstacle", "contact", "contact_far"]
     single = [f"{group}.{feature.name}" for group in groups for feature in _group(group)]
     own = [name for name, entry in FEATURES.items() if entry.of == "own"]
     each = [f"{side}.{name}" for side in sides for name, entry in FEATURES.items() if entry.of == "neighbour"]

@@ -45,7 +45,9 @@ def test_targets__keep_the_slope_and_never_leave_the_trust_radius() -> None:
     """By hand, r = 0.05 and k = 3: g = 0.15 moves by 0.15 / (3 + 3), g = 1e6 by almost 0.05, g = 0 not at all."""
     gradient = np.array([0.0, 0.15, -0.15, 1e6, 1e6, 0.15, -1e6, -0.15], np.float32)
     mean = np.array([0.3, 0.0, 0.0, 0.0, 1.0, -2.0, -2.0, 2.0], np.float32)
-    target, weight = trusted_targets(Tried(np.zeros((8, 1), np.float32), mean, gradient), 0.05, 3.0)
+    target, weight = trusted_targets(
+        Tried(np.zeros((8, 1), np.float32), mean, gradient, np.ones(8, np.float32)), 0.05, 3.0
+    )
     np.testing.assert_allclose(target, [0.3, 0.025, -0.025, 0.05, 1.0, -1.975, -2.0, 1.975], rtol=1e-5)
     np.testing.assert_allclose(weight[[0, 1, 2, 4]], [3.0, 6.0, 6.0, 3.0], rtol=1e-6)
     np.testing.assert_allclose((weight * (target - mean))[:4], gradient[:4], rtol=1e-5)  # the slope where it stands

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from ethbrake_marl.envs.state import state_features
-from ethbrake_marl.observations import Feature, ObservationSpec
+from ethbrake_marl.observations import Feature, ObservationSpec, choose_observation
 from ethbrake_marl.rewards import REWARDS, TERMS, RewardParams, Term
 from ethbrake_marl.scenario import load_scenario
 
@@ -41,6 +41,7 @@ def environment_tables() -> dict[str, str]:
         "observation": feature_table(ObservationSpec().features),
         "obstacle": feature_table(ObservationSpec(role=True, obstacle=True).features, ObservationSpec().size),
         "contact": feature_table(ObservationSpec(contact=True).features, ObservationSpec().size),
+        "contact_far": feature_table(choose_observation(["contact_far"], 0.1).features),
         "state": feature_table(state_features(load_scenario("paper-random"))),
         "terms": term_table(TERMS.values()),
         "rewards": reward_table(REWARDS),

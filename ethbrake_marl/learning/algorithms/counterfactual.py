@@ -35,6 +35,10 @@ def _none(value: object) -> bool:
     return value is None
 
 
+def _zero(value: float) -> bool:
+    return value == 0.0
+
+
 Steps = Annotated[int, Field(ge=1, le=1000)]
 
 
@@ -56,6 +60,9 @@ class CounterfactualRecipe(TrainingRecipe):
     n_epochs: Annotated[int, Field(ge=1, le=1000)]
     batch_size: Annotated[int, Field(ge=2)]
     averaging: Fraction
+    focus: Annotated[float, Field(ge=0.0, le=0.99, exclude_if=_zero)] = (
+        0.0  # share of what is tried that a scout chooses
+    )
     network: ActorShape
     modes: Annotated[ModesPlan | None, Field(exclude_if=_none)] = None  # several networks and a gate
 
@@ -118,6 +125,7 @@ class Counterfactual(Algorithm):
             recipe.n_epochs,
             recipe.batch_size,
             recipe.averaging,
+            recipe.focus,
         )
         settings: dict[str, Any] = {"learning_rate": recipe.learning_rate.at, "seed": recipe.seed}
         model: CounterfactualModel

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from ethbrake_marl.engine.branches import Act, Moment, Offsets, branch, join_moments, moment_of, play_to_the_end
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS
+from ethbrake_marl.learning.algorithms.scout import Scout, choose_rows
 from ethbrake_marl.learning.recipe import ActorShape
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.rows import command_at, speed_at
@@ -35,7 +36,9 @@ class AveragedActor(BasePolicy):
     The average stands under the names of Stable-Baselines3's PPO, as a bundle wants it.
     """
 
-    def __init__(self, observation_space: Space[Any], action_space: Any, rate: Schedule, shape: ActorShape) -> None:
+    def __init__(
+        self, observation_space: Space[Any], action_space: Any, rate: Schedule, shape: ActorShape, focus: float = 0.0
+    ) -> None:
         super().__init__(observation_space, action_space)
         assert isinstance(observation_space, Box)
         inputs, activation = observation_space.shape[0], ACTIVATIONS[shape.activation]
@@ -52,7 +55,9 @@ class AveragedActor(BasePolicy):
         self.learning = nn.Sequential(*create_mlp(inputs, -1, list(shape.policy), activation), last)
         self._spec = shape.spec(inputs)
         self._average(0.0, towards_learning=False)
-        self.optimizer = torch.optim.Adam(self.learning.parameters(), lr=rate(1.0), eps=1e-5)
+        self.scout = Scout(inputs) if focus > 0.0 else None
+        learned = [*self.learning.parameters(), *(self.scout.parameters() if self.scout is not None else ())]
+        self.optimizer = torch.optim.Adam(learned, lr=rate(1.0), eps=1e-5)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
         """Begin with these tensors of a bundle."""
@@ -77,6 +82,11 @@ class AveragedActor(BasePolicy):
     def act(self, observation: Float32s) -> Float32s:
         """Its actions [rows] in [-1, 1]."""
         return np.clip(self.means(observation), -1.0, 1.0)
+
+    def expect(self, observation: Float32s) -> Floats:
+        """The size of the gradient that its scout expects, [rows]."""
+        assert self.scout is not None
+        return self.scout.expect(observation)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Actions [rows, 1] of the average."""
@@ -109,6 +119,7 @@ class Tried(NamedTuple):
     seen: Float32s  # [B, F]
     mean: Float32s  # [B] what the actor said; beyond -1 and 1 it means -1 and 1
     gradient: Float32s  # [B] of the return by the action
+    importance: Float32s  # [B] what each counts
 
 
 class TryingOut(NamedTuple):
@@ -125,6 +136,7 @@ class TryingOut(NamedTuple):
     n_epochs: int
     batch_size: int
     averaging: float
+    focus: float = 0.0  # share of what is tried that a scout chooses
 
 
 class Actor(Protocol):
@@ -135,6 +147,9 @@ class Actor(Protocol):
 
     def act(self, observation: Float32s) -> Float32s:
         """Actions [rows] in [-1, 1]."""
+
+    def expect(self, observation: Float32s) -> Floats:
+        """The size of the gradient that its scouts expect, [rows]."""
 
 
 class CounterfactualModel(BaseAlgorithm):
@@ -157,7 +172,9 @@ class CounterfactualModel(BaseAlgorithm):
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        self.policy = AveragedActor(self.observation_space, self.action_space, self.lr_schedule, self._shape)
+        self.policy = AveragedActor(
+            self.observation_space, self.action_space, self.lr_schedule, self._shape, self.how.focus
+        )
 
     def learn(
         self,
@@ -205,8 +222,9 @@ class CounterfactualModel(BaseAlgorithm):
         """Try some of the visited decisions with more and with less, each to the end of its episode."""
         assert isinstance(self.env, EthBrakeVecEnv)
         how, learners = self.how, len(self.env.engine.learners)
-        rows = moving_rows(moments, self.env.engine.scenario.vehicles).repeat(learners)
-        rows = np.flatnonzero(rows)[torch.randperm(int(rows.sum()))[: how.counterfactuals].numpy()]
+        moving = np.flatnonzero(moving_rows(moments, self.env.engine.scenario.vehicles).repeat(learners))
+        observed = seen.reshape(-1, seen.shape[2])
+        rows, importance = choose_rows(observed, moving, how.counterfactuals, how.focus, actor.expect)
         sizes = _log_uniform(*how.offset, len(rows))
         holds = np.array(how.holds, np.int64)[torch.randint(len(how.holds), (len(rows),)).numpy()]
         both = np.concatenate([sizes, -sizes])
@@ -216,15 +234,16 @@ class CounterfactualModel(BaseAlgorithm):
         gained, moved = play_to_the_end(engine, actor.act, offsets, how.gamma)
         gradient = np.clip(_difference(gained) / _difference(moved), -how.gradient_limit, how.gradient_limit)
         good = np.isfinite(gradient)
-        observed = seen.reshape(-1, seen.shape[2])[rows[good]]
-        return Tried(observed, actor.means(observed), gradient[good].astype(np.float32))
+        then = observed[rows[good]]
+        return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
 
     def _train(self, actor: AveragedActor, tried: Tried) -> None:
         """Regress the actor on actions that are better, within the trust radius; log what that was."""
         how = self.how
         self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, how.trust_radius, how.anchor)
-        seen, wanted, weights = (torch.from_numpy(array) for array in (tried.seen, target, weight))
+        arrays = (tried.seen, target, weight * tried.importance, np.abs(tried.gradient), tried.importance)
+        seen, wanted, weights, sizes, importance = (torch.from_numpy(array) for array in arrays)
         losses = []
         for _ in range(how.n_epochs):
             for batch in torch.split(torch.randperm(len(wanted)), how.batch_size):
@@ -232,6 +251,8 @@ class CounterfactualModel(BaseAlgorithm):
                 loss = (weights[batch] * (means - wanted[batch]) ** 2).mean()
                 actor.optimizer.zero_grad()
                 loss.backward()
+                if actor.scout is not None:
+                    actor.scout.loss(seen[batch], sizes[batch], importance[batch]).backward()  # type: ignore[no-untyped-call]
                 actor.optimizer.step()
                 actor.follow(how.averaging)
                 losses.append(loss.item())

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Space
-from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import update_learning_rate
 from torch import Tensor, nn
@@ -21,6 +19,7 @@ from ethbrake_marl.engine.branches import Act, Moment, branch, visit
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.learning.algorithms.averaged_gate import AveragedGate
 from ethbrake_marl.learning.algorithms.counterfactual_model import (
     AveragedActor,
     CounterfactualModel,
@@ -30,9 +29,9 @@ from ethbrake_marl.learning.algorithms.counterfactual_model import (
 )
 from ethbrake_marl.learning.algorithms.mode_worlds import Shown, drive_from, explore, own_worlds, show_templates
 from ethbrake_marl.learning.algorithms.modes import ModesPlan, Stage, stages_of
-from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS
+from ethbrake_marl.learning.algorithms.scout import Scout, choose_rows
 from ethbrake_marl.learning.recipe import ActorShape
-from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.physics import Floats
 from ethbrake_marl.policies.actor import Float32s
 
 OTHER_COUNT: dict[HarmCount, HarmCount] = {"first": "total", "total": "first"}
@@ -44,65 +43,23 @@ class NoOtherMode(EthBrakeError, ValueError):
     """No template does better than the networks so far: there is no other mode to be learned."""
 
 
-class AveragedGate(nn.Module):
-    """A gate that learns (``learning``), and the running average of its weights (``average``), which decides.
-
-    It remembers the last decisions at which networks were compared: what was seen, and how much more than the best one
-    each of them costs.
-    """
-
-    seen: Tensor  # [M, F]
-    more: Tensor  # [M, K]
-    compared: Tensor  # [1] so far; the newest take the places of the oldest
-
-    def __init__(self, inputs: int, networks: int, plan: ModesPlan, shape: ActorShape, rate: Schedule) -> None:
-        super().__init__()
-        layers = create_mlp(inputs, networks, list(plan.gate), ACTIVATIONS[shape.activation])
-        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, the first network acts
-        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]
-        self.average = nn.Sequential(*layers)
-        self.learning = copy.deepcopy(self.average)
-        self.optimizer = torch.optim.Adam(self.learning.parameters(), lr=rate(1.0), eps=1e-5)
-        self.register_buffer("seen", torch.zeros(plan.gate_memory, inputs))
-        self.register_buffer("more", torch.zeros(plan.gate_memory, networks))
-        self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
-
-    def remember(self, seen: Float32s, more: Float32s) -> None:
-        """Keep compared decisions."""
-        M, before = len(self.seen), int(self.compared)
-        places = torch.arange(before, before + len(seen)) % M
-        self.seen[places], self.more[places] = torch.from_numpy(seen), torch.from_numpy(more)
-        self.compared += len(seen)
-
-    def recall(self, count: int) -> tuple[Tensor, Tensor]:
-        """Some of the kept ones, [count, F] and [count, K]."""
-        some = torch.randint(min(int(self.compared), len(self.seen)), (count,))
-        return self.seen[some], self.more[some]
-
-    def choose(self, observation: Float32s) -> NDArray[np.int64]:
-        """Which network acts on each of the observations [rows, F], [rows]."""
-        with torch.no_grad():
-            chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
-        return chosen
-
-    def follow(self, keep: float) -> None:
-        """Move the average towards the weights that learn, keeping this share of what it was."""
-        with torch.no_grad():
-            for mean, learns in zip(self.average.parameters(), self.learning.parameters(), strict=True):
-                mean.lerp_(learns, 1.0 - keep)
-
-
 class ModesPolicy(BasePolicy):
     """Several actors and a gate; under the names that ``policies.manifest.tensor_table`` has for them."""
 
     def __init__(
-        self, observation_space: Space[Any], action_space: Any, rate: Schedule, shape: ActorShape, plan: ModesPlan
+        self,
+        observation_space: Space[Any],
+        action_space: Any,
+        rate: Schedule,
+        shape: ActorShape,
+        plan: ModesPlan,
+        focus: float = 0.0,
     ) -> None:
         super().__init__(observation_space, action_space)
         assert isinstance(observation_space, Box)
-        actors = [AveragedActor(observation_space, action_space, rate, shape) for _ in range(plan.networks)]
+        actors = [AveragedActor(observation_space, action_space, rate, shape, focus) for _ in range(plan.networks)]
         self.members = nn.ModuleList(actors)
-        self.gate = AveragedGate(observation_space.shape[0], plan.networks, plan, shape, rate)
+        self.gate = AveragedGate(observation_space.shape[0], plan, shape, rate, focus)
 
     def member(self, number: int) -> AveragedActor:
         """One of its actors."""
@@ -121,6 +78,14 @@ class ModesPolicy(BasePolicy):
     def act(self, observation: Float32s) -> Float32s:
         """Its actions [rows] in [-1, 1]."""
         return np.clip(self.means(observation), -1.0, 1.0)
+
+    def expect(self, observation: Float32s) -> Floats:
+        """The size of the gradient that the scouts of the actors expect where the gate chooses them, [rows]."""
+        chosen, found = self.gate.choose(observation), np.empty(len(observation))
+        for number in range(len(self.members)):
+            rows = np.flatnonzero(chosen == number)
+            found[rows] = self.member(number).expect(observation[rows])
+        return found
 
     def forward(self, observation: Tensor) -> Tensor:
         """Actions [rows, 1] of the averages."""
@@ -150,7 +115,9 @@ class ModesModel(CounterfactualModel):
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        self.policy = ModesPolicy(self.observation_space, self.action_space, self.lr_schedule, self._shape, self.plan)
+        self.policy = ModesPolicy(
+            self.observation_space, self.action_space, self.lr_schedule, self._shape, self.plan, self.how.focus
+        )
 
     def _update(self, told: BaseCallback, total: int) -> None:
         each = self.n_envs * self.how.n_steps
@@ -233,8 +200,8 @@ class ModesModel(CounterfactualModel):
             if len(rows) > 1:
                 self._train(self.policy.member(number), Tried(*(array[rows] for array in tried)))
 
-    def _compare(self, seen: Float32s, moments: Moment) -> tuple[Float32s, Floats]:
-        """What is seen [B, F] at some visited decisions, and what going on with each network costs there [B, K].
+    def _compare(self, seen: Float32s, moments: Moment) -> tuple[Float32s, Floats, Float32s]:
+        """At some decisions: what is seen [B, F], what going on with each network costs [B, K], what each counts [B].
 
         Where all networks would do the same now nothing depends on the choice: the gate is asked again at the next one.
         """
@@ -243,26 +210,29 @@ class ModesModel(CounterfactualModel):
         observed = seen.reshape(-1, seen.shape[2])
         actions = np.stack([act(observed) for act in members])
         differ = (np.ptp(actions, axis=0) > SAME_ACTION) & moving_rows(moments, engine.scenario.vehicles)
-        rows: Ints = np.flatnonzero(differ)
-        rows = rows[torch.randperm(len(rows))[: self.plan.gate_states].numpy()]
+        count, expect = self.plan.gate_states, self.policy.gate.expect
+        rows, importance = choose_rows(observed, np.flatnonzero(differ), count, self.how.focus, expect)
         other, then = OTHER_COUNT[engine.reward.harm_count], moments.take(rows)
         costs = np.empty((len(rows), len(members)))
         for number, act in enumerate(members):
             gained, harm = drive_from(engine, then, act, self.how.gamma, other)
             costs[:, number] = self.plan.tie_break * harm - gained
         good = np.isfinite(costs).all(axis=1)
-        return observed[rows[good]], costs[good]
+        return observed[rows[good]], costs[good], importance[good]
 
-    def _train_gate(self, seen: Float32s, costs: Floats) -> None:
+    def _train_gate(self, seen: Float32s, costs: Floats, importance: Float32s | None = None) -> None:
         """Teach the gate which network costs least, each decision as much as the others would cost more."""
+        importance = np.ones(len(seen), np.float32) if importance is None else importance
         gate = self.policy.gate
         self._update_learning_rate(gate.optimizer)
         more = (costs - costs.min(axis=1, keepdims=True)).astype(np.float32)
         rows = np.flatnonzero(more.max(axis=1) > SAME_COST)
-        gate.remember(seen[rows], more[rows])
+        gate.remember(seen[rows], more[rows] * importance[rows, np.newaxis])
+        if gate.scout is not None:
+            self._train_scout(gate.scout, seen, more.max(axis=1), importance)
         if len(rows):
             regret = np.take_along_axis(more[rows], gate.choose(seen[rows])[:, np.newaxis], axis=1)
-            self.logger.record("gate/regret", float(regret.mean()))
+            self.logger.record("gate/regret", float((regret[:, 0] * importance[rows]).mean()))
         if int(gate.compared) == 0:
             return
         losses = []
@@ -277,3 +247,11 @@ class ModesModel(CounterfactualModel):
             gate.follow(self.how.averaging)
             losses.append(loss.item())
         self.logger.record("gate/loss", float(np.mean(losses)))
+
+    def _train_scout(self, scout: Scout, seen: Float32s, size: Float32s, importance: Float32s) -> None:
+        """Teach the gate's scout what the choice was worth, in one pass."""
+        arrays = [torch.from_numpy(array) for array in (seen, size, importance)]
+        for batch in torch.split(torch.randperm(len(seen)), self.how.batch_size):
+            self.policy.gate.optimizer.zero_grad()
+            scout.loss(*(array[batch] for array in arrays)).backward()  # type: ignore[no-untyped-call]
+            self.policy.gate.optimizer.step()
