@@ -182,6 +182,12 @@ def has_finished(run: RunDirectory) -> bool:
     return status.get("status") == "finished" or (status.get("stage") is not None and not resumable)
 
 
+def is_finished(path: Path) -> bool:
+    """Whether ``path`` holds a training that came to its end."""
+    run = RunDirectory(path)
+    return run.status.is_file() and read_object(run.status).get("status") == "finished"
+
+
 @contextmanager
 def only_process(run: RunDirectory) -> Iterator[None]:
     """Hold the run's lock, which ends with the process however it ends.
