@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ethbrake_marl.cli.machine import this_machine
-from ethbrake_marl.cli.options import JsonOption, ScenarioOption
-from ethbrake_marl.cli.settings import SetOption, read_settings
+from ethbrake_marl.cli.options import JsonOption, ScenarioOption, SetOption
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, show, write_json
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import LIST_SEED, load_runnable
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.learning.settings import read_settings
 
 if TYPE_CHECKING:
     from ethbrake_marl.studies.ablation.plan import Plan
@@ -157,7 +157,7 @@ def _plan(
     given = read_settings(settings, loaded)
     plan = Plan(
         levels=tuple(read_levels(names, given.scenario)),
-        recipes=tuple(with_scheme(given.change(recipe), chosen) for recipe in loaded),
+        recipes=tuple(with_scheme(given.change(recipe, say), chosen) for recipe in loaded),
         noted=given.texts,
         list_seed=list_seed,
         folder=output,

@@ -43,6 +43,12 @@ ForceOption = Annotated[bool, typer.Option("--force", help="Replace what is alre
 VehicleOption = Annotated[
     str | None, typer.Option(help="Who is driven; other learners brake fully.", show_default="the learner")
 ]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Another value of the scenario, or of the recipe: mass_t=40. Repeatable."
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout.")]
 
 
