@@ -11,13 +11,14 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
+from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
 from ethbrake_marl.studies.jobs.work import ONE_THREAD, Answer, answer, process_name
 
 _WAIT_S = 1.0
 
 
-class WorkerLost(RuntimeError):
+class WorkerLost(EthBrakeError):
     """A worker ended in the middle of a job."""
 
 
