@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ethbrake_marl.cli.machine import this_machine
-from ethbrake_marl.cli.options import JsonOption, ScenarioOption, SetOption
+from ethbrake_marl.cli.options import JobsOption, JsonOption, ScenarioOption, SetOption
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, show, write_json
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import LIST_SEED, load_runnable
@@ -95,6 +95,7 @@ def generalise_command(
     search_episodes: Annotated[int, typer.Option(help="Worlds of the joint optimum; 0: none.")] = 0,
     budget: Annotated[int, typer.Option(help="Candidates per world of that search.")] = 20_000,
     settings: SetOption = None,
+    jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Let trained policies drive longer lines with the same weights.
@@ -115,7 +116,7 @@ def generalise_command(
     agents = load_runs([each.strip() for each in runs.split(",")], line)
     question = LineQuestion(line, lengths, episodes, seed, harm_count, search_episodes, budget)
     with interruptible("nothing was written"), progress_bars() as bars:
-        found = drive_longer(question, agents, bars.show_progress)
+        found = drive_longer(question, agents, bars.show_progress, jobs)
     if as_json:
         write_json([one.to_json() for one in found])
     else:

@@ -49,6 +49,9 @@ SetOption = Annotated[
         "--set", metavar="KEY=VALUE", help="Another value of the scenario, or of the recipe: mass_t=40. Repeatable."
     ),
 ]
+JobsOption = Annotated[
+    int, typer.Option("--jobs", min=1, max=64, help="So many at once, a process each; changes no result.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout.")]
 
 

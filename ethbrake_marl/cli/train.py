@@ -10,6 +10,7 @@ import typer
 
 from ethbrake_marl.cli.options import (
     ForceOption,
+    JobsOption,
     JsonOption,
     NameOption,
     OutputOption,
@@ -133,6 +134,7 @@ def learning_curves_command(
     ] = "ppo:5,sac:3",
     settings: SetOption = None,
     steps: StepsOption = None,
+    jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Train several seeds of several recipes, and draw their learning curves in one figure.
@@ -155,6 +157,7 @@ def learning_curves_command(
                 plan,
                 output,
                 steps=steps,
+                jobs=jobs,
                 tell=bars.show_progress,
                 settings=given.texts,
             )

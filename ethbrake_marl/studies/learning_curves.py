@@ -65,12 +65,13 @@ def train_all(
     *,
     steps: int | None = None,
     settings: Sequence[str] = (),
+    jobs: int = 1,
     tell: OnProgress | None = None,
 ) -> bool:
     """Train every seed of every recipe into ``folder/RECIPE-seedK``: finished ones are kept, begun ones go on.
 
-    Gives False when Ctrl-C stopped it. Raises ``InvalidInput`` for a folder that holds another training than this one
-    would be (``learning.training``), before any is begun, besides what ``train`` raises.
+    ``jobs`` of them at a time. Gives False when Ctrl-C stopped it. Raises ``InvalidInput`` for a folder that holds
+    another training than this one would be (``learning.training``), before any is begun, besides what ``train`` raises.
     """
     wanted = {
         folder / f"{trainings.recipe.name}-seed{seed}": resolve(
@@ -82,9 +83,8 @@ def train_all(
     for path, training in wanted.items():
         if RunDirectory(path).status.is_file():
             check_same(path, training)
-    return finish_trainings(
-        [TrainingJob(training, path, tuple(settings)) for path, training in wanted.items()], 1, tell
-    )
+    trainings = [TrainingJob(training, path, tuple(settings)) for path, training in wanted.items()]
+    return finish_trainings(trainings, jobs, tell)
 
 
 def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) -> dict[str, Any]:

@@ -22,9 +22,6 @@ import yaml
 from ethbrake_marl.studies.jobs.local import LocalWorkers
 from ethbrake_marl.studies.jobs.run import Attempt, run_jobs
 from ethbrake_marl.studies.jobs.work import pack
-from ethbrake_marl.studies.sweep.file import read_sweep
-from ethbrake_marl.studies.sweep.plan import Row, SweepPlan, plan_sweep
-from ethbrake_marl.studies.sweep.run import run_sweep
 
 NOTHING = ("0", "0", *["0.0"] * 6, "")
 
@@ -36,6 +33,11 @@ def no_work(row: tuple[str, ...]) -> tuple[str, ...]:
 
 def empty_jobs(folder: Path, jobs: int) -> None:
     """Plan and record so many jobs of no work."""
+    # torch takes seconds to load, and the processes that load this file again need none
+    from ethbrake_marl.studies.sweep.file import read_sweep
+    from ethbrake_marl.studies.sweep.plan import Row, SweepPlan, plan_sweep
+    from ethbrake_marl.studies.sweep.run import run_sweep
+
     grid = {"scenario": ["paper-random", "paper-distance"], "recipe": ["ppo", "sac"], "seed": {"count": jobs // 4}}
     file = folder / "sweep.yaml"
     file.write_text(yaml.safe_dump({"grid": grid}))
@@ -57,20 +59,24 @@ def empty_jobs(folder: Path, jobs: int) -> None:
 
 
 def busy_processes(jobs: int, busy_s: float) -> None:
-    """How much of the time two processes had a job, while long jobs were left."""
-    worked_s, processes = 0.0, 2
+    """How much of the time two processes had a job; the first of each begins when the process has."""
+    processes = 2
+    worked_s, begun = 0.0, time.monotonic()
+    first_s: list[float] = []
 
     def note(attempt: Attempt) -> None:
         nonlocal worked_s
         worked_s += busy_s
+        first_s.append(time.monotonic() - begun - busy_s)
 
     started = time.monotonic()
     with closing(LocalWorkers(processes)) as workers:
         run_jobs(lambda number: pack(_sleep, busy_s), jobs, workers, note)
     wall_s = time.monotonic() - started
+    ideal_s = worked_s / processes
     print(
-        f"{jobs} jobs of {busy_s:g} s on {processes} processes: {wall_s:.1f} s,"
-        f" {100.0 * worked_s / processes / wall_s:.1f} % of ideal, {(wall_s - worked_s / processes) / jobs:.2f} s a job"
+        f"{jobs} jobs of {busy_s:g} s on {processes} processes: {wall_s:.1f} s, {100.0 * ideal_s / wall_s:.1f} % of"
+        f" ideal, {(wall_s - ideal_s) / jobs:.2f} s a job; the first had begun after {first_s[0]:.1f} s"
     )
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from typing import Any
 
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
+from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.studies.jobs.run import Attempt, run_jobs
 from ethbrake_marl.studies.jobs.work import ONE_THREAD, Answer, answer, process_name
 
 _WAIT_S = 1.0
@@ -104,6 +107,31 @@ class LocalWorkers:
         how = f"was killed by signal {-ended}" if ended < 0 else f"ended with status {ended}"
         where = f"{os.uname().nodename}, process {worker.process.pid}"
         return Answer(None, WorkerLost(f"the worker {how} in the middle of the job"), True, 0.0, where)
+
+
+def run_all(
+    call_of: Callable[[int], bytes], jobs: int, processes: int, name: str, tell: OnProgress
+) -> list[Any] | None:
+    """What every job gives, in their order; None when Ctrl-C stopped it. Raises what the first job raises that fails.
+
+    ``name`` is what they are called together to who is told.
+    """
+    found: list[Any] = [None] * jobs
+    done = 0
+    tell(Progress(name, done, jobs))
+
+    def note(attempt: Attempt) -> None:
+        nonlocal done
+        if not attempt.last:
+            return
+        if attempt.answer.error is not None:
+            raise attempt.answer.error
+        found[attempt.number] = attempt.answer.value
+        done += 1
+        tell(Progress(name, done, jobs))
+
+    with closing(LocalWorkers(processes)) as workers:
+        return found if run_jobs(call_of, jobs, workers, note) else None
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,8 +11,7 @@ from ethbrake_marl.learning.run_folder import RunDirectory, is_finished
 from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.learning.training import Training
 from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.studies.jobs.local import LocalWorkers
-from ethbrake_marl.studies.jobs.run import Attempt, run_jobs
+from ethbrake_marl.studies.jobs.local import run_all
 from ethbrake_marl.studies.jobs.work import pack
 
 
@@ -47,22 +45,8 @@ def finish_trainings(jobs: Sequence[TrainingJob], processes: int = 1, tell: OnPr
     say = tell or (lambda progress: None)
     if processes == 1 or len(jobs) < 2:
         return all(finish_training(job, partial(_tell_named, say, job.folder.name)) for job in jobs)
-    say(Progress("trainings", 0, len(jobs)))
-    done = 0
-
-    def note(attempt: Attempt) -> None:
-        nonlocal done
-        if attempt.last and attempt.answer.error is not None:
-            raise attempt.answer.error
-        if attempt.last:
-            done += 1
-            say(Progress("trainings", done, len(jobs)))
-
-    def call_of(number: int) -> bytes:
-        return pack(finish_training, jobs[number])
-
-    with closing(LocalWorkers(processes)) as workers:
-        return run_jobs(call_of, len(jobs), workers, note)
+    found = run_all(lambda number: pack(finish_training, jobs[number]), len(jobs), processes, "trainings", say)
+    return found is not None
 
 
 def _tell_named(tell: Callable[[Progress], None], name: str, progress: Progress) -> None:
