@@ -15,7 +15,7 @@ from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.files.messages import Wording, explain
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 
-MOST_JOBS = 1_000_000
+MOST_JOBS = 200_000
 LEVEL = "cooperation-"  # how the scenario of a level of cooperation begins
 
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
