@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.run_folder import RunDirectory, progress_rows, wait_for_others
 from ethbrake_marl.learning.training import Training, check_same
@@ -31,8 +31,9 @@ _FREE_S = 60.0  # a worker that has lost its driver may hold the folder for a mo
 def do_job(job: TrainingJob, log: Path) -> tuple[str, ...] | None:
     """The values of ``RESULTS``, as text; None where the training was stopped before its end.
 
-    What is printed goes to ``log``, which is deleted at a good end. Raises what a training raises, and
-    ``InvalidInput`` where the sweep's folder cannot be seen or the run's folder holds another training.
+    What is printed goes to ``log``, which is deleted at a good end. Raises what a training raises, ``InvalidInput``
+    where the sweep's folder cannot be seen or the run's folder holds another training, and ``BlockingIOError`` where
+    another worker has just begun it.
     """
     if not log.parent.is_dir():
         raise InvalidInput(
@@ -43,7 +44,11 @@ def do_job(job: TrainingJob, log: Path) -> tuple[str, ...] | None:
         if RunDirectory(job.folder).status.is_file():
             wait_for_others(job.folder, _FREE_S)
             check_same(job.folder, job.training)
-        found = read_results(job.training, job.folder) if finish_training(job) else None
+        try:
+            finished = finish_training(job)
+        except AlreadyExists as error:  # begun in this moment by a worker that has lost its driver
+            raise BlockingIOError(str(error)) from None
+        found = read_results(job.training, job.folder) if finished else None
     if found is not None:
         log.unlink(missing_ok=True)
     return found
