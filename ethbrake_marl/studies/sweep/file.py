@@ -22,7 +22,6 @@ _Seed = Annotated[int, Field(ge=0, lt=2**32)]
 _Names = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
 _Values = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
 _Settings = dict[str, Any]
-_SEED_IN_SET = "seed is no setting here; give it beside recipe, as seed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +52,15 @@ class SeedRange(_Part):
     count: Annotated[int, Field(ge=1, le=MOST_JOBS)]
 
 
+def _check_keys(value: _Settings) -> _Settings:
+    for key in value:
+        if key in ("seed", "recipe.seed"):
+            raise ValueError("seed is no setting here; give it beside recipe, as seed")
+        if "=" in key:
+            raise ValueError(f"{flow_text(key, 60)}: a key has no = in it")
+    return value
+
+
 def _form_of_seeds(value: Any) -> str:
     return "#range" if isinstance(value, dict | SeedRange) else "#list"
 
@@ -70,10 +78,8 @@ class _Lines(_Part):
 
     @field_validator("settings")
     @classmethod
-    def _no_seed(cls, value: _Settings) -> _Settings:
-        if {"seed", "recipe.seed"} & value.keys():
-            raise ValueError(_SEED_IN_SET)
-        return value
+    def _keys_of_settings(cls, value: _Settings) -> _Settings:
+        return _check_keys(value)
 
     @model_validator(mode="after")
     def _one_of_two(self) -> _Lines:
@@ -127,10 +133,8 @@ class SweepFile(_Part):
 
     @field_validator("settings")
     @classmethod
-    def _no_seed(cls, value: _Settings) -> _Settings:
-        if {"seed", "recipe.seed"} & value.keys():
-            raise ValueError(_SEED_IN_SET)
-        return value
+    def _keys_of_settings(cls, value: _Settings) -> _Settings:
+        return _check_keys(value)
 
     def requests(self) -> Iterator[Request]:
         """The jobs: of the grid, seed by seed, so that first results of all are there early; then those listed."""
