@@ -83,7 +83,8 @@ def run_sweep(
     for name in (RUNS, LOGS):
         (folder / name).mkdir(parents=True, exist_ok=True)
     with _only_sweep(folder):
-        remove_unfinished(folder)
+        for place in (folder, folder / RUNS):
+            remove_unfinished(place)
         results, left, damaged = kept_results(plan, folder)
         failures: list[Failure] = []
         with Journal(folder) as journal:
