@@ -9,7 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.files.messages import Wording, explain
@@ -21,7 +31,19 @@ LEVEL = "cooperation-"  # how the scenario of a level of cooperation begins
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
 _Names = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
 _Values = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
-_Settings = dict[str, Any]
+
+
+def _check_keys(value: dict[str, Any]) -> dict[str, Any]:
+    for key in value:
+        if key in ("seed", "recipe.seed"):
+            raise ValueError("seed is no setting here; give it beside recipe, as seed")
+        if "=" in key:
+            raise ValueError(f"{flow_text(key, 60)}: a key has no = in it")
+    return value
+
+
+_Settings = Annotated[dict[str, Any], AfterValidator(_check_keys)]
+_Lists = Annotated[dict[str, _Values], AfterValidator(_check_keys)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +74,6 @@ class SeedRange(_Part):
     count: Annotated[int, Field(ge=1, le=MOST_JOBS)]
 
 
-def _check_keys(value: _Settings) -> _Settings:
-    for key in value:
-        if key in ("seed", "recipe.seed"):
-            raise ValueError("seed is no setting here; give it beside recipe, as seed")
-        if "=" in key:
-            raise ValueError(f"{flow_text(key, 60)}: a key has no = in it")
-    return value
-
-
 def _form_of_seeds(value: Any) -> str:
     return "#range" if isinstance(value, dict | SeedRange) else "#list"
 
@@ -76,11 +89,6 @@ class _Lines(_Part):
 
     settings: _Settings = Field(default={}, alias="set")
 
-    @field_validator("settings")
-    @classmethod
-    def _keys_of_settings(cls, value: _Settings) -> _Settings:
-        return _check_keys(value)
-
     @model_validator(mode="after")
     def _one_of_two(self) -> _Lines:
         if (getattr(self, "scenario", None) is None) == (getattr(self, "level", None) is None):
@@ -95,7 +103,7 @@ class Grid(_Lines):
     level: _Names | None = None
     recipe: _Names
     seed: _Seeds = (0,)
-    settings: dict[str, _Values] = Field(default={}, alias="set")
+    settings: _Lists = Field(default={}, alias="set")
 
     @field_validator("scenario", "level", "recipe", "seed", mode="before")
     @classmethod
@@ -131,11 +139,6 @@ class SweepFile(_Part):
     grid: Grid | None = None
     jobs: Annotated[tuple[ListedJob, ...], Field(strict=False)] = ()
 
-    @field_validator("settings")
-    @classmethod
-    def _keys_of_settings(cls, value: _Settings) -> _Settings:
-        return _check_keys(value)
-
     def requests(self) -> Iterator[Request]:
         """The jobs: of the grid, seed by seed, so that first results of all are there early; then those listed."""
         if self.grid is not None:
@@ -155,7 +158,7 @@ class SweepFile(_Part):
             for (scenario, level), recipe, texts in itertools.product(lines, grid.recipe, changes):
                 yield Request("grid", scenario, level, recipe, seed, texts)
 
-    def _texts(self, own: _Settings, place: str) -> tuple[str, ...]:
+    def _texts(self, own: dict[str, Any], place: str) -> tuple[str, ...]:
         twice = [key for key in own if key in self.settings]
         if twice:
             raise InvalidInput(f"{place}.set.{twice[0]}: stands in the file's own set too; leave one of them out")
