@@ -62,7 +62,7 @@ def main() -> int:
     workers = LocalWorkers(options.jobs) if options.ray is None else RayWorkers(options.ray)
     with closing(workers):
         result = run_sweep(plan, options.folder, workers, retries=5, call_of=call_of)
-    return len(result.failures)
+    return 130 if result.interrupted else len(result.failures)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import json
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -22,6 +23,7 @@ from ethbrake_marl.policies.policy import load_policy
 from tests.studies.sweep.disturbing import PROGRAM, holders, journal
 
 TABLE = "results.csv"
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def read(file: Path) -> list[dict[str, str]]:
@@ -123,13 +125,30 @@ def test_bad_options__are_refused(write_sweep, small, tmp_path, options):
     assert not (tmp_path / "new").exists()
 
 
-def test_disturbed_sweep__has_the_same_table(finished_sweep, small, tmp_path):
-    """Two processes: the driver is killed while they train, then ended by Ctrl-C, then left alone."""
-    folder, file = tmp_path / "out", tmp_path / "sweep.yaml"
+@pytest.mark.long
+def test_disturbed_sweep__of_trainings_has_the_same_table(finished_sweep, small, tmp_path):
+    file = tmp_path / "sweep.yaml"
     file.write_text(yaml.safe_dump(small))
-    command = [*PROGRAM, "sweep", str(file), "--output", str(folder), "--jobs", "2"]
+    folder = tmp_path / "out"
+    disturb([*PROGRAM, "sweep", str(file), "--output", str(folder), "--jobs", "2"], folder)
+    assert (folder / TABLE).read_bytes() == (finished_sweep / TABLE).read_bytes()
+    assert sorted(ends(folder).values()) == [1, 1, 1, 1]
+
+
+def test_disturbed_sweep__has_the_same_table(write_sweep, tmp_path):
+    file = write_sweep(grid={"scenario": "paper-random", "recipe": "ppo", "seed": {"count": 6}})
+    command = [sys.executable, "-m", "tests.studies.sweep.counting", str(file)]
+    alone, folder = tmp_path / "alone", tmp_path / "out"
+    subprocess.run([*command, str(alone), "--jobs", "1"], cwd=ROOT, stderr=subprocess.DEVNULL, check=True)
+    disturb([*command, str(folder), "--jobs", "2"], folder)
+    assert (folder / TABLE).read_bytes() == (alone / TABLE).read_bytes()
+    assert sorted(ends(folder).values()) == [1] * 6
+
+
+def disturb(command: list[str], folder: Path) -> None:
+    """Begin a sweep, kill it while jobs run, begin it again, end it by Ctrl-C; the third one comes to its end."""
     for end in (signal.SIGKILL, signal.SIGINT):
-        driver = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        driver = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
         try:
             while not holders(folder):
                 assert driver.poll() is None
@@ -141,8 +160,10 @@ def test_disturbed_sweep__has_the_same_table(finished_sweep, small, tmp_path):
             driver.wait()
         while holders(folder):  # processes whose driver was killed end by themselves
             time.sleep(0.01)
-    finished = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=600, check=False)
+    finished = subprocess.run(command, cwd=ROOT, stderr=subprocess.PIPE, text=True, timeout=600, check=False)
     assert finished.returncode == 0, finished.stderr
-    assert (folder / TABLE).read_bytes() == (finished_sweep / TABLE).read_bytes()
-    ends = Counter(one["hash"] for one in journal(folder) if one["status"] == "finished")
-    assert sorted(ends.values()) == [1, 1, 1, 1]
+
+
+def ends(folder: Path) -> Counter[str]:
+    """How often each job was finished."""
+    return Counter(one["hash"] for one in journal(folder) if one["status"] == "finished")
