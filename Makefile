@@ -27,7 +27,7 @@ if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for th
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -41,6 +41,7 @@ help:
 	@echo "make test-light       install the wheel alone: at most 650 MB, no torch, and its examples run"
 	@echo "make test-libraries   train with other people's libraries, each in its own environment below .venvs/, and print the matrix"
 	@echo "make proofs           statements about the code that a solver proves, one line each"
+	@echo "make test-cluster     a sweep on a Ray cluster of two nodes on this machine, whose workers are killed at random, its driver once"
 	@echo "make shield-bugs      plant 19 bugs in copies of the shield; each must turn a test red"
 	@echo "make test-bounds      the tests at the lowest versions that pyproject.toml allows, and at the newest"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
@@ -146,6 +147,10 @@ test-libraries: $(STAMP)
 proofs: $(STAMP)
 	@echo "== proofs"
 	@NUMBA_DISABLE_JIT=1 $(BIN)/python -m tests.proofs
+test-cluster: $(STAMP)
+	@echo "== a sweep on a Ray cluster, disturbed"
+	@$(PIP_INSTALL) -e ".[cluster]"
+	@$(BIN)/python -m tests.studies.sweep.cluster $(ARGS)
 
 shield-bugs: $(STAMP)
 	@echo "== planted shield bugs"

@@ -106,6 +106,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("pyarrow", "minari", "h5py"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("starlette", "uvicorn"), "explore"),
+    "ray": "cluster",
 }
 
 

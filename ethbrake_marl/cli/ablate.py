@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ethbrake_marl.cli.machine import this_machine
-from ethbrake_marl.cli.options import JsonOption, ScenarioOption
-from ethbrake_marl.cli.settings import SetOption, read_settings
+from ethbrake_marl.cli.options import JobsOption, JsonOption, ScenarioOption, SetOption
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, show, write_json
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import LIST_SEED, load_runnable
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.learning.settings import read_settings
 
 if TYPE_CHECKING:
     from ethbrake_marl.studies.ablation.plan import Plan
@@ -95,6 +95,7 @@ def generalise_command(
     search_episodes: Annotated[int, typer.Option(help="Worlds of the joint optimum; 0: none.")] = 0,
     budget: Annotated[int, typer.Option(help="Candidates per world of that search.")] = 20_000,
     settings: SetOption = None,
+    jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Let trained policies drive longer lines with the same weights.
@@ -115,7 +116,7 @@ def generalise_command(
     agents = load_runs([each.strip() for each in runs.split(",")], line)
     question = LineQuestion(line, lengths, episodes, seed, harm_count, search_episodes, budget)
     with interruptible("nothing was written"), progress_bars() as bars:
-        found = drive_longer(question, agents, bars.show_progress)
+        found = drive_longer(question, agents, bars.show_progress, jobs)
     if as_json:
         write_json([one.to_json() for one in found])
     else:
@@ -157,7 +158,7 @@ def _plan(
     given = read_settings(settings, loaded)
     plan = Plan(
         levels=tuple(read_levels(names, given.scenario)),
-        recipes=tuple(with_scheme(given.change(recipe), chosen) for recipe in loaded),
+        recipes=tuple(with_scheme(given.change(recipe, say), chosen) for recipe in loaded),
         noted=given.texts,
         list_seed=list_seed,
         folder=output,

@@ -30,6 +30,7 @@ from ethbrake_marl.cli.replay import replay_command
 from ethbrake_marl.cli.reproduce import reproduce_command
 from ethbrake_marl.cli.run import run_experiment_command
 from ethbrake_marl.cli.scenario import scenario_app
+from ethbrake_marl.cli.sweep import sweep_command
 from ethbrake_marl.cli.terminal import (
     abandon_output,
     say,
@@ -71,6 +72,7 @@ app.command("resume", epilog="Example: ethbrake resume runs/paper-random-ppo-see
 app.command(
     "learning-curves", epilog="Example: ethbrake learning-curves --scenario paper-delay-low --output runs/low-delay"
 )(learning_curves_command)
+app.command("sweep", epilog="Example: ethbrake sweep sweep.yaml --output runs/sweep")(sweep_command)
 app.command("ablate", epilog="Example: ethbrake ablate --quick --output runs/ablation-quick")(ablate_command)
 app.command("generalise", epilog=GENERALISE)(generalise_command)
 app.command("export", epilog="Example: ethbrake export runs/early --onnx early.onnx")(export_command)

@@ -13,8 +13,7 @@ import numpy as np
 import typer
 
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption
-from ethbrake_marl.cli.settings import SetOption, read_settings
+from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, say, show, write_json
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import check_target
@@ -22,6 +21,7 @@ from ethbrake_marl.evaluation.bounds import proven_of_table, shipped_bounds, shi
 from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, load_runnable, make_agents
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.learning.settings import read_settings
 from ethbrake_marl.limits.best_harm import BUDGET, LEFT_OUT, search_list
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table, save_table
 from ethbrake_marl.limits.driven_profiles import fold_agent

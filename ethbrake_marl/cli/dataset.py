@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.cli.options import ForceOption, ScenarioOption, VehicleOption
-from ethbrake_marl.cli.settings import SetOption, read_settings
+from ethbrake_marl.cli.options import ForceOption, ScenarioOption, SetOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, say
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.dataset.write import (
@@ -19,6 +18,7 @@ from ethbrake_marl.evaluation.dataset.write import (
 )
 from ethbrake_marl.evaluation.inputs import LIST_SEED, check_agents, load_evaluated, make_lineup
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.learning.settings import read_settings
 from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import typer
 
 from ethbrake_marl.cli.machine import this_machine
-from ethbrake_marl.cli.options import JsonOption, ScenarioOption
-from ethbrake_marl.cli.settings import SetOption, read_settings
+from ethbrake_marl.cli.options import JsonOption, ScenarioOption, SetOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, show, write_json
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.inputs import check_agents, load_driven, make_lineup
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.learning.settings import read_settings
 from ethbrake_marl.limits.shipped import best_known
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, Task

@@ -13,10 +13,9 @@ from rich.table import Table
 
 from ethbrake_marl.agents.knowledge import knowledge_text
 from ethbrake_marl.agents.registry import agent_entries
-from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, VehicleOption
+from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption, VehicleOption
 from ethbrake_marl.cli.picture import PictureOption, counted_without, picture_app, picture_target, tell_left_out
 from ethbrake_marl.cli.report import ReportOption, check_page, write_evaluation_report
-from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation import (
@@ -50,6 +49,7 @@ from ethbrake_marl.evaluation.results_file import results_to_json
 from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table, modes_to_json
 from ethbrake_marl.evaluation.text import metrics_table
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.learning.settings import read_settings
 from ethbrake_marl.scenario import Sample, Task
 from ethbrake_marl.scenario.sample import kind_columns
 from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty

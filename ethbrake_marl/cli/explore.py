@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 
 import typer
 
-from ethbrake_marl.cli.options import ScenarioOption, VehicleOption
-from ethbrake_marl.cli.settings import SetOption, read_settings
+from ethbrake_marl.cli.options import ScenarioOption, SetOption, VehicleOption
 from ethbrake_marl.cli.terminal import say, show
 from ethbrake_marl.errors import need
 from ethbrake_marl.evaluation.inputs import LIST_SEED, load_driven, make_lineup
+from ethbrake_marl.learning.settings import read_settings
 
 AGENTS = "full_brake,copy_leader,e_v2x_bm,ppo@shipped,ppo@shipped+step"
 

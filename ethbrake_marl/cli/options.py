@@ -43,6 +43,15 @@ ForceOption = Annotated[bool, typer.Option("--force", help="Replace what is alre
 VehicleOption = Annotated[
     str | None, typer.Option(help="Who is driven; other learners brake fully.", show_default="the learner")
 ]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Another value of the scenario, or of the recipe: mass_t=40. Repeatable."
+    ),
+]
+JobsOption = Annotated[
+    int, typer.Option("--jobs", min=1, max=64, help="So many at once, a process each; changes no result.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout.")]
 
 

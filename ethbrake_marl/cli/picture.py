@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, VehicleOption
-from ethbrake_marl.cli.settings import SetOption, read_settings
+from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation import check_target
@@ -19,6 +18,7 @@ from ethbrake_marl.evaluation.inputs import LIST_SEED, load_driven, make_agents,
 from ethbrake_marl.evaluation.text import left_out_line
 from ethbrake_marl.figures import picture_ending
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.learning.settings import read_settings
 from ethbrake_marl.physics import LeftOutRows
 from ethbrake_marl.scenario import Task
 from ethbrake_marl.shield.uncertainty import parse_uncertainty

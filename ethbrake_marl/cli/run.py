@@ -14,18 +14,19 @@ from ethbrake_marl.cli.options import (
     OutputOption,
     RecipeOption,
     ScenarioOption,
+    SetOption,
     StepsOption,
     StopWhenLostOption,
     TrainingSeedOption,
     VehicleOption,
 )
-from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, say, write_json
 from ethbrake_marl.cli.train import KEPT, end_of_training
 from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, load_driven
 from ethbrake_marl.evaluation.per_world import PER_WORLD
 from ethbrake_marl.evaluation.results_file import results_to_json
 from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.settings import read_settings
 
 
 def run_experiment_command(
@@ -55,7 +56,7 @@ def run_experiment_command(
 
         plan = load_recipe(recipe)
         given = read_settings(settings, [plan])
-        chosen, plan = load_driven(scenario, vehicle, given.scenario), given.change(plan)
+        chosen, plan = load_driven(scenario, vehicle, given.scenario), given.change(plan, say)
         folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
         with progress_bars() as bars:
             result = run_experiment(

@@ -130,11 +130,20 @@ class Bars:
         self._last_label, self._last_done = "", False
 
     def show(
-        self, name: str, done: int, total: int, metrics: Mapping[str, float] | None = None, note: str = ""
+        self,
+        name: str,
+        done: int,
+        total: int,
+        metrics: Mapping[str, float] | None = None,
+        note: str = "",
+        label: str | None = None,
     ) -> None:
-        """The part ``name`` has come to ``done`` of ``total``; ``note`` is said once, above the bars."""
+        """The part ``name`` has come to ``done`` of ``total``; ``note`` is said once, above the bars.
+
+        ``label`` is what stands before the figures, by default the name and the harm.
+        """
         harm = (metrics or {}).get("first_impact_harm")
-        label = one_line(name if harm is None else f"{name}, first-impact harm {harm:.2f}")
+        label = one_line(label or (name if harm is None else f"{name}, first-impact harm {harm:.2f}"))
         if note:
             self.tell(note)
         if self._bars is None:

@@ -10,23 +10,25 @@ import typer
 
 from ethbrake_marl.cli.options import (
     ForceOption,
+    JobsOption,
     JsonOption,
     NameOption,
     OutputOption,
     RecipeOption,
     ScenarioOption,
     SchemeOption,
+    SetOption,
     StepsOption,
     StopWhenLostOption,
     TrainingSeedOption,
 )
-from ethbrake_marl.cli.settings import SetOption, read_settings
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, write_json
 from ethbrake_marl.errors import AlreadyExists, check_one_learner
 from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.evaluation.per_world import check_target, write_output
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.schemes import check_scheme, who_drives_what
+from ethbrake_marl.learning.settings import read_settings
 from ethbrake_marl.policies.onnx import onnx_model
 from ethbrake_marl.policies.policy import save_policy
 from ethbrake_marl.policies.shipped import load_named_policy
@@ -65,7 +67,7 @@ def train_command(
 
         plan = load_recipe(recipe)
         given = read_settings(settings, [plan])
-        chosen, plan = load_runnable(scenario, given.scenario), given.change(plan)
+        chosen, plan = load_runnable(scenario, given.scenario), given.change(plan, say)
         if scheme is not None:
             plan = plan.replace(scheme=check_scheme(scheme))
         training = resolve(plan, chosen)
@@ -132,6 +134,7 @@ def learning_curves_command(
     ] = "ppo:5,sac:3",
     settings: SetOption = None,
     steps: StepsOption = None,
+    jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Train several seeds of several recipes, and draw their learning curves in one figure.
@@ -144,7 +147,7 @@ def learning_curves_command(
         plan = parse_trainings(recipes)
         given = read_settings(settings, [trainings.recipe for trainings in plan])
         chosen = load_runnable(scenario, given.scenario)
-        plan = [replace(trainings, recipe=given.change(trainings.recipe)) for trainings in plan]
+        plan = [replace(trainings, recipe=given.change(trainings.recipe, say)) for trainings in plan]
         check_one_learner(
             chosen.name, [chosen.vehicle_names[i] for i in chosen.learners], "learning curves need exactly one"
         )
@@ -154,6 +157,7 @@ def learning_curves_command(
                 plan,
                 output,
                 steps=steps,
+                jobs=jobs,
                 tell=bars.show_progress,
                 settings=given.texts,
             )

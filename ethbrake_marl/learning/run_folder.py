@@ -6,7 +6,7 @@ import csv
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +19,7 @@ from ethbrake_marl.files.durable import new_folder, write_file
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 
 _LIMIT_BYTES = 16 << 20  # of a JSON file
+_LOCK = "run.lock"
 
 RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
@@ -182,13 +183,25 @@ def has_finished(run: RunDirectory) -> bool:
     return status.get("status") == "finished" or (status.get("stage") is not None and not resumable)
 
 
+def is_finished(path: Path) -> bool:
+    """Whether ``path`` holds a training that came to its end."""
+    run = RunDirectory(path)
+    return run.status.is_file() and read_object(run.status).get("status") == "finished"
+
+
+def wait_for_others(path: Path, longest_s: float) -> None:
+    """Wait until no other process trains in the folder, so long at most: one that was left alone ends by itself."""
+    with suppress(Timeout, OSError), FileLock(path / _LOCK, timeout=longest_s, mode=0o666):
+        pass
+
+
 @contextmanager
 def only_process(run: RunDirectory) -> Iterator[None]:
     """Hold the run's lock, which ends with the process however it ends.
 
     Raises ``InvalidInput`` when another process trains in this folder.
     """
-    lock = FileLock(run.path / "run.lock", blocking=False, mode=0o666)
+    lock = FileLock(run.path / _LOCK, blocking=False, mode=0o666)
     try:
         lock.acquire()
     except Timeout:

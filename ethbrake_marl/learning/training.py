@@ -64,7 +64,7 @@ def resolve(recipe: TrainingRecipe | str | Path, scenario: Scenario | str | Path
     recipe = recipe.replace(**changes) if changes else recipe
     scheme = scheme_of(recipe, scenario)
     recipe.check_learners(len(scenario.learners))
-    identity = hashlib.sha256(json.dumps(_content(recipe, scenario), sort_keys=True).encode()).hexdigest()
+    identity = training_identity(training_content(recipe, scenario))
     return Training(recipe, scenario, scheme, drivers(scheme, scenario), observation_of(recipe, scenario), identity)
 
 
@@ -112,7 +112,7 @@ def check_same(folder: Path, training: Training) -> None:
     found = training_in(folder, config)
     if found.identity == training.identity:
         return
-    kept, wanted = (_content(each.recipe, each.scenario) for each in (found, training))
+    kept, wanted = (training_content(each.recipe, each.scenario) for each in (found, training))
     other = [
         f"{part} {key}"
         for part in wanted
@@ -124,9 +124,14 @@ def check_same(folder: Path, training: Training) -> None:
     )
 
 
-def _content(recipe: TrainingRecipe, scenario: Scenario) -> Content:
-    """Plain data with every default in it, without words."""
+def training_content(recipe: TrainingRecipe, scenario: Scenario) -> Content:
+    """What makes a training what it is: plain data with every default in it, without words."""
     return {
         "recipe": recipe.model_dump(mode="json", exclude=set(WORDS)),
         "scenario": scenario.content(without=WORDS),
     }
+
+
+def training_identity(content: Content) -> str:
+    """SHA-256 of such content, in hexadecimal digits."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -7,8 +7,7 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +19,12 @@ from ethbrake_marl.figures.curves import SeedCurve, at_common_steps, seed_curves
 from ethbrake_marl.figures.style import Figure, write_picture
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.learning.run_folder import RETURN, RunDirectory, progress_column, progress_rows, read_object
-from ethbrake_marl.learning.train import resume, train
-from ethbrake_marl.learning.training import Training, check_same, resolve
+from ethbrake_marl.learning.run_folder import RETURN, RunDirectory, progress_column, progress_rows
+from ethbrake_marl.learning.training import check_same, resolve
 from ethbrake_marl.policies.policy import load_policy
-from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.studies.jobs.training import TrainingJob, finish_trainings
 
 FIGURE, TABLE, SUMMARY = "learning_curves.png", "learning_curves.csv", "learning_curves.json"
 
@@ -66,12 +65,13 @@ def train_all(
     *,
     steps: int | None = None,
     settings: Sequence[str] = (),
+    jobs: int = 1,
     tell: OnProgress | None = None,
 ) -> bool:
     """Train every seed of every recipe into ``folder/RECIPE-seedK``: finished ones are kept, begun ones go on.
 
-    Gives False when Ctrl-C stopped it. Raises ``InvalidInput`` for a folder that holds another training than this one
-    would be (``learning.training``), before any is begun, besides what ``train`` raises.
+    ``jobs`` of them at a time. Gives False when Ctrl-C stopped it. Raises ``InvalidInput`` for a folder that holds
+    another training than this one would be (``learning.training``), before any is begun, besides what ``train`` raises.
     """
     wanted = {
         folder / f"{trainings.recipe.name}-seed{seed}": resolve(
@@ -83,10 +83,8 @@ def train_all(
     for path, training in wanted.items():
         if RunDirectory(path).status.is_file():
             check_same(path, training)
-    return all(
-        _train_one(training, path, settings, None if tell is None else partial(_tell_named, tell, path.name))
-        for path, training in wanted.items()
-    )
+    trainings = [TrainingJob(training, path, tuple(settings)) for path, training in wanted.items()]
+    return finish_trainings(trainings, jobs, tell)
 
 
 def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) -> dict[str, Any]:
@@ -138,20 +136,6 @@ def _read_curves(plan: Sequence[Trainings], folder: Path) -> dict[str, dict[str,
             if metric != _RETURNED or all(values):  # no episode may have ended in a very short training
                 curves[metric][name] = at_common_steps(values)
     return {metric: lines for metric, lines in curves.items() if lines}
-
-
-def _train_one(training: Training, path: Path, settings: Sequence[str], tell: OnProgress | None) -> bool:
-    """Whether it is finished now."""
-    run = RunDirectory(path)
-    if not run.status.is_file():
-        return train(training.recipe, training.scenario, path, settings=settings, on_progress=tell).status == "finished"
-    if read_object(run.status).get("status") == "finished":
-        return True
-    return resume(path, on_progress=tell).status == "finished"
-
-
-def _tell_named(tell: OnProgress, name: str, progress: Progress) -> None:
-    tell(replace(progress, name=name))
 
 
 def _estimate(harms: Any) -> dict[str, Any]:

@@ -66,6 +66,7 @@ def test_dependencies__each_stands_with_the_extra_that_brings_it():
     extra_of = {requirement.name: extra for extra, requirement in doctor._requirements()}
     assert extra_of["numpy"] == extra_of["numba"] == ""
     assert (extra_of["torch"], extra_of["benchmarl"], extra_of["onnx"]) == ("train", "marl", "export")
+    assert extra_of["ray"] == "cluster"
     assert "pytest" not in extra_of
 
 

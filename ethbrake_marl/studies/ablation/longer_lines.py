@@ -32,6 +32,8 @@ from ethbrake_marl.scenario.roles import LEARNER
 from ethbrake_marl.studies.ablation.comparison import TOLERANCE
 from ethbrake_marl.studies.ablation.plan import read_kept
 from ethbrake_marl.studies.ablation.run import Harms, harms_of
+from ethbrake_marl.studies.jobs.local import run_all
+from ethbrake_marl.studies.jobs.work import pack
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,17 +143,29 @@ def _check_front(path: str, policy: Policy, scenario: Scenario) -> None:
         )
 
 
-def drive_longer(question: LineQuestion, agents: Sequence[Agent], tell: OnProgress | None = None) -> list[LineResult]:
+def drive_longer(
+    question: LineQuestion, agents: Sequence[Agent], tell: OnProgress | None = None, processes: int = 1
+) -> list[LineResult]:
     """Let every agent drive all learners of lines of each length, on the same worlds as full braking.
 
-    All lines are made before the first is driven. Raises ``InvalidInput`` for a length that is given twice or that the
-    scenario cannot have.
+    All lines are made before the first is driven; ``processes`` lengths at a time. Raises ``InvalidInput`` for a
+    length that is given twice or that the scenario cannot have.
     """
     if len(set(question.vehicles)) < len(question.vehicles):
         raise InvalidInput(f"vehicles {', '.join(map(str, question.vehicles))}: each length once")
     lines = [lengthen(question.scenario, vehicles) for vehicles in question.vehicles]
     lists = [line.sample(question.episodes, question.list_seed) for line in lines]
-    return [_of_length(question, *line, agents, tell) for line in zip(lines, lists, strict=True)]
+    if processes == 1 or len(lines) < 2:
+        return [_of_length(question, *line, agents, tell) for line in zip(lines, lists, strict=True)]
+    say = tell or (lambda progress: None)
+
+    def call_of(number: int) -> bytes:
+        return pack(_of_length, question, lines[number], lists[number], tuple(agents), None)
+
+    found = run_all(call_of, len(lines), processes, "lengths", say)
+    if found is None:
+        raise KeyboardInterrupt
+    return found
 
 
 def _of_length(

@@ -19,6 +19,7 @@ from ethbrake_marl.learning.run_folder import RunDirectory, read_object
 from ethbrake_marl.learning.training import check_same, resolve
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.studies.jobs.training import TrainingJob
 
 LADDER = (
     "cooperation-0-sensors",
@@ -140,6 +141,10 @@ class Training:
             return 0
         steps = status.get("steps", 0)
         return max(self.recipe.total_steps - (steps if isinstance(steps, int) else 0), 1)
+
+    def job(self) -> TrainingJob:
+        """What brings it to its end."""
+        return TrainingJob(resolve(self.recipe, self.level.scenario), self.folder, self.noted)
 
 
 @dataclass(frozen=True, slots=True)

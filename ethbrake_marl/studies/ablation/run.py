@@ -1,15 +1,9 @@
-"""Training everything that an ablation needs: finished trainings are kept, begun ones go on, several at once."""
+"""Training everything that an ablation needs, and letting it drive the common worlds."""
 
 from __future__ import annotations
 
-import os
-import threading
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
-from functools import partial
-from multiprocessing import active_children, get_context, parent_process
-from multiprocessing.process import BaseProcess
 from typing import Any
 
 import numpy as np
@@ -19,16 +13,14 @@ from ethbrake_marl.evaluation.identity import policies_by_name, result_identity
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.learning.run_folder import RunDirectory
 from ethbrake_marl.learning.team_file import load_team
-from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.studies.ablation.joint_optimum import LevelOptimum, best_known, search_all
 from ethbrake_marl.studies.ablation.plan import Level, Plan, Training, common_worlds
+from ethbrake_marl.studies.jobs.training import finish_trainings
 
 
 def train_all(trainings: Sequence[Training], jobs: int, tell: OnProgress | None = None) -> bool:
@@ -37,29 +29,7 @@ def train_all(trainings: Sequence[Training], jobs: int, tell: OnProgress | None 
     The policies do not depend on ``jobs`` or on interruptions. Raises what ``Training.steps_left`` and ``train``
     raise.
     """
-    left = [training for training in trainings if training.steps_left()]
-    say = tell or (lambda progress: None)
-    if jobs == 1 or len(left) < 2:
-        return all(_train(training, partial(_tell, say, training.folder.name)) for training in left)
-    plugins, spawn = loaded_plugins(), get_context("spawn")
-    load_the_same(plugins)  # a file that was changed since is told here, in one line
-    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_begin_worker, initargs=(plugins,)) as pool:
-        futures = [pool.submit(_train, training) for training in left]
-        say(Progress("trainings", 0, len(left)))
-        try:
-            for done, future in enumerate(as_completed(futures)):
-                if not future.result():
-                    raise KeyboardInterrupt
-                say(Progress("trainings", done + 1, len(left)))
-        except KeyboardInterrupt:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for worker in active_children():
-                worker.terminate()  # a training ends after its update, with a checkpoint
-            return False
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return True
+    return finish_trainings([training.job() for training in trainings if training.steps_left()], jobs, tell)
 
 
 def check_finished(trainings: Iterable[Training]) -> None:
@@ -67,33 +37,6 @@ def check_finished(trainings: Iterable[Training]) -> None:
     for training in trainings:
         if not training.steps_left():
             load_team(training.folder, training.level.scenario)
-
-
-def _begin_worker(plugins: Sequence[Plugin]) -> None:
-    """Leave Ctrl-C to the parent, which passes it on once, end with the parent however that ends; load its plug-ins."""
-    os.setpgrp()
-    parent = parent_process()
-    assert parent is not None
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    load_the_same(plugins)
-
-
-def _end_with(parent: BaseProcess) -> None:
-    parent.join()
-    os._exit(1)
-
-
-def _train(training: Training, tell: OnProgress | None = None) -> bool:
-    """Whether it is finished now."""
-    if RunDirectory(training.folder).status.is_file():
-        return resume(training.folder, on_progress=tell).status == "finished"
-    training.folder.parent.mkdir(parents=True, exist_ok=True)
-    result = train(training.recipe, training.level.scenario, training.folder, settings=training.noted, on_progress=tell)
-    return result.status == "finished"
-
-
-def _tell(tell: OnProgress, name: str, progress: Progress) -> None:
-    tell(Progress(name, progress.done, progress.total))
 
 
 @dataclass(frozen=True, slots=True)

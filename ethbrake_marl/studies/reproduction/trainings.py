@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.learning.run_folder import RunDirectory, read_object
+from ethbrake_marl.learning.run_folder import is_finished
 from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario import Scenario, load_scenario
 
@@ -107,12 +107,7 @@ def training_folders(folder: Path, group: Group) -> Iterator[tuple[str, list[Pat
 
 def finished(folder: Path, group: Group) -> dict[str, list[Path]]:
     """The recipes of a group all of whose seeds have been trained to the end, and their folders."""
-    return {name: paths for name, paths in training_folders(folder, group) if all(_is_finished(p) for p in paths)}
-
-
-def _is_finished(path: Path) -> bool:
-    run = RunDirectory(path)
-    return run.status.is_file() and read_object(run.status).get("status") == "finished"
+    return {name: paths for name, paths in training_folders(folder, group) if all(is_finished(p) for p in paths)}
 
 
 def seconds_left(folder: Path, wanted: Collection[str]) -> float:
@@ -122,7 +117,7 @@ def seconds_left(folder: Path, wanted: Collection[str]) -> float:
         if group.name in wanted:
             for name, paths in training_folders(folder, group):
                 trained, _ = group.trained[name]
-                left += sum(trained.decisions / trained.per_s for path in paths if not _is_finished(path))
+                left += sum(trained.decisions / trained.per_s for path in paths if not is_finished(path))
     return left
 
 

@@ -18,8 +18,8 @@ from ethbrake_marl.evaluation.passport import parse_passport
 from ethbrake_marl.evaluation.replay import Given, replay
 from ethbrake_marl.learning import train as learning_train
 from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe, load_recipe
-from ethbrake_marl.studies.ablation import run as trainings
 from ethbrake_marl.studies.ablation.plan import Plan, Training, read_levels, with_scheme
+from ethbrake_marl.studies.jobs import training as trainings
 
 LEVELS = "cooperation-0-sensors,cooperation-3-pair,cooperation-3-congested"
 SMALL = ["--levels", LEVELS, "--seeds", "2", "--episodes", "20", "--search-episodes", "4", "--budget", "50"]

@@ -55,6 +55,7 @@ def test_drive_longer__full_braking_gains_nothing_on_itself():
         assert (one.decrease.value, one.worse_off.value, one.share.value) == (0.0, 0.0, 0.0)
     three = evaluate(PAIR.sample(20, 7), {"b": make_agent("full_brake")}, scenario=PAIR).outcome("b").total_harm
     assert found[0].reached.value == pytest.approx(three.mean(), rel=1e-12)
+    assert drive_longer(question, [make_agent("full_brake")], processes=2) == found
 
 
 def test_drive_longer__all_lines_are_made_before_one_is_driven(monkeypatch):

@@ -1,44 +1,36 @@
-"""The option ``--set``: which of its settings are the scenario's and which the recipe's, and what belongs together."""
+"""Settings ``key=value``: which are the scenario's and which the recipe's, and what belongs together."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
-import typer
-
-from ethbrake_marl.cli.terminal import say
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.overrides import Override, changed_parts, parse_overrides
 from ethbrake_marl.learning.recipe import WORDS, TrainingRecipe
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.scenario.quantities import OLD_KEYS
 
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set", metavar="KEY=VALUE", help="Another value of the scenario, or of the recipe: mass_t=40. Repeatable."
-    ),
-]
 _NO_SETTING = {"name", *WORDS}  # they tell about a file, and change nothing
 _TOGETHER = (("gamma", "reward.shaping_discount"),)  # keys of a recipe whose values must be equal
 
 
 class Settings(NamedTuple):
-    """What ``--set`` asks for."""
+    """What is asked for."""
 
     texts: tuple[str, ...]  # as they were given
     scenario: tuple[Override, ...]
     recipe: tuple[Override, ...]
 
-    def change(self, recipe: TrainingRecipe) -> TrainingRecipe:
-        """The recipe with those of its settings that it has; says what else may have to be changed with them."""
+    def change(self, recipe: TrainingRecipe, tell: Callable[[str], None] | None = None) -> TrainingRecipe:
+        """The recipe with those of its settings that it has; ``tell`` hears what else may have to be changed."""
         own = [override for override in self.recipe if override.top in type(recipe).model_fields]
         if not own:
             return recipe
         changed = recipe.replace(**changed_parts(recipe.model_dump(mode="json"), own))
-        for note in unpaired_settings(changed, own):
-            say(f"note: {note}")
+        if tell is not None:
+            for note in unpaired_settings(changed, own):
+                tell(f"note: {note}")
         return changed
 
 

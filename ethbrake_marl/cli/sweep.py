@@ -1,0 +1,130 @@
+"""The command ``ethbrake sweep``: many trainings from one file, here or on a Ray cluster."""
+
+from __future__ import annotations
+
+import os
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from ethbrake_marl.cli.options import JsonOption
+from ethbrake_marl.cli.terminal import INTERRUPTED, Bars, interruptible, progress_bars, say, show, write_json
+from ethbrake_marl.errors import InvalidInput, need
+
+if TYPE_CHECKING:
+    from ethbrake_marl.studies.jobs.work import Workers
+    from ethbrake_marl.studies.sweep.plan import SweepPlan
+    from ethbrake_marl.studies.sweep.run import SweepResult, SweepState
+
+FAILED = 1  # exit status where some jobs failed
+KEPT = "the same command goes on with what is in the folder"
+_MOST = 4096
+
+
+def sweep_command(
+    file: Annotated[Path, typer.Argument(metavar="SWEEP.yaml", help="A grid or a list of jobs.")],
+    output: Annotated[Path, typer.Option("--output", metavar="FOLDER", help="Folder of everything.")],
+    jobs: Annotated[
+        int | None,
+        typer.Option(help="Jobs at once, a process with one thread each.", show_default="the usable cores"),
+    ] = None,
+    ray: Annotated[
+        str | None, typer.Option(metavar="local|ADDRESS", help="Run the jobs on Ray, not in processes of our own.")
+    ] = None,
+    retries: Annotated[int, typer.Option(help="Further attempts at a job whose process was lost.")] = 2,
+    form: Annotated[Literal["csv", "parquet"], typer.Option("--format", help="Of the table.")] = "csv",
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the jobs and what they take; do nothing.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Train every job of a file, and write one table of what they reached.
+
+    The same command goes on after an interruption: finished jobs are kept, begun ones go on. Exit status 1 where jobs
+    failed: failures.csv holds the last lines of each.
+    """
+    with interruptible(KEPT):
+        # torch takes seconds to load, and no other command needs it
+        from ethbrake_marl.studies.ablation.plan import check_folder
+        from ethbrake_marl.studies.sweep.file import read_sweep
+        from ethbrake_marl.studies.sweep.plan import plan_sweep
+
+        number = len(os.sched_getaffinity(0)) if jobs is None else jobs
+        if ray is not None:
+            need("ray")
+        if not 1 <= number <= _MOST or not 0 <= retries <= 100:
+            raise InvalidInput(f"jobs {number}, retries {retries}: must be from 1 to {_MOST:,}, and from 0 to 100")
+        if form == "parquet":
+            need("pyarrow")
+        plan = plan_sweep(read_sweep(file))
+        check_folder(output)
+        if dry_run:
+            _show_plan(plan, output, number, as_json)
+            return
+        with closing(_workers(ray, jobs, number)) as workers:
+            result = _run(plan, output, workers, retries, form)
+    _show_result(result, output, as_json)
+
+
+def _workers(ray: str | None, jobs: int | None, number: int) -> Workers:
+    if ray is None:
+        from ethbrake_marl.studies.jobs.local import LocalWorkers
+
+        return LocalWorkers(number)
+    from ethbrake_marl.studies.jobs.cluster import LOCAL, RayWorkers
+
+    return RayWorkers(ray, number if ray == LOCAL else jobs)
+
+
+def _run(plan: SweepPlan, output: Path, workers: Workers, retries: int, form: Literal["csv", "parquet"]) -> SweepResult:
+    from ethbrake_marl.studies.sweep.run import run_sweep
+
+    with progress_bars() as bars:
+
+        def tell(state: SweepState) -> None:
+            _show_state(bars, state)
+
+        return run_sweep(plan, output, workers, retries=retries, form=form, tell=tell)
+
+
+def _show_state(bars: Bars, state: SweepState) -> None:
+    left = "" if state.left_s is None or state.done == state.total else f", about {_coarse(state.left_s)} left"
+    bars.show("sweep", state.done, state.total, note=state.note, label=f"sweep{left}")
+
+
+def _coarse(seconds: float) -> str:
+    """A time in so few words that it seldom changes."""
+    if seconds < 100.0:
+        return f"{max(round(seconds / 20.0) * 20, 10)} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.0f} h"
+
+
+def _show_plan(plan: SweepPlan, output: Path, number: int, as_json: bool) -> None:
+    from ethbrake_marl.studies.sweep.cost import cost_of, state_of
+
+    cost = cost_of(plan, output, number)
+    left = {row.identity for row in cost.rows}
+    states = ((row, state_of(output, row) if row.identity in left else "finished") for row in plan.rows)
+    if as_json:
+        jobs = [{"hash": row.identity, "job": row.name, "set": row.settings, "state": state} for row, state in states]
+        write_json({"jobs": jobs, "decisions_left": cost.decisions, "core_s_left": cost.work_s})
+        return
+    for row, state in states:
+        show("  ".join([f"{state:8}", row.name, *row.asked.settings]))
+    say(str(cost))
+
+
+def _show_result(result: SweepResult, output: Path, as_json: bool) -> None:
+    from ethbrake_marl.studies.sweep.table import FAILURES
+
+    counts = {"jobs": result.jobs, "finished": result.finished, "failed": len(result.failures)}
+    if as_json:
+        write_json({**counts, "interrupted": result.interrupted, "table": str(result.table)})
+    told = f"{result.finished:,} of {result.jobs:,} jobs finished; table: {result.table}"
+    if result.failures:
+        told += f"; {len(result.failures):,} failed: {output / FAILURES}"
+    say(f"interrupted; {told}; {KEPT}" if result.interrupted else told)
+    if result.interrupted:
+        raise typer.Exit(INTERRUPTED)
+    if result.failures:
+        raise typer.Exit(FAILED)

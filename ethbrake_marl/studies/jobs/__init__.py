@@ -1,0 +1,1 @@
+"""Independent jobs: in processes of this machine or on a Ray cluster, tried again where one is lost."""

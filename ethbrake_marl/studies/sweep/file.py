@@ -1,0 +1,196 @@
+"""The YAML file of a sweep: a grid, a list of jobs, or both, checked before anything starts."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.files.messages import Wording, explain
+from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
+
+MOST_JOBS = 200_000
+LEVEL = "cooperation-"  # how the scenario of a level of cooperation begins
+
+_Seed = Annotated[int, Field(ge=0, lt=2**32)]
+_Names = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
+_Values = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
+
+
+def _check_keys(value: dict[str, Any]) -> dict[str, Any]:
+    for key in value:
+        if key in ("seed", "recipe.seed"):
+            raise ValueError("seed is no setting here; give it beside recipe, as seed")
+        if "=" in key:
+            raise ValueError(f"{flow_text(key, 60)}: a key has no = in it")
+    return value
+
+
+_Settings = Annotated[dict[str, Any], AfterValidator(_check_keys)]
+_Lists = Annotated[dict[str, _Values], AfterValidator(_check_keys)]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One job as the file asks for it."""
+
+    place: str  # in the file
+    scenario: str  # a name or a path
+    level: str  # of cooperation; empty where a scenario was named
+    recipe: str  # a name or a path
+    seed: int
+    settings: tuple[str, ...]  # KEY=VALUE each, as for ``train --set``
+
+    @property
+    def kind(self) -> tuple[str, str, tuple[str, ...]]:
+        """The job without its seed."""
+        return self.scenario, self.recipe, self.settings
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+
+class SeedRange(_Part):
+    """``count`` seeds from ``first`` on."""
+
+    first: _Seed = 0
+    count: Annotated[int, Field(ge=1, le=MOST_JOBS)]
+
+
+def _form_of_seeds(value: Any) -> str:
+    return "#range" if isinstance(value, dict | SeedRange) else "#list"
+
+
+_Seeds = Annotated[
+    Annotated[tuple[_Seed, ...], Field(strict=False, min_length=1), Tag("#list")] | Annotated[SeedRange, Tag("#range")],
+    Discriminator(_form_of_seeds),
+]
+
+
+class _Lines(_Part):
+    """What a grid and a job have in common: a scenario, or the level of cooperation in its place."""
+
+    settings: _Settings = Field(default={}, alias="set")
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> _Lines:
+        if (getattr(self, "scenario", None) is None) == (getattr(self, "level", None) is None):
+            raise ValueError("give one of the two: scenario, or level (4-all is the scenario cooperation-4-all)")
+        return self
+
+
+class Grid(_Lines):
+    """All combinations of what is listed."""
+
+    scenario: _Names | None = None
+    level: _Names | None = None
+    recipe: _Names
+    seed: _Seeds = (0,)
+    settings: _Lists = Field(default={}, alias="set")
+
+    @field_validator("scenario", "level", "recipe", "seed", mode="before")
+    @classmethod
+    def _one_is_a_list_of_one(cls, value: Any) -> Any:
+        return (value,) if isinstance(value, str | int) and not isinstance(value, bool) else value
+
+    def seeds(self) -> range | tuple[int, ...]:
+        """The seeds."""
+        return (
+            range(self.seed.first, self.seed.first + self.seed.count) if isinstance(self.seed, SeedRange) else self.seed
+        )
+
+    def size(self) -> int:
+        """Number of jobs."""
+        lists = (self.scenario or self.level or (), self.recipe, self.seeds(), *self.settings.values())
+        return math.prod(len(each) for each in lists)
+
+
+class ListedJob(_Lines):
+    """One job."""
+
+    scenario: str | None = None
+    level: str | None = None
+    recipe: str
+    seed: _Seed = 0
+
+
+class SweepFile(_Part):
+    """The whole file; ``settings`` hold for every job."""
+
+    title: str = ""
+    settings: _Settings = Field(default={}, alias="set")
+    grid: Grid | None = None
+    jobs: Annotated[tuple[ListedJob, ...], Field(strict=False)] = ()
+
+    def requests(self) -> Iterator[Request]:
+        """The jobs: of the grid, seed by seed, so that first results of all are there early; then those listed."""
+        if self.grid is not None:
+            yield from self._of_grid(self.grid)
+        for k, job in enumerate(self.jobs):
+            scenario, level = (job.scenario, "") if job.level is None else (LEVEL + job.level, job.level)
+            texts = self._texts(job.settings, f"jobs[{k}]")
+            yield Request(f"jobs[{k}]", str(scenario), level, job.recipe, job.seed, texts)
+
+    def _of_grid(self, grid: Grid) -> Iterator[Request]:
+        lines = [(name, "") for name in grid.scenario or ()] + [(LEVEL + name, name) for name in grid.level or ()]
+        changes = [
+            self._texts(dict(zip(grid.settings, values, strict=True)), "grid")
+            for values in itertools.product(*grid.settings.values())
+        ]
+        for seed in grid.seeds():
+            for (scenario, level), recipe, texts in itertools.product(lines, grid.recipe, changes):
+                yield Request("grid", scenario, level, recipe, seed, texts)
+
+    def _texts(self, own: dict[str, Any], place: str) -> tuple[str, ...]:
+        twice = [key for key in own if key in self.settings]
+        if twice:
+            raise InvalidInput(f"{place}.set.{twice[0]}: stands in the file's own set too; leave one of them out")
+        return tuple(f"{key}={flow_text(value)}" for key, value in {**self.settings, **own}.items())
+
+
+def read_sweep(path: str | Path) -> SweepFile:
+    """Read the file of a sweep; raises ``InvalidInput`` with file, line, key, value and what would be right."""
+    document = read_yaml(path)
+    if not isinstance(document.content, dict):
+        raise InvalidInput(f"{document.file}: must be a mapping with a grid or a list of jobs")
+    try:
+        found = SweepFile.model_validate(document.content)
+    except ValidationError as error:
+        raise explain(error, document, _SweepWording()) from None
+    _check_size(found, document)
+    return found
+
+
+def _check_size(found: SweepFile, document: Document) -> None:
+    size = (0 if found.grid is None else found.grid.size()) + len(found.jobs)
+    if not 1 <= size <= MOST_JOBS:
+        raise InvalidInput(f"{document.file}: asks for {count_of(size, 'job')}; must be from 1 to {MOST_JOBS:,}")
+
+
+class _SweepWording(Wording):
+    def known(self, path: YamlPath) -> list[str]:
+        """The keys of the part in which ``path`` ends."""
+        parts: dict[Any, type[BaseModel]] = {"grid": Grid, "jobs": ListedJob}
+        model = SeedRange if "seed" in path[:-1] else parts.get(path[0], SweepFile) if len(path) > 1 else SweepFile
+        return [field.alias or name for name, field in model.model_fields.items()]
+
+    def needed(self, path: YamlPath) -> str:
+        """Where an example stands."""
+        return "it is needed; docs/scaling.md shows an example"
