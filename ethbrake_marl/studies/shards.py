@@ -252,7 +252,7 @@ def _name(bounds: Bounds) -> str:
 
 
 def _to_bytes(content: Any) -> bytes:
-    return (json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
+    return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
 
 
 def _read_json(file: Path) -> dict[str, Any]:

@@ -137,10 +137,12 @@ def summarise_shards(asked: Asked, tally: Tally) -> list[SummaryRow]:
 
 def rescore_shards(asked: Asked, tally: Tally) -> list[Rescored]:
     """Every agent under every objective of the question and both counts, as ``rescore``."""
-    vehicles = range(asked.question.scenario.vehicles)
+    agents, vehicles = _agents(tally), range(asked.question.scenario.vehicles)
     return [
-        Rescored(name, each, harm_count, tuple(agent.needed(objective_column(each, harm_count, i)) for i in vehicles))
-        for name, agent in _agents(tally).items()
+        Rescored(
+            name, each, harm_count, tuple(agents[name].needed(objective_column(each, harm_count, i)) for i in vehicles)
+        )
+        for name in asked.identity["agents"]
         for harm_count in HARM_COUNTS
         for each in asked.question.objectives
     ]
