@@ -37,7 +37,16 @@ RESULTS = "results.json"
 
 
 def check_shards(shards: int | None, jobs: int, output: Path | None, rows: bool, others: Mapping[str, object]) -> None:
-    """Refuse options that do not go together; ``others`` are those that need every world at once."""
+    """Refuse options that do not go together.
+
+    Args:
+        shards: parts of the list; None: it is evaluated in one piece.
+        jobs: processes.
+        output: folder of finished shards.
+        rows: one row per world and agent is asked for.
+        others: options that need every world at once, by name.
+
+    """
     if shards is None:
         alone = {"--jobs": jobs != 1, "--output": output is not None, "--rows": rows}
         if given := [name for name, is_given in alone.items() if is_given]:
@@ -70,7 +79,24 @@ def evaluate_in_shards(
     objectives: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Drive the list shard by shard, and print the same table as without shards."""
+    """Drive the list shard by shard, and print the table that is printed without shards.
+
+    Args:
+        scenario: with the learners that are driven.
+        agents: as they were written.
+        shards: parts of the list.
+        jobs: processes.
+        output: folder that keeps finished shards; None: nothing is kept.
+        rows: keep one row per world and agent, too.
+        episodes: worlds of the list.
+        seed: of the list.
+        harm_count: harm that agents minimise.
+        shield: the old way to put one around learned agents.
+        uncertainty: what robust shields do not know.
+        objectives: under which results are told, too.
+        as_json: print JSON alone.
+
+    """
     intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
     lineup = make_lineup(agents, scenario, harm_count=harm_count, shield=shield, uncertainty=intervals)
     question = Question(scenario, tuple(lineup), episodes, seed, harm_count, uncertainty, tuple(objectives))

@@ -82,7 +82,15 @@ def evaluate(
 def evaluate_block(
     sample: Sample, agents: Mapping[str, Driver], *, scenario: Scenario, seed: int
 ) -> tuple[Evaluation | None, tuple[LeftOut, ...]]:
-    """``evaluate`` a part of a list at once, and which of its worlds were left out; None where that is all of them."""
+    """``evaluate`` a part of a list at once, and which of its worlds were left out; None where that is all of them.
+
+    Args:
+        sample: the part, which is advanced together.
+        agents: as for ``evaluate``; they drive the scenario's learners.
+        scenario: of the list.
+        seed: of the list.
+
+    """
     driven = driven_vehicles(scenario, None, agents)
     whole = _drive_all(sample, agents, scenario, driven, seed, sample.worlds.n, None, True)
     if len(whole.left_out) == sample.worlds.n:

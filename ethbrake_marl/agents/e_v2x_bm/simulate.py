@@ -43,8 +43,16 @@ def simulate_constant(
 ) -> Simulated:
     """Simulate world ``rows[k]`` to the horizon with ``deceleration_mps2[k]``; the worlds have no obstacle.
 
-    ``command_mps2`` [n, N] are commands that ``advance`` has taken, those of all other vehicles. Raises
-    ``PhysicsError`` by the place in ``rows`` of what cannot be simulated.
+    Args:
+        worlds: n worlds of N vehicles.
+        command_mps2: [n, N] commands that ``advance`` has accepted; those of the other vehicles are used.
+        vehicle: the one that decelerates (0 = front).
+        rows: [k] worlds, each as often as it is simulated.
+        deceleration_mps2: [k] from 0 to the vehicle's capacity.
+        horizon_s: end of every simulation (s).
+
+    Raises ``PhysicsError`` by the place in ``rows`` of what cannot be simulated.
+
     """
     v = worlds.vehicles
     shape = rows.size, worlds.N - 1

@@ -30,9 +30,11 @@ class _Agent:
         self._tally, self._baseline, self._worlds = tally, baseline, worlds
 
     def count(self, name: str) -> int:
+        """Worlds in which something was so."""
         return self._tally.counts.get(name, 0)
 
     def share(self, name: str) -> Estimate:
+        """Their share, with the exact interval."""
         return exact_rate(self.count(name), self._worlds)
 
     def _whole(self, tally: AgentTally | None, name: str) -> Moments | None:
@@ -40,10 +42,12 @@ class _Agent:
         return found if found is not None and found.count == self._worlds else None
 
     def mean(self, name: str) -> Estimate | None:
+        """The mean of a number; None unless every world has it."""
         found = self._whole(self._tally, name)
         return None if found is None else mean_of(found)
 
     def needed(self, name: str) -> Estimate:
+        """The mean of a number that every world has."""
         return mean_of(self._tally.moments[name])
 
     def against(self, name: str) -> Estimate | None:
@@ -92,47 +96,42 @@ def summarise_shards(asked: Asked, tally: Tally) -> list[SummaryRow]:
     question = asked.question
     told = {name: _told_range(name, entries) for name, entries in tally.ranges.items()}
     conditions = parameters_of(question.task, question.seed, tally.worlds, asked.because, told)
-    beside = is_papers_list(question.scenario, question.seed, question.task.vehicles)
-    rows = []
-    for name in asked.identity["agents"]:
-        found = _agents(tally)[name]
-        shoved, hybrid = found.mean("shoved_m"), found.count("hybrid") == tally.worlds
-        rows.append(
-            SummaryRow(
-                agent=name,
-                episodes=tally.worlds,
-                collisions=found.count("collisions"),
-                horizon_ends=found.count("horizon_ends"),
-                collision_rate=found.share("collisions"),
-                first_impact_harm=found.needed(HARM_NAMES["first"]),
-                total_harm=found.needed(HARM_NAMES["total"]),
-                first_difference=found.against(HARM_NAMES["first"]),
-                total_difference=found.against(HARM_NAMES["total"]),
-                first_decrease=found.decrease(HARM_NAMES["first"]),
-                total_decrease=found.decrease(HARM_NAMES["total"]),
-                predicted_harm=found.mean("predicted_harm"),
-                policy_share=found.count("policy") / tally.worlds if hybrid else None,
-                parameters=conditions,
-                distance=found.distance(),
-                shoved_m=shoved,
-                shoved_far=None if shoved is None else found.share("shoved_far"),
-                sampled_harm=found.mean("sampled_harm"),
-                left_out=tally.left_out,
-                beside_paper=beside,
-                knows=asked.knows[name],
-                hidden_share=tally.hidden / tally.worlds,
-                worlds_sha256=f"{tally.worlds_hash:064x}",
-                scenario_sha256=asked.identity["scenario_sha256"],
-                policy_sha256=asked.policies[name],
-                versions=asked.identity["versions"],
-                metrics={
-                    column.removeprefix(COLUMN): found.needed(column)
-                    for column in tally.agents[name].moments
-                    if column.startswith(COLUMN)
-                },
-            )
-        )
-    return rows
+    agents = _agents(tally)
+    return [_row(asked, tally, name, agents[name], conditions) for name in asked.identity["agents"]]
+
+
+def _row(asked: Asked, tally: Tally, name: str, found: _Agent, conditions: dict[str, Any]) -> SummaryRow:
+    question, shoved, hybrid = asked.question, found.mean("shoved_m"), found.count("hybrid") == tally.worlds
+    columns = [column for column in tally.agents[name].moments if column.startswith(COLUMN)]
+    return SummaryRow(
+        agent=name,
+        episodes=tally.worlds,
+        collisions=found.count("collisions"),
+        horizon_ends=found.count("horizon_ends"),
+        collision_rate=found.share("collisions"),
+        first_impact_harm=found.needed(HARM_NAMES["first"]),
+        total_harm=found.needed(HARM_NAMES["total"]),
+        first_difference=found.against(HARM_NAMES["first"]),
+        total_difference=found.against(HARM_NAMES["total"]),
+        first_decrease=found.decrease(HARM_NAMES["first"]),
+        total_decrease=found.decrease(HARM_NAMES["total"]),
+        predicted_harm=found.mean("predicted_harm"),
+        policy_share=found.count("policy") / tally.worlds if hybrid else None,
+        parameters=conditions,
+        distance=found.distance(),
+        shoved_m=shoved,
+        shoved_far=None if shoved is None else found.share("shoved_far"),
+        sampled_harm=found.mean("sampled_harm"),
+        left_out=tally.left_out,
+        beside_paper=is_papers_list(question.scenario, question.seed, question.task.vehicles),
+        knows=asked.knows[name],
+        hidden_share=tally.hidden / tally.worlds,
+        worlds_sha256=f"{tally.worlds_hash:064x}",
+        scenario_sha256=asked.identity["scenario_sha256"],
+        policy_sha256=asked.policies[name],
+        versions=asked.identity["versions"],
+        metrics={column.removeprefix(COLUMN): found.needed(column) for column in columns},
+    )
 
 
 def rescore_shards(asked: Asked, tally: Tally) -> list[Rescored]:
