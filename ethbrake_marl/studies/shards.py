@@ -127,7 +127,12 @@ class ShardFolder:
         rows = self.rows_of((first, end))
         if rows is not None and (not rows.is_file() or rows.stat().st_size != (told.get("rows") or {}).get("bytes")):
             raise InvalidInput(f"{rows}: is not the one that was written with {file.name}; delete both")
-        return (first, end), Tally.from_json(told["tally"])
+        tally = Tally.from_json(told["tally"])
+        if tally.worlds + len(tally.left_out) != end - first or (
+            tally.worlds and set(tally.agents) != set(self.asked.identity["agents"])
+        ):
+            raise InvalidInput(f"{file}: does not count its worlds; delete it, and they are driven again")
+        return (first, end), tally
 
 
 def evaluate_shards(

@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.exact import Moments
+from ethbrake_marl.evaluation.exact import VALUE_BITS, Moments
 from ethbrake_marl.evaluation.outcome import LeftOut
 
 HASHES = 1 << 256  # sums of hashes are kept modulo this
+_MOST = 1 << 64
+_ALWAYS = ("first_impact_harm", "total_harm")  # numbers that every agent has in every world
 Range = tuple[float, float]
 
 
@@ -48,7 +50,7 @@ class AgentTally:
         """What ``to_json`` gave; raises ``KeyError``, ``TypeError`` or ``ValueError`` for anything else."""
         return cls(
             {name: _whole(value) for name, value in told["counts"].items()},
-            {name: Moments(_whole(n), int(s, 16), int(q, 16)) for name, (n, s, q) in told["moments"].items()},
+            {name: _moments(*parts) for name, parts in told["moments"].items()},
             {name: int(value, 16) for name, value in told["products"].items()},
         )
 
@@ -95,22 +97,41 @@ class Tally:
     def from_json(cls, told: Any) -> Tally:
         """What ``to_json`` gave; raises ``InvalidInput`` for anything else."""
         try:
-            return cls(
+            tally = cls(
                 _whole(told["worlds"]),
                 _whole(told["hidden"]),
                 int(told["worlds_hash"], 16) % HASHES,
                 {name: tuple((float(a), float(b)) for a, b in entries) for name, entries in told["ranges"].items()},
-                tuple(LeftOut(*left) for left in told["left_out"]),
+                tuple(_left_out(*left) for left in told["left_out"]),
                 {name: AgentTally.from_json(agent) for name, agent in told["agents"].items()},
             )
+            for agent in tally.agents.values() if tally.worlds else ():
+                if any(agent.moments[name].count != tally.worlds for name in _ALWAYS):
+                    raise ValueError("an agent that did not drive every world")
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise InvalidInput(f"is no tally of a shard: {error!r}") from None
+        return tally
 
 
 def _whole(value: Any) -> int:
-    if type(value) is not int or value < 0:
+    if type(value) is not int or not 0 <= value < _MOST:
         raise ValueError(f"{value!r} is no whole number from 0 on")
     return value
+
+
+def _moments(count: Any, total: str, squares: str) -> Moments:
+    """Moments that some values can have, none of them beyond 2^1000."""
+    found = Moments(_whole(count), int(total, 16), int(squares, 16))
+    n = found.count
+    if abs(found.total) > n << (VALUE_BITS + 1000) or n * found.squares < found.total**2 or (n == 0 < found.squares):
+        raise ValueError("moments that no values have")
+    return found
+
+
+def _left_out(world: Any, seed: Any, agent: Any, reason: Any) -> LeftOut:
+    if not (isinstance(agent, str) and isinstance(reason, str)):
+        raise ValueError(f"{agent!r}, {reason!r}: must be texts")
+    return LeftOut(_whole(world), _whole(seed), agent, reason)
 
 
 def _joined(

@@ -127,7 +127,12 @@ def test_a_list_of_which_every_world_fails__is_refused(tmp_path: Path, paper_ran
 
 def test_tally__comes_back_from_json_as_it_was(tally: Tally) -> None:
     assert Tally.from_json(json.loads(json.dumps(tally.to_json()))) == tally
-    for bad in ({}, {**tally.to_json(), "worlds": -1}, {**tally.to_json(), "agents": {"x": {}}}, [], None):
+    whole = tally.to_json()
+    agent = {"counts": {}, "moments": {"total_harm": [N, "0x1", "0x0"]}, "products": {}}
+    short = {**agent, "moments": {"first_impact_harm": [3, "0x0", "0x0"], "total_harm": [N, "0x0", "0x0"]}}
+    wrong = [{"worlds": -1}, {"agents": {"x": {}}}, {"agents": {"x": agent}}, {"agents": {"x": short}}]
+    wrong += [{"left_out": [[0, 7, 3, None]]}, {"ranges": {"gaps_m": [1]}}, {"worlds": 10**30}]
+    for bad in ({}, [], None, *({**whole, **change} for change in wrong)):
         with pytest.raises(InvalidInput, match="no tally"):
             Tally.from_json(bad)
 
