@@ -11,13 +11,14 @@ from typer.exceptions import TyperException
 from typer.main import get_command
 
 from ethbrake_marl.cli.ablate import ablate_command, generalise_command
+from ethbrake_marl.cli.agents import agents_command
 from ethbrake_marl.cli.bench import bench_command
 from ethbrake_marl.cli.best_harm import best_harm_command
 from ethbrake_marl.cli.compare import compare_command
 from ethbrake_marl.cli.dataset import dataset_command
 from ethbrake_marl.cli.doctor import doctor_command
 from ethbrake_marl.cli.equal_time import equal_time_command
-from ethbrake_marl.cli.evaluate import agents_command, evaluate_command, shield_command
+from ethbrake_marl.cli.evaluate import evaluate_command, shield_command
 from ethbrake_marl.cli.explore import explore_command
 from ethbrake_marl.cli.falsify import falsify_command
 from ethbrake_marl.cli.options import VersionOption, rename_old_options

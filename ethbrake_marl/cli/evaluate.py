@@ -8,15 +8,19 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
-from rich.table import Table
 
-from ethbrake_marl.agents.knowledge import knowledge_text
-from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption, VehicleOption
 from ethbrake_marl.cli.picture import PictureOption, counted_without, picture_app, picture_target, tell_left_out
 from ethbrake_marl.cli.report import ReportOption, check_page, write_evaluation_report
-from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
+from ethbrake_marl.cli.shards import (
+    JobsOption,
+    KeptOption,
+    RowsOption,
+    ShardsOption,
+    check_shards,
+    evaluate_in_shards,
+)
+from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation import (
     SummaryRow,
@@ -96,6 +100,10 @@ def evaluate_command(
         str | None,
         typer.Option(metavar="COLUMN", help="Also tell the results by group: scenario (a mixture), vehicle_2_type."),
     ] = None,
+    shards: ShardsOption = None,
+    jobs: JobsOption = 1,
+    output: KeptOption = None,
+    rows: RowsOption = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -105,9 +113,28 @@ def evaluate_command(
     +refined, then one shield, +episode, +step or +robust; for instance full_brake+step or ppo@PATH+refined+episode.
     PATH is a run or a policy bundle, or shipped.
     """
+    whole = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
+    check_shards(shards, jobs, output, rows, whole)
     _check_outputs(per_world, report, force=force)
     chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
     objectives = declared_objectives(objective or (), chosen.vehicles)
+    if shards is not None:
+        evaluate_in_shards(
+            chosen,
+            agents.split(","),
+            shards=shards,
+            jobs=jobs,
+            output=output,
+            rows=rows,
+            episodes=EPISODES if episodes is None else episodes,
+            seed=LIST_SEED if seed is None else seed,
+            harm_count=harm_count,
+            shield=shield,
+            uncertainty=uncertainty,
+            objectives=objectives,
+            as_json=as_json,
+        )
+        return
     sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
     if by is not None:
         check_group(kind_columns(sample.types, sample.scenarios), by)
@@ -123,23 +150,23 @@ def evaluate_command(
             chunk=PROGRESS_EVERY,
             on_progress=lambda agent, done: bars.show(agent, done, sample.worlds.n),
         )
-        rows = summarise(evaluation)
+        summary = summarise(evaluation)
         if report is not None:
-            write_evaluation_report(report, evaluation, rows, lineup, bars, harm_count=harm_count, force=force)
+            write_evaluation_report(report, evaluation, summary, lineup, bars, harm_count=harm_count, force=force)
     told = rescore(evaluation, objectives)
     groups = {} if by is None else summarise_by(evaluation, by)
     if per_world is not None:
         write_per_world(per_world, evaluation, objectives=objectives, force=force)
     agents_told = {"harm_count": harm_count, "uncertainty": uncertainty}
-    results = results_to_json(rows, told=told, groups=groups, per_world=per_world, settings=agents_told)
+    results = results_to_json(summary, told=told, groups=groups, per_world=per_world, settings=agents_told)
     if per_world is not None:
         _write_results_beside(per_world, results, force=force)
     if as_json:
         write_json(results)
     else:
-        show_rows(rows)
+        show_rows(summary)
         show_groups(groups)
-    moving = {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
+    moving = {row.agent: row.horizon_ends for row in summary if row.policy_share is not None}
     if note := horizon_note(moving, sample.worlds.n, chosen.horizon_s):
         say(note)
     if told and not as_json:
@@ -268,23 +295,3 @@ def measure_modes(agents: str, sample: Sample, task: Task) -> list[ModeRow]:
             task,
             on_progress=lambda name, done: bars.show(name, done, sample.worlds.n),
         )
-
-
-def agents_command(as_json: JsonOption = False) -> None:
-    """List all agents: how each is written, what it does, what it knows.
-
-    What begins with + goes behind any agent, for instance full_brake+step: +refined first, then one shield.
-    """
-    entries = agent_entries()
-    if as_json:
-        write_json([{"agent": e.form, "about": e.about, "knows": list(e.knows)} for e in entries])
-        return
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("Agent", no_wrap=True)
-    table.add_column("Drives by", overflow="fold")
-    table.add_column("Knows", overflow="fold")
-    for entry in entries:
-        added = "also " if entry.form.startswith("+") else ""
-        table.add_row(entry.form, entry.about, added + knowledge_text(entry.knows))
-    result_console().print(table)
-    show("ladder stands for coast to best_harm; a typo gets a suggestion. See docs/baselines.md and docs/shield.md.")

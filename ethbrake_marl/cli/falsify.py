@@ -13,8 +13,7 @@ from rich import box
 from rich.table import Table
 
 from ethbrake_marl.cli.machine import this_machine
-from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, VehicleOption
-from ethbrake_marl.cli.settings import SetOption, read_settings
+from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation import check_target
@@ -32,6 +31,7 @@ from ethbrake_marl.evaluation.named_worlds import (
 )
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.learning.settings import read_settings
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Sample
 from ethbrake_marl.studies.falsification.falsify import Falsified, falsify

@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.physics import Floats, Worlds, advance, advance_sampled
-from ethbrake_marl.physics.episode import decision_s, first_decision_s
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance_sampled
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.episode import decision_s, first_decision_s, onset_s
 from ethbrake_marl.physics.events import solo_motion
-from ethbrake_marl.physics.obstacle import obstacle_ahead, with_post_ahead
+from ethbrake_marl.physics.failed import failure
+from ethbrake_marl.physics.impact import GAP, MASS, SPEED
+from ethbrake_marl.physics.obstacle import obstacle_ahead, place_obstacle, with_post_ahead
+from ethbrake_marl.physics.segment import COMMAND, DONE, HIT, LIMIT, ONSET, ROW_WIDTH, TABLE_ROWS, advance_table
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.scenario.roles import constant_command
 
@@ -42,17 +46,53 @@ class ShovedFront:
         return cls(worlds, np.array([solo_motion(v, u, tau, most, horizon_s)[1] for v, u, tau, most in alone]))
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Add the way of one step."""
-        moving = np.flatnonzero(until_s > before.time_s)
-        post = with_post_ahead(before.take(moving), until_s[moving] - before.time_s[moving])
-        after, _ = advance(post, command_mps2[moving], until_s=until_s[moving])
-        self._way_m[moving] += post.obstacle_gap_m - after.obstacle_gap_m
+        """Add the way of one step, by a post ahead: the world's own obstacle, or one out of reach."""
+        v = before.vehicles
+        post_m = with_post_ahead(before, until_s - before.time_s).obstacle_gap_m
+        status = np.full(before.n, DONE)
+        add_front_ways(
+            post_m, before.obstacle_hit, before.gaps_m, before.speeds_mps, before.time_s, before.pair_hit, command_mps2,
+            until_s, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, self._way_m, status,
+        )  # fmt: skip
+        if (status != DONE).any():
+            raise failure(status, before.time_s, until_s)
 
     @property
     def metres(self) -> Floats:
         """How far Vehicle 1 was shoved in each world so far, [n]."""
         shoved: Floats = self._way_m - self._own_way_m
         return shoved
+
+
+@compiled
+def add_front_ways(
+    post: Floats, post_hit: Bools, gaps: Floats, speeds: Floats, time: Floats, hit: Bools, command: Floats,
+    until: Floats, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, way: Floats, status: Ints,
+) -> None:  # fmt: skip
+    """Add to ``way`` [n] how far Vehicle 1 comes in the step to ``until``: the change of its gap to the ``post``.
+
+    As ``advance`` of these worlds with the post as their obstacle, to the same bits. Worlds that have ended stay;
+    ``status`` [n] tells which could not be advanced.
+    """
+    vehicles = speeds.shape[1]
+    table = np.zeros((TABLE_ROWS, vehicles + 1))
+    no_rows = np.empty((0, ROW_WIDTH))
+    for k in range(speeds.shape[0]):
+        if not until[k] > time[k]:
+            continue
+        place_obstacle(table, post[k], 1.0 if post_hit[k] else 0.0)
+        table[SPEED, 0] = 0.0
+        for i in range(vehicles):
+            table[COMMAND, i + 1] = command[k, i]
+            table[SPEED, i + 1] = speeds[k, i]
+            table[MASS, i + 1] = mass[k, i]
+            table[LIMIT, i + 1] = limit[k, i]
+            table[ONSET, i + 1] = onset_s(latency[k, i], time[k])
+        for p in range(vehicles - 1):
+            table[GAP, p + 1] = gaps[k, p]
+            table[HIT, p + 1] = 1.0 if hit[k, p] else 0.0
+        status[k] = advance_table(table, restitution[k], until[k] - time[k], time[k], k, no_rows, 0)[1]
+        way[k] += post[k] - table[GAP, 0]
 
 
 VEHICLE_2 = 1  # the map's samples begin with its latency

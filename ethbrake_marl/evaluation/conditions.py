@@ -11,6 +11,7 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.scenario import Task
 from ethbrake_marl.scenario.quantities import DECLARED
 from ethbrake_marl.scenario.sample import quantity, quantity_rules
 
@@ -41,20 +42,38 @@ def quantities(worlds: Worlds) -> dict[str, Any]:
 
 def parameters(evaluation: Evaluation) -> dict[str, Any]:
     """Conditions of an evaluation as plain data: scenario, seed, count, who drove what, and all ``quantities``."""
-    scenario = evaluation.scenario
-    driven = [scenario.vehicle_names[i] for i in evaluation.vehicles]
+    because = evaluation.limits.because if isinstance(evaluation.limits, Unproven) else None
+    found = quantities(evaluation.worlds)
+    return parameters_of(evaluation.task, evaluation.seed, evaluation.worlds.n, because, found)
+
+
+def parameters_of(
+    task: Task, seed: int | None, count: int, because: str | None, found: Mapping[str, Any]
+) -> dict[str, Any]:
+    """``parameters`` from their parts.
+
+    Args:
+        task: scenario, and who was driven.
+        seed: of the list; None for worlds that were given.
+        count: number of worlds.
+        because: why nothing is proven for these worlds; None where it is.
+        found: ``quantities`` of the worlds.
+
+    """
+    scenario = task.scenario
+    driven = [scenario.vehicle_names[i] for i in task.vehicles]
     scripts = {scenario.vehicle_names[i]: script for i, script in scenario.scripts.items()}
     scripts = {name: script for name, script in scripts.items() if name not in driven}
     return {
         "scenario": scenario.name,
-        "seed": evaluation.seed,
-        "count": evaluation.worlds.n,
+        "seed": seed,
+        "count": count,
         **({"controlled_vehicle": driven[0]} if len(driven) == 1 else {"controlled_vehicles": driven}),
         "scripts": scripts,
         "time_step_s": scenario.time_step_s,
         "horizon_s": scenario.horizon_s,
-        "no_limits_because": evaluation.limits.because if isinstance(evaluation.limits, Unproven) else None,
-        **quantities(evaluation.worlds),
+        "no_limits_because": because,
+        **found,
     }
 
 

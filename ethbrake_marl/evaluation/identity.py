@@ -23,7 +23,17 @@ from ethbrake_marl.physics import Ints, Worlds
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.scenario import Sample, Scenario
 
-Kind = Literal["evaluate", "shield", "equal-time", "best-harm", "ablate", "generalise", "learning-curves", "robustness"]
+Kind = Literal[
+    "evaluate",
+    "evaluate-shards",
+    "shield",
+    "equal-time",
+    "best-harm",
+    "ablate",
+    "generalise",
+    "learning-curves",
+    "robustness",
+]
 _PACKAGES = ("ethbrake-marl", "numba", "numpy")
 _WORDS = {"name", "title", "description", "source"}  # what a scenario is called changes nothing
 _BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that takes no memory

@@ -92,7 +92,11 @@ def is_papers_test(evaluation: Evaluation) -> bool:
 
     Every value of the scenario counts, not its name; Vehicle 2 is driven, and the worlds are no table of the user's.
     """
-    scenario = evaluation.scenario
-    if scenario.name not in _SHOWN_WITH or evaluation.seed is None or evaluation.vehicles != (1,):
+    return is_papers_list(evaluation.scenario, evaluation.seed, evaluation.vehicles)
+
+
+def is_papers_list(scenario: Scenario, seed: int | None, vehicles: tuple[int, ...]) -> bool:
+    """``is_papers_test`` for these driven ``vehicles`` (from 0) in the list of this seed; None: the user's table."""
+    if scenario.name not in _SHOWN_WITH or seed is None or vehicles != (1,):
         return False
     return is_as_shipped(scenario)

@@ -111,8 +111,8 @@ def per_world_columns(evaluation: Evaluation, objectives: Sequence[Declared] = (
     return found
 
 
-def initial_columns(evaluation: Evaluation) -> Columns:
-    """World number and its initial state: gaps, speeds, and any other quantity that differs between worlds.
+def initial_columns(evaluation: Evaluation, *, every: bool = False) -> Columns:
+    """World number and its initial state: gaps, speeds, and any other quantity that differs between worlds, or every.
 
     Where there is such, also the scenario of a mixture, and each vehicle's type. Quantities are named
     as in a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``.
@@ -121,7 +121,7 @@ def initial_columns(evaluation: Evaluation) -> Columns:
     columns |= {name: column.tolist() for name, column in evaluation.kinds.items()}
     for field, rule in quantity_rules(evaluation.worlds).items():
         values = quantity(evaluation.worlds, field)
-        if field in _ALWAYS or np.ptp(values, axis=0).any():
+        if every or field in _ALWAYS or np.ptp(values, axis=0).any():
             columns |= {rule.column_of(i): values[:, i].tolist() for i in range(values.shape[1])}
     return columns
 

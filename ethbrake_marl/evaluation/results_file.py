@@ -17,7 +17,12 @@ from ethbrake_marl.files.plain import parse_strict_json, read_plain
 
 HARMS = ("first_impact_harm", "total_harm")
 USUAL: Mapping[str, str | None] = {"harm_count": "first", "uncertainty": None}  # settings of agents
-_COMPARED: dict[Kind, tuple[str, ...]] = {"evaluate": HARMS, "equal-time": HARMS, "shield": ("harm",)}  # harms of each
+_COMPARED: dict[Kind, tuple[str, ...]] = {  # harms of each
+    "evaluate": HARMS,
+    "evaluate-shards": HARMS,
+    "equal-time": HARMS,
+    "shield": ("harm",),
+}
 _LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one with every world
 _MOST_EPISODES = 10**12
 _MOST_HARM = 1e100  # m2/s2; a number that can be squared

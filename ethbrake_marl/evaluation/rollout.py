@@ -75,6 +75,40 @@ def evaluate(
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
     driven = driven_vehicles(scenario, vehicle, agents)
+    whole = _drive_all(sample, agents, scenario, driven, seed, chunk, on_progress, aftermath)
+    return whole.evaluation(scenario, driven, seed)
+
+
+def evaluate_block(
+    sample: Sample, agents: Mapping[str, Driver], *, scenario: Scenario, seed: int
+) -> tuple[Evaluation | None, tuple[LeftOut, ...]]:
+    """``evaluate`` a part of a list at once, and which of its worlds were left out; None where that is all of them.
+
+    Args:
+        sample: the part, which is advanced together.
+        agents: as for ``evaluate``; they drive the scenario's learners.
+        scenario: of the list.
+        seed: of the list.
+
+    """
+    driven = driven_vehicles(scenario, None, agents)
+    whole = _drive_all(sample, agents, scenario, driven, seed, sample.worlds.n, None, True)
+    if len(whole.left_out) == sample.worlds.n:
+        return None, whole.left_out
+    return whole.evaluation(scenario, driven, seed), whole.left_out
+
+
+def _drive_all(
+    sample: Sample,
+    agents: Mapping[str, Driver],
+    scenario: Scenario,
+    driven: tuple[int, ...],
+    seed: int | None,
+    chunk: int,
+    on_progress: OnWorlds | None,
+    aftermath: bool,
+) -> _Whole:
+    """Let each agent drive every world, and note in which of them one of them fails."""
     parts: dict[str, list[_Part]] = {name: [] for name in agents}
     lost: dict[int, LeftOut] = {}
     for name, agent in agents.items():
@@ -88,8 +122,7 @@ def evaluate(
                 parts[name].append(_Part(outcome, kept))
             if on_progress is not None:
                 on_progress(name, int(rows[-1]) + 1)
-    whole = _Whole(sample, parts, tuple(lost[row] for row in sorted(lost)), np.array(sorted(lost), np.int64))
-    return whole.evaluation(scenario, driven, seed)
+    return _Whole(sample, parts, tuple(lost[row] for row in sorted(lost)), np.array(sorted(lost), np.int64))
 
 
 def _check_request(worlds: object, agents: object, scenario: object, chunk: object) -> None:

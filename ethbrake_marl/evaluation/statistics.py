@@ -1,8 +1,9 @@
 """Estimates with 95 % intervals, from one number per world.
 
 The worlds of a list are independent draws, and every agent is measured on the same ones: rates get Wilson's score
-interval, means the t interval of the mean, and comparisons with a baseline are paired by world, so that the spread
-between easy and hard worlds cancels.
+interval (of a sharded list the exact one), means the t interval of the mean, and comparisons with a baseline are paired
+by world, so that the spread between easy and hard worlds cancels. Means and their errors come from exact sums
+(``evaluation.exact``): the order of the worlds changes no bit of them.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri, stdtrit
+from scipy.special import betaincinv, ndtri, stdtrit
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.exact import Moments, difference, exact_products, moments, ratio_error
 from ethbrake_marl.physics import Floats
 
 CONFIDENCE = 0.95
@@ -59,10 +61,27 @@ def rate(successes: int, count: int, *, confidence: float = CONFIDENCE) -> Estim
     With z the normal quantile: centre ``(p + z^2/2n) / (1 + z^2/n)``, half-width
     ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``. Raises ``InvalidInput`` unless 0 <= successes <= count >= 1.
     """
-    if not (count >= 1 and 0 <= successes <= count):
-        raise InvalidInput(f"rate: {successes} of {count}: must be 0 <= successes <= count, and count at least 1")
+    _check_rate(successes, count)
     p = successes / count
     return Estimate(p, wilson(p, count, confidence=confidence))
+
+
+def exact_rate(successes: int, count: int, *, confidence: float = CONFIDENCE) -> Estimate:
+    """Share ``successes / count`` with the exact (Clopper-Pearson) interval, which covers at least ``confidence``.
+
+    Its ends are the shares at which so many successes or more, or so few or fewer, have probability
+    ``(1 - confidence) / 2``: quantiles of the beta distribution. Raises ``InvalidInput`` as ``rate``.
+    """
+    _check_rate(successes, count)
+    k, n, tail = successes, count, 0.5 - 0.5 * confidence
+    low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
+    high = 1.0 if k == n else float(betaincinv(k + 1, n - k, 1.0 - tail))
+    return Estimate(k / n, (low, high))
+
+
+def _check_rate(successes: int, count: int) -> None:
+    if not (count >= 1 and 0 <= successes <= count):
+        raise InvalidInput(f"rate: {successes} of {count}: must be 0 <= successes <= count, and count at least 1")
 
 
 def wilson(p: float, count: int, *, confidence: float = CONFIDENCE) -> tuple[float, float]:
@@ -82,14 +101,19 @@ def mean(values: Floats, *, confidence: float = CONFIDENCE) -> Estimate:
     At thousands of worlds the mean is normal whatever the harm's own distribution, and the interval equals the
     bootstrap's. Raises ``InvalidInput`` when ``values`` is empty or not finite.
     """
-    data = _check(values)
-    return _around(float(data.mean()), data, 1.0, confidence)
+    return mean_of(moments(_check(values)), confidence=confidence)
+
+
+def mean_of(found: Moments, *, confidence: float = CONFIDENCE) -> Estimate:
+    """``mean`` of at least one value, from exact moments."""
+    return _around(found.mean, found.standard_error if found.count > 1 else 0.0, found.count, confidence)
 
 
 def paired_difference(values: Floats, baseline: Floats, *, confidence: float = CONFIDENCE) -> Estimate:
     """Mean of ``values - baseline`` world by world, with the t interval of that mean."""
     data, reference = _check_pair(values, baseline)
-    return mean(data - reference, confidence=confidence)
+    products = exact_products(data, reference)
+    return mean_of(difference(moments(data), moments(reference), products), confidence=confidence)
 
 
 def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
@@ -120,20 +144,24 @@ def relative_decrease(values: Floats, baseline: Floats, *, confidence: float = C
     and the standard error of r is ``s_residual / (sqrt(n) mean(baseline))``.
     """
     data, reference = _check_pair(values, baseline)
-    scale = float(reference.mean())
-    if scale == 0.0:
+    return decrease_of(moments(data), moments(reference), exact_products(data, reference), confidence=confidence)
+
+
+def decrease_of(
+    values: Moments, baseline: Moments, products: int, *, confidence: float = CONFIDENCE
+) -> Estimate | None:
+    """``relative_decrease`` from exact moments and the exact sum of the products."""
+    if baseline.total == 0:
         return None
-    ratio = float(data.mean()) / scale
-    return _around(1.0 - ratio, data - ratio * reference, scale, confidence)
+    error = ratio_error(values, baseline, products) if values.count > 1 else 0.0
+    return _around(1.0 - values.total / baseline.total, error, values.count, confidence)
 
 
-def _around(value: float, data: Floats, scale: float, confidence: float) -> Estimate:
-    """``value`` with the half-width ``t s(data) / (sqrt(n) |scale|)``."""
-    n = len(data)
+def _around(value: float, error: float, n: int, confidence: float) -> Estimate:
+    """``value`` with the half-width ``t error`` of n - 1 degrees of freedom."""
     if n < 2:
         return Estimate(value, None)
-    quantile = float(stdtrit(n - 1, 0.5 + 0.5 * confidence))
-    half = quantile * float(data.std(ddof=1)) / (math.sqrt(n) * abs(scale))
+    half = float(stdtrit(n - 1, 0.5 + 0.5 * confidence)) * error
     return Estimate(value, (value - half, value + half))
 
 

@@ -2,12 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import bootstrap
+from scipy.stats import binom, bootstrap
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import (
     Estimate,
     estimates_to_json,
+    exact_rate,
     mean,
     paired_difference,
     rate,
@@ -107,3 +108,29 @@ def test_json__of_an_estimate_has_its_interval_as_a_list_and_null_for_what_does_
         ("harm", 2.0), ("harm_interval", [1.0, 3.0]), ("alone", 4.0), ("alone_interval", None),
         ("absent", None), ("absent_interval", None),
     ]  # fmt: skip
+
+
+def test_exact_rate__the_textbook_interval_of_clopper_and_pearson() -> None:
+    assert exact_rate(5, 10).value == 0.5
+    assert exact_rate(5, 10).interval == pytest.approx((0.1870860, 0.8129140), abs=1e-7)
+
+
+@pytest.mark.parametrize("count", [1, 10, 10**8])
+def test_exact_rate__none_and_all_reach_the_ends(count: int) -> None:
+    reach = 1.0 - 0.025 ** (1.0 / count)
+    assert exact_rate(0, count).interval == pytest.approx((0.0, reach), rel=1e-6)
+    assert exact_rate(count, count).interval == pytest.approx((1.0 - reach, 1.0), rel=1e-9)
+
+
+@pytest.mark.parametrize(("successes", "count"), [(1, 3), (3, 10**8), (5 * 10**7, 10**8), (10**8 - 2, 10**8)])
+def test_exact_rate__its_ends_have_the_tails_that_they_must(successes: int, count: int) -> None:
+    low, high = exact_rate(successes, count).interval
+    assert binom.sf(successes - 1, count, low) == pytest.approx(0.025, rel=1e-6)
+    assert binom.cdf(successes, count, high) == pytest.approx(0.025, rel=1e-6)
+
+
+def test_mean__does_not_depend_on_the_order_of_the_worlds() -> None:
+    harm = np.random.default_rng(9).exponential(20.0, 1000)
+    other = harm[::-1].copy()
+    assert mean(harm) == mean(other)
+    assert paired_difference(harm, other) == paired_difference(other[::-1].copy(), harm[::-1].copy())

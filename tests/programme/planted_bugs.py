@@ -30,9 +30,10 @@ SB3 = "ethbrake_marl/envs/sb3.py"
 COMPARISON, OPTIMUM, PLAN = (
     f"ethbrake_marl/studies/ablation/{name}.py" for name in ("comparison", "joint_optimum", "plan")
 )
-STATISTICS, SEEDS, TABLE, REGRET, ROLLOUT = (
-    f"ethbrake_marl/evaluation/{name}.py" for name in ("statistics", "seed_statistics", "table", "regret", "rollout")
+EXACT, SEEDS, TABLE, REGRET, ROLLOUT = (
+    f"ethbrake_marl/evaluation/{name}.py" for name in ("exact", "seed_statistics", "table", "regret", "rollout")
 )
+SHARDS = "ethbrake_marl/studies/shards.py"
 COURSE, LOOP, EVENTS, KEPT, INDEPENDENT, RECIPE = (
     f"ethbrake_marl/learning/{name}.py"
     for name in ("progress", "loop", "run_log", "training", "algorithms/independent_ppo", "recipe")
@@ -57,7 +58,11 @@ OF_V2X = ("tests/scenario/test_v2x.py",)
 OF_ENGINE = ("tests/engine/test_engine.py", "tests/test_rewards.py", "tests/envs/test_sb3.py")
 OF_ABLATION = ("tests/studies/ablation/test_levels.py", "tests/studies/ablation/test_comparison.py")
 OF_OPTIMUM = ("tests/studies/ablation/test_joint_optimum.py",)
-OF_STATISTICS = ("tests/evaluation/test_statistics.py", "tests/evaluation/test_seed_statistics.py")
+OF_STATISTICS = (
+    "tests/evaluation/test_exact.py",
+    "tests/evaluation/test_statistics.py",
+    "tests/evaluation/test_seed_statistics.py",
+)
 OF_TABLES = ("tests/evaluation/test_table.py", "tests/evaluation/test_regret.py", "tests/evaluation/test_rollout.py")
 OF_LEARNING = ("tests/learning/test_progress.py", "tests/learning/test_recipe.py", "tests/learning/test_train.py")
 OF_FILES = ("tests/learning/test_training.py", "tests/learning/test_event_files.py")
@@ -176,9 +181,18 @@ BUGS: dict[str, Bug] = {
     ),
     "levels may differ in their lines": Bug(PLAN, "(*_LINE, *_WORLD, *_VEHICLE)", "(*_LINE, *_VEHICLE)", OF_ABLATION),
     # ------------------------------------------------------------ evaluation
-    "standard deviation of a population": Bug(STATISTICS, "data.std(ddof=1)", "data.std(ddof=0)", OF_STATISTICS),
+    "standard deviation of a population": Bug(
+        EXACT, "(n * n * (n - 1)) << PRODUCT_BITS", "(n * n * n) << PRODUCT_BITS", OF_STATISTICS
+    ),
     "relative decrease as if nothing were paired": Bug(
-        STATISTICS, "data - ratio * reference, scale", "data, scale", OF_STATISTICS
+        EXACT,
+        "values.squares * y * y - 2 * x * y * products + x * x * others.squares",
+        "(n * values.squares - x * x) * y * y // n",
+        OF_STATISTICS,
+    ),
+    "the upper bits of a summand are lost": Bug(EXACT, "sign * (high >> 32)", "sign * 0", OF_STATISTICS),
+    "parts of a list that are finished are driven again": Bug(
+        SHARDS, "            first = until", "            first = have", ("tests/studies/test_shards.py",)
     ),
     "interval over seeds without drawing worlds anew": Bug(
         SEEDS, "drawn = rng.integers(worlds, size=(size, worlds)) +", "drawn = np.arange(worlds) + 0 *", OF_STATISTICS

@@ -1,0 +1,133 @@
+"""``ethbrake evaluate --shards``: a list of any length in flat memory, by several processes, resumable."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
+from ethbrake_marl.errors import InvalidInput, check_whole_number, need
+from ethbrake_marl.evaluation import SummaryRow, horizon_note, rescored_table, rich_table
+from ethbrake_marl.evaluation.inputs import check_agents, make_lineup
+from ethbrake_marl.evaluation.shards.question import Question, ask
+from ethbrake_marl.evaluation.shards.summary import rescore_shards, shards_to_json, summarise_shards
+from ethbrake_marl.evaluation.text import metrics_table
+from ethbrake_marl.files.durable import write_file
+from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.studies.shards import MOST_JOBS, ShardFolder, evaluate_shards
+
+ShardsOption = Annotated[
+    int | None, typer.Option(metavar="K", help="Evaluate the list in K parts, in flat memory; changes no figure.")
+]
+JobsOption = Annotated[int, typer.Option(metavar="N", help="With --shards: processes; changes no figure.")]
+KeptOption = Annotated[
+    Path | None,
+    typer.Option("--output", metavar="FOLDER", help="With --shards: keeps finished ones; the same command goes on."),
+]
+RowsOption = Annotated[
+    bool, typer.Option("--rows", help="With --output: also one row per world and agent, as Parquet files in it.")
+]
+RESULTS = "results.json"
+
+
+def check_shards(shards: int | None, jobs: int, output: Path | None, rows: bool, others: Mapping[str, object]) -> None:
+    """Refuse options that do not go together.
+
+    Args:
+        shards: parts of the list; None: it is evaluated in one piece.
+        jobs: processes.
+        output: folder of finished shards.
+        rows: one row per world and agent is asked for.
+        others: options that need every world at once, by name.
+
+    """
+    if shards is None:
+        alone = {"--jobs": jobs != 1, "--output": output is not None, "--rows": rows}
+        if given := [name for name, is_given in alone.items() if is_given]:
+            raise InvalidInput(f"{given[0]}: is for an evaluation in parts; add --shards 100")
+        return
+    if given := [name for name, value in others.items() if value]:
+        more = "; for one row per world give --output FOLDER --rows" if "--per-world" in given else ""
+        raise InvalidInput(f"{given[0]}: needs every world at once, and --shards keeps none{more}")
+    check_whole_number("shards", shards, 1)
+    check_whole_number("jobs", jobs, 1, MOST_JOBS)
+    if rows and output is None:
+        raise InvalidInput("--rows: needs a folder for them: --output FOLDER")
+    if rows:
+        need("pyarrow")
+
+
+def evaluate_in_shards(
+    scenario: Scenario,
+    agents: Sequence[str],
+    *,
+    shards: int,
+    jobs: int,
+    output: Path | None,
+    rows: bool,
+    episodes: int,
+    seed: int,
+    harm_count: HarmCount,
+    shield: str,
+    uncertainty: str | None,
+    objectives: Sequence[str],
+    as_json: bool,
+) -> None:
+    """Drive the list shard by shard, and print the table that is printed without shards.
+
+    Args:
+        scenario: with the learners that are driven.
+        agents: as they were written.
+        shards: parts of the list.
+        jobs: processes.
+        output: folder that keeps finished shards; None: nothing is kept.
+        rows: keep one row per world and agent, too.
+        episodes: worlds of the list.
+        seed: of the list.
+        harm_count: harm that agents minimise.
+        shield: the old way to put one around learned agents.
+        uncertainty: what robust shields do not know.
+        objectives: under which results are told, too.
+        as_json: print JSON alone.
+
+    """
+    intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
+    lineup = make_lineup(agents, scenario, harm_count=harm_count, shield=shield, uncertainty=intervals)
+    question = Question(scenario, tuple(lineup), episodes, seed, harm_count, uncertainty, tuple(objectives))
+    check_agents(lineup, scenario.sample(1, seed).worlds, scenario)
+    asked = ask(question)
+    folder = None if output is None else ShardFolder(output, asked, rows)
+    kept = "nothing was written" if folder is None else "finished shards are kept: the same command goes on"
+    with interruptible(kept), progress_bars() as bars:
+        tally = evaluate_shards(asked, shards=shards, jobs=jobs, folder=folder, tell=bars.show_progress)
+    summary = summarise_shards(asked, tally)
+    results = shards_to_json(asked, tally, summary)
+    if output is not None:
+        write_file(output / RESULTS, (json.dumps(results, indent=2, allow_nan=False) + "\n").encode())
+        say(f"finished shards: {output}; the results: {output / RESULTS}")
+    if as_json:
+        write_json(results)
+    else:
+        _show(summary)
+    moving = {row.agent: row.horizon_ends for row in summary if row.policy_share is not None}
+    if note := horizon_note(moving, tally.worlds, scenario.horizon_s):
+        say(note)
+    if objectives and not as_json:
+        result_console().print(rescored_table(rescore_shards(asked, tally), harm_count))
+
+
+def _show(rows: Sequence[SummaryRow]) -> None:
+    """The table, and how its intervals were made."""
+    result_console().print(rich_table(rows))
+    if rows[0].metrics:
+        result_console().print(metrics_table(rows))
+    show(
+        "Intervals: rates exact (Clopper-Pearson), means by Student's t; all from exact sums, the same bits in any"
+        " number of shards."
+    )

@@ -1,0 +1,1 @@
+"""Evaluations of lists that no memory holds: in shards, ranges of worlds whose statistics merge without rounding."""

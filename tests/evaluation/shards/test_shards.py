@@ -1,0 +1,172 @@
+"""A list in shards: the same bits for any number of shards, workers and any size of the blocks, and today's figures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.evaluation import evaluate, rescore, summarise
+from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.evaluation.shards.question import Question, answer_shard, ask, shard_bounds
+from ethbrake_marl.evaluation.shards.summary import rescore_shards, shards_to_json, summarise_shards
+from ethbrake_marl.evaluation.shards.tally import Tally
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.studies.shards import evaluate_shards
+
+AGENTS = ("full_brake", "e_v2x_bm:pairwise")
+N = 7_300
+
+FAILING = """
+import numpy as np
+from ethbrake_marl.errors import PhysicsError
+
+class Failing:
+    name, knows = "failing", "own sensors"
+
+    def begin(self, worlds, vehicle, rows):
+        self.bad = np.flatnonzero(worlds.gaps_m[:, 0] < {below})
+
+    def act(self, worlds, vehicle):
+        if self.bad.size:
+            raise PhysicsError({{int(row): "planted" for row in self.bad}})
+        return -worlds.vehicles.braking_capacity_mps2[:, vehicle]
+
+def make():
+    return Failing()
+"""
+
+
+@pytest.fixture(scope="module")
+def asked(paper_random: Scenario):
+    return ask(Question(paper_random, AGENTS, N, 11, objectives=("own",)))
+
+
+@pytest.fixture(scope="module")
+def tally(asked) -> Tally:
+    return evaluate_shards(asked, shards=1)
+
+
+@pytest.mark.parametrize(("shards", "block"), [(2, 2_000), (7, 1_000), (3, 5_000)])
+def test_tally__is_the_same_bits_in_any_shards_and_blocks(asked, tally: Tally, shards: int, block: int) -> None:
+    found = evaluate_shards(asked, shards=shards, block=block)
+    assert found == tally
+    assert json.dumps(shards_to_json(asked, found, summarise_shards(asked, found))) == json.dumps(
+        shards_to_json(asked, tally, summarise_shards(asked, tally))
+    )
+
+
+def test_tally__is_the_same_bits_from_two_processes(paper_random: Scenario) -> None:
+    asked = ask(Question(paper_random, ("full_brake", "e_v2x_bm"), 3_000, 5))
+    alone = evaluate_shards(asked, shards=1)
+    assert evaluate_shards(asked, shards=3, jobs=2) == alone
+
+
+def test_rows__are_those_of_evaluate_on_the_same_worlds(asked, tally: Tally, paper_random: Scenario) -> None:
+    sample = paper_random.sample(N, 11)
+    evaluation = evaluate(sample, make_lineup(AGENTS, paper_random), scenario=paper_random, seed=11, chunk=777)
+    sharded, whole = summarise_shards(asked, tally), summarise(evaluation)
+    for one, other in zip(sharded, whole, strict=True):
+        assert one.collision_rate.value == other.collision_rate.value
+        assert one.collision_rate.interval == pytest.approx(other.collision_rate.interval, abs=2e-4)
+        names = ("first_impact_harm", "total_harm", "first_difference", "total_difference", "first_decrease",
+                 "total_decrease", "predicted_harm", "sampled_harm", "shoved_m", "collisions", "horizon_ends", "knows",
+                 "hidden_share", "episodes", "policy_share", "beside_paper", "scenario_sha256")  # fmt: skip
+        for name in names:
+            assert getattr(one, name) == getattr(other, name), name  # to the last bit: both are exact sums
+        assert one.parameters == other.parameters
+        assert one.distance.regret_first is None  # no table holds the worlds of seed 11
+    assert rescore_shards(asked, tally) == rescore(evaluation, ["own"])
+
+
+def test_regret__where_a_table_holds_every_world(paper_random: Scenario) -> None:
+    question = Question(paper_random, ("full_brake", "e_v2x_bm:pairwise"), 1_200, 7)
+    asked = ask(question)
+    found = summarise_shards(asked, evaluate_shards(asked, shards=2))
+    sample = paper_random.sample(1_200, 7)
+    lineup = make_lineup(question.agents, paper_random)
+    whole = summarise(evaluate(sample, lineup, scenario=paper_random, seed=7))
+    for one, other in zip(found, whole, strict=True):
+        for name in ("regret_first", "regret_total", "realised_first", "best_known_first", "proven_harm", "gap_first"):
+            assert getattr(one.distance, name) == getattr(other.distance, name), name
+        assert one.distance.unavoidable_rate.value == other.distance.unavoidable_rate.value
+        assert one.distance.below_best_known == other.distance.below_best_known
+
+
+def test_worlds_that_fail__are_left_out_for_all_agents(tmp_path: Path, paper_random: Scenario) -> None:
+    file = tmp_path / "failing.py"
+    file.write_text(FAILING.format(below=5.01))
+    question = Question(paper_random, ("full_brake", f"{file}:make"), 2_500, 7)
+    asked = ask(question)
+    one, three = (evaluate_shards(asked, shards=k) for k in (1, 3))
+    sample = paper_random.sample(2_500, 7)
+    bad = np.flatnonzero(sample.worlds.gaps_m[:, 0] < 5.01)
+    assert one == three and one.worlds == 2_500 - bad.size and bad.size > 0
+    assert [(left.world, left.seed, left.reason) for left in one.left_out] == [(k, 7, "planted") for k in bad.tolist()]
+    rows = summarise_shards(asked, one)
+    good = np.setdiff1d(np.arange(2_500), bad)
+    whole = summarise(
+        evaluate(sample.worlds.take(good), make_lineup(["full_brake"], paper_random), scenario=paper_random)
+    )
+    assert rows[0].first_impact_harm == whole[0].first_impact_harm
+    assert len(rows[0].left_out) == bad.size
+
+
+def test_a_list_of_which_every_world_fails__is_refused(tmp_path: Path, paper_random: Scenario) -> None:
+    file = tmp_path / "failing_all.py"
+    file.write_text(FAILING.format(below=1e9))
+    asked = ask(Question(paper_random, (f"{file}:make",), 1_500, 7))
+    with pytest.raises(PhysicsError, match="planted"):
+        summarise_shards(asked, evaluate_shards(asked, shards=2))
+
+
+def test_tally__comes_back_from_json_as_it_was(tally: Tally) -> None:
+    assert Tally.from_json(json.loads(json.dumps(tally.to_json()))) == tally
+    whole = tally.to_json()
+    agent = {"counts": {}, "moments": {"total_harm": [N, "0x1", "0x0"]}, "products": {}}
+    short = {**agent, "moments": {"first_impact_harm": [3, "0x0", "0x0"], "total_harm": [N, "0x0", "0x0"]}}
+    wrong = [{"worlds": -1}, {"agents": {"x": {}}}, {"agents": {"x": agent}}, {"agents": {"x": short}}]
+    wrong += [{"left_out": [[0, 7, 3, None]]}, {"ranges": {"gaps_m": [1]}}, {"worlds": 10**30}]
+    for bad in ({}, [], None, *({**whole, **change} for change in wrong)):
+        with pytest.raises(InvalidInput, match="no tally"):
+            Tally.from_json(bad)
+
+
+def test_worlds_hash__tells_another_list(paper_random: Scenario, tally: Tally) -> None:
+    for scenario, seed in ((paper_random, 12), (load_scenario("paper-random-early"), 11)):
+        other = ask(Question(scenario, ("full_brake",), 2_000, seed))
+        assert evaluate_shards(other, shards=1).worlds_hash != tally.worlds_hash
+
+
+def test_shard_bounds__are_whole_leaves() -> None:
+    assert shard_bounds(10_300, 7)[-1] == (9_000, 10_300)
+    assert shard_bounds(10_300, 1) == [(0, 10_300)]
+    assert shard_bounds(500, 7) == [(0, 500)]
+    for episodes, shards in ((10_300, 7), (10**8, 97), (999, 3)):
+        bounds = shard_bounds(episodes, shards)
+        assert bounds[0][0] == 0 and bounds[-1][1] == episodes
+        assert all(one[1] == other[0] for one, other in pairwise(bounds))
+
+
+@pytest.mark.parametrize("bounds", [(500, 1_000), (0, 999), (1_000, 1_000)])
+def test_a_shard_that_is_no_range_of_leaves__is_refused(asked, bounds: tuple[int, int]) -> None:
+    with pytest.raises(InvalidInput, match="whole leaves"):
+        answer_shard(asked, *bounds)
+
+
+def test_a_shard__refuses_another_version_than_it_was_asked_about(asked) -> None:
+    other = replace(asked, identity={**asked.identity, "versions": {"numba": "0"}})
+    with pytest.raises(InvalidInput, match="versions changed"):
+        answer_shard(other, 0, 1_000)
+
+
+@pytest.mark.long
+def test_a_hundred_thousand_worlds__are_the_same_bits_in_1_2_and_7_shards(paper_random: Scenario) -> None:
+    asked = ask(Question(paper_random, ("full_brake", "e_v2x_bm"), 100_000, 7))
+    one, two, seven = (evaluate_shards(asked, shards=k, jobs=min(k, 2)) for k in (1, 2, 7))
+    assert one == two == seven

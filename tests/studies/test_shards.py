@@ -1,0 +1,139 @@
+"""The folder of a sharded evaluation: what is finished is kept, what is damaged or foreign is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.evaluation.shards.question import Asked, Question, ask
+from ethbrake_marl.evaluation.shards.tally import Tally
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.studies import shards as studied
+from ethbrake_marl.studies.shards import ShardFolder, evaluate_shards
+
+N = 4_500
+
+
+@pytest.fixture(scope="module")
+def asked(paper_random: Scenario) -> Asked:
+    return ask(Question(paper_random, ("full_brake", "coast"), N, 11))
+
+
+@pytest.fixture(scope="module")
+def tally(asked: Asked) -> Tally:
+    return evaluate_shards(asked, shards=1)
+
+
+@pytest.fixture
+def driven(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+    """The ranges of worlds that are driven from now on."""
+    found: list[tuple[int, int]] = []
+    answer = studied.answer_shard
+
+    def noted(asked, first, end, *more):
+        found.append((first, end))
+        return answer(asked, first, end, *more)
+
+    monkeypatch.setattr(studied, "answer_shard", noted)
+    return found
+
+
+def interrupted(asked: Asked, folder: ShardFolder, after: int, shards: int) -> None:
+    """Let an evaluation be killed when so many shards are finished."""
+
+    def tell(progress) -> None:
+        if len(list(folder.path.glob("shard-*.json"))) == after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_shards(asked, shards=shards, folder=folder, tell=tell)
+
+
+def test_killed__goes_on_with_what_is_left_in_any_number_of_shards(asked, tally, driven, tmp_path: Path) -> None:
+    folder = ShardFolder(tmp_path / "kept", asked)
+    interrupted(asked, folder, 2, shards=4)
+    assert driven == [(0, 1_000), (1_000, 2_000)]
+    driven.clear()
+    assert evaluate_shards(asked, shards=2, folder=folder) == tally
+    assert driven == [(2_000, 4_500)]
+    driven.clear()
+    assert evaluate_shards(asked, shards=3, folder=folder) == tally
+    assert driven == []
+
+
+def test_another_question__is_refused_and_told(asked, paper_random, tmp_path: Path) -> None:
+    folder = ShardFolder(tmp_path, asked)
+    evaluate_shards(asked, shards=1, folder=folder)
+    other = ask(Question(paper_random, ("full_brake",), N, 12))
+    with pytest.raises(InvalidInput, match=r"another question \(agents, knows, policy_sha256, seed differ\)"):
+        evaluate_shards(other, shards=1, folder=ShardFolder(tmp_path, other))
+    with pytest.raises(InvalidInput, match="rows differ"):
+        evaluate_shards(asked, shards=1, folder=ShardFolder(tmp_path, asked, with_rows=True))
+
+
+def test_a_folder_of_something_else__is_left_alone(asked, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(AlreadyExists, match="no folder of shards"):
+        evaluate_shards(asked, shards=1, folder=ShardFolder(tmp_path, asked))
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_two_at_once__the_second_is_refused(asked, tmp_path: Path) -> None:
+    folder = ShardFolder(tmp_path, asked)
+    with folder.alone(), pytest.raises(InvalidInput, match="another evaluation works in it"):
+        evaluate_shards(asked, shards=1, folder=ShardFolder(tmp_path, asked))
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda told: told["tally"].update(worlds=4_501), "is damaged"),
+        (lambda told: told.update(asked="0"), "another question"),
+        (lambda told: told.update(end=4_000), "another question"),
+        (lambda told: told.update(first="0"), "another question"),
+        (lambda told: told.pop("tally"), "is damaged"),
+    ],
+)
+def test_a_damaged_shard__is_refused_by_name(asked, tally, tmp_path: Path, damage, reason: str) -> None:
+    folder = ShardFolder(tmp_path, asked)
+    folder.prepare()
+    folder.keep((0, N), tally)
+    (file,) = tmp_path.glob("shard-*.json")
+    told = json.loads(file.read_text())
+    damage(told)
+    file.write_text(json.dumps(told))
+    with pytest.raises(InvalidInput, match=f"{file.name}.*{reason}"):
+        evaluate_shards(asked, shards=1, folder=folder)
+    file.write_text("{")
+    with pytest.raises(InvalidInput, match="no JSON"):
+        evaluate_shards(asked, shards=1, folder=folder)
+
+
+def test_rows__are_the_same_for_any_shards_and_those_of_killed_shards_go(asked, tally, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    tables = []
+    for shards in (1, 4):
+        folder = ShardFolder(tmp_path / str(shards), asked, with_rows=True)
+        if shards == 4:
+            interrupted(asked, folder, 2, shards)
+            (folder.path / "worlds-0000000002000-0000000004500.parquet").write_bytes(b"half")
+        assert evaluate_shards(asked, shards=shards, folder=folder, block=1_000 * shards) == tally
+        files = sorted(folder.path.glob("worlds-*.parquet"))
+        assert len(files) == shards
+        tables.append([row for file in files for row in parquet.read_table(file).to_pylist()])
+    assert tables[0] == tables[1]
+    assert [(row["world"], row["agent"]) for row in tables[0][:3]] == [
+        (0, "full_brake"),
+        (0, "coast"),
+        (1, "full_brake"),
+    ]
+    braking = [row["total_harm"] for row in tables[0] if row["agent"] == "full_brake"]
+    assert len(braking) == N
+    assert np.mean(braking) == pytest.approx(tally.agents["full_brake"].moments["total_harm"].mean, rel=1e-12)
+    (tmp_path / "1" / "worlds-0000000000000-0000000004500.parquet").write_bytes(b"")
+    with pytest.raises(InvalidInput, match="is not the one that was written with"):
+        evaluate_shards(asked, shards=1, folder=ShardFolder(tmp_path / "1", asked, with_rows=True))
