@@ -28,7 +28,7 @@ if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for th
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check docs clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds
+.PHONY: help venv run test lint check docs dist clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -36,6 +36,7 @@ help:
 	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make check            lint and test"
 	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"
+	@echo "make dist             wheel and sdist in dist/, built twice with the same SHA-256"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
@@ -121,6 +122,10 @@ docs: $(DOCS_STAMP)
 	@echo "== the documentation site"
 	@$(BIN)/python -m sphinx -W --keep-going -q -b html -d docs/_build/doctrees docs docs/_build/html $(ARGS)
 	@echo "== docs/_build/html/index.html"
+
+dist: $(STAMP)
+	@echo "== wheel and sdist, twice"
+	@$(BIN)/python -m tests.wheel.reproducible $(ARGS)
 
 test-physics: $(STAMP)
 	@echo "== long programme on the physics"

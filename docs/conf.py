@@ -21,10 +21,12 @@ highlight_language = "none"
 myst_heading_anchors = 4
 myst_enable_extensions = ["dollarmath"]
 
-# Notebooks are Markdown files with code cells. Their outputs are kept from build to build until a cell changes.
+# Notebooks are Markdown files with code cells, each run in an empty folder. Their outputs are kept from build to build
+# until a cell changes; `make clean` forgets them.
 nb_execution_mode = "cache"
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
+nb_execution_in_temp = True
 nb_merge_streams = True
 
 autodoc_typehints = "none"  # they stand in the signature's line
@@ -33,6 +35,7 @@ napoleon_numpy_docstring = False
 
 html_theme = "furo"
 html_title = f"ethbrake_marl {__version__}"
+html_extra_path = ["../scenarios/scenario.schema.json"]
 html_copy_source = False
 html_show_sourcelink = False
 copybutton_prompt_text = "$ "

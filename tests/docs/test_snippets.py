@@ -9,7 +9,7 @@ import pytest
 
 from tests.docs.site import DOCS
 
-PAGES = ("shipped-policies",)
+PAGES = ("pettingzoo-listing", "shipped-policies")
 PROGRAM = re.compile(r"```python\n(.*?)```(?:\n\n```\n(.*?)```)?", re.DOTALL)
 
 
