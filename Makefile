@@ -9,6 +9,7 @@ SHELL := /bin/sh
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DOCS_STAMP := $(VENV)/.docs
 PEERS := .venv-peers
 TORCH_INDEX ?=
 PYTHON ?=
@@ -27,13 +28,15 @@ if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for th
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
 	@echo "make test [ARGS=...]  the test suite, without the tests marked long"
 	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make check            lint and test"
+	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"
+	@echo "make dist             wheel and sdist in dist/, built twice with the same SHA-256"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
@@ -112,6 +115,20 @@ lint: $(STAMP)
 check: lint
 	@$(MAKE) --no-print-directory test
 
+$(DOCS_STAMP): $(STAMP)
+	@echo "== Installing what builds the site"
+	@$(PIP_INSTALL) -e ".[docs]"
+	@touch $@
+
+docs: $(DOCS_STAMP)
+	@echo "== the documentation site"
+	@$(BIN)/python -m sphinx -W --keep-going -q -b html -d docs/_build/doctrees docs docs/_build/html $(ARGS)
+	@echo "== docs/_build/html/index.html"
+
+dist: $(STAMP)
+	@echo "== wheel and sdist, twice"
+	@$(BIN)/python -m tests.wheel.reproducible $(ARGS)
+
 test-physics: $(STAMP)
 	@echo "== long programme on the physics"
 	@$(BIN)/python -m tests.physics.programme $(ARGS)
@@ -169,5 +186,5 @@ bench-peers: $(STAMP)
 	@$(BIN)/python -m tests.benchmarks.peers --environment $(PEERS) --torch-index "$(TORCH_INDEX)" $(ARGS)
 
 clean:
-	rm -rf $(VENV) $(PEERS) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist
-	find ethbrake_marl tests train -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf $(VENV) $(PEERS) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist docs/_build
+	find ethbrake_marl tests train docs -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -204,6 +204,9 @@ _HEAD = """\
 #   {{normal: {{mean: 20, sd: 1, low: 18, high: 22}}}}    truncated to [low, high]
 #   {{choice: [6, 7, 8]}}    optionally with weights: [1, 2, 1]
 # One entry stands for every vehicle (each draws its own value); a list has one entry per vehicle, front to rear.
+# yaml-language-server: $schema=scenario.schema.json
+# Your editor completes and checks this file once that schema stands beside it:
+#   ethbrake scenario schema > scenario.schema.json
 """
 
 

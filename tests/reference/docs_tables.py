@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from ethbrake_marl import ethbrake_v0
 from ethbrake_marl.envs.state import state_features
 from ethbrake_marl.observations import Feature, ObservationSpec, choose_observation
 from ethbrake_marl.rewards import REWARDS, TERMS, RewardParams, Term
@@ -35,9 +36,35 @@ def term_table(terms: Iterable[Term]) -> str:
     return _markdown(("term", "unit", "meaning"), [(f"`{t.name}`", t.unit, t.meaning) for t in terms])
 
 
+def fact_table() -> str:
+    """Markdown table of what PettingZoo's pages say of an environment, here with its default arguments."""
+    env = ethbrake_v0.parallel_env()
+    agent = env.possible_agents[0]
+    spaces = {
+        "Action": env.action_space(agent),
+        "Observation": env.observation_space(agent),
+        "State": env.state_space,
+    }
+    rows = [
+        ("Import", "`from ethbrake_marl import ethbrake_v0`"),
+        ("Actions", "continuous"),
+        ("Parallel API", "yes"),
+        ("Manual control", "no"),
+        ("Agents", f"{len(env.possible_agents)} by default, 2 to 64 by scenario"),
+        ("Agent names", ", ".join(f"`{name}`" for name in env.possible_agents)),
+    ]
+    for name, space in spaces.items():
+        rows += [
+            (f"{name} shape", f"({space.shape[0]},)"),
+            (f"{name} values", f"[{space.low.min():g}, {space.high.max():g}]"),
+        ]
+    return _markdown(("fact", "value"), rows)
+
+
 def environment_tables() -> dict[str, str]:
     """Every table of docs/environment.md by its marker."""
     return {
+        "facts": fact_table(),
         "observation": feature_table(ObservationSpec().features),
         "obstacle": feature_table(ObservationSpec(role=True, obstacle=True).features, ObservationSpec().size),
         "contact": feature_table(ObservationSpec(contact=True).features, ObservationSpec().size),

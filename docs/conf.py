@@ -1,0 +1,42 @@
+"""Configuration of the documentation site: `make docs` builds it in docs/_build/html, and any warning stops it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from ethbrake_marl import __version__
+
+sys.path.insert(0, str(Path(__file__).parent))  # for the folder extension/
+
+project = "ethbrake_marl"
+author = "ethbrake_marl contributors"
+release = version = __version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "extension"]
+exclude_patterns = ["_build", "README.md", "extension"]
+highlight_language = "none"
+
+# Links to headings are those of GitHub, so that pages read the same there.
+myst_heading_anchors = 4
+myst_enable_extensions = ["dollarmath"]
+
+# Notebooks are Markdown files with code cells, each run in an empty folder. Their outputs are kept from build to build
+# until a cell changes; `make clean` forgets them.
+nb_execution_mode = "cache"
+nb_execution_timeout = 600
+nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+nb_merge_streams = True
+
+autodoc_typehints = "none"  # they stand in the signature's line
+autodoc_member_order = "bysource"
+napoleon_numpy_docstring = False
+
+html_theme = "furo"
+html_title = f"ethbrake_marl {__version__}"
+html_extra_path = ["../scenarios/scenario.schema.json"]
+html_copy_source = False
+html_show_sourcelink = False
+copybutton_prompt_text = "$ "
+copybutton_only_copy_prompt_lines = True

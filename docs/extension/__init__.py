@@ -1,0 +1,40 @@
+"""The documentation site's own Sphinx extension: pages that are made from other files of the repository."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
+
+from extension.api import add_public_names
+from extension.pages import add_cards, add_records, make_changelog, make_start, relink
+
+MADE = {
+    "index": make_start,
+    "changelog": make_changelog,
+    "api": add_public_names,
+    "shipped-policies": add_cards,
+    "decisions/README": add_records,
+}
+
+
+def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Complete a page that is made, and lead links that leave docs/ to their page on the site."""
+    try:
+        source[0] = MADE[docname](source[0]) if docname in MADE else relink(source[0], docname)
+    except ValueError as error:
+        raise ExtensionError(f"{docname}: {error}") from error
+
+
+def keep_colon(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
+    """Keep napoleon from taking what stands before a colon in a property's docstring for its type."""
+    if what in ("property", "attribute") and lines:
+        lines[0] = f": {lines[0]}"  # an empty type, which it leaves out
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Connect to Sphinx."""
+    app.connect("source-read", make_page)
+    app.connect("autodoc-process-docstring", keep_colon, priority=400)  # napoleon has 500
+    return {"parallel_read_safe": True}

@@ -1,0 +1,18 @@
+"""The parts of the site's extension that need no Sphinx, loaded from docs/extension/."""
+
+from __future__ import annotations
+
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def load(name: str) -> ModuleType:
+    """The module ``docs/extension/NAME.py``."""
+    spec = spec_from_file_location(f"site_{name}", DOCS / "extension" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
