@@ -124,13 +124,17 @@ class Suite:
         return frozenset(each.content.seed for each in self.lists)
 
 
-def suite_names(folder: Path = SUITES) -> list[str]:
-    """The suites that ship."""
-    return sorted(path.parent.name for path in folder.glob(f"*/{CONTENT}"))
+def suite_names(folder: Path | None = None) -> list[str]:
+    """The suites of a folder; of the package, if none is given."""
+    return sorted(path.parent.name for path in (folder or SUITES).glob(f"*/{CONTENT}"))
 
 
-def load_suite(name: str, folder: Path = SUITES) -> Suite:
-    """The suite called ``name``. Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for a damaged one."""
+def load_suite(name: str, folder: Path | None = None) -> Suite:
+    """The suite called ``name``, of those that ship or of another folder.
+
+    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for a damaged one.
+    """
+    folder = folder or SUITES
     if name not in suite_names(folder):
         raise unknown_name("suite", name, suite_names(folder))
     file = folder / name / CONTENT

@@ -40,17 +40,21 @@ def leaderboard_table(found: Leaderboard) -> Table:
 
 
 def list_table(entry: Entry, suite: Suite) -> Table:
-    """One line per list of one entry, for a terminal."""
+    """One line per list of one entry, for a terminal; means per world."""
     drawn = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    drawn.add_column("List", overflow="fold")
-    for heading in ("Share %", "Worst decile", "First", "Total", "Collisions %"):
-        drawn.add_column(heading, justify="right")
+    drawn.add_column("List", no_wrap=True)
+    for heading in ("Share %", "Worst decile", "First", "Total", "Collided %", "Moving %"):
+        drawn.add_column(heading, justify="right", no_wrap=True)
+    reasons = []
     for each in suite.lists:
         result = entry.lists[each.name]
         if isinstance(result, NotDriven):
-            drawn.add_row(each.name, Text(f"not driven: {result.not_driven}"), "", "", "", "")
+            drawn.add_row(each.name, "not driven", *["–"] * 5)
+            reasons.append(f"{each.name}: {result.not_driven}")
         else:
-            drawn.add_row(each.name, *_figures(result))
+            drawn.add_row(each.name, *_short_figures(result))
+    drawn.caption = Text("\n".join(reasons)) if reasons else None
+    drawn.caption_justify = "left"
     return drawn
 
 
@@ -81,7 +85,10 @@ def leaderboard_page(found: Leaderboard) -> str:
 
 def _each_list(found: Leaderboard) -> Section:
     """Every list with the figures of every entry."""
-    head = ("Agent", "Realised share, %", "Worst decile: regret", "First-impact harm", "Total harm", "Collisions, %")
+    head = (
+        "Agent", "Realised share, %", "Worst decile: regret", "First-impact harm", "Total harm", "Collisions, %",
+        "Moving at the horizon, %",
+    )  # fmt: skip
     rows: list[Block | Sequence[object]] = []
     for each in found.suite.lists:
         content = each.content
@@ -96,7 +103,7 @@ def _each_list(found: Leaderboard) -> Section:
             if isinstance(result, ListResult):
                 rows.append([row.entry.agent, *_cells(result)])
             else:
-                rows.append([row.entry.agent, Cell("not driven", result.not_driven, words=True), *["–"] * 4])
+                rows.append([row.entry.agent, Cell("not driven", result.not_driven, words=True), *["–"] * 5])
     return Section("Lists", [table(head, rows, caption="Harm is in m²/s², mean per world")])
 
 
@@ -129,15 +136,15 @@ def _share(entry: Entry, name: str) -> str:
     return f"{100.0 * result.realised_share.value:z.1f}" if isinstance(result, ListResult) else "–"
 
 
-def _figures(result: ListResult) -> list[str]:
-    """The figures of a list in words, in the order of the headings."""
+def _short_figures(result: ListResult) -> list[str]:
+    """The figures of a list in words, in the order of the headings; intervals of the two that rank."""
+    harms = (result.first_impact_harm, result.total_harm)
     return [
         result.realised_share.estimate.in_words(digits=1, scale=100.0),
-        *(
-            told.estimate.in_words()
-            for told in (result.worst_decile_regret, result.first_impact_harm, result.total_harm)
-        ),
-        result.collision_rate.estimate.in_words(digits=1, scale=100.0),
+        result.worst_decile_regret.estimate.in_words(digits=1),
+        *(f"{told.value:.2f}" for told in harms),
+        f"{100.0 * result.collision_rate.value:.1f}",
+        f"{100.0 * result.horizon_ends / result.worlds:.1f}",
     ]
 
 
@@ -146,7 +153,8 @@ def _cells(result: ListResult) -> list[Cell]:
     shares = (result.realised_share, result.collision_rate)
     harms = [result.worst_decile_regret, result.first_impact_harm, result.total_harm]
     first, last = (_cell(told.estimate) for told in shares)
-    return [first, *(_cell(told.estimate, scale=1.0, digits=2) for told in harms), last]
+    moving = Cell(f"{100.0 * result.horizon_ends / result.worlds:.1f}")
+    return [first, *(_cell(told.estimate, scale=1.0, digits=2) for told in harms), last, moving]
 
 
 def _list_cell(entry: Entry, name: str) -> Cell:
