@@ -13,6 +13,7 @@ from typer.main import get_command
 from ethbrake_marl.cli.ablate import ablate_command, generalise_command
 from ethbrake_marl.cli.agents import agents_command
 from ethbrake_marl.cli.bench import bench_command
+from ethbrake_marl.cli.benchmark import benchmark_command, leaderboard_command
 from ethbrake_marl.cli.best_harm import best_harm_command
 from ethbrake_marl.cli.compare import compare_command
 from ethbrake_marl.cli.dataset import dataset_command
@@ -105,6 +106,12 @@ app.command("dataset", epilog="Example: ethbrake dataset --agents best_harm --ep
 )
 app.command("replay", epilog="Example: ethbrake replay PASSPORT --output again.html")(replay_command)
 app.command("explore", epilog="Example: ethbrake explore --agents full_brake,ppo@shipped")(explore_command)
+app.command("benchmark", epilog="Example: ethbrake benchmark v1 --agent ppo@shipped --output mine.json")(
+    benchmark_command
+)
+app.command("leaderboard", epilog="Example: ethbrake leaderboard mine.json theirs.json --output table.html")(
+    leaderboard_command
+)
 app.command("doctor", epilog="Example: ethbrake doctor")(doctor_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
 app.command("equal-time", epilog="Example: ethbrake equal-time --episodes 200 --repeats 1")(equal_time_command)

@@ -76,14 +76,20 @@ def scenario_sha256(scenario: Scenario) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
+def driving_policy(agent: object) -> object:
+    """What is inside everything that is around an agent: the policy that it drives by, or the agent itself."""
+    while isinstance(agent, AgentAround | LearnedAgent):
+        agent = agent.policy
+    return agent
+
+
 def policy_sha256(agent: object) -> str | None:
     """The hash of the policy that an agent drives by, inside whatever is around it; None without one.
 
     Of a bundle it is that in its manifest, which binds names, network and weights (``Manifest.manifest_sha256``); of
     another library's, that of its weights (``agents.foreign.weights_sha256``).
     """
-    while isinstance(agent, AgentAround | LearnedAgent):
-        agent = agent.policy
+    agent = driving_policy(agent)
     if isinstance(agent, PolicyAgent):
         return agent.weights_sha256()
     return agent.manifest.manifest_sha256 if isinstance(agent, Policy) else None

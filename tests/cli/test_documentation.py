@@ -30,7 +30,7 @@ def names(typer_app) -> set[str]:
 
 def test_cli_page__has_every_command_and_agent():
     training = {"run", "train", "resume", "learning-curves", "sweep", "ablate", "generalise", "export", "import-legacy"}
-    measuring = {"evaluate", "compare", "shield", "best-harm", "equal-time"}
+    measuring = {"evaluate", "compare", "falsify", "shield", "best-harm", "equal-time", "benchmark", "leaderboard"}
     looking = {"agents", "record", "replay", "explore", "reproduce"}
     assert names(app) == training | measuring | looking | {"doctor", "bench", "dataset"}
     for command in names(app) | {"scenario", "recipe"}:

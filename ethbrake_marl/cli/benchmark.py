@@ -1,0 +1,113 @@
+"""The commands ``ethbrake benchmark`` and ``ethbrake leaderboard``: parse, drive or check, print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ethbrake_marl.cli.options import ForceOption, JsonOption
+from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import check_target
+from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
+from ethbrake_marl.studies.benchmark.leaderboard import Leaderboard, read_leaderboard, verify
+from ethbrake_marl.studies.benchmark.suite import load_suite
+from ethbrake_marl.studies.benchmark.table import (
+    RANK,
+    SCORE,
+    leaderboard_markdown,
+    leaderboard_page,
+    leaderboard_table,
+    list_table,
+)
+
+_PAGES = (".html", ".htm")
+_MARKDOWN = ".md"
+
+
+def benchmark_command(
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite that ships, such as v1.")],
+    agent: Annotated[str, typer.Option(metavar="SPEC", help="Who drives; any agent of `ethbrake evaluate`.")],
+    output: Annotated[
+        Path | None, typer.Option(metavar="ENTRY.json", help="Also write the entry to this file.")
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Let an agent drive a frozen suite of lists, and score it.
+
+    The score of a list is the realised share of what is possible, 0 for full braking and 1 for the best known. A list
+    that the agent cannot drive has none, and then there is no overall score.
+    """
+    if output is not None:
+        _check_ending(output, (".json",), "an entry ends in .json")
+        check_target(output, force=force)
+    chosen = load_suite(suite)
+    with interruptible("nothing was written"), progress_bars() as bars:
+        entry = make_entry(chosen, agent, on_progress=bars.show_progress)
+    if output is not None:
+        write_entry(output, entry, force=force)
+        say(f"entry: {output}")
+    if as_json:
+        write_json(entry.model_dump(mode="json"))
+        return
+    result_console().print(list_table(entry, chosen))
+    mean = entry.mean_of_driven.estimate.in_words(digits=1, scale=100.0, unit=" %")
+    if entry.overall is not None:
+        show(f"{agent}: overall {mean} of what is possible, mean over {len(chosen.lists)} lists of suite {suite}")
+    else:
+        show(
+            f"{agent}: no overall score, as it drives {entry.lists_driven} of {len(chosen.lists)} lists of suite"
+            f" {suite}; {mean} of what is possible there"
+        )
+
+
+def leaderboard_command(
+    entries: Annotated[list[Path], typer.Argument(metavar="ENTRY.json...", help="Entries of one suite.")],
+    output: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Also write the table, as a page (.html) or Markdown (.md).")
+    ] = None,
+    verify_entries: Annotated[
+        bool, typer.Option("--verify", help="Let every agent drive again, and refuse figures that this does not give.")
+    ] = False,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Check entries of `ethbrake benchmark`, and show them as one table.
+
+    Refused by name: entries of another suite, changed ones, those without some list or world, of a policy made with a
+    seed of the suite, and those that stand among the others twice.
+    """
+    if output is not None:
+        _check_ending(output, (*_PAGES, _MARKDOWN), "the table ends in .html or .md")
+        check_target(output, force=force)
+    found = read_leaderboard(entries)
+    if verify_entries:
+        _verify(found)
+    if output is not None:
+        markdown = output.suffix.lower() == _MARKDOWN
+        text = leaderboard_markdown(found) if markdown else leaderboard_page(found)
+        write_output(output, text.encode(), force=force)
+        say(f"table: {output}")
+    if as_json:
+        write_json(found.to_json())
+        return
+    result_console().print(leaderboard_table(found))
+    for text in (SCORE, RANK, f"Suite {found.suite.name}, SHA-256 {found.suite.sha256}"):
+        show(text)
+
+
+def _verify(found: Leaderboard) -> None:
+    """Drive every entry again, and say what was found."""
+    for row in found.rows:
+        with interruptible("nothing was written"), progress_bars() as bars:
+            same = verify(row, found.suite, on_progress=bars.show_progress)
+        say(f"{row.path}: {same}")
+
+
+def _check_ending(path: Path, endings: tuple[str, ...], right: str) -> None:
+    if path.suffix.lower() not in endings:
+        raise InvalidInput(f"{path}: {right}")

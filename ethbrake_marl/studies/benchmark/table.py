@@ -1,0 +1,171 @@
+"""The leaderboard as text, as Markdown, and as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from ethbrake_marl.evaluation.statistics import Estimate
+from ethbrake_marl.pages.frame import Section, page, paragraph
+from ethbrake_marl.pages.parts import Block, Cell, facts, table
+from ethbrake_marl.studies.benchmark.entry import Entry, ListResult, NotDriven
+from ethbrake_marl.studies.benchmark.leaderboard import Leaderboard, Row
+from ethbrake_marl.studies.benchmark.suite import Suite
+
+SCORE = (
+    "Realised share of what is possible, in %: (full braking - agent) / (full braking - best known) of the mean harm"
+    " of a list; 0 is full braking, 100 the best known. 95 % intervals in brackets."
+)
+RANK = (
+    "Only who drives every list is ranked, by the mean over all lists. A mean over some of them is shown, and is no"
+    " score: those lists may be the easy ones."
+)
+
+
+def leaderboard_table(found: Leaderboard) -> Table:
+    """One line per entry, for a terminal; lists that were not driven show a dash."""
+    drawn = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    drawn.add_column("", justify="right", no_wrap=True)
+    drawn.add_column("Agent", overflow="fold")
+    drawn.add_column("Overall", justify="right", no_wrap=True)
+    drawn.add_column("Lists", justify="right", no_wrap=True)
+    drawn.add_column("Realised share of each list, in the suite's order", overflow="fold")
+    for rank, row in _ranks(found):
+        each = "  ".join(f"{name} {_share(row.entry, name)}" for name in row.entry.lists)
+        drawn.add_row(rank, Text(row.entry.agent), _overall(row), _lists(row, found.suite), Text(each))
+    return drawn
+
+
+def list_table(entry: Entry, suite: Suite) -> Table:
+    """One line per list of one entry, for a terminal; means per world."""
+    drawn = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    drawn.add_column("List", no_wrap=True)
+    for heading in ("Share %", "Worst decile", "First", "Total", "Collided %", "Moving %"):
+        drawn.add_column(heading, justify="right", no_wrap=True)
+    reasons = []
+    for each in suite.lists:
+        result = entry.lists[each.name]
+        if isinstance(result, NotDriven):
+            drawn.add_row(each.name, "not driven", *["–"] * 5)
+            reasons.append(f"{each.name}: {result.not_driven}")
+        else:
+            drawn.add_row(each.name, *_short_figures(result))
+    drawn.caption = Text("\n".join(reasons)) if reasons else None
+    drawn.caption_justify = "left"
+    return drawn
+
+
+def leaderboard_markdown(found: Leaderboard) -> str:
+    """The leaderboard as a table of Markdown, one column per list."""
+    names = [each.name for each in found.suite.lists]
+    head = ["", "Agent", "Overall", *names]
+    lines = [_line(head), _line(["---:", "---", *["---:"] * (len(names) + 1)])]
+    for rank, row in _ranks(found):
+        overall = _overall(row) if row.ranked else f"({_overall(row)}, {_lists(row, found.suite)} lists)"
+        lines.append(_line([rank, f"`{row.entry.agent}`", overall, *(_share(row.entry, name) for name in names)]))
+    return "\n".join(lines) + "\n"
+
+
+def leaderboard_page(found: Leaderboard) -> str:
+    """The leaderboard as a page: the ranking, each list, and where each entry comes from."""
+    suite = found.suite
+    lead = f"Suite {suite.name}, SHA-256 {suite.sha256}. {SCORE}"
+    names = [each.name for each in suite.lists]
+    head = ["Agent", "Rank", "Overall", "Lists", *names]
+    rows = [
+        [row.entry.agent, rank, _cell(row.score), _lists(row, suite), *(_list_cell(row.entry, name) for name in names)]
+        for rank, row in _ranks(found)
+    ]
+    ranking = Section("Ranking", [table(head, rows, caption="Realised share, %"), paragraph(RANK, "quiet")])
+    return page(f"Benchmark {suite.name}", [ranking, _each_list(found), _entries(found)], lead=lead)
+
+
+def _each_list(found: Leaderboard) -> Section:
+    """Every list with the figures of every entry."""
+    head = (
+        "Agent", "Realised share, %", "Worst decile: regret", "First-impact harm", "Total harm", "Collisions, %",
+        "Moving at the horizon, %",
+    )  # fmt: skip
+    rows: list[Block | Sequence[object]] = []
+    for each in found.suite.lists:
+        content = each.content
+        rows.append(
+            Block(
+                f"{each.name}: {content.worlds} worlds of seed {content.seed}, {content.harm_count} harm; full braking"
+                f" {content.full_brake_harm:.2f}, best known {content.best_known_harm:.2f} m²/s²"
+            )
+        )
+        for row in found.rows:
+            result = row.entry.lists[each.name]
+            if isinstance(result, ListResult):
+                rows.append([row.entry.agent, *_cells(result)])
+            else:
+                rows.append([row.entry.agent, Cell("not driven", result.not_driven, words=True), *["–"] * 5])
+    return Section("Lists", [table(head, rows, caption="Harm is in m²/s², mean per world")])
+
+
+def _entries(found: Leaderboard) -> Section:
+    """How each entry was made."""
+    told = {
+        row.entry.agent: f"{row.entry.command}; policies: {', '.join(sorted(row.policies)) or 'none'}; "
+        + ", ".join(f"{name} {version}" for name, version in row.entry.versions.items())
+        + f"; entry SHA-256 {row.entry.entry_sha256}"
+        for row in found.rows
+    }
+    return Section("Entries", [facts(told)])
+
+
+def _ranks(found: Leaderboard) -> list[tuple[str, Row]]:
+    """Every entry with its rank; a dash for who did not drive every list."""
+    return [(str(k + 1) if row.ranked else "–", row) for k, row in enumerate(found.rows)]
+
+
+def _lists(row: Row, suite: Suite) -> str:
+    return f"{row.entry.lists_driven} of {len(suite.lists)}"
+
+
+def _overall(row: Row) -> str:
+    return row.score.in_words(digits=1, scale=100.0)
+
+
+def _share(entry: Entry, name: str) -> str:
+    result = entry.lists[name]
+    return f"{100.0 * result.realised_share.value:z.1f}" if isinstance(result, ListResult) else "–"
+
+
+def _short_figures(result: ListResult) -> list[str]:
+    """The figures of a list in words, in the order of the headings; intervals of the two that rank."""
+    harms = (result.first_impact_harm, result.total_harm)
+    return [
+        result.realised_share.estimate.in_words(digits=1, scale=100.0),
+        result.worst_decile_regret.estimate.in_words(digits=1),
+        *(f"{told.value:.2f}" for told in harms),
+        f"{100.0 * result.collision_rate.value:.1f}",
+        f"{100.0 * result.horizon_ends / result.worlds:.1f}",
+    ]
+
+
+def _cells(result: ListResult) -> list[Cell]:
+    """The same as cells of a page."""
+    shares = (result.realised_share, result.collision_rate)
+    harms = [result.worst_decile_regret, result.first_impact_harm, result.total_harm]
+    first, last = (_cell(told.estimate) for told in shares)
+    moving = Cell(f"{100.0 * result.horizon_ends / result.worlds:.1f}")
+    return [first, *(_cell(told.estimate, scale=1.0, digits=2) for told in harms), last, moving]
+
+
+def _list_cell(entry: Entry, name: str) -> Cell:
+    result = entry.lists[name]
+    return _cell(result.realised_share.estimate) if isinstance(result, ListResult) else Cell("–")
+
+
+def _cell(estimate: Estimate, *, scale: float = 100.0, digits: int = 1) -> Cell:
+    value, _, interval = estimate.in_words(digits=digits, scale=scale).partition(" ")
+    return Cell(value, interval)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

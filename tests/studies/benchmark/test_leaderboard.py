@@ -1,0 +1,170 @@
+"""What the leaderboard takes, how it ranks, and every entry that it refuses by name."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
+from ethbrake_marl.studies.benchmark.leaderboard import Row, read_leaderboard, verify
+from ethbrake_marl.studies.benchmark.suite import plain_sha256
+from ethbrake_marl.studies.benchmark.table import leaderboard_markdown, leaderboard_page
+
+NAMES = ("full_brake", "coast", "full_brake+step")
+
+
+@pytest.fixture
+def kept(entries: Path, tmp_path: Path) -> Path:
+    """A copy of the entries, to be changed."""
+    folder = tmp_path / "entries"
+    shutil.copytree(entries, folder)
+    return folder
+
+
+def paths(folder: Path) -> list[Path]:
+    return [folder / f"{name}.json" for name in NAMES]
+
+
+def change(file: Path, edit: Callable[[dict[str, Any]], None], *, bind: bool = True) -> None:
+    """Edit an entry as somebody would who knows how its hash is made."""
+    content = json.loads(file.read_text())
+    edit(content)
+    if bind:
+        content["entry_sha256"] = plain_sha256({k: v for k, v in content.items() if k != "entry_sha256"})
+    file.write_text(json.dumps(content))
+
+
+def test_entries__are_ranked_by_their_score_and_those_of_some_lists_stand_below(tiny, entries):
+    found = read_leaderboard(paths(entries), tiny)
+    ranked = [row for row in found.rows if row.ranked]
+    assert found.rows[-1].entry.agent == "full_brake+step" and not found.rows[-1].ranked
+    assert [row.score.value for row in ranked] == sorted((row.score.value for row in ranked), reverse=True)
+    assert read_leaderboard(paths(entries)[::-1], tiny) == found
+
+
+def test_table__is_told_as_markdown_and_as_a_page(tiny, entries):
+    found = read_leaderboard(paths(entries), tiny)
+    lines = leaderboard_markdown(found).splitlines()
+    assert lines[0] == "|  | Agent | Overall | paper-random | paper-random-obstacle | cooperation-3-pair |"
+    assert "| – | `full_brake+step` | (" in lines[-1] and "2 of 3 lists) | " in lines[-1] and lines[-1].endswith("– |")
+    page = leaderboard_page(found)
+    assert page.startswith("<!DOCTYPE html>") and tiny.sha256 in page and "not driven" in page
+    assert all(row.entry.entry_sha256 in page for row in found.rows)
+
+
+def leave_out_list(content):
+    del content["lists"]["cooperation-3-pair"]
+
+
+def leave_out_world(content):
+    content["lists"]["paper-random"]["worlds"] = 11
+
+
+def other_world(content):
+    told = content["lists"]["paper-random"]["worlds_sha256"]
+    content["lists"]["paper-random"]["worlds_sha256"] = ("1" if told[0] == "0" else "0") + told[1:]
+
+
+def better_share(content):
+    content["lists"]["paper-random"]["realised_share"] = {"value": 0.9, "interval": [0.8, 1.0]}
+
+
+def better_mean(content):
+    content["mean_of_driven"]["value"] = content["overall"]["value"] = 0.99
+
+
+def drop_interval(content):
+    content["lists"]["paper-random"]["total_harm"]["interval"] = None
+
+
+def suite_seed(content):
+    content["lists"]["paper-random"]["policy_seeds"] = {"vehicle_2": {"training": 901}}
+
+
+def other_suite(content):
+    content["suite_sha256"] = "0" * 64
+
+
+def more_lists(content):
+    content["lists"]["easy"] = content["lists"]["paper-random"]
+
+
+REFUSED = [
+    (leave_out_list, "leaves out 1 list: cooperation-3-pair"),
+    (leave_out_world, "list paper-random: 11 worlds; the list has 12"),
+    (other_world, "list paper-random: other worlds: SHA-256"),
+    (better_share, "list paper-random: realised_share is 0.9, but the harm that it tells gives"),
+    (better_mean, "its mean share is not that of its 3 driven lists"),
+    (drop_interval, "has no interval around it"),
+    (suite_seed, "its policy of vehicle_2 was made with training seed 901, which is suite tiny's own"),
+    (other_suite, "is about another suite: tiny with SHA-256 000000000000"),
+    (more_lists, "has a list that suite tiny has not: easy"),
+    (lambda content: content.pop("versions"), "versions: is missing"),
+    (lambda content: content.update(score=1), "score: unknown key"),
+    (lambda content: content.update(lists_driven=True), "lists_driven: must be"),
+]
+
+
+@pytest.mark.parametrize(("edit", "told"), REFUSED, ids=lambda each: getattr(each, "__name__", ""))
+def test_entries__that_were_edited_are_refused_by_name(tiny, kept, edit, told):
+    change(kept / "coast.json", edit)
+    with pytest.raises(InvalidInput, match=rf"coast\.json.*{re.escape(told)}"):
+        read_leaderboard(paths(kept), tiny)
+
+
+def test_edited_numbers__do_not_fit_the_entrys_own_hash(tiny, kept):
+    change(kept / "coast.json", lambda content: content.update(agent="mine"), bind=False)
+    with pytest.raises(InvalidInput, match=r"coast\.json: was changed after it was made"):
+        read_leaderboard(paths(kept), tiny)
+
+
+def test_entries__that_stand_there_twice_are_refused(tiny, kept):
+    shutil.copy(kept / "coast.json", kept / "again.json")
+    with pytest.raises(InvalidInput, match=r"again\.json: is the same agent with the same policies as .*coast\.json"):
+        read_leaderboard([*paths(kept), kept / "again.json"], tiny)
+    change(kept / "again.json", lambda content: content.update(agent="mine"))
+    with pytest.raises(InvalidInput, match=r"again\.json: does the same in every world as .*coast\.json"):
+        read_leaderboard([*paths(kept), kept / "again.json"], tiny)
+
+
+def test_files_that_are_no_entries__are_refused(tiny, kept):
+    (kept / "coast.json").write_text("[]")
+    with pytest.raises(InvalidInput, match=r"coast\.json"):
+        read_leaderboard(paths(kept), tiny)
+    (kept / "coast.json").write_text("{")
+    with pytest.raises(InvalidInput, match=r"coast\.json: is no JSON"):
+        read_leaderboard(paths(kept), tiny)
+    with pytest.raises(InvalidInput, match="no entries given"):
+        read_leaderboard([], tiny)
+    with pytest.raises(UnknownName, match="suite 'tiny'"):
+        read_leaderboard([kept / "full_brake.json"])
+
+
+def test_verification__drives_again_and_finds_edits_that_fit_each_other(tiny, kept):
+    found = read_leaderboard([kept / "coast.json", kept / "full_brake+step.json"], tiny)
+    assert [verify(row, tiny) for row in found.rows] == ["the same, bit for bit"] * 2
+    coast = next(row.entry for row in found.rows if row.entry.agent == "coast")
+
+    def collide_less(content):
+        content["lists"]["paper-random"]["collision_rate"] = {"value": 0.25, "interval": [0.1, 0.5]}
+
+    change(kept / "coast.json", collide_less)
+    (row,) = read_leaderboard([kept / "coast.json"], tiny).rows
+    with pytest.raises(InvalidInput, match=r"coast\.json, list paper-random: collision_rate is 0\.25, and driving"):
+        verify(row, tiny)
+    another = make_entry(tiny, "constant:3").model_copy(update={"agent": "coast"})
+    edited = another.model_copy(update={"entry_sha256": another.content_sha256()})
+    write_entry(kept / "other.json", edited)
+    (row,) = read_leaderboard([kept / "other.json"], tiny).rows
+    with pytest.raises(InvalidInput, match=r"other\.json, list paper-random: \w+ is .*, and driving again gives"):
+        verify(row, tiny)
+    named = coast.model_copy(update={"agent": "mine.py:make_agent"})
+    with pytest.raises(InvalidInput, match="its agent is code"):
+        verify(Row(Path("mine.json"), named), tiny)
