@@ -1,4 +1,4 @@
-"""How a suite is frozen: once, from scenarios and tables of the best known; a change is another suite."""
+"""Freezing a suite: once, from scenarios and tables of the best known; a change is another suite."""
 
 from __future__ import annotations
 
