@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance_sampled
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.episode import decision_s, first_decision_s, onset_s
 from ethbrake_marl.physics.events import solo_motion
 from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED
 from ethbrake_marl.physics.obstacle import obstacle_ahead, place_obstacle, with_post_ahead
+from ethbrake_marl.physics.sampled import sample_numbers, sample_worlds
 from ethbrake_marl.physics.segment import COMMAND, DONE, HIT, LIMIT, ONSET, ROW_WIDTH, TABLE_ROWS, advance_table
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.scenario.roles import constant_command
@@ -99,14 +100,16 @@ VEHICLE_2 = 1  # the map's samples begin with its latency
 
 
 class SampledHarm:
-    """Watches episodes and replays their commands, step by step, through ``advance_sampled`` at the time step.
+    """Watches episodes and replays their commands, step by step, through the map of ``advance_sampled``.
 
     Each world goes to the horizon; after the end of its exact episode the last commands are held. The agent decided on
     the exact motion; nobody decides anew. See ``of`` for whom it exists.
     """
 
     def __init__(self, worlds: Worlds, scenario: Scenario) -> None:
-        self._worlds = worlds
+        self._vehicles = worlds.vehicles
+        self._gaps_m, self._speeds_mps = worlds.gaps_m.copy(), worlds.speeds_mps.copy()
+        self._time_s, self._pair_hit = worlds.time_s.copy(), worlds.pair_hit.copy()
         self._command = np.zeros(worlds.speeds_mps.shape)
         self._harm = np.zeros(worlds.n)
         self._start_s = first_decision_s(worlds, [VEHICLE_2])
@@ -133,12 +136,19 @@ class SampledHarm:
         """Go on by one step: every world to its next sample, none beyond its first one at or after the horizon."""
         self._samples += 1
         next_s = np.minimum(decision_s(self._start_s, self._step_s, self._samples), self._horizon_s)
-        until_s = np.maximum(next_s, self._worlds.time_s)
-        self._worlds, impacts = advance_sampled(self._worlds, self._command, until_s=until_s, step_s=self._step_s)
-        self._harm += impacts.total_harm.sum(axis=1)
+        until_s, v = np.maximum(next_s, self._time_s), self._vehicles
+        first, last = sample_numbers(self._time_s, until_s, v.latency_s[:, VEHICLE_2], self._step_s)
+        shape = self._gaps_m.shape
+        harm = np.zeros(shape)
+        sample_worlds(
+            self._gaps_m, self._speeds_mps, self._time_s, self._pair_hit, self._command, until_s, self._step_s, first,
+            last, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, np.zeros(shape), harm,
+            np.zeros(shape, np.int64),
+        )  # fmt: skip
+        self._harm += harm.sum(axis=1)
 
     def finish(self) -> Floats:
         """Go on to the horizon; gives the sum of each world, [n] m2/s2."""
-        while (self._worlds.time_s < self._horizon_s - 1e-6 * self._step_s).any():
+        while (self._time_s < self._horizon_s - 1e-6 * self._step_s).any():
             self._move()
         return self._harm

@@ -215,8 +215,16 @@ def _samples(worlds: Worlds, until: Floats, step_s: float) -> tuple[Ints, Ints]:
             f"advance_sampled: world {k} has a negative speed at {worlds.time_s[k]:g} s, before its first sample at"
             f" {start[k]:g} s; the map knows no impacts before that"
         )
-    end = (until - start) / step_s
-    first = np.where(before, -1.0, np.rint(position))
+    return sample_numbers(worlds.time_s, until, start, step_s)
+
+
+def sample_numbers(time_s: Floats, until_s: Floats, start_s: Floats, step_s: float) -> tuple[Ints, Ints]:
+    """The samples at ``time_s`` and at or after ``until_s`` [n] of worlds whose first one is at ``start_s``, from 0.
+
+    -1 stands for a time before that. Times on the grid may be rounded.
+    """
+    position, end = (time_s - start_s) / step_s, (until_s - start_s) / step_s
+    first = np.where(position < -_ON_SAMPLE, -1.0, np.rint(position))
     last = np.where(end < -_ON_SAMPLE, -1.0, np.ceil(end - _ON_SAMPLE))
     return first.astype(np.int64), last.astype(np.int64)
 
