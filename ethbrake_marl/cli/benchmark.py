@@ -19,7 +19,6 @@ from ethbrake_marl.studies.benchmark.table import (
     RANK,
     SCORE,
     leaderboard_markdown,
-    leaderboard_page,
     leaderboard_table,
     list_table,
 )
@@ -88,9 +87,7 @@ def leaderboard_command(
     if verify_entries:
         _verify(found)
     if output is not None:
-        markdown = output.suffix.lower() == _MARKDOWN
-        text = leaderboard_markdown(found) if markdown else leaderboard_page(found)
-        write_output(output, text.encode(), force=force)
+        write_output(output, _as_file(found, output).encode(), force=force)
         say(f"table: {output}")
     if as_json:
         write_json(found.to_json())
@@ -98,6 +95,16 @@ def leaderboard_command(
     result_console().print(leaderboard_table(found))
     for text in (SCORE, RANK, f"Suite {found.suite.name}, SHA-256 {found.suite.sha256}"):
         show(text)
+
+
+def _as_file(found: Leaderboard, output: Path) -> str:
+    """The table as what the file's ending asks for."""
+    if output.suffix.lower() == _MARKDOWN:
+        return leaderboard_markdown(found)
+    # Here: templates take time to load, and most commands write no page.
+    from ethbrake_marl.studies.benchmark.page import leaderboard_page
+
+    return leaderboard_page(found)
 
 
 def _verify(found: Leaderboard) -> None:

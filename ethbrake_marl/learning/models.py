@@ -37,7 +37,7 @@ def policy_maker(algorithm: Algorithm, training: Training) -> Callable[[Model], 
         "observation": observation_schema(observation),
         "scenario": scenario.model_dump(mode="json"),
         "reward": recipe.reward.model_dump(mode="json"),
-        "seeds": {"training": recipe.seed},
+        "seeds": {"training": recipe.seed, "evaluation": recipe.evaluation.seed},
         "versions": installed_versions(),
     }
 

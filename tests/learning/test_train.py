@@ -123,7 +123,7 @@ def test_train__is_bitwise_reproducible_and_leaves_global_random_states(recipe: 
     assert _bytes(tmp_path / "a" / "policy")[1] != _bytes(tmp_path / "c" / "policy")[1]
     assert (random.random(), np.random.rand()) == expected[:2]  # noqa: NPY002
     assert torch.equal(torch.get_rng_state(), expected[2])
-    assert load_policy(tmp_path / "c").manifest.seeds == {"training": 6}
+    assert load_policy(tmp_path / "c").manifest.seeds == {"training": 6, "evaluation": recipe.evaluation.seed}
 
 
 def test_train__learners_share_one_policy(recipe: TrainingRecipe, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The leaderboard as text, as Markdown, and as a page."""
+"""Entries and leaderboards as text and as Markdown; ``page`` has the page."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from ethbrake_marl.evaluation.statistics import Estimate
-from ethbrake_marl.pages.frame import Section, page, paragraph
-from ethbrake_marl.pages.parts import Block, Cell, facts, table
 from ethbrake_marl.studies.benchmark.entry import Entry, ListResult, NotDriven
 from ethbrake_marl.studies.benchmark.leaderboard import Leaderboard, Row
 from ethbrake_marl.studies.benchmark.suite import Suite
@@ -33,9 +30,9 @@ def leaderboard_table(found: Leaderboard) -> Table:
     drawn.add_column("Overall", justify="right", no_wrap=True)
     drawn.add_column("Lists", justify="right", no_wrap=True)
     drawn.add_column("Realised share of each list, in the suite's order", overflow="fold")
-    for rank, row in _ranks(found):
+    for rank, row in ranks(found):
         each = "  ".join(f"{name} {_share(row.entry, name)}" for name in row.entry.lists)
-        drawn.add_row(rank, Text(row.entry.agent), _overall(row), _lists(row, found.suite), Text(each))
+        drawn.add_row(rank, Text(row.entry.agent), _overall(row), lists_told(row, found.suite), Text(each))
     return drawn
 
 
@@ -63,67 +60,19 @@ def leaderboard_markdown(found: Leaderboard) -> str:
     names = [each.name for each in found.suite.lists]
     head = ["", "Agent", "Overall", *names]
     lines = [_line(head), _line(["---:", "---", *["---:"] * (len(names) + 1)])]
-    for rank, row in _ranks(found):
-        overall = _overall(row) if row.ranked else f"({_overall(row)}, {_lists(row, found.suite)} lists)"
+    for rank, row in ranks(found):
+        overall = _overall(row) if row.ranked else f"({_overall(row)}, {lists_told(row, found.suite)} lists)"
         lines.append(_line([rank, f"`{row.entry.agent}`", overall, *(_share(row.entry, name) for name in names)]))
     return "\n".join(lines) + "\n"
 
 
-def leaderboard_page(found: Leaderboard) -> str:
-    """The leaderboard as a page: the ranking, each list, and where each entry comes from."""
-    suite = found.suite
-    lead = f"Suite {suite.name}, SHA-256 {suite.sha256}. {SCORE}"
-    names = [each.name for each in suite.lists]
-    head = ["Agent", "Rank", "Overall", "Lists", *names]
-    rows = [
-        [row.entry.agent, rank, _cell(row.score), _lists(row, suite), *(_list_cell(row.entry, name) for name in names)]
-        for rank, row in _ranks(found)
-    ]
-    ranking = Section("Ranking", [table(head, rows, caption="Realised share, %"), paragraph(RANK, "quiet")])
-    return page(f"Benchmark {suite.name}", [ranking, _each_list(found), _entries(found)], lead=lead)
-
-
-def _each_list(found: Leaderboard) -> Section:
-    """Every list with the figures of every entry."""
-    head = (
-        "Agent", "Realised share, %", "Worst decile: regret", "First-impact harm", "Total harm", "Collisions, %",
-        "Moving at the horizon, %",
-    )  # fmt: skip
-    rows: list[Block | Sequence[object]] = []
-    for each in found.suite.lists:
-        content = each.content
-        rows.append(
-            Block(
-                f"{each.name}: {content.worlds} worlds of seed {content.seed}, {content.harm_count} harm; full braking"
-                f" {content.full_brake_harm:.2f}, best known {content.best_known_harm:.2f} m²/s²"
-            )
-        )
-        for row in found.rows:
-            result = row.entry.lists[each.name]
-            if isinstance(result, ListResult):
-                rows.append([row.entry.agent, *_cells(result)])
-            else:
-                rows.append([row.entry.agent, Cell("not driven", result.not_driven, words=True), *["–"] * 5])
-    return Section("Lists", [table(head, rows, caption="Harm is in m²/s², mean per world")])
-
-
-def _entries(found: Leaderboard) -> Section:
-    """How each entry was made."""
-    told = {
-        row.entry.agent: f"{row.entry.command}; policies: {', '.join(sorted(row.policies)) or 'none'}; "
-        + ", ".join(f"{name} {version}" for name, version in row.entry.versions.items())
-        + f"; entry SHA-256 {row.entry.entry_sha256}"
-        for row in found.rows
-    }
-    return Section("Entries", [facts(told)])
-
-
-def _ranks(found: Leaderboard) -> list[tuple[str, Row]]:
+def ranks(found: Leaderboard) -> list[tuple[str, Row]]:
     """Every entry with its rank; a dash for who did not drive every list."""
     return [(str(k + 1) if row.ranked else "–", row) for k, row in enumerate(found.rows)]
 
 
-def _lists(row: Row, suite: Suite) -> str:
+def lists_told(row: Row, suite: Suite) -> str:
+    """How many lists it drove, of how many."""
     return f"{row.entry.lists_driven} of {len(suite.lists)}"
 
 
@@ -146,25 +95,6 @@ def _short_figures(result: ListResult) -> list[str]:
         f"{100.0 * result.collision_rate.value:.1f}",
         f"{100.0 * result.horizon_ends / result.worlds:.1f}",
     ]
-
-
-def _cells(result: ListResult) -> list[Cell]:
-    """The same as cells of a page."""
-    shares = (result.realised_share, result.collision_rate)
-    harms = [result.worst_decile_regret, result.first_impact_harm, result.total_harm]
-    first, last = (_cell(told.estimate) for told in shares)
-    moving = Cell(f"{100.0 * result.horizon_ends / result.worlds:.1f}")
-    return [first, *(_cell(told.estimate, scale=1.0, digits=2) for told in harms), last, moving]
-
-
-def _list_cell(entry: Entry, name: str) -> Cell:
-    result = entry.lists[name]
-    return _cell(result.realised_share.estimate) if isinstance(result, ListResult) else Cell("–")
-
-
-def _cell(estimate: Estimate, *, scale: float = 100.0, digits: int = 1) -> Cell:
-    value, _, interval = estimate.in_words(digits=digits, scale=scale).partition(" ")
-    return Cell(value, interval)
 
 
 def _line(cells: Sequence[str]) -> str:

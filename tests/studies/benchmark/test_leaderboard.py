@@ -14,8 +14,9 @@ import pytest
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
 from ethbrake_marl.studies.benchmark.leaderboard import Row, read_leaderboard, verify
+from ethbrake_marl.studies.benchmark.page import leaderboard_page
 from ethbrake_marl.studies.benchmark.suite import plain_sha256
-from ethbrake_marl.studies.benchmark.table import leaderboard_markdown, leaderboard_page
+from ethbrake_marl.studies.benchmark.table import leaderboard_markdown
 
 NAMES = ("full_brake", "coast", "full_brake+step")
 
