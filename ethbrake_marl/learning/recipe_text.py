@@ -53,6 +53,7 @@ _MEANINGS = {
     "trust_radius": "farthest that one update asks an action to move",
     "anchor": "how much an action that makes no difference holds to where it is",
     "averaging": "share of itself that the average of the weights, which drives, keeps in each gradient step",
+    "focus": "share of what is tried that a scout chooses; left out: 0, all decisions alike",
     "modes": "several networks and a gate between them; left out: one network",
     "log_every_updates": "updates between two rows of the progress table",
 }

@@ -19,7 +19,7 @@ from ethbrake_marl.studies.reproduction.item import LIST_SEED, Settings
 from ethbrake_marl.studies.reproduction.verdicts import Less
 
 FULL_BRAKE, PAIRWISE, COUPLED = "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm"
-SAC, PPO, UNIVERSAL = "sac@shipped/sac", "ppo@shipped/ppo", "ppo@shipped/universal"
+SAC, PPO, UNIVERSAL = "sac@shipped/sac", "ppo@shipped/ppo", "ppo@shipped/universal-ppo"
 PREDICTED, PROVEN = "E-V2X-BM, predicted", "least harm, proven"
 NAMES = {  # of the strategies in tables and figures
     FULL_BRAKE: "Non-ethical (full braking)",

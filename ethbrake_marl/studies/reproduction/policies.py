@@ -15,7 +15,7 @@ from ethbrake_marl.shield.agents import Bound
 from ethbrake_marl.studies.reproduction.item import FULL, Settings
 from ethbrake_marl.studies.reproduction.trainings import EARLY, STOPPED, finished, group_named
 
-STAND_IN = "universal"  # the shipped policy that stands in for one that has not converged, where nothing is trained
+STAND_IN = "universal-ppo"  # the shipped policy that stands in for one that has not converged, where nothing is trained
 
 
 class Unconverged(NamedTuple):
