@@ -28,7 +28,7 @@ if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for th
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist benchmark
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -51,6 +51,7 @@ help:
 	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of the physics (ARGS='--modules rewards,v2x --sample 40': of others)"
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
+	@echo "make benchmark        drive suite v1 with the agents of docs/benchmark.md and make its tables (ARGS: some agents)"
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make clean            remove $(VENV), $(PEERS), .venvs, caches and builds (runs/ stays)"
 	@echo "TORCH_INDEX=URL       take torch from this index; else uv picks the build for this machine"
@@ -184,6 +185,9 @@ mutation: $(STAMP)
 
 bench-peers: $(STAMP)
 	@$(BIN)/python -m tests.benchmarks.peers --environment $(PEERS) --torch-index "$(TORCH_INDEX)" $(ARGS)
+
+benchmark: $(STAMP)
+	@$(BIN)/python -m tests.studies.benchmark.rows $(ARGS)
 
 clean:
 	rm -rf $(VENV) $(PEERS) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist docs/_build

@@ -1,0 +1,63 @@
+"""The first rows of the benchmark: `python -m tests.studies.benchmark.rows [AGENT ...]`.
+
+Makes the entries of these agents anew (by default: of all rows) in docs/benchmark/v1, and puts the tables into
+docs/benchmark.md. With --tables it drives nobody.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+from ethbrake_marl.progress import ShownProgress
+from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
+from ethbrake_marl.studies.benchmark.leaderboard import read_leaderboard
+from ethbrake_marl.studies.benchmark.suite import Suite, load_suite
+from ethbrake_marl.studies.benchmark.table import leaderboard_markdown
+
+ROWS = (
+    "full_brake", "e_v2x_bm", "ppo@shipped", "policy@shipped", "universal@shipped", "policy@shipped+step",
+    "best_harm:2000",
+)  # fmt: skip
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+PAGE, ENTRIES = DOCS / "benchmark.md", DOCS / "benchmark" / "v1"
+
+
+def list_markdown(suite: Suite) -> str:
+    """The lists of a suite, in Markdown."""
+    lines = [
+        "| List | What | Vehicles | Driven | Seed | Harm | Full braking | Best known |",
+        "| --- | --- | ---: | --- | ---: | --- | ---: | ---: |",
+    ]
+    for each in suite.lists:
+        content, scenario = each.content, each.scenario
+        driven = ", ".join(str(vehicle + 1) for vehicle in scenario.learners)
+        cells = (f"`{each.name}`", content.about, scenario.vehicles, driven, content.seed, content.harm_count)
+        levels = (f"{content.full_brake_harm:.2f}", f"{content.best_known_harm:.2f}")
+        lines.append(f"| {' | '.join(map(str, (*cells, *levels)))} |")
+    return "\n".join(lines)
+
+
+def page_tables() -> dict[str, str]:
+    """Every table of docs/benchmark.md by its marker."""
+    suite = load_suite("v1")
+    found = read_leaderboard(sorted(ENTRIES.glob("*.json")), suite)
+    return {"lists": list_markdown(suite), "rows": leaderboard_markdown(found).rstrip("\n")}
+
+
+def main(arguments: list[str]) -> None:
+    """Make entries, then the tables."""
+    suite = load_suite("v1")
+    for agent in [] if arguments == ["--tables"] else arguments or ROWS:
+        print(agent, flush=True)
+        entry = make_entry(suite, agent, on_progress=ShownProgress())
+        write_entry(ENTRIES / f"{re.sub(r'[/:]', '-', agent)}.json", entry, force=True)
+    text = PAGE.read_text("utf-8")
+    for marker, table in page_tables().items():
+        text = re.sub(rf"(<!-- {marker} -->\n).*?(\n<!-- end -->)", rf"\g<1>{table}\g<2>", text, flags=re.DOTALL)
+    PAGE.write_text(text, "utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
