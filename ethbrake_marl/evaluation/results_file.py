@@ -19,9 +19,9 @@ HARMS = ("first_impact_harm", "total_harm")
 USUAL: Mapping[str, str | None] = {"harm_count": "first", "uncertainty": None}  # settings of agents
 _COMPARED: dict[Kind, tuple[str, ...]] = {  # harms of each
     "evaluate": HARMS,
-    "evaluate-shards": HARMS,
     "equal-time": HARMS,
     "shield": ("harm",),
+    "evaluate-shards": HARMS,
 }
 _LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one with every world
 _MOST_EPISODES = 10**12
