@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import qmc
 
 from ethbrake_marl.errors import check_whole_number
 from ethbrake_marl.physics import Floats, Ints
@@ -61,6 +60,8 @@ class _Spread:
     """Scrambled Sobol points, drawn a whole round at a time: their balance needs powers of two."""
 
     def __init__(self, dimensions: int, seed: int) -> None:
+        from scipy.stats import qmc  # takes a second to load, and most commands search nothing
+
         self._sobol = qmc.Sobol(dimensions, rng=np.random.default_rng([seed, dimensions, 1]))
         self._left = np.empty((0, dimensions))
 

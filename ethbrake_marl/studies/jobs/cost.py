@@ -1,4 +1,4 @@
-"""What a training takes on this machine, measured by a short one."""
+"""The cost of a training on this machine, measured by a short one."""
 
 from __future__ import annotations
 

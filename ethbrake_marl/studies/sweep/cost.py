@@ -1,4 +1,4 @@
-"""What is left of a sweep, and what it takes: told before anything is begun."""
+"""The cost of what is left of a sweep, told before anything is begun."""
 
 from __future__ import annotations
 

@@ -22,4 +22,4 @@ def test_page__shows_the_table_that_the_entries_make(marker):
 def test_entries_that_are_shown__beat_the_best_known_on_no_list_and_in_few_worlds():
     for path in ENTRIES.glob("*.json"):
         for result in read_entry(path).driven.values():
-            assert result.realised_share.value <= 1.0 and result.below_best_known <= 0.05 * result.worlds
+            assert result.realised_share.value <= 1.0 and result.below_best_known <= 0.1 * result.worlds
