@@ -80,7 +80,7 @@ def evaluate_command(
         typer.Option(metavar="QUANTITY=WIDTH,...", help=f"What the robust shield does not know, such as {EXAMPLE}."),
     ] = None,
     initial_states: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Your own worlds, one per row, instead of the list.")
+        Path | None, typer.Option(metavar="CSV|YAML", help="Your own worlds: one per row, or named ones of falsify.")
     ] = None,
     vehicle: VehicleOption = None,
     settings: SetOption = None,

@@ -12,6 +12,7 @@ import typer
 from rich import box
 from rich.table import Table
 
+from ethbrake_marl.agents.spelling import parse_spec
 from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
@@ -42,6 +43,7 @@ ROUNDING = 1e-6  # m2/s2
 
 
 def falsify_command(
+    context: typer.Context,
     agent: Annotated[
         str | None, typer.Option(help="Who drives; any agent of `ethbrake evaluate`.", show_default="policy@shipped")
     ] = None,
@@ -79,7 +81,11 @@ def falsify_command(
     --again FILE the kept worlds are driven again, by --agent or who drove then; exit status 1: one of them is worse.
     """
     if again is not None:
-        _drive_again(again, agent, as_json=as_json)
+        _refuse_others(context)
+        with interruptible("nothing was written"):
+            worse = _drive_again(again, agent, as_json=as_json)
+        if worse:
+            raise typer.Exit(WORSE)
         return
     agent = agent or "policy@shipped"
     if output is not None:
@@ -112,7 +118,9 @@ def falsify_command(
             measure=measure,
             against=against,
             harm_count=harm_count,
-            found_by=_command(measured_by, agent, against, scenario, budget, seed, most, given.texts, at_random),
+            found_by=_command(
+                measured_by, agent, against, scenario, budget, seed, most, vehicle, given.texts, at_random
+            ),
             worlds=worlds,
         )
         told |= kept.model_dump(exclude_none=True)
@@ -128,15 +136,35 @@ def falsify_command(
     show(_summary(found, measured_by, budget))
 
 
-def _drive_again(file: Path, agent: str | None, *, as_json: bool) -> None:
-    """Measure the worlds of a file once more, and compare; exit status 1 if one is worse."""
+def _refuse_others(context: typer.Context) -> None:
+    """Refuse options that ``--again`` would ignore: the file says the rest."""
+    for name in context.params.keys() - {"agent", "again", "as_json"}:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            option = "--keep" if name == "most" else f"--{name.replace('_', '-')}"
+            raise InvalidInput(f"--again: the file says what is measured; {option} has no place beside it, --agent has")
+
+
+def _drive_again(file: Path, agent: str | None, *, as_json: bool) -> int:
+    """Measure the worlds of a file once more, and compare; how many are worse, or could not be driven."""
     kept = read_named_worlds(file)
+    for spec in (*([kept.agent] if agent is None else []), *([kept.against] if kept.against else [])):
+        if (code := parse_spec(spec).file) is not None:
+            raise InvalidInput(
+                f"{file}: names an agent that is code ({code[0]}), which is not run because a file names it; --agent"
+                " names another one, and who is compared with is edited in the file"
+            )
     chosen = load_evaluated(kept.scenario, None, read_settings(kept.settings).scenario)
     measured_by = make_measure(kept.measure, agent or kept.agent, kept.against, chosen, kept.harm_count)
     worlds = kept.worlds_of(chosen, str(file))
     measured = measured_by(Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0))
     rows = [
-        {"name": world.name, "before": world.score, "now": float(now), "worse": bool(now > world.score + ROUNDING)}
+        {
+            "name": world.name,
+            "before": world.score,
+            "now": float(now) if np.isfinite(now) else None,
+            "worse": not np.isfinite(now) or bool(now > world.score + ROUNDING),
+        }
         for world, now in zip(kept.worlds, measured.score, strict=True)
     ]
     if as_json:
@@ -146,18 +174,18 @@ def _drive_again(file: Path, agent: str | None, *, as_json: bool) -> None:
         for name in ("World", f"{kept.measure} before", "now", ""):
             table.add_column(name, overflow="fold")
         for row in rows:
-            table.add_row(
-                str(row["name"]), f"{row['before']:.4f}", f"{row['now']:.4f}", "worse" if row["worse"] else ""
-            )
+            now = "could not be driven" if row["now"] is None else f"{row['now']:.4f}"
+            table.add_row(str(row["name"]), f"{row['before']:.4f}", now, "worse" if row["worse"] else "")
         result_console().print(table)
     worse = sum(bool(row["worse"]) for row in rows)
     say(f"{file}: {agent or kept.agent} is worse in {worse} of {count_of(len(rows), 'world')}")
-    if worse:
-        raise typer.Exit(WORSE)
+    return worse
 
 
 def _named(found: Falsified, measure: Measure) -> list[NamedWorld]:
     """The kept worlds, worst first."""
+    if not found.sample.worlds.n:
+        return []
     states, measured = states_of(found.sample.worlds, measure.scenario), found.measured
     beside: Floats | list[None] = [None] * len(states) if measured.reference is None else measured.reference
     return [
@@ -220,6 +248,7 @@ def _command(
     budget: int,
     seed: int,
     most: int,
+    vehicle: str | None,
     settings: tuple[str, ...],
     at_random: bool,
 ) -> str:
@@ -227,5 +256,6 @@ def _command(
     words += [] if against is None else ["--against", against]
     words += ["--scenario", scenario, "--budget", str(budget), "--seed", str(seed), "--keep", str(most)]
     words += ["--at-random"] if at_random else []
+    words += [] if vehicle is None else ["--vehicle", vehicle]
     words += ["--harm-count", measure.harm_count] + [word for text in settings for word in ("--set", text)]
     return shlex.join(words)

@@ -23,6 +23,7 @@ from ethbrake_marl.scenario.sample import quantity_columns
 FORMAT: Literal["ethbrake-worlds"] = "ethbrake-worlds"
 VERSION: Literal[1] = 1
 MOST = 1000  # worlds of a file
+SIZE_LIMIT = 8 << 20  # bytes of it: so many worlds of a long line
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -73,7 +74,7 @@ class NamedWorlds(_Strict):
 
 def read_named_worlds(path: str | Path) -> NamedWorlds:
     """Read a file of named worlds; raises ``InvalidInput`` naming file, line and key."""
-    document = read_yaml(path)
+    document = read_yaml(path, SIZE_LIMIT)
     try:
         found = NamedWorlds.model_validate(document.content)
     except ValidationError as error:

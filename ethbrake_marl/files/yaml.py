@@ -97,16 +97,19 @@ class _Open:
     key: str | None = None
 
 
-def read_yaml(path: str | Path) -> Document:
-    """Read one YAML file; raises ``InvalidInput`` with file, line, column and reason for every defect."""
-    return parse_yaml(read_plain(path, SIZE_LIMIT), str(Path(path)))
+def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
+    """Read one YAML file of at most ``limit`` bytes.
+
+    Raises ``InvalidInput`` with file, line, column and reason for every defect.
+    """
+    return parse_yaml(read_plain(path, limit), str(Path(path)), limit)
 
 
-def parse_yaml(text: str | bytes, file: str = "<text>") -> Document:
+def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT) -> Document:
     """Parse one YAML document; ``file`` is how messages call it. Raises as ``read_yaml``."""
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
-    if len(data) > SIZE_LIMIT:
-        _fail(file, None, f"larger than {SIZE_LIMIT // 1024} KiB, the limit for these files")
+    if len(data) > limit:
+        _fail(file, None, f"larger than {limit // 1024} KiB, the limit for these files")
     try:
         decoded = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -86,3 +86,40 @@ def test_falsify__refuses(ethbrake: Command, options: tuple[str, ...], said: str
 def test_falsify__keeps_a_file_that_is_there(ethbrake: Command, file: Path) -> None:
     before = file.read_bytes()
     assert ethbrake(*FOUND, "--output", file).status == 2 and file.read_bytes() == before
+
+
+def test_falsify__says_when_nothing_is_found(ethbrake: Command, tmp_path: Path) -> None:
+    same = ("falsify", "--agent", "full_brake", "--against", "constant:7", "--budget", "64")
+    answer = ethbrake(*same, "--output", tmp_path / "none.yaml")
+    assert answer.status == 0 and "nothing was found" in answer.err and not (tmp_path / "none.yaml").exists()
+    assert json.loads(ethbrake(*same, "--json").out)["worlds"] == []
+
+
+@pytest.mark.parametrize("key", ["agent", "against"])
+def test_falsify_again__runs_no_code_that_a_file_names(ethbrake: Command, file: Path, tmp_path: Path, key: str) -> None:
+    (tmp_path / "evil.py").write_text("from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n")
+    text = file.read_text("utf-8").replace(
+        f"{key}: {'coast' if key == 'agent' else 'full_brake'}\n", f'{key}: "{tmp_path}/evil.py:make"\n'
+    )
+    assert "evil.py" in text
+    file.write_text(text, "utf-8")
+    answer = ethbrake("falsify", "--again", file)
+    assert answer.status == 2 and "is code" in answer.err and not (tmp_path / "evil.ran").exists()
+
+
+@pytest.mark.parametrize("option", [("--harm-count", "total"), ("--scenario", "stress-wide"), ("--keep", "3")])
+def test_falsify_again__refuses_what_the_file_says(ethbrake: Command, file: Path, option: tuple[str, str]) -> None:
+    answer = ethbrake("falsify", "--again", file, *option)
+    assert answer.status == 2 and option[0] in answer.err
+
+
+def test_falsify__as_many_worlds_as_it_keeps_read_back(ethbrake: Command, tmp_path: Path) -> None:
+    path = tmp_path / "many.yaml"
+    call = ("falsify", "--agent", "full_brake", "--measure", "harm", "--scenario", "stress-wide", "--keep", "200")
+    assert ethbrake(*call, "--budget", "512", "--at-random", "--output", path).status == 0
+    assert path.stat().st_size > 64 << 10 and len(read_named_worlds(path).worlds) == 200
+
+
+def test_falsify__a_ladder_is_no_agent(ethbrake: Command) -> None:
+    answer = ethbrake("falsify", "--agent", "ladder", "--measure", "harm", "--budget", "8")
+    assert answer.status == 2 and "stands for several agents" in answer.err

@@ -87,4 +87,7 @@ def make_measure(
     if name == "difference" and against is None:
         raise InvalidInput("--measure difference: compares two agents; say which is the other one, --against AGENT")
     specs = [agent] if name in ("harm", "bound") else [agent, against or HINDSIGHT]
-    return Measure(name, make_lineup(specs, scenario, harm_count=harm_count), scenario, harm_count)
+    lineup = make_lineup(specs, scenario, harm_count=harm_count)
+    if len(lineup) != len(specs):
+        raise InvalidInput(f"agent {' or '.join(specs)}: stands for several agents; one is needed here")
+    return Measure(name, lineup, scenario, harm_count)
