@@ -51,6 +51,32 @@ BUGS = {
         certify_kernel, "decide_world", "    if value <= budget:\n        plan[step]",
         "    if value <= 2.0 * budget:\n        plan[step]", statements.decision,
     ),
+    "later proposals are not certified": Bug(
+        certify_kernel, "decide_world", "    if value <= budget:\n        plan[step]",
+        "    if value <= budget or step > 0:\n        plan[step]", statements.decision,
+    ),
+    "the fallback is the plan's first action": Bug(
+        certify_kernel, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
+        "take_steps(world, states, ended, step, plan[0], after, over)", statements.decision,
+    ),
+    "the plan is followed from the second decision on": Bug(
+        certify_kernel, "decide_world", "value = worst_of_plan(world, after, over, step + 1,",
+        "value = worst_of_plan(world, after, over, 1,", statements.decision,
+    ),
+    "a constant begins one decision late": Bug(
+        certify_kernel, "better_plan", "for j in range(step, plan.shape[0]):",
+        "for j in range(step + 1, plan.shape[0]):",
+        statements.decision,
+    ),
+    "a vehicle that never moves": Bug(
+        events, "solo_motion", "    way = 0.0\n    steady",
+        "    return speed, 0.0, math.nan\n    way = 0.0\n    steady",
+        statements.stopping,
+    ),
+    "half the time": Bug(
+        events, "solo_motion", "    way = 0.0\n    steady", "    duration = duration / 2.0\n    way = 0.0\n    steady",
+        statements.stopping,
+    ),
     "the plan that was certified with a proposal is not kept": Bug(
         certify_kernel, "decide_world", "            plan[:] = room[0]", "            pass", statements.decision
     ),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from itertools import product
 from types import ModuleType
 from typing import Any
 
@@ -17,13 +18,13 @@ import z3
 
 from ethbrake_marl.physics import events, impact
 from ethbrake_marl.shield import certify_kernel
-from tests.proofs.paths import Condition, Ended, Symbol, SymbolicMath, exact, holds_always, paths, symbols
+from tests.proofs.paths import Condition, Ended, Symbol, SymbolicMath, exact, holds_always, is_infinite, paths, symbols
 
 Statement = Callable[[], int]  # the number of paths it was proven along
 STATEMENTS: dict[str, Statement] = {}
 
 BOUNCING, PLASTIC = 1.0, 0.01  # m/s, closing speeds above and below ``PLASTIC_SPEED_MPS``
-HORIZON = 3  # decisions that are left in the statements about the shield
+DECISIONS = ((0, 3), (2, 3), (2, 1))  # in the statements about the shield: how many were made, how many are left
 
 
 def states(text: str) -> Callable[[Statement], Statement]:
@@ -74,7 +75,11 @@ def stopping() -> int:
         after, way, _ = end.result
         prove(end, exact(after) >= 0, "forwards")
         prove(end, z3.And(exact(way) >= 0, exact(way) <= whole), "no farther than its stopping distance")
-        prove(end, exact(way) == whole, "exactly that once it stands", exact(after) == 0, exact(speed) > 0)
+        stopped = exact(time) * exact(capacity) >= exact(latency) * exact(capacity) + exact(speed)
+        prove(end, z3.And(exact(after) == 0, exact(way) == whole), "then it stands, there", stopped, exact(speed) > 0)
+        braking = exact(time - latency) * exact(capacity)
+        slower = exact(speed) - z3.If(braking > 0, braking, 0)
+        prove(end, exact(after) == slower, "until then it slows down by its capacity", z3.Not(stopped))
     return len(found)
 
 
@@ -162,18 +167,19 @@ def settling() -> int:
 class _Line:
     """A world as the shield sees it: what each action leads to, and the harm of each sequence of actions, unknown."""
 
-    def __init__(self) -> None:
+    def __init__(self, made: int, left: int) -> None:
         number = z3.RealSort()
-        self.harm = z3.Function("harm", *[number] * HORIZON, number)  # of the whole episode
+        self.made = made
+        self.harm = z3.Function("harm", *[number] * left, number)  # of the whole episode
         self.so_far = z3.Function("so_far", number, number)  # after the first action
         self.going = z3.Function("going", number, z3.IntSort())  # after the first action: -1, 0 or 1
-        self.plan = symbols(" ".join(f"plan{k}" for k in range(HORIZON)))
+        self.plan = symbols(" ".join(f"plan{k}" for k in range(made + left)))  # of the whole episode
         self.proposed, self.budget, self.certified = symbols("proposed budget certified")
         self.fresh = 0
 
     def known(self) -> list[Any]:
         """The invariant: the plan's harm is certified, and within the budget; its first step does not fail."""
-        plan = [exact(each) for each in self.plan]
+        plan = [exact(each) for each in self.plan[self.made :]]
         return [
             self.harm(*plan) == exact(self.certified),
             exact(self.certified) <= exact(self.budget),
@@ -182,8 +188,9 @@ class _Line:
             z3.Implies(self.going(plan[0]) == 0, self.so_far(plan[0]) == exact(self.certified)),
         ]
 
-    def take_steps(self, _: Any, __: Any, ___: Any, ____: int, action: Any, after: Any, _____: Any) -> int:
+    def take_steps(self, _: Any, __: Any, ___: Any, step: int, action: Any, after: Any, ____: Any) -> int:
         """The step of one action: it fails, ends the episode, or leaves it going; the same each time it is asked."""
+        assert step == self.made, "another step is taken"
         after[0] = action
         going = self.going(exact(action))
         if Condition(going < 0):
@@ -196,6 +203,7 @@ class _Line:
 
     def worst_of_plan(self, _: Any, after: Any, __: Any, step: int, plan: Any, most: Any) -> Any:
         """Harm of the action and then the plan; infinite above ``most``."""
+        assert step == self.made + 1, "the plan is followed from another step on"
         harm = self.harm(exact(after[0]), *(exact(each) for each in plan[step:]))
         if isinstance(most, float) and most == math.inf:
             return Symbol(harm)
@@ -217,17 +225,17 @@ def decision() -> int:
     What the physics does is an unknown function of the actions: the same for the same actions, which is all it needs.
     """
     count = 0
-    for usable in (True, False):
-        line = _Line()
+    for usable, (made, left) in product((True, False), DECISIONS):
+        line = _Line(made, left)
 
         def decide(line: _Line = line, usable: bool = usable) -> tuple[Any, Any, Any]:
             line.fresh = 0
-            plan, room = np.array(line.plan, object), np.zeros((2, HORIZON), object)
+            plan, room = np.array(line.plan, object), np.zeros((2, len(line.plan)), object)
             after, out = np.zeros(1, object), np.zeros(4, object)
             proposed = line.proposed if usable else math.nan
             good = certify_kernel.decide_world(
-                None, None, np.zeros(1, bool), 0, proposed, line.budget, line.certified, np.zeros(1), plan, room,
-                after, np.zeros(1, bool), out,
+                None, None, np.zeros(1, bool), line.made, proposed, line.budget, line.certified, np.zeros(1), plan,
+                room, after, np.zeros(1, bool), out,
             )  # fmt: skip
             return good, plan, out
 
@@ -235,9 +243,11 @@ def decision() -> int:
         for end in found:
             good, plan, out = end.result
             assert good
+            assert not is_infinite(out[2]), "the bound is infinite"
             applied, bound = exact(out[0]), exact(out[2])
             prove(end, bound <= exact(line.budget), "the bound is within the budget")
-            rest = [exact(each) for each in plan[1:]]
+            assert exact(plan[made]).eq(applied), "what is applied is not in the plan"
+            rest = [exact(each) for each in plan[made + 1 :]]
             goes_on = line.going(applied) > 0
             prove(end, line.harm(applied, *rest) == bound, "the plan that is kept has the bound", goes_on)
             prove(end, line.so_far(applied) == bound, "so has the harm, if the episode is over", z3.Not(goes_on))
