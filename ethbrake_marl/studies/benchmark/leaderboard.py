@@ -21,7 +21,6 @@ from ethbrake_marl.studies.benchmark.entry import (
 )
 from ethbrake_marl.studies.benchmark.suite import Suite, SuiteList, load_suite
 
-_SAME = 1e-9  # of what follows from other numbers of the same entry
 _SAME_HARM = 1e-6  # m2/s2, relative or absolute; of the same episodes computed by other versions
 
 
@@ -139,7 +138,8 @@ def _check_overall(path: Path, entry: Entry, suite: Suite) -> None:
     again = bind_entry(suite, entry.agent, entry.lists)
     same = entry.lists_driven == again.lists_driven and (entry.overall is None) == (again.overall is None)
     means = [told for told in (entry.mean_of_driven, entry.overall) if told is not None]
-    if not same or not all(_close(told.value, again.mean_of_driven.value, _SAME) for told in means):
+    mean = again.mean_of_driven.model_dump(mode="json")
+    if not same or not all(_same_values(told.model_dump(mode="json"), mean) for told in means):
         raise InvalidInput(
             f"{path}: its mean share is not that of its {count_of(again.lists_driven, 'driven list')},"
             f" {again.mean_of_driven.value:g}"
@@ -181,6 +181,8 @@ def verify(row: Row, suite: Suite, *, on_progress: OnProgress | None = None) -> 
             raise InvalidInput(f"{where}: {'was' if isinstance(told, ListResult) else 'was not'} driven, unlike here")
         if isinstance(told, ListResult) and isinstance(found, ListResult):
             _check_same(where, told, found)
+            if told.outcome_sha256 != found.outcome_sha256 and entry.versions == again.versions:
+                raise InvalidInput(f"{where}: outcome_sha256 is not that of driving again, with the same versions")
             bits = bits and told.outcome_sha256 == found.outcome_sha256
     return "the same, bit for bit" if bits else "the same figures, by other versions to other last digits"
 

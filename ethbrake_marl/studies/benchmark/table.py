@@ -8,6 +8,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from ethbrake_marl.errors import one_line
 from ethbrake_marl.studies.benchmark.entry import Entry, ListResult, NotDriven
 from ethbrake_marl.studies.benchmark.leaderboard import Leaderboard, Row
 from ethbrake_marl.studies.benchmark.suite import Suite
@@ -62,7 +63,8 @@ def leaderboard_markdown(found: Leaderboard) -> str:
     lines = [_line(head), _line(["---:", "---", *["---:"] * (len(names) + 1)])]
     for rank, row in ranks(found):
         overall = _overall(row) if row.ranked else f"({_overall(row)}, {lists_told(row, found.suite)} lists)"
-        lines.append(_line([rank, f"`{row.entry.agent}`", overall, *(_share(row.entry, name) for name in names)]))
+        agent = one_line(row.entry.agent).replace("`", "'").replace("|", "/")
+        lines.append(_line([rank, f"`{agent}`", overall, *(_share(row.entry, name) for name in names)]))
     return "\n".join(lines) + "\n"
 
 

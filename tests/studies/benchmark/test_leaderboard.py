@@ -81,6 +81,10 @@ def better_mean(content):
     content["mean_of_driven"]["value"] = content["overall"]["value"] = 0.99
 
 
+def wider_overall(content):
+    content["overall"]["interval"] = [-3.0, 99.0]
+
+
 def drop_interval(content):
     content["lists"]["paper-random"]["total_harm"]["interval"] = None
 
@@ -103,6 +107,7 @@ REFUSED = [
     (other_world, "list paper-random: other worlds: SHA-256"),
     (better_share, "list paper-random: realised_share is 0.9, but the harm that it tells gives"),
     (better_mean, "its mean share is not that of its 3 driven lists"),
+    (wider_overall, "its mean share is not that of its 3 driven lists"),
     (drop_interval, "has no interval around it"),
     (suite_seed, "its policy of vehicle_2 was made with training seed 901, which is suite tiny's own"),
     (other_suite, "is about another suite: tiny with SHA-256 000000000000"),
