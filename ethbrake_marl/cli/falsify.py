@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -34,7 +35,7 @@ from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.settings import read_settings
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.scenario import Sample
+from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.studies.falsification.falsify import Falsified, falsify
 from ethbrake_marl.studies.falsification.measures import HINDSIGHT, MEASURES, Measure, MeasureName, make_measure
 
@@ -108,21 +109,7 @@ def falsify_command(
     worlds = _named(found, measured_by)
     told = _told(found, budget) | {"worlds": [world.model_dump(exclude_none=True) for world in worlds]}
     if worlds:
-        kept = NamedWorlds(
-            format=FORMAT,
-            version=VERSION,
-            scenario=scenario,
-            scenario_sha256=scenario_sha256(chosen),
-            settings=[*given.texts, *([f"roles={{{vehicle}: learner}}"] if vehicle else [])],
-            agent=agent,
-            measure=measure,
-            against=against,
-            harm_count=harm_count,
-            found_by=_command(
-                measured_by, agent, against, scenario, budget, seed, most, vehicle, given.texts, at_random
-            ),
-            worlds=worlds,
-        )
+        kept = _kept({**context.params, "agent": agent}, chosen, worlds, given.texts)
         told |= kept.model_dump(exclude_none=True)
         if output is not None:
             write_output(output, named_worlds_text(kept).encode(), force=force)
@@ -240,22 +227,32 @@ def _summary(found: Falsified, measure: Measure, budget: int) -> str:
     )
 
 
-def _command(
-    measure: Measure,
-    agent: str,
-    against: str | None,
-    scenario: str,
-    budget: int,
-    seed: int,
-    most: int,
-    vehicle: str | None,
-    settings: tuple[str, ...],
-    at_random: bool,
-) -> str:
-    words = ["ethbrake", "falsify", "--agent", agent, "--measure", measure.name]
-    words += [] if against is None else ["--against", against]
-    words += ["--scenario", scenario, "--budget", str(budget), "--seed", str(seed), "--keep", str(most)]
-    words += ["--at-random"] if at_random else []
-    words += [] if vehicle is None else ["--vehicle", vehicle]
-    words += ["--harm-count", measure.harm_count] + [word for text in settings for word in ("--set", text)]
+def _kept(
+    asked: Mapping[str, Any], scenario: Scenario, worlds: list[NamedWorld], texts: tuple[str, ...]
+) -> NamedWorlds:
+    """The file of these worlds; ``asked`` are the command's options, ``texts`` its settings."""
+    vehicle = asked["vehicle"]
+    return NamedWorlds(
+        format=FORMAT,
+        version=VERSION,
+        scenario=asked["scenario"],
+        scenario_sha256=scenario_sha256(scenario),
+        settings=[*texts, *([f"roles={{{vehicle}: learner}}"] if vehicle else [])],
+        agent=asked["agent"],
+        measure=asked["measure"],
+        against=asked["against"],
+        harm_count=asked["harm_count"],
+        found_by=_command(asked, texts),
+        worlds=worlds,
+    )
+
+
+def _command(asked: Mapping[str, Any], texts: tuple[str, ...]) -> str:
+    """The command that finds the same worlds."""
+    words = ["ethbrake", "falsify", "--agent", asked["agent"], "--measure", asked["measure"]]
+    words += [] if asked["against"] is None else ["--against", asked["against"]]
+    words += ["--scenario", asked["scenario"], "--budget", str(asked["budget"]), "--seed", str(asked["seed"])]
+    words += ["--keep", str(asked["most"]), *(["--at-random"] if asked["at_random"] else [])]
+    words += [] if asked["vehicle"] is None else ["--vehicle", asked["vehicle"]]
+    words += ["--harm-count", asked["harm_count"]] + [word for text in texts for word in ("--set", text)]
     return shlex.join(words)
