@@ -20,7 +20,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import train
 from ethbrake_marl.policies.policy import load_policy
-from tests.studies.sweep.disturbing import PROGRAM, holders, journal
+from tests.studies.sweep.disturbing import PROGRAM, holders, journal, parent
 
 TABLE = "results.csv"
 ROOT = Path(__file__).resolve().parents[3]
@@ -150,7 +150,7 @@ def disturb(command: list[str], folder: Path) -> None:
     for end in (signal.SIGKILL, signal.SIGINT):
         driver = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
         try:
-            while not holders(folder):
+            while driver.pid not in map(parent, holders(folder)):
                 assert driver.poll() is None
                 time.sleep(0.01)
             driver.send_signal(end)
