@@ -44,9 +44,12 @@ def forbidden(tree: ast.Module) -> Iterator[tuple[int, str]]:
                 yield line, whole or node.attr
         elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "load" and _of_a_model(node):
             yield line, "load"
-        elif isinstance(node, ast.keyword) and node.arg in ("shell", "allow_pickle"):
-            if not (isinstance(node.value, ast.Constant) and node.value.value is False):
-                yield node.value.lineno, f"{node.arg}="
+        elif isinstance(node, ast.keyword) and node.arg in ("shell", "allow_pickle") and not _is_false(node.value):
+            yield node.value.lineno, f"{node.arg}="
+
+
+def _is_false(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and node.value is False
 
 
 def _of_a_model(node: ast.Call) -> bool:
