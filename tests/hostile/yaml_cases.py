@@ -9,8 +9,9 @@ from pathlib import Path
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.scenario import load_scenario
 from tests.hostile.case import Case, damaged, write
+from tests.hostile.recipe_parts import RECIPE_PARTS
 from tests.hostile.yaml_changes import CERTAIN, SCENARIO_ONLY, UNCERTAIN, encoded
-from tests.hostile.yaml_parts import RECIPE, SAC, SCENARIO
+from tests.hostile.yaml_parts import RECIPE, SAC, SCENARIO, replaced
 
 
 def scenarios(rng: random.Random) -> Iterator[Case]:
@@ -33,6 +34,8 @@ def recipes(rng: random.Random) -> Iterator[Case]:
             for k in range(28):
                 text = SAC if k % 4 == 3 else RECIPE
                 yield _recipe(category, encoded(rng, category, change(rng, text)), certain)
+    for category, (old, others) in RECIPE_PARTS.items():
+        yield from (_recipe(category, replaced(RECIPE, old, other), True) for other in others)
     for _ in range(75):
         yield _recipe("damaged", damaged(rng, RECIPE.encode()), False)
 
