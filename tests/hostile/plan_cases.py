@@ -259,7 +259,7 @@ def _sweep(category: str, content: bytes | str, *, certain: bool = True) -> Case
         write(folder / "taken", "precious")
 
     command = ("sweep", "mine.yaml", "--output", "taken", "--jobs", "1")
-    return Case("sweep", category, command, build, certain=certain, reader=_reader(certain, _planned))
+    return Case("sweep", category, command, build, certain=certain, reader=_reader(certain, _planned), content=content)
 
 
 def _planned() -> object:
@@ -272,6 +272,7 @@ def _worlds(category: str, content: bytes | str, *, certain: bool = True) -> Cas
         category,
         ("falsify", "--again", "mine.yaml"),
         lambda folder: write(folder / "mine.yaml", content),
+        content=content,
         certain=certain,
         # who drives, and where, is looked at when the worlds are driven
         reader=None

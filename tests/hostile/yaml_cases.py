@@ -48,6 +48,7 @@ def _scenario(category: str, content: bytes | str, certain: bool) -> Case:
         lambda folder: write(folder / "mine.yaml", content),
         certain=certain,
         reader=lambda: load_scenario("mine.yaml"),
+        content=content,
     )
 
 
@@ -58,4 +59,6 @@ def _recipe(category: str, content: bytes | str, certain: bool) -> Case:
 
     # The output is taken: a recipe in order is refused for that, before anything is trained.
     command = ("train", "--recipe", "mine.yaml", "--output", "taken")
-    return Case("recipe", category, command, build, certain=certain, reader=lambda: load_recipe("mine.yaml"))
+    return Case(
+        "recipe", category, command, build, certain=certain, reader=lambda: load_recipe("mine.yaml"), content=content
+    )
