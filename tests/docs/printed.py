@@ -18,7 +18,7 @@ BY_HAND = "nothing to compare"  # a file to copy, something that waits for a per
 
 
 class How(NamedTuple):
-    """Where it is compared, and by what: a test, or the commands that make it; and figures in it that others printed."""
+    """Where it is compared, by which test or commands; and the figures in it that somebody else printed."""
 
     where: str
     by: tuple[str, ...] = ()
