@@ -35,7 +35,9 @@ napoleon_numpy_docstring = False
 
 html_theme = "furo"
 html_title = f"ethbrake_marl {__version__}"
-html_extra_path = ["../scenarios/scenario.schema.json"]
+html_extra_path = ["../scenarios/scenario.schema.json", "../train/recipe.schema.json"]
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
 copybutton_prompt_text = "$ "
