@@ -30,6 +30,7 @@ PAGES = sorted([ROOT / "README.md", *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.
 FENCE = re.compile(r"\s*(```+|~~~+|:::+)")
 TARGET = re.compile(r"\]\([^)]*\)|https?://\S+")  # of a link, which cannot be broken
 FREE = re.compile(r"\s*(\||#|<|!\[)|\[[\w-]+\]: |---$|\S+$")  # tables, headings, HTML, pictures, one word
+BREAK = re.compile(r"\s*(\||#|<|!\[)")
 ITEM = re.compile(r"\s*(?:[-*]|\d+\.)\s")
 
 
@@ -54,9 +55,7 @@ def prose(text: str) -> Iterator[tuple[int, str]]:
 def long_lines(text: str) -> list[int]:
     """Numbers of lines that are too long for no good reason."""
     return [
-        number
-        for number, line in prose(text)
-        if len(TARGET.sub("]", line)) > MOST_CHARACTERS and not FREE.match(line)
+        number for number, line in prose(text) if len(TARGET.sub("]", line)) > MOST_CHARACTERS and not FREE.match(line)
     ]
 
 
@@ -66,7 +65,7 @@ def long_paragraphs(text: str) -> list[int]:
     begins = [(0, ""), *lines]
     found, start, length = [], 0, 0
     for (before, _), (number, line) in pairwise(begins):
-        if not line.strip() or FREE.match(line) and " " not in line.strip() or re.match(r"\s*(\||#|<)", line):
+        if not line.strip() or BREAK.match(line):
             length = 0
             continue
         if length == 0 or ITEM.match(line) or number != before + 1:
