@@ -19,7 +19,7 @@ MOST_LINES = 8  # of a paragraph
 NOT_YET = {
     f"docs/{name}.md"
     for name in (
-        "avoidability", "baselines", "benchmark", "best-harm", "cli", "cooperation", "datasets", "environment",
+        "avoidability", "baselines", "benchmark", "best-harm", "cli", "cooperation", "datasets",
         "evaluation", "explorer", "extending", "falsify", "learning", "other-libraries", "paper",
         "performance", "physics-tests", "reproduction", "sampled", "scaling", "scenarios", "security", "shield",
         "tests",
