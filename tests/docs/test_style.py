@@ -21,7 +21,7 @@ NOT_YET = {
     for name in (
         "avoidability", "baselines", "benchmark", "best-harm", "cli", "cooperation", "datasets",
         "evaluation", "explorer", "extending", "falsify", "learning", "other-libraries", "paper",
-        "performance", "physics-tests", "reproduction", "sampled", "scaling", "scenarios", "security", "shield",
+        "performance", "physics-tests", "reproduction", "sampled", "scaling", "security", "shield",
         "tests",
     )
 }  # fmt: skip
