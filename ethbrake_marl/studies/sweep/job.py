@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.durable import remove_folder
+from ethbrake_marl.learning.loop import StopAt
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.run_folder import RunDirectory, is_finished, progress_rows, wait_for_others
 from ethbrake_marl.learning.training import Training, check_same
@@ -29,8 +30,8 @@ RESULTS = (
 _FREE_S = 60.0  # a worker that has lost its driver may hold the folder for a moment
 
 
-def do_job(job: TrainingJob, log: Path) -> tuple[str, ...] | None:
-    """The values of ``RESULTS``, as text; None where the training was stopped before its end.
+def do_job(job: TrainingJob, log: Path, stop_at: StopAt | None = None) -> tuple[str, ...] | None:
+    """The values of ``RESULTS``, as text; None where the training was stopped before its end, by ``stop_at`` too.
 
     What is printed goes to ``log``, which is deleted at a good end. Raises what a training raises, ``InvalidInput``
     where the sweep's folder cannot be seen or the run's folder holds another training, and ``BlockingIOError`` where
@@ -48,7 +49,7 @@ def do_job(job: TrainingJob, log: Path) -> tuple[str, ...] | None:
             if is_finished(job.folder) and not _keeps_policies(job):
                 remove_folder(job.folder)  # a finished run has no checkpoint: it is trained anew
         try:
-            finished = finish_training(job)
+            finished = finish_training(job, stop_at=stop_at)
         except AlreadyExists as error:  # begun in this moment by a worker that has lost its driver
             raise BlockingIOError(str(error)) from None
         found = read_results(job.training, job.folder) if finished else None
