@@ -1,4 +1,4 @@
-"""What the keys of a recipe mean, and the text of a new one: every key with its value and a comment."""
+"""Meanings of the keys of a recipe, and the text of a new one: every key with its value and a comment."""
 
 from __future__ import annotations
 
