@@ -19,7 +19,7 @@ MOST_LINES = 8  # of a paragraph
 NOT_YET = {
     f"docs/{name}.md"
     for name in (
-        "avoidability", "baselines", "benchmark", "best-harm", "cli", "cooperation", "datasets",
+        "avoidability", "baselines", "benchmark", "best-harm", "cli", "cooperation",
         "explorer", "learning", "other-libraries", "paper",
         "performance", "physics-tests", "reproduction", "sampled", "scaling", "security", "shield",
         "tests",
