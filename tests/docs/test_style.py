@@ -20,7 +20,7 @@ NOT_YET = {
     f"docs/{name}.md"
     for name in (
         "avoidability", "baselines", "benchmark", "best-harm", "cli", "cooperation",
-        "learning", "other-libraries", "paper",
+        "learning", "paper",
         "performance", "physics-tests", "reproduction", "sampled", "scaling", "security", "shield",
         "tests",
     )
