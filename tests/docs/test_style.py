@@ -19,7 +19,7 @@ MOST_LINES = 8  # of a paragraph
 NOT_YET = {
     f"docs/{name}.md"
     for name in (
-        "avoidability", "baselines", "benchmark", "best-harm", "cli", "cooperation",
+        "avoidability", "benchmark", "best-harm", "cli", "cooperation",
         "learning", "paper",
         "performance", "physics-tests", "reproduction", "sampled", "scaling", "security", "shield",
         "tests",
