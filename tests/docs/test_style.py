@@ -20,7 +20,7 @@ NOT_YET = {
     f"docs/{name}.md"
     for name in (
         "avoidability", "benchmark", "best-harm", "cli", "cooperation",
-        "learning", "paper",
+        "learning",
         "performance", "physics-tests", "reproduction", "sampled", "scaling", "security", "shield",
         "tests",
     )
