@@ -19,7 +19,7 @@ MOST_LINES = 8  # of a paragraph
 NOT_YET = {
     f"docs/{name}.md"
     for name in (
-        "avoidability", "benchmark", "best-harm", "cli", "cooperation",
+        "avoidability", "benchmark", "cli", "cooperation",
         "learning",
         "performance", "physics-tests", "reproduction", "sampled", "scaling", "security", "shield",
         "tests",
