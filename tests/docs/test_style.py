@@ -21,7 +21,7 @@ NOT_YET = {
     for name in (
         "avoidability", "benchmark", "cli", "cooperation",
         "learning",
-        "physics-tests", "reproduction", "scaling", "security", "shield",
+        "reproduction", "scaling", "security", "shield",
         "tests",
     )
 }  # fmt: skip
