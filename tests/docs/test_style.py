@@ -21,7 +21,7 @@ NOT_YET = {
     for name in (
         "avoidability", "benchmark", "cli", "cooperation",
         "learning",
-        "reproduction", "scaling", "security", "shield",
+        "reproduction", "scaling", "shield",
         "tests",
     )
 }  # fmt: skip
