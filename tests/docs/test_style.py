@@ -22,7 +22,6 @@ NOT_YET = {
         "avoidability", "benchmark", "cli", "cooperation",
         "learning",
         "reproduction", "scaling", "shield",
-        "tests",
     )
 }  # fmt: skip
 PAGES = sorted([ROOT / "README.md", *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")])
