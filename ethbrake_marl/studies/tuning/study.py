@@ -82,7 +82,7 @@ class TuningStudy:
         with naming_extras():
             import optuna
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self._search, self._sampling = place.file.search, place.file.sampler
+        self._place, self._search, self._sampling = place, place.file.search, place.file.sampler
         try:
             self._study = optuna.create_study(
                 storage=_open_storage(place),
@@ -96,7 +96,7 @@ class TuningStudy:
 
     def trials(self) -> list[TrialRecord]:
         """Every trial, by its number."""
-        return sorted((self._record(each) for each in self._all()), key=lambda each: each.number)
+        return sorted(map(self._record, self._all()), key=lambda each: each.number)
 
     def trial(self, number: int) -> TrialRecord:
         """One of them."""
@@ -161,18 +161,15 @@ class TuningStudy:
         return optuna.Trial(self._study, self._frozen(number)._trial_id)
 
     def _record(self, trial: FrozenTrial) -> TrialRecord:
-        note = trial.user_attrs
-        state = _STATES[trial.state.name]
-        return TrialRecord(
-            trial.number,
-            state,
-            self._values(trial),
-            str(note.get(_OWNER, "")),
-            str(note.get(_HASH, "")),
-            trial.value if state == "finished" else None,
-            tuple(str(each) for each in json.loads(note.get(_RESULTS, "[]"))),
-            str(note.get(_REASON, "")),
-        )
+        note, state = trial.user_attrs, _STATES[trial.state.name]
+        try:
+            results = tuple(str(each) for each in json.loads(note.get(_RESULTS, "[]")))
+            values = self._values(trial)
+        except (ValueError, TypeError, LookupError) as error:
+            raise InvalidInput(f"storage {self._place}: trial {trial.number} is damaged ({error})") from None
+        owner, identity, reason = (str(note.get(what, "")) for what in (_OWNER, _HASH, _REASON))
+        harm = trial.value if state == "finished" else None
+        return TrialRecord(trial.number, state, values, owner, identity, harm, results, reason)
 
     def _values(self, trial: FrozenTrial) -> dict[str, Any] | None:
         if trial.params.keys() != self._search.keys():
@@ -232,5 +229,5 @@ def _stored(dimension: Range | Choices, value: Any) -> Any:
 
 def _value(dimension: Range | Choices, stored: Any) -> Any:
     if isinstance(dimension, Choices):
-        return next(value for value in dimension.choices if flow_text(value) == stored)
+        return {flow_text(value): value for value in dimension.choices}[stored]
     return int(stored) if dimension.whole else float(stored)

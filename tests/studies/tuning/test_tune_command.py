@@ -196,6 +196,26 @@ def test_tune__without_optuna_says_how_to_install_it(write_tuning, tmp_path, mon
     assert capsys.readouterr().err.endswith("-m pip install 'ethbrake-marl[tune]'\n")
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ('{"op_code":0', '{"op_kode":0', "cannot be used"),
+        ('{"op_code":0', "\x00", "cannot be used"),
+        ('"results":"[', '"results":"{', "trial 0 is damaged"),
+        ('"results":"[', '"results":7,"x":"[', "cannot be used"),
+    ],
+)
+def test_damaged_journal__is_refused_in_one_line(finished_tuning, write_tuning, tmp_path, capsys, old, new, reason):
+    folder = tmp_path / "out"
+    shutil.copytree(finished_tuning, folder)
+    journal = folder / "study.journal"
+    assert old in journal.read_text()
+    journal.write_text(journal.read_text().replace(old, new))
+    assert tune(write_tuning(), folder) == 2
+    told = capsys.readouterr().err
+    assert reason in told and len(told.splitlines()) == 1
+
+
 def test_second_command__in_a_folder_is_refused(finished_tuning, write_tuning, tmp_path, capsys):
     from filelock import FileLock
 
