@@ -87,7 +87,7 @@ def bound_cells(samples: Samples, n: int, bounds: Floats) -> None:
 def _slope(samples: Samples, k: int) -> float:
     """Of the harm from sample ``k`` to the next one."""
     width = samples.at[k + 1] - samples.at[k]
-    return (samples.harm[k + 1] - samples.harm[k]) / max(width, NARROWEST_MPS2)
+    return float((samples.harm[k + 1] - samples.harm[k]) / max(width, NARROWEST_MPS2))
 
 
 @compiled_bare

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -39,7 +39,8 @@ _LOOKED = GRID + CANDIDATES + CELLS * INSIDE
 _NARROWED = _LOOKED + 2 * BORDERS
 _MOST = _NARROWED + MINIMA
 _FEW = 6
-_NONE = np.int64(0)  # no literal, for which all physics would be compiled once more
+# Bounds that are no literals, for each of which all physics would be compiled once more:
+_ZERO, _ONE, _FIVE, _GRID_END, _CANDIDATES_END = (cast(int, np.int64(k)) for k in (0, 1, 5, GRID, CANDIDATES))
 _SHARES = np.linspace(0.0, 1.0, GRID)
 _SHARES_INSIDE = np.arange(1, INSIDE + 1) / (INSIDE + 1)
 _FIFTHS = np.arange(1, 5) / 5  # new points between the ends of a border
@@ -96,9 +97,9 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
     for k in range(CANDIDATES):
         new.at[k] = breakpoints[k]
     put_in_order(new, CANDIDATES)
-    status = simulate(line, grid, _NONE, np.int64(GRID), math.inf)
+    status = simulate(line, grid, _ZERO, _GRID_END, math.inf)
     if status == DONE:
-        status = simulate(line, new, _NONE, np.int64(CANDIDATES), math.inf)
+        status = simulate(line, new, _ZERO, _CANDIDATES_END, math.inf)
     merge(grid, GRID, new, CANDIDATES, room.two)
     return status
 
@@ -125,7 +126,7 @@ def look_inside(line: Line, room: Room) -> int:
         width = grid.at[cells[c] + 1] - low
         for k in range(INSIDE):
             new.at[INSIDE * c + k] = low + width * _SHARES_INSIDE[k]
-    status = simulate(line, new, _NONE, INSIDE * found, math.inf)
+    status = simulate(line, new, _ZERO, INSIDE * found, math.inf)
     number = GRID + CANDIDATES + INSIDE * found
     merge(looked, GRID + CANDIDATES, new, INSIDE * found, grid)
     for k in range(number, _LOOKED):
@@ -178,7 +179,7 @@ def _cut(line: Line, few: Samples) -> int:
         low, width = few.at[0], few.at[5] - few.at[0]
         for k in range(4):
             few.at[1 + k] = low + width * _FIFTHS[k]
-        status = simulate(line, few, np.int64(1), np.int64(5), math.inf)
+        status = simulate(line, few, _ONE, _FIVE, math.inf)
         if status != DONE:
             return status
         border, least = 0, math.inf
@@ -244,7 +245,7 @@ def step_back(line: Line, around: Samples, best: float, capacity: float, out: Fl
     """
     for k in range(5):
         around.at[k] = min(max(best + NARROWEST_MPS2 * (k - 2.0), 0.0), capacity)
-    status = simulate(line, around, _NONE, np.int64(5), math.inf)
+    status = simulate(line, around, _ZERO, _FIVE, math.inf)
     pick, least, middle = 1, math.inf, 0.0
     for k in range(3):
         worst = max(max(around.harm[k], around.harm[k + 1]), around.harm[k + 2])
