@@ -219,7 +219,7 @@ def _of_each_vehicle(constants: Floats, problem: ProfileProblem) -> Floats:
 def _check_plan(running: Running, plan: Floats) -> None:
     most = int(running.problem.last_step.max(initial=0))
     vehicles = len(running.problem.vehicles)
-    fits = plan.ndim == 2 and vehicles == 1 or plan.ndim == 3 and plan.shape[2] == vehicles
+    fits = vehicles == 1 if plan.ndim == 2 else plan.shape[2:] == (vehicles,)
     if not fits or plan.shape[0] != running.n or plan.shape[1] < most:
         wanted = f"({running.n}, at least {most}{'' if vehicles == 1 else f', {vehicles}'})"
         raise InvalidInput(f"shield: plan {plan.shape}; {wanted} is needed")

@@ -30,7 +30,6 @@ from ethbrake_marl.physics.episode import (
 from ethbrake_marl.physics.impact import MASS
 from ethbrake_marl.physics.segment import COMMAND, LIMIT
 
-
 # rows of the lines: command of those that are not shielded (m/s2), latency (s), mass (t), speed limit (m/s), and the
 # harm that each vehicle may bear (m2/s2), a row that is missing where there is no such limit
 OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_CAP = range(5)
@@ -192,7 +191,7 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 
 @compiled
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
-    """Harm of the episode under constant ``c`` of [C, K] from here, in one segment; infinity where the physics fails."""
+    """Harm of the episode under constant ``c`` of [C, K] from here, in one segment; infinity: the physics fails."""
     table, clock, vehicles, bounds = world.table, world.clock[m], world.vehicles, world.bounds
     enter(world, m, state)
     for i in range(vehicles.shape[0]):
