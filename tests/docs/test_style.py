@@ -20,7 +20,7 @@ NOT_YET = {
     f"docs/{name}.md"
     for name in (
         "avoidability", "cooperation",
-        "learning",
+       
         "scaling", "shield",
     )
 }  # fmt: skip
