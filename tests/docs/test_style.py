@@ -85,6 +85,12 @@ def test_page__has_short_lines_and_short_paragraphs(path: Path) -> None:
         assert not any(wrong.values()), wrong
 
 
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_page__has_code_blocks_that_begin_and_end_on_lines_of_their_own(path: Path) -> None:
+    lines = path.read_text("utf-8").splitlines()
+    assert [line for line in lines if re.search(r"\S.*```|```\S+ .*\S *```", line) and "````" not in line] == []
+
+
 @pytest.mark.parametrize(
     ("text", "lines", "paragraphs"),
     [
