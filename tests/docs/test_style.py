@@ -20,7 +20,6 @@ NOT_YET = {
     f"docs/{name}.md"
     for name in (
         "avoidability", "cooperation",
-       
         "scaling", "shield",
     )
 }  # fmt: skip
