@@ -28,7 +28,7 @@ if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for th
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist benchmark
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist benchmark audit
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -40,8 +40,9 @@ help:
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
-	@echo "make test-hostile     6,000 files and command lines of strangers: each refused in one line, or in order"
-	@echo "make test-light       install the wheel alone: at most 650 MB, no torch, and its examples run"
+	@echo "make test-hostile     6,800 files and command lines of strangers: each refused in one line, or in order"
+	@echo "make audit            every pinned package with its licence; reported weaknesses where pip-audit is installed"
+	@echo "make test-light       install the wheel alone: at most 650 MB, no torch, and its examples run; then the sdist"
 	@echo "make test-libraries   train with other people's libraries, each in its own environment below .venvs/, and print the matrix"
 	@echo "make proofs           statements about the code that a solver proves, one line each"
 	@echo "make test-cluster     a sweep on a Ray cluster of two nodes on this machine, whose workers are killed at random, its driver once"
@@ -157,6 +158,10 @@ test-order: $(STAMP)
 test-hostile: $(STAMP)
 	@echo "== files that a stranger wrote or a disk damaged"
 	@$(BIN)/python -m tests.hostile $(ARGS)
+
+audit: $(STAMP)
+	@echo "== what the package stands on"
+	@$(BIN)/python -m tests.programme.audit
 
 test-libraries: $(STAMP)
 	@echo "== other people's libraries"

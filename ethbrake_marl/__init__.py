@@ -112,7 +112,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError
     from ethbrake_marl.errors import MissingExtra as MissingExtra
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 
 def _read_homes() -> dict[str, str]:

@@ -107,6 +107,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("starlette", "uvicorn"), "explore"),
     "ray": "cluster",
+    "optuna": "tune",
 }
 
 
@@ -217,7 +218,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> UnknownName:
     """Build the error for an unknown ``name``, with a suggestion when one is close."""
     names = sorted(known)
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
-    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names)}"
+    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}"
     return UnknownName(f"unknown {kind} {name!r}; {hint}")
 
 

@@ -15,6 +15,7 @@ from ethbrake_marl.errors import (
     count_of,
     one_line,
     plain_text,
+    unknown_name,
 )
 
 
@@ -30,6 +31,10 @@ def test_message__keeps_beginning_and_end_of_what_is_long(long: str) -> None:
     assert text.startswith("mine.yaml, line 3: gaps_m = ") and text.endswith(": must be a number")
     assert f"({len(long) + 46:,} characters)" in text
     assert len(text) <= LINE_LIMIT and text.isprintable()
+
+
+def test_unknown_name__says_where_nothing_is_known() -> None:
+    assert str(unknown_name("term", "mine", [])) == "unknown term 'mine'; known: none"
 
 
 def test_one_line__is_the_same_the_second_time() -> None:

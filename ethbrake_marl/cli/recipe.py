@@ -13,6 +13,7 @@ from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import SIZE_LIMIT
 from ethbrake_marl.learning.recipe import load_recipe, recipe_path, shipped_recipes
+from ethbrake_marl.learning.recipe_schema import recipe_json_schema
 from ethbrake_marl.learning.recipe_text import new_recipe_text
 
 recipe_app = typer.Typer(
@@ -66,3 +67,12 @@ def recipe_new(
     file = output / f"{name}.yaml"
     write_output(file, new_recipe_text(name, based_on).encode(), force=force)
     say(f"written: {file}; change it, then: ethbrake recipe validate {file}")
+
+
+@recipe_app.command("schema", epilog="Example: ethbrake recipe schema > recipe.schema.json")
+def recipe_schema() -> None:
+    """Print the JSON Schema of recipe files.
+
+    For editors that complete and check YAML.
+    """
+    write_json(recipe_json_schema())

@@ -21,7 +21,7 @@ from ethbrake_marl.scenario.quantities import QUANTITIES
 from ethbrake_marl.scenario.sample import quantity_columns
 
 FORMAT: Literal["ethbrake-worlds"] = "ethbrake-worlds"
-VERSION: Literal[1] = 1
+VERSION = 1
 MOST = 1000  # worlds of a file
 SIZE_LIMIT = 8 << 20  # bytes of it: so many worlds of a long line
 
@@ -46,7 +46,7 @@ class NamedWorlds(_Strict):
     """A file of named worlds."""
 
     format: Literal["ethbrake-worlds"]
-    version: Literal[1]
+    version: Annotated[int, Field(ge=VERSION, le=VERSION)]  # a literal would take true and 1.0, which equal 1
     scenario: str
     scenario_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     settings: list[str] = []  # what was set beside the scenario's name, as ``--set`` takes it

@@ -48,6 +48,7 @@ def with_obstacle(worlds: Worlds) -> Worlds:
         ahead(0.0, worlds.command_mps2),
         np.full(worlds.n, np.inf),
         np.zeros(worlds.n, np.bool_),
+        worlds.messages,
     )
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
+from ethbrake_marl.files.json_schema import schema_lines
 from ethbrake_marl.files.yaml import Document, flow_text, read_yaml
 from ethbrake_marl.scenario.fields import NAME_PATTERN
 from ethbrake_marl.scenario.mixture import member_content
@@ -204,9 +205,6 @@ _HEAD = """\
 #   {{normal: {{mean: 20, sd: 1, low: 18, high: 22}}}}    truncated to [low, high]
 #   {{choice: [6, 7, 8]}}    optionally with weights: [1, 2, 1]
 # One entry stands for every vehicle (each draws its own value); a list has one entry per vehicle, front to rear.
-# yaml-language-server: $schema=scenario.schema.json
-# Your editor completes and checks this file once that schema stands beside it:
-#   ethbrake scenario schema > scenario.schema.json
 """
 
 
@@ -240,7 +238,7 @@ def new_scenario_text(name: str, based_on: str = "paper-random") -> str:
     if base.members:
         values["mixture"] = [_short_member(entry) for entry in values["mixture"]]
     keys = [f"\n# {_comment(key)}\n{_line(key, values)}\n" for key in Scenario.model_fields]
-    return _HEAD.format(name=name, based_on=base.name) + "".join(keys)
+    return _HEAD.format(name=name, based_on=base.name) + schema_lines("scenario") + "".join(keys)
 
 
 _EXAMPLES = {

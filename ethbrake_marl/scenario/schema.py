@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ValidationError, field_validator, model_validator
-from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
-from pydantic_core.core_schema import NullableSchema, ValidationInfo, WithDefaultSchema
+from pydantic_core.core_schema import ValidationInfo
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.html import html_table
+from ethbrake_marl.files.json_schema import FileSchema, publish
 from ethbrake_marl.files.messages import explain
 from ethbrake_marl.files.yaml import Document, flow_text
 from ethbrake_marl.scenario.checks import (
@@ -223,24 +223,8 @@ def scenario_json_schema() -> dict[str, Any]:
     by_types = {"anyOf": [{"required": ["vehicle_types"]}, {"required": [*OF_EVERY_VEHICLE]}]}
     whole = {"if": {"not": {"required": ["mixture"]}}, "then": {"allOf": [*one_of_two, by_types]}}
     needed = {"speed_deviations_mps": ["line_speed_mps"]}
-    schema = Scenario.model_json_schema(schema_generator=_FileSchema)
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        **schema, **whole, "dependentRequired": needed,
-    }  # fmt: skip
-
-
-class _FileSchema(GenerateJsonSchema):
-    """In a file a key that is not used is left out; it is never ``null``."""
-
-    def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
-        """The schema of the value where there is one."""
-        return self.generate_inner(schema["schema"])
-
-    def default_schema(self, schema: WithDefaultSchema) -> JsonSchemaValue:
-        """As always, but without ``"default": null``."""
-        described = super().default_schema(schema)
-        return {key: value for key, value in described.items() if key != "default" or value is not None}
+    schema = Scenario.model_json_schema(schema_generator=FileSchema)
+    return publish({**schema, **whole, "dependentRequired": needed})
 
 
 def _build(scenario: Scenario, document: Document) -> None:

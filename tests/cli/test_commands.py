@@ -29,6 +29,11 @@ COMMANDS = [
     "scenario validate",
     "scenario new",
     "scenario schema",
+    "recipe list",
+    "recipe show",
+    "recipe validate",
+    "recipe new",
+    "recipe schema",
 ]
 
 

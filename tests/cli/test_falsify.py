@@ -56,6 +56,7 @@ def test_falsify__tells_the_command_that_finds_the_same(ethbrake: Command, file:
         (("name: regret-2", "name: regret-1"), "world 'regret-1' is given twice"),
         (("gap_2_m", "gap_3_m"), "gap_3_m"),
         (("version: 1", "version: 2"), "line 2: version"),
+        (("version: 1", "version: true"), "line 2: version"),
     ],
 )
 def test_falsify_again__refuses_a_file_that_is_damaged(

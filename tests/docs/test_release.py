@@ -5,11 +5,17 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 import ethbrake_marl as eb
+from ethbrake_marl.learning.recipe import shipped_recipes
+from ethbrake_marl.learning.recipe_schema import recipe_json_schema
+from ethbrake_marl.learning.recipe_text import new_recipe_text
 from ethbrake_marl.scenario import list_scenarios, new_scenario_text, scenario_json_schema
 from tests.docs.site import DOCS
 
@@ -26,11 +32,22 @@ def test_version__is_the_same_wherever_it_stands() -> None:
     assert [author["name"] for author in citation["authors"]] == [author["name"] for author in project["authors"]]
 
 
-def test_schema__that_ships_is_the_one_that_the_command_prints() -> None:
-    shipped = (ROOT / "scenarios" / "scenario.schema.json").read_text("utf-8")
-    assert shipped == json.dumps(scenario_json_schema(), indent=2) + "\n"
-    assert "# yaml-language-server: $schema=scenario.schema.json\n" in new_scenario_text("mine")
-    assert all(entry.path.suffix == ".yaml" for entry in list_scenarios())
+@pytest.mark.parametrize(
+    ("file", "schema", "text"),
+    [
+        ("scenarios/scenario.schema.json", scenario_json_schema, new_scenario_text),
+        ("train/recipe.schema.json", recipe_json_schema, new_recipe_text),
+    ],
+)
+def test_schema__that_ships_is_the_one_that_the_command_prints(
+    file: str, schema: Callable[[], dict[str, Any]], text: Callable[[str], str]
+) -> None:
+    assert (ROOT / file).read_text("utf-8") == json.dumps(schema(), indent=2) + "\n"
+    assert f"# yaml-language-server: $schema={Path(file).name}\n" in text("mine")
+
+
+def test_schemas__are_no_scenario_and_no_recipe() -> None:
+    assert all(path.suffix == ".yaml" for path in (*shipped_recipes().values(), *(e.path for e in list_scenarios())))
 
 
 @pytest.mark.parametrize("name", GUIDES)

@@ -15,6 +15,7 @@ import yaml
 import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.recipe_schema import recipe_json_schema
 from ethbrake_marl.learning.train import train
 from ethbrake_marl.policies.policy import load_policy
 from ethbrake_marl.rewards import TERMS, StepOutcome, reward_params
@@ -96,6 +97,11 @@ def test_term__stands_in_the_infos_of_every_interface(mine: Any) -> None:
     batch = eb.make_sb3_vec_env(SCENARIO, 2, seed=1, reward=reward)
     batch.reset()
     assert batch.step(np.full((2, 1), -0.5, np.float32))[1][0] == np.float32(rewards["vehicle_2"])
+
+
+def test_term__has_its_place_in_the_schema_of_recipes(mine: Any) -> None:
+    weights = recipe_json_schema()["$defs"]["RewardParams"]["properties"]
+    assert weights["calm"]["minimum"] == weights["harm"]["minimum"] == 0
 
 
 def test_term__per_learner_leaves_the_others_out() -> None:

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
-import random
 import sys
 import tempfile
 import time
@@ -24,26 +23,12 @@ from collections import defaultdict
 from pathlib import Path
 
 from tests.hostile.cage import Verdict, judge
-from tests.hostile.case import Case, Generator
 from tests.hostile.confined import can_confine, confine, die_with_parent
-from tests.hostile.kinds import KINDS, warm_up
+from tests.hostile.gates import gate_rows, kind_rows
+from tests.hostile.kinds import KINDS, cases_of, warm_up
 from tests.hostile.surroundings import gained, listing
 
 HEADING = f"{'kind':12} {'category':34} {'cases':>6} {'refused':>8} {'in order':>9} {'broken':>7} {'CPU s':>6}  longest"
-
-
-def cases_of(kind: str, generator: Generator, seed: int, sample: int | None) -> list[Case]:
-    """The cases of a kind, or ``sample`` of them: as many categories as there are, in turn."""
-    every = list(generator(random.Random(f"{seed} {kind}")))
-    if sample is None or sample >= len(every):
-        return every
-    grouped: dict[str, list[Case]] = defaultdict(list)
-    for case in every:
-        grouped[case.category].append(case)
-    for group in grouped.values():
-        random.Random(f"{seed} {kind} sample").shuffle(group)
-    in_turn = (case for row in itertools.zip_longest(*grouped.values()) for case in row if case is not None)
-    return list(itertools.islice(in_turn, sample))
 
 
 def main() -> int:
@@ -57,7 +42,8 @@ def main() -> int:
     parser.add_argument("--verbose", action="store_true", help="also print each case's message")
     arguments = parser.parse_args()
     if arguments.list:
-        return show_counts(arguments.seed)
+        print("\n".join((*kind_rows(arguments.seed), *gate_rows())))
+        return 0
     with tempfile.TemporaryDirectory(prefix="hostile-", ignore_cleanup_errors=True) as name:
         child = os.fork()  # what confines the attack cannot be undone, and this process has its folder to remove
         if child:
@@ -111,17 +97,6 @@ def judge_kind(kind: str, arguments: argparse.Namespace, own: Path, names: set[s
     for category, verdicts in found.items():
         print(row(kind, category, verdicts), flush=True)
     return list(itertools.chain(*found.values()))
-
-
-def show_counts(seed: int) -> int:
-    """One line per kind."""
-    total = 0
-    for kind, generator in KINDS.items():
-        cases = cases_of(kind, generator, seed, None)
-        total += len(cases)
-        print(f"| {kind} | {len({case.category for case in cases})} | {len(cases):,} |")
-    print(f"| in all | | {total:,} |")
-    return 0
 
 
 def row(kind: str, category: str, verdicts: list[Verdict]) -> str:

@@ -27,6 +27,7 @@ class Case:
     reader: Callable[[], object] | None = None  # the same through Python: must raise an error of the project's family
     meanwhile: Build | None = None  # goes on in another process while the command runs
     environment: Mapping[str, str] = field(default_factory=dict)
+    content: bytes | str = b""  # of the one file that is tried, where there is one
     may_change: tuple[str, ...] = ()  # what a command that is not refused may write, inside the folder
 
 

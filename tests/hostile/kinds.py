@@ -1,11 +1,14 @@
-"""The kinds of hostile cases, and what must have happened once before one of them is judged."""
+"""The kinds of hostile cases, the cases of each, and what must have happened once before one of them is judged."""
 
 from __future__ import annotations
 
 import functools
 import gc
 import io
+import itertools
+import random
 import shutil
+from collections import defaultdict
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
@@ -15,10 +18,11 @@ import typer.main
 from ethbrake_marl.cli.app import run_command
 from tests.hostile.archives import good_bytes
 from tests.hostile.bundle_cases import bundles
-from tests.hostile.case import Generator, write
+from tests.hostile.case import Case, Generator, write
 from tests.hostile.command_cases import commands
 from tests.hostile.csv_cases import HEADER, ROW, tables_of_states
 from tests.hostile.place_cases import places
+from tests.hostile.plan_cases import SWEEP, named_worlds, sweeps, worlds_text
 from tests.hostile.run_cases import checkpoints, runs
 from tests.hostile.stopped_runs import stopped
 from tests.hostile.table_cases import COMMAND, best_harm_tables
@@ -28,6 +32,8 @@ from tests.hostile.yaml_parts import RECIPE, SCENARIO
 KINDS: dict[str, Generator] = {
     "scenario": scenarios,
     "recipe": recipes,
+    "sweep": sweeps,
+    "worlds": named_worlds,
     "CSV": tables_of_states,
     "table": best_harm_tables,
     "place": places,
@@ -36,6 +42,20 @@ KINDS: dict[str, Generator] = {
     "checkpoint": checkpoints,
     "command": commands,
 }
+
+
+def cases_of(kind: str, generator: Generator, seed: int, sample: int | None) -> list[Case]:
+    """The cases of a kind, or ``sample`` of them: as many categories as there are, in turn."""
+    every = list(generator(random.Random(f"{seed} {kind}")))
+    if sample is None or sample >= len(every):
+        return every
+    grouped: dict[str, list[Case]] = defaultdict(list)
+    for case in every:
+        grouped[case.category].append(case)
+    for group in grouped.values():
+        random.Random(f"{seed} {kind} sample").shuffle(group)
+    in_turn = (case for row in itertools.zip_longest(*grouped.values()) for case in row if case is not None)
+    return list(itertools.islice(in_turn, sample))
 
 
 def warm_up(folder: Path) -> None:
@@ -60,6 +80,10 @@ def warm_up(folder: Path) -> None:
         run_command(["shield", "--agents", "x"])
         few = ["evaluate", "--agents", "coast,full_brake", "--episodes", "3"]
         run_command([*few, "--per-world", str(folder / "worlds-out.csv")])
+        write(folder / "sweep.yaml", SWEEP)
+        run_command(["sweep", str(folder / "sweep.yaml"), "--output", str(folder / "mine.yaml")])
+        write(folder / "worlds.yaml", worlds_text())
+        run_command(["falsify", "--again", str(folder / "worlds.yaml")])
         write(folder / "t.npz", good_bytes())
         write(folder / "bad" / "t.npz", b"")
         write(folder / "worlds.csv", f"{HEADER}\n{ROW}\n")

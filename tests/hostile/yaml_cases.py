@@ -9,8 +9,9 @@ from pathlib import Path
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.scenario import load_scenario
 from tests.hostile.case import Case, damaged, write
+from tests.hostile.recipe_parts import RECIPE_PARTS
 from tests.hostile.yaml_changes import CERTAIN, SCENARIO_ONLY, UNCERTAIN, encoded
-from tests.hostile.yaml_parts import RECIPE, SAC, SCENARIO
+from tests.hostile.yaml_parts import RECIPE, SAC, SCENARIO, replaced
 
 
 def scenarios(rng: random.Random) -> Iterator[Case]:
@@ -33,6 +34,8 @@ def recipes(rng: random.Random) -> Iterator[Case]:
             for k in range(28):
                 text = SAC if k % 4 == 3 else RECIPE
                 yield _recipe(category, encoded(rng, category, change(rng, text)), certain)
+    for category, (old, others) in RECIPE_PARTS.items():
+        yield from (_recipe(category, replaced(RECIPE, old, other), True) for other in others)
     for _ in range(75):
         yield _recipe("damaged", damaged(rng, RECIPE.encode()), False)
 
@@ -45,6 +48,7 @@ def _scenario(category: str, content: bytes | str, certain: bool) -> Case:
         lambda folder: write(folder / "mine.yaml", content),
         certain=certain,
         reader=lambda: load_scenario("mine.yaml"),
+        content=content,
     )
 
 
@@ -55,4 +59,6 @@ def _recipe(category: str, content: bytes | str, certain: bool) -> Case:
 
     # The output is taken: a recipe in order is refused for that, before anything is trained.
     command = ("train", "--recipe", "mine.yaml", "--output", "taken")
-    return Case("recipe", category, command, build, certain=certain, reader=lambda: load_recipe("mine.yaml"))
+    return Case(
+        "recipe", category, command, build, certain=certain, reader=lambda: load_recipe("mine.yaml"), content=content
+    )

@@ -183,6 +183,13 @@ def with_line(rng: random.Random, text: str, line: str) -> str:
     return "\n".join(parts) + "\n"
 
 
+def replaced(text: str, old: str, new: str) -> str:
+    """The text with the first ``old``, which is there, replaced."""
+    if old not in text:
+        raise ValueError(f"{old!r} is not in the text")
+    return text.replace(old, new, 1)
+
+
 def without(rng: random.Random, text: str) -> str:
     """The text without one of the keys that are needed."""
     needed = (

@@ -5,9 +5,10 @@ import re
 from pathlib import Path
 
 import pytest
+from jsonschema import Draft202012Validator
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.files.yaml import flow_text
+from ethbrake_marl.files.yaml import flow_text, read_yaml
 from ethbrake_marl.learning.recipe import shipped_recipes
 from ethbrake_marl.scenario import (
     Scenario,
@@ -18,6 +19,7 @@ from ethbrake_marl.scenario import (
     read_scenario,
     scenario_folder,
     scenario_json_schema,
+    scenario_path,
 )
 from ethbrake_marl.scenario import catalogue as shipped_files
 from ethbrake_marl.scenario.fields import OF_EVERY_VEHICLE
@@ -161,6 +163,13 @@ def test_json_schema__names_every_field_and_serialises():
     assert schema["if"] == {"not": {"required": ["mixture"]}}  # whose members say everything else
     every = schema["then"]["allOf"][-1]["anyOf"]
     assert [way["required"] for way in every] == [["vehicle_types"], [*OF_EVERY_VEHICLE]]
+
+
+@pytest.mark.parametrize("name", [entry.name for entry in list_scenarios()])
+def test_json_schema__lets_shipped_and_new_scenarios_pass(name: str) -> None:
+    editor = Draft202012Validator(scenario_json_schema())
+    for content in (read_yaml(scenario_path(name)).content, parse_yaml(new_scenario_text("mine", name), "x").content):
+        assert [error.message for error in editor.iter_errors(content)] == []
 
 
 def test_json_schema__asks_for_one_of_two_ways_and_knows_no_null():

@@ -1,8 +1,9 @@
 """The wheel alone in an empty environment: how large it is, and that all of the core runs there without torch.
 
-``make test-light`` (or ``python -m tests.wheel [--environment FOLDER]``). Prints one line for each thing tried:
-ok or FAILED, seconds, what; and exits with status 1 when one has failed. ``--environment`` names an environment to
-install into instead of a new one; its packages stay.
+Then the sdist in the wheel's place: it must bring the same files, and pass a smoke test. ``make test-light`` (or
+``python -m tests.wheel [--environment FOLDER]``) prints one line for each thing tried: ok or FAILED, seconds, what; and
+exits with status 1 when one has failed. ``--environment`` names an environment to install into instead of a new one;
+its packages stay.
 """
 
 from __future__ import annotations
@@ -19,9 +20,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.wheel.reproducible import build
+
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_MB = 650
 NOT_OURS = ("pip", "setuptools", "pkg_resources", "wheel", "_distutils_hack")  # what an empty environment begins with
+NAME = "ethbrake-marl"
 SHIPPED = "ppo@shipped,ppo@shipped+episode"
 NEEDS_TRAIN = "-m pip install 'ethbrake-marl[train]'"
 
@@ -52,6 +56,9 @@ COMMANDS = (
 )
 
 
+SMOKE = (COMMANDS[0], COMMANDS[1], COMMANDS[6], COMMANDS[7])  # of the sdist, whose files are the wheel's
+
+
 def readme_example() -> str:
     """The first Python program of the README."""
     found = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
@@ -69,17 +76,23 @@ def calls() -> Iterator[Call]:
     yield Call(COMMANDS[-1].arguments, 1, NEEDS_TRAIN)  # in Python: an exception, whose last line says it
 
 
-def install(environment: Path, folder: Path) -> None:
-    """Build the wheel and install it at the versions of constraints.txt."""
+def prepare(environment: Path, folder: Path) -> tuple[Path, Path]:
+    """Make the environment and build wheel and sdist into ``folder``; the two files."""
     if not (environment / "bin" / "python").exists():
         venv.create(environment, with_pip=True)
-    pip = ["-m", "pip", "--quiet", "--disable-pip-version-check"]
-    subprocess.run([sys.executable, *pip, "wheel", "--no-deps", "-w", str(folder), str(ROOT)], check=True)
-    (wheel,) = folder.glob("*.whl")
-    python = str(environment / "bin" / "python")
+    build(folder)
+    return next(folder.glob("*.whl")), next(folder.glob("*.tar.gz"))
+
+
+def install(environment: Path, file: Path) -> set[tuple[str, str]]:
+    """Install a wheel or sdist at the versions of constraints.txt; path and hash of each of its files."""
+    pip = [str(environment / "bin" / "python"), "-m", "pip", "--quiet", "--disable-pip-version-check", "install"]
     constraints = ["-c", str(ROOT / "constraints.txt")]
-    subprocess.run([python, *pip, "install", *constraints, "--force-reinstall", "--no-deps", str(wheel)], check=True)
-    subprocess.run([python, *pip, "install", *constraints, str(wheel)], check=True)
+    subprocess.run([*pip, *constraints, "--force-reinstall", "--no-deps", str(file)], check=True)
+    subprocess.run([*pip, *constraints, str(file)], check=True)
+    (record,) = environment.glob(f"lib/python*/site-packages/{NAME.replace('-', '_')}-*.dist-info/RECORD")
+    rows = [line.rsplit(",", 2) for line in record.read_text("utf-8").splitlines()]
+    return {(path, digest) for path, digest, _ in rows if path.startswith("ethbrake_marl/") and digest}
 
 
 def installed_mb(environment: Path) -> float:
@@ -122,13 +135,25 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="ethbrake-wheel-") as temporary:
         folder = Path(temporary)
         environment = given.environment.absolute() if given.environment else folder / "environment"
-        (folder / "wheel").mkdir()
-        install(environment, folder / "wheel")
+        (folder / "built").mkdir()
+        wheel, sdist = prepare(environment, folder / "built")
+        files = install(environment, wheel)
         size = installed_mb(environment)
-        print(f"{'ok    ' if size <= LIMIT_MB else 'FAILED'}  {size:.0f} MB installed; at most {LIMIT_MB}", flush=True)
+        ended = [told(size <= LIMIT_MB, f"{size:.0f} MB installed; at most {LIMIT_MB}")]
         (folder / "work").mkdir()
-        ended = [run(call, environment, folder / "work") for call in calls()]
-    sys.exit(0 if size <= LIMIT_MB and all(ended) else 1)
+        ended += [run(call, environment, folder / "work") for call in calls()]
+        again = install(environment, sdist)
+        ended.append(told(bool(files) and files == again, f"the sdist brings the wheel's {len(files)} files"))
+        ended += [
+            run(call, environment, folder / "work") for call in (Call(("python", "-c", readme_example())), *SMOKE)
+        ]
+    sys.exit(0 if all(ended) else 1)
+
+
+def told(ok: bool, what: str) -> bool:
+    """Print one line that is not about a command."""
+    print(f"{'ok    ' if ok else 'FAILED'}  {what}", flush=True)
+    return ok
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ethbrake_marl.learning.session import stop_on_signal
 from ethbrake_marl.studies.jobs.work import Answer, Workers
 
 RETRIES = 2  # further attempts at a job whose worker was lost
@@ -29,9 +30,9 @@ def run_jobs(
     *,
     retries: int = RETRIES,
 ) -> bool:
-    """Run the jobs 0 to ``jobs - 1``, in this order as far as there is room; False when Ctrl-C stopped it.
+    """Run the jobs 0 to ``jobs - 1``, in this order as far as there is room; False when Ctrl-C or SIGTERM stopped it.
 
-    What ``on_attempt`` raises stops it too: running jobs are asked to end and are waited for.
+    Running jobs are then asked to end and are waited for, and so they are when ``on_attempt`` raises.
 
     Args:
         call_of: makes a job's call, when its turn has come.
@@ -43,20 +44,23 @@ def run_jobs(
     """
     waiting, running, attempts = deque(range(jobs)), set[int](), dict[int, int]()
     try:
-        while waiting or running:
-            while waiting and workers.room() > 0:
-                number = waiting.popleft()
-                attempts[number] = attempts.get(number, 0) + 1
-                running.add(number)
-                workers.begin(number, call_of(number))
-            for number, answer in workers.wait():
-                running.discard(number)
-                again = answer.again and attempts[number] <= retries
-                if again:
-                    waiting.appendleft(number)
-                on_attempt(Attempt(number, attempts[number], answer, not again))
-                if not again:
-                    del attempts[number]
+        with stop_on_signal() as asked:
+            while waiting or running:
+                if asked():
+                    raise KeyboardInterrupt
+                while waiting and workers.room() > 0:
+                    number = waiting.popleft()
+                    attempts[number] = attempts.get(number, 0) + 1
+                    workers.begin(number, call_of(number))
+                    running.add(number)
+                for number, answer in workers.wait():
+                    running.discard(number)
+                    again = answer.again and attempts[number] <= retries
+                    if again:
+                        waiting.appendleft(number)
+                    on_attempt(Attempt(number, attempts[number], answer, not again))
+                    if not again:
+                        del attempts[number]
     except BaseException as error:
         _stop(running, workers, on_attempt, attempts)
         if isinstance(error, KeyboardInterrupt):

@@ -19,8 +19,10 @@ from ethbrake_marl.studies.jobs.work import Answer, answer, pack
 class Pretended:
     """Two workers that end jobs in reverse; jobs of ``lost`` lose theirs so often, ``wrong`` ones fail for good."""
 
-    def __init__(self, lost: dict[int, int], wrong: set[int], stop_at: int | None = None) -> None:
-        self.lost, self.wrong, self.stop_at = dict(lost), wrong, stop_at
+    def __init__(
+        self, lost: dict[int, int], wrong: set[int], stop_at: int | None = None, by: signal.Signals = signal.SIGINT
+    ) -> None:
+        self.lost, self.wrong, self.stop_at, self.by = dict(lost), wrong, stop_at, by
         self.running: list[int] = []
         self.begun: list[int] = []
         self.interrupted = False
@@ -37,7 +39,8 @@ class Pretended:
         number = self.running.pop()
         if number == self.stop_at and not self.interrupted:
             self.running.append(number)
-            raise KeyboardInterrupt
+            signal.raise_signal(self.by)
+            return []
         if self.lost.get(number, 0) > 0:
             self.lost[number] -= 1
             return [(number, Answer(None, WorkerLost("lost"), True))]
@@ -73,11 +76,26 @@ def test_jobs__a_lost_one_is_tried_again_so_often_and_no_more() -> None:
     assert (last[3].attempt, type(last[3].answer.error)) == (1, InvalidInput)  # it would be the same again
 
 
-def test_jobs__ctrl_c_asks_those_that_run_to_end_and_begins_no_other() -> None:
-    workers = Pretended({}, set(), stop_at=2)
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+def test_jobs__a_signal_asks_those_that_run_to_end_and_begins_no_other(by: signal.Signals) -> None:
+    workers = Pretended({}, set(), stop_at=2, by=by)
     whole, attempts = run(workers, jobs=6)
     assert not whole and workers.interrupted and workers.running == []
     assert workers.begun == [0, 1, 2] and [one.number for one in attempts] == [1]
+
+
+def test_jobs__ctrl_c_while_one_is_begun_waits_for_it() -> None:
+    class Interrupted(Pretended):
+        def begin(self, number: int, call: bytes) -> None:
+            signal.raise_signal(signal.SIGINT)  # a process that is half begun would be waited for without end
+            super().begin(number, call)
+
+    before = signal.getsignal(signal.SIGINT)
+    workers = Interrupted({}, set())
+    workers.room = lambda: 1 - len(workers.begun)  # type: ignore[method-assign]
+    whole, attempts = run(workers)
+    assert not whole and [one.number for one in attempts] == workers.begun == [0] and workers.running == []
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_jobs__an_error_of_who_is_told_stops_them() -> None:

@@ -29,3 +29,11 @@ def holders(folder: Path) -> dict[int, str]:
         runs = [Path(each).parent.name for each in targets if each.startswith(f"{folder}/runs/")]
         found |= {int(process.name): run for run in runs}
     return found
+
+
+def parent(process: int) -> int:
+    """Who began a process; 0 for one that has ended in the meantime."""
+    try:
+        return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+    except OSError:
+        return 0
