@@ -28,7 +28,7 @@ if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for th
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist benchmark audit
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist benchmark audit figures
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -36,6 +36,7 @@ help:
 	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make check            lint and test"
 	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"
+	@echo "make figures          the printed blocks, tables and pictures of README and docs made again and compared (minutes)"
 	@echo "make dist             wheel and sdist in dist/, built twice with the same SHA-256"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
@@ -126,6 +127,10 @@ docs: $(DOCS_STAMP)
 	@echo "== the documentation site"
 	@$(BIN)/python -m sphinx -W --keep-going -q -b html -d docs/_build/doctrees docs docs/_build/html $(ARGS)
 	@echo "== docs/_build/html/index.html"
+
+figures: $(STAMP)
+	@echo "== what the pages show, made again"
+	@$(BIN)/python -m tests.docs.figures $(ARGS)
 
 dist: $(STAMP)
 	@echo "== wheel and sdist, twice"

@@ -106,14 +106,15 @@ _ENTRIES: dict[str, Entry] = {
         f"{_SCRIPTS}:make_gentlest_front",
     ),
     "e_v2x_bm": Entry(
-        "e_v2x_bm[:pairwise]",
-        "the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state",
+        "e_v2x_bm[:pairwise][:believed]",
+        "the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state;"
+        " believed: on what was received, and the scenario's ranges for the rest",
         (Source.MODEL,),
         "agents.e_v2x_bm.agent:make_e_v2x_bm",
     ),
     "planner": Entry(
-        "planner[:CANDIDATES|:20ms]",
-        "a search in the simulation at every decision, with this budget for each",
+        "planner[:CANDIDATES|:20ms][:believed]",
+        "a search in the simulation at every decision, with this budget for each; believed: as above",
         (Source.MODEL,),
         "agents.planner:make_planner",
     ),

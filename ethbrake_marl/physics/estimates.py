@@ -112,3 +112,18 @@ def age_s(worlds: Worlds) -> Floats:
         age[periodic] = np.where(told_s >= 0.0, now - told_s, np.inf)[periodic]
         age[:, np.arange(N), np.arange(N)] = 0.0
     return age
+
+
+@compiled
+def move_on(speed: Floats, command: Floats, onset: Floats, limit: Floats, duration: Floats) -> tuple[Floats, Floats]:
+    """Speeds and ways, each [n, N], of vehicles alone after ``duration``, the command acting from ``onset`` (s) on.
+
+    All are [n, N], speeds not below 0.
+    """
+    after, way = np.empty(speed.shape), np.empty(speed.shape)
+    for k in range(speed.shape[0]):
+        for i in range(speed.shape[1]):
+            after[k, i], way[k, i], _ = solo_motion(
+                speed[k, i], command[k, i], onset[k, i], limit[k, i], duration[k, i]
+            )
+    return after, way

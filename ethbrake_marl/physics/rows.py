@@ -173,21 +173,21 @@ def own_latency_and_news(params: Floats, vehicles: int) -> tuple[Floats, Floats]
     return params[:, own:news].copy(), params[:, news:end].copy().reshape(-1, vehicles, vehicles)
 
 
-def unpack(packed: Packed) -> Worlds:
-    """The worlds of these rows, in their own memory."""
+def unpack(packed: Packed, vehicles: Vehicles | None = None) -> Worlds:
+    """The worlds of these rows, in their own memory but for ``vehicles``, if they are given as they were unpacked."""
     state, params = packed
     N = vehicles_in(state)
-    gaps = gap_at(N)
-    obstacle = with_obstacle_columns(state, N)[:, state_width(N) :]
+    gaps, n = gap_at(N), len(state)
+    far = not has_obstacle(state, N)
     return Worlds(
-        _vehicles(params, N),
+        _vehicles(params, N) if vehicles is None else vehicles,
         state[:, gaps : gaps + N - 1].copy(),
         state[:, speed_at(N) : command_at(N)].copy(),
         state[:, TIME].copy(),
         state[:, gaps + N - 1 : harm_at(N)] == 1.0,
         state[:, command_at(N) : previous_at(N)].copy(),
-        obstacle[:, 0].copy(),
-        obstacle[:, 1] == 1.0,
+        np.full(n, np.inf) if far else state[:, state_width(N)].copy(),
+        np.zeros(n, np.bool_) if far else state[:, state_width(N) + 1] == 1.0,
         params[:, messages_at(N) :].copy(),
     )
 

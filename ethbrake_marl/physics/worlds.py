@@ -197,6 +197,17 @@ def _assigned(whole: NDArray[Any], rows: Ints, part: NDArray[Any]) -> NDArray[An
     return copy
 
 
+def sum_rows(values: Floats) -> Floats:
+    """``values.sum(axis=1)`` to the same bits; faster where a row is short, which NumPy adds up entry by entry."""
+    if not 0 < values.shape[1] < 8:
+        total: Floats = values.sum(axis=1)
+        return total
+    total = values[:, 0].copy()
+    for column in values.T[1:]:
+        total += column
+    return total
+
+
 def make_worlds(
     gaps_m: ArrayLike,
     speeds_mps: ArrayLike,

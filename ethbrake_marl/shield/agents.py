@@ -219,7 +219,7 @@ class StepShieldAgent(AgentAround):
         if self._asked is None:
             due = self._due(worlds)
             proposed = proposed_action(self.policy, worlds, vehicle)
-            proposer = Proposer(self.policy, worlds) if self._later_rollouts else None
+            proposer = Proposer({vehicle: self.policy}, worlds) if self._later_rollouts else None
             certified = shield.propose(proposed, seen=state_columns(worlds), only=due, proposer=proposer)
             command = action_to_command(certified.decision.applied, worlds.vehicles, vehicle)
             self._asked = _Asked(worlds.time_s, certified, np.where(due, command, self._wanted))

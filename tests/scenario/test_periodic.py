@@ -221,3 +221,16 @@ def test_given_states__need_a_channel_without_chance() -> None:
     env = parallel_env(scenario=periodic())
     with pytest.raises(InvalidInput, match="the scenario draws what each vehicle knows when"):
         env.reset(options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}})
+
+
+def test_mixture__its_scenarios_share_the_persistence() -> None:
+    members = [
+        {"scenario": {**load_scenario(name).declared(), "v2x": v2x}}
+        for name, v2x in (("paper-random", {"preset": "nominal", "persistence": "periodic"}), ("paper-slow", "nominal"))
+    ]
+    with pytest.raises(InvalidInput, match=r"v2x\.persistence must be the same in all"):
+        Scenario(name="mixed", mixture=members)
+    members[1]["scenario"]["v2x"] = {"preset": "blocked", "persistence": "periodic"}
+    mixed = Scenario(name="mixed", mixture=members)
+    assert is_periodic(mixed.sample(30, 3).worlds).all()
+    driven(engine_of(mixed), 5)

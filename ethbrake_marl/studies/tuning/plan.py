@@ -13,10 +13,12 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import load_runnable
+from ethbrake_marl.files.plugins import noted_plugins
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.settings import read_settings
 from ethbrake_marl.learning.training import Training, resolve, training_content
+from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies.tuning.file import Choices, Range, TuningFile
 
@@ -41,7 +43,7 @@ class TuningPlan:
     file: TuningFile
     recipe: TrainingRecipe  # with the file's settings, its seed and its list
     scenario: Scenario
-    identity: str  # SHA-256 of all that makes a trial's harm what it is
+    identity: str  # SHA-256 of all that makes a trial's harm what it is, versions and plug-ins included
 
     def training(self, values: Values) -> Training:
         """The training of a trial; raises ``InvalidInput`` where the values do not go together."""
@@ -82,7 +84,7 @@ def plan_tuning(file: TuningFile) -> TuningPlan:
     resolve(changed, scenario)
     content = training_content(changed, scenario)
     told = {"training": content, **file.model_dump(mode="json", include={"search", "measure", "prune", "sampler"})}
-    told["order"] = [*file.search]  # a sampler draws in this order
+    told |= {"order": [*file.search], "versions": installed_versions(), "plugins": noted_plugins()}
     identity = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
     plan = TuningPlan(file, changed, scenario, identity)
     _check_space(plan)

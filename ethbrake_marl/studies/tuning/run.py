@@ -17,6 +17,7 @@ from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.files.durable import remove_unfinished, write_file
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.run_folder import read_object
+from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.studies.jobs.run import RETRIES, Attempt, run_jobs
 from ethbrake_marl.studies.jobs.training import TrainingJob
 from ethbrake_marl.studies.jobs.work import Workers, pack
@@ -206,9 +207,17 @@ def _name(trial: int) -> str:
 
 
 def check_tuning(plan: TuningPlan, folder: Path) -> None:
-    """Raise ``InvalidInput`` where the folder holds another tuning."""
+    """Raise ``InvalidInput`` where the folder holds another tuning, or one by other versions."""
     file = folder / _RECORD
-    if file.is_file() and read_object(file).get("tuning") != plan.identity:
+    if not file.is_file():
+        return
+    record, now = read_object(file), installed_versions()
+    then = record.get("versions")
+    if isinstance(then, dict) and then != now:
+        names = [name for name in {**then, **now} if then.get(name) != now.get(name)]
+        other = "; ".join(f"{name} {then.get(name)}, here {now.get(name)}" for name in names)
+        raise InvalidInput(f"{folder}: was tuned with {other}: harms could not be compared; give another folder")
+    if record.get("tuning") != plan.identity:
         raise InvalidInput(f"{folder}: holds another tuning; give another folder (--output), or the same file")
 
 
@@ -217,7 +226,12 @@ def _owner(plan: TuningPlan, folder: Path) -> str:
     check_tuning(plan, folder)
     file = folder / _RECORD
     if not file.is_file():
-        content = {"format": "ethbrake-tuning", "tuning": plan.identity, "owner": uuid.uuid4().hex}
+        content = {
+            "format": "ethbrake-tuning",
+            "tuning": plan.identity,
+            "owner": uuid.uuid4().hex,
+            "versions": installed_versions(),
+        }
         write_file(file, json.dumps(content, indent=2).encode() + b"\n")
     return str(read_object(file).get("owner"))
 

@@ -148,6 +148,17 @@ def test_folder_of_another_tuning__is_refused(finished_tuning, write_tuning, cap
     assert (finished_tuning / TABLE).read_bytes() == table
 
 
+def test_folder_of_other_versions__is_refused_with_their_names(finished_tuning, write_tuning, tmp_path, capsys):
+    folder = tmp_path / "out"
+    shutil.copytree(finished_tuning, folder)
+    record = json.loads((folder / "tuning.json").read_text())
+    record["versions"]["torch"] = "1.0"
+    (folder / "tuning.json").write_text(json.dumps(record))
+    assert tune(write_tuning(), folder) == 2
+    told = capsys.readouterr().err
+    assert "was tuned with torch 1.0, here 2." in told and "numpy" not in told
+
+
 def test_storage__can_be_shared_by_folders(write_tuning, tmp_path):
     plan, storage = plan_tuning(read_tuning(write_tuning())), f"sqlite:///{tmp_path / 'study.db'}"
     with closing(LocalWorkers(2)) as workers:

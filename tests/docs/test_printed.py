@@ -1,0 +1,164 @@
+"""Everything that the pages show as printed has its place where it is compared; what is quick is compared here."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.scenario import load_scenario, scenario_path, worlds_from_table
+from tests.docs.blocks import (
+    ROOT,
+    Shown,
+    agrees,
+    commands_of,
+    missing_figures,
+    pictures,
+    printed_blocks,
+    tables_of_figures,
+)
+from tests.docs.printed import BLOCKS, EXACT, PICTURES, TABLES, How, how, where_rows
+from tests.docs.speeds import CASES, line
+
+Run = Callable[..., tuple[str, str]]
+MADE = ("docs/reproduction.md",)  # whole pages that are made from data; tests/test_reproduction_page.py compares them
+KINDS = [
+    pytest.param(printed_blocks, BLOCKS, id="blocks"),
+    pytest.param(tables_of_figures, TABLES, id="tables"),
+    pytest.param(pictures, PICTURES, id="pictures"),
+]
+
+
+@pytest.mark.parametrize(("shown", "table"), KINDS)
+def test_everything_shown__has_its_place(shown: Callable[[], Iterator[Shown]], table: dict[str, How]) -> None:
+    found = [(each, how(table, each.begin)) for each in shown() if each.page not in MADE or table is PICTURES]
+    assert [f"{each.page}: {each.begin}" for each, place in found if place is None] == []
+    used = {place[0] for _, place in found if place is not None}
+    assert [key for key in table if key not in used] == []
+
+
+def test_everything_shown__names_tests_and_programs_that_are_there() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
+    for place in (*BLOCKS.values(), *TABLES.values(), *PICTURES.values()):
+        for by in place.by:
+            assert not by.startswith("tests/") or (ROOT / by).exists(), by
+            assert not by.startswith("make ") or by.split()[1] in targets, by
+
+
+def test_page__shows_where_each_is_compared() -> None:
+    assert "\n".join(where_rows()) + "\n" in (ROOT / "docs" / "tests.md").read_text("utf-8")
+
+
+@pytest.fixture
+def told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Runs a command line in this process in an empty folder; stderr and stdout."""
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.chdir(tmp_path)
+
+    def call(command: str) -> tuple[str, str]:
+        capsys.readouterr()
+        run_command(command.split()[1:])
+        captured = capsys.readouterr()
+        return captured.err, captured.out
+
+    return call
+
+
+def _blocks() -> list[Shown]:
+    places = [(each, how(BLOCKS, each.begin)) for each in printed_blocks()]
+    own = [each for each, place in places if place is not None and place[1] == EXACT and "ethbrake" in each.begin]
+    return [each for each in own if "tutorials" not in each.page]  # of which tests/cli/test_documentation.py takes care
+
+
+@pytest.mark.parametrize("block", _blocks(), ids=lambda block: block.begin[:60])
+def test_block__is_what_its_commands_print(block: Shown, told: Run) -> None:
+    if block.begin == "ethbrake scenario validate rainy.yaml":  # whose mistake the page tells
+        told("ethbrake scenario new rainy")
+        text = Path("rainy.yaml").read_text("utf-8")
+        Path("rainy.yaml").write_text(text.replace("\nmass_t:", "\nmass_kg:"))
+    for command, shown in commands_of(block.text):
+        assert agrees(shown, "".join(told(command)).splitlines()), command
+
+
+def test_table_of_shipped_lists__is_printed_by_its_command(told: Run) -> None:
+    (table,) = (each for each in tables_of_figures() if each.begin.startswith("| list | worlds | proven"))
+    printed = told("ethbrake best-harm --shipped")[1].splitlines()
+    for row in table.text.splitlines():
+        assert any(one.startswith(row.rstrip()) for one in printed), row
+
+
+def test_reference_values__are_those_of_the_closed_form() -> None:
+    (table,) = (each for each in tables_of_figures() if each.begin.startswith("| d1, d2; v1, v2, v3"))
+    for row in table.text.splitlines()[2:]:
+        world, ends, optimum, full = row.strip("|").split("|")
+        gaps, speeds, latency = ([float(word) for word in part.split(",")] for part in world.split(";"))
+        scenario = load_scenario("paper-random").replace(latency_s=[0.0, *latency])
+        start = {f"gap_{k}_m": [gap] for k, gap in enumerate(gaps, 1)}
+        start |= {f"speed_{k}_mps": [speed] for k, speed in enumerate(speeds, 1)}
+        worlds = worlds_from_table(start, scenario)
+        found = optimise_pairwise(worlds, 1)
+        told = [found.spares_front_mps2, found.spares_rear_mps2, found.deceleration_mps2, found.harm]
+        told.append(pairwise_harm(worlds, [6, 7, 6]).sum(axis=1))
+        assert missing_figures(f"{ends} {optimum} {full}", " ".join(repr(float(each[0])) for each in told)) == [], row
+
+
+@pytest.mark.parametrize("begin", ["| name | gaps | speeds", "| name | speeds | gaps"])
+def test_tables_of_scenarios__hold_the_numbers_of_their_files(begin: str) -> None:
+    (table,) = (each for each in tables_of_figures() if each.begin.startswith(begin))
+    for row in table.text.splitlines()[2:]:
+        name, *cells = [cell.strip() for cell in row.strip("|").split("|")]
+        declared = re.sub(
+            r"(?m)^(?!\w+(_m|_s|_mps|_mps2|_t|types|roles):|  ).*$",
+            "",
+            scenario_path(name.strip("`")).read_text("utf-8"),
+        )
+        told = [
+            re.sub(r"m/s2|vehicles? \d", "", cell) for cell in cells[: 3 if "in the paper" in begin else len(cells)]
+        ]
+        numbers = {float(each) for each in re.findall(r"\d+(?:\.\d+)?", declared)}
+        assert {float(each) for each in re.findall(r"\d+(?:\.\d+)?", " ".join(told[:3]))} <= numbers, row
+
+
+def test_speeds__outside_their_range_are_as_shown() -> None:
+    (block,) = (each for each in printed_blocks() if each.begin.startswith("paper-random full_brake  "))
+    assert [line(*case) for case in CASES] == block.text.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed", "same"),
+    [
+        ("a", "a", True),
+        ("a", "b", False),
+        ("a\n...\nd", "a\nb\nc\nd", True),
+        ("a\n...\nd", "a\nd", True),
+        ("a\n...", "a\nb", True),
+        ("a\n  ...\nc", "a\nb", False),
+        ("...\na", "b\na\n\n", True),
+        ("a", "a\nb", False),
+        ("", "a", False),
+        ("a ...", "a b c", True),
+        ("a ...", "b", False),
+        ("a...", "ab", False),
+    ],
+)
+def test_agrees__where_dots_stand_for_any_lines(shown: str, printed: str, same: bool) -> None:
+    assert agrees(shown.splitlines(), printed.splitlines()) == same
+
+
+@pytest.mark.parametrize(
+    ("table", "printed", "missing"),
+    [
+        ("| a | 1.25 |", "1.2496", []),
+        ("| a | 1.25 |", "1.244", ["1.25"]),
+        ("| a | 65.1 % [64.1, 66.0] |", "0.6508 0.641 0.66 64.1 66", []),
+        ("| a | 65.1 |", "0.651", ["65.1"]),
+        ("| a | 0.5 %, 12 |", "0.0049 13", []),  # of whole numbers nothing is said
+        ("| a | −3.14 |", "-3.141", []),
+    ],
+)
+def test_missing_figures__are_those_that_nothing_rounds_to(table: str, printed: str, missing: list[str]) -> None:
+    assert missing_figures(table, printed) == missing
