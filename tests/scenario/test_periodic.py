@@ -228,7 +228,7 @@ def test_mixture__its_scenarios_share_the_persistence() -> None:
         {"scenario": {**load_scenario(name).declared(), "v2x": v2x}}
         for name, v2x in (
             ("paper-random", {"preset": "nominal", "persistence": "periodic"}),
-            ("paper-random-early", "nominal"),
+            ("paper-random-brake-only", "nominal"),
         )
     ]
     with pytest.raises(InvalidInput, match=r"v2x\.persistence must be the same in all"):
