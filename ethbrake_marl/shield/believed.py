@@ -114,7 +114,7 @@ class BelievedShieldAgent(AgentAround):
             assert shield.running is not None
             due &= ~shield.running.finished
             proposed = proposed_action(self.policy, worlds, vehicle)
-            decision = shield.decide(proposed, only=due, proposer=Proposer(self.policy, believed))
+            decision = shield.decide(proposed, only=due, proposer=Proposer({vehicle: self.policy}, believed))
             command = action_to_command(decision.applied, worlds.vehicles, vehicle)
             self._wanted[due] = command[due]
             self.interventions = self.interventions + (decision.intervened & due)
