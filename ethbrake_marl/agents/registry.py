@@ -249,7 +249,7 @@ def find_entry(written: AgentSpec) -> Entry:
     if written.file is not None:
         return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", (Source.UNSTATED,), _FROM_FILE)
     if written.name not in _ENTRIES:
-        raise unknown_name("agent", written.name, {*_ENTRIES, "ladder"})
+        raise unknown_name("agent", written.name, {*_ENTRIES, "ladder"}, may_be_own=True)
     entry = _ENTRIES[written.name]
     if written.argument is not None and ":" not in entry.form:
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
