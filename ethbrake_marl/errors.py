@@ -107,6 +107,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("starlette", "uvicorn"), "explore"),
     "ray": "cluster",
+    "optuna": "tune",
 }
 
 

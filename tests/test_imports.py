@@ -101,8 +101,8 @@ def planted(folder: Path, files: dict[str, str]) -> list[Arrow]:
     return arrows(folder / PACKAGE)
 
 
-def test_readme__shows_the_levels_from_the_top_down() -> None:
-    text = (ROOT / "README.md").read_text("utf-8")
+def test_page_of_the_layout__shows_the_levels_from_the_top_down() -> None:
+    text = (ROOT / "docs" / "layout.md").read_text("utf-8")
     rows = text[text.index("| in `ethbrake_marl/` |") :].split("\n\n")[0].splitlines()[2:]
     shown = [name.strip("`/").removesuffix(".py") for row in rows for name in row.split("|")[1].strip().split(", ")]
     levels = [LEVEL[name] for name in shown]

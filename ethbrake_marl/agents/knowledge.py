@@ -1,7 +1,7 @@
 """The vocabulary in which every agent states what it knows of the line while it drives.
 
 An agent says it with an attribute ``knows``: one ``Source``, its name, or several where parts of it know different
-things (a shield around a policy). A channel (``v2x``) hides things from the first two sources only.
+things (a shield around a policy). A channel (``v2x``) hides things from the first three sources only.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ class Source(StrEnum):
 
     SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
     MESSAGES = "messages"  # the messages that have reached it
+    BELIEFS = "believed model"  # also what the scenario says of all lines: ranges, scripts, physics; nothing hidden
     STATE = "true state"  # the others' states, capacities and latencies as they are, received or not
     MODEL = "true model"  # also masses, restitution, every script: enough to roll the line forward in the same physics
     UNSTATED = "not stated"  # of an agent that does not say

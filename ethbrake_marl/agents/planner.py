@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ethbrake_marl.agents.believing import Believing, split_believed
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.protocol import Agent, fixed_commands, place
@@ -166,7 +167,9 @@ def _budget(argument: str | None) -> tuple[int, float]:
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """``planner``, ``planner:CANDIDATES`` or ``planner:20ms``."""
-    return Planner(
-        argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s, most_candidates=settings.most_candidates
+    """``planner``, ``planner:CANDIDATES`` or ``planner:20ms``; with ``:believed`` behind, in the believed world."""
+    budget, believes = split_believed(argument)
+    planner = Planner(
+        budget, harm_count=settings.harm_count, horizon_s=settings.horizon_s, most_candidates=settings.most_candidates
     )
+    return Believing(planner, settings.needed_scenario(), shows=True) if believes else planner

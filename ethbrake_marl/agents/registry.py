@@ -106,14 +106,15 @@ _ENTRIES: dict[str, Entry] = {
         f"{_SCRIPTS}:make_gentlest_front",
     ),
     "e_v2x_bm": Entry(
-        "e_v2x_bm[:pairwise]",
-        "the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state",
+        "e_v2x_bm[:pairwise][:believed]",
+        "the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state;"
+        " believed: on what was received, and the scenario's ranges for the rest",
         (Source.MODEL,),
         "agents.e_v2x_bm.agent:make_e_v2x_bm",
     ),
     "planner": Entry(
-        "planner[:CANDIDATES|:20ms]",
-        "a search in the simulation at every decision, with this budget for each",
+        "planner[:CANDIDATES|:20ms][:believed]",
+        "a search in the simulation at every decision, with this budget for each; believed: as above",
         (Source.MODEL,),
         "agents.planner:make_planner",
     ),
@@ -149,17 +150,22 @@ _WRAPPERS: dict[str, Entry] = {
         "agents.refined:refine",
     ),
     "episode": Entry(
-        "+episode[:pairwise]",
-        "behind Algorithm 1: it or E-V2X-BM drives the episode, whichever harms less",
+        "+episode[:pairwise][:believed]",
+        "behind Algorithm 1: it or E-V2X-BM drives the episode, whichever harms less; believed: as far as is received",
         (Source.MODEL,),
-        "shield.agents:shield_episodes",
+        "shield.factories:shield_episodes",
     ),
-    "step": Entry("+step", "every action certified, or replaced", (Source.MODEL,), "shield.agents:shield_steps"),
-    "robust": Entry(
-        "+robust",
-        "the same where not everything is known: against an uncertainty",
+    "step": Entry(
+        "+step[:believed]",
+        "every action certified, or replaced; believed: certified in the world that the vehicle believes in",
         (Source.MODEL,),
-        "shield.agents:shield_steps_robustly",
+        "shield.factories:shield_steps",
+    ),
+    "robust": Entry(
+        "+robust[:believed]",
+        "the same where not everything is known: against an uncertainty; believed: against all that was not received",
+        (Source.MODEL,),
+        "shield.factories:shield_steps_robustly",
     ),
 }
 

@@ -16,6 +16,7 @@ from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.physics.rows import unpack
 from ethbrake_marl.scenario import Scenario
 
 
@@ -108,7 +109,7 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
     """Show the step that the engine has just made; gives the worlds as they are now."""
     if not watched_by:
         return before
-    now = engine.worlds
+    now = unpack(engine.packed, before.vehicles)  # the episodes are the same, and so are their vehicles
     for watch in watched_by:
         watch.see(before, command_mps2, now.time_s)
     return now

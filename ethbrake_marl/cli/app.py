@@ -48,6 +48,7 @@ from ethbrake_marl.cli.train import (
     resume_command,
     train_command,
 )
+from ethbrake_marl.cli.tune import tune_command
 from ethbrake_marl.errors import EthBrakeError, naming_extras
 
 BAD_INPUT = 2
@@ -75,6 +76,9 @@ app.command(
     "learning-curves", epilog="Example: ethbrake learning-curves --scenario paper-delay-low --output runs/low-delay"
 )(learning_curves_command)
 app.command("sweep", epilog="Example: ethbrake sweep sweep.yaml --output runs/sweep")(sweep_command)
+app.command("tune", epilog="Example: ethbrake tune tuning.yaml --output runs/tuning --trials 30 --export best.yaml")(
+    tune_command
+)
 app.command("ablate", epilog="Example: ethbrake ablate --quick --output runs/ablation-quick")(ablate_command)
 app.command("generalise", epilog=GENERALISE)(generalise_command)
 app.command("export", epilog="Example: ethbrake export runs/early --onnx early.onnx")(export_command)

@@ -15,6 +15,7 @@ from ethbrake_marl.cli.report import ReportOption, check_page, write_evaluation_
 from ethbrake_marl.cli.shards import (
     JobsOption,
     KeptOption,
+    RayOption,
     RowsOption,
     ShardsOption,
     check_shards,
@@ -102,6 +103,7 @@ def evaluate_command(
     ] = None,
     shards: ShardsOption = None,
     jobs: JobsOption = 1,
+    ray: RayOption = None,
     output: KeptOption = None,
     rows: RowsOption = False,
     force: ForceOption = False,
@@ -114,7 +116,7 @@ def evaluate_command(
     PATH is a run or a policy bundle, or shipped.
     """
     whole = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
-    check_shards(shards, jobs, output, rows, whole)
+    check_shards(shards, jobs, ray, output, rows, whole)
     _check_outputs(per_world, report, force=force)
     chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
     objectives = declared_objectives(objective or (), chosen.vehicles)
@@ -124,6 +126,7 @@ def evaluate_command(
             agents.split(","),
             shards=shards,
             jobs=jobs,
+            ray=ray,
             output=output,
             rows=rows,
             episodes=EPISODES if episodes is None else episodes,

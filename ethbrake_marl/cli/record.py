@@ -16,7 +16,7 @@ from ethbrake_marl.evaluation.per_world import write_output
 
 
 def record_command(
-    output: Annotated[Path, typer.Option("--output", metavar="FILE.gif|FILE.mp4", help="The film to write.")],
+    output: Annotated[Path, typer.Option("--output", metavar="FILE.gif|FILE.mp4|FILE.svg", help="The film to write.")],
     agents: Annotated[
         str, typer.Option(metavar="A,B,...", help="Who drives, one below the other; as in `ethbrake evaluate`.")
     ] = "e_v2x_bm",

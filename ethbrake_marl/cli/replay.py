@@ -40,7 +40,8 @@ def replay_command(
     ] = None,
     settings: SetOption = None,
     output: Annotated[
-        Path | None, typer.Option(metavar="FILE.html|FILE.gif|FILE.mp4", help="Also write it as a page or a film.")
+        Path | None,
+        typer.Option(metavar="FILE.html|FILE.gif|FILE.mp4|FILE.svg", help="Also write it as a page or a film."),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,

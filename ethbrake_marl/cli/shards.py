@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Annotated
 
@@ -20,12 +22,19 @@ from ethbrake_marl.files.durable import write_file
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.studies.jobs.work import Workers
 from ethbrake_marl.studies.shards import MOST_JOBS, ShardFolder, evaluate_shards
 
 ShardsOption = Annotated[
     int | None, typer.Option(metavar="K", help="Evaluate the list in K parts, in flat memory; changes no figure.")
 ]
 JobsOption = Annotated[int, typer.Option(metavar="N", help="With --shards: processes; changes no figure.")]
+RayOption = Annotated[
+    str | None,
+    typer.Option(
+        "--ray", metavar="local|ADDRESS", help="With --shards: on Ray, on all its cores or on --jobs of them."
+    ),
+]
 KeptOption = Annotated[
     Path | None,
     typer.Option("--output", metavar="FOLDER", help="With --shards: keeps finished ones; the same command goes on."),
@@ -36,19 +45,22 @@ RowsOption = Annotated[
 RESULTS = "results.json"
 
 
-def check_shards(shards: int | None, jobs: int, output: Path | None, rows: bool, others: Mapping[str, object]) -> None:
+def check_shards(
+    shards: int | None, jobs: int, ray: str | None, output: Path | None, rows: bool, others: Mapping[str, object]
+) -> None:
     """Refuse options that do not go together.
 
     Args:
         shards: parts of the list; None: it is evaluated in one piece.
         jobs: processes.
+        ray: a Ray that is to answer the shards.
         output: folder of finished shards.
         rows: one row per world and agent is asked for.
         others: options that need every world at once, by name.
 
     """
     if shards is None:
-        alone = {"--jobs": jobs != 1, "--output": output is not None, "--rows": rows}
+        alone = {"--jobs": jobs != 1, "--ray": ray is not None, "--output": output is not None, "--rows": rows}
         if given := [name for name, is_given in alone.items() if is_given]:
             raise InvalidInput(f"{given[0]}: is for an evaluation in parts; add --shards 100")
         return
@@ -61,6 +73,8 @@ def check_shards(shards: int | None, jobs: int, output: Path | None, rows: bool,
         raise InvalidInput("--rows: needs a folder for them: --output FOLDER")
     if rows:
         need("pyarrow")
+    if ray is not None:
+        need("ray")
 
 
 def evaluate_in_shards(
@@ -69,6 +83,7 @@ def evaluate_in_shards(
     *,
     shards: int,
     jobs: int,
+    ray: str | None,
     output: Path | None,
     rows: bool,
     episodes: int,
@@ -86,6 +101,7 @@ def evaluate_in_shards(
         agents: as they were written.
         shards: parts of the list.
         jobs: processes.
+        ray: address of a cluster, or local; None: processes of this machine.
         output: folder that keeps finished shards; None: nothing is kept.
         rows: keep one row per world and agent, too.
         episodes: worlds of the list.
@@ -104,8 +120,11 @@ def evaluate_in_shards(
     asked = ask(question)
     folder = None if output is None else ShardFolder(output, asked, rows)
     kept = "nothing was written" if folder is None else "finished shards are kept: the same command goes on"
-    with interruptible(kept), progress_bars() as bars:
-        tally = evaluate_shards(asked, shards=shards, jobs=jobs, folder=folder, tell=bars.show_progress)
+    with interruptible(kept), progress_bars() as bars, ExitStack() as stack:
+        workers = None if ray is None else stack.enter_context(closing(_on_ray(ray, jobs)))
+        tally = evaluate_shards(
+            asked, shards=shards, jobs=jobs, workers=workers, folder=folder, tell=bars.show_progress
+        )
     summary = summarise_shards(asked, tally)
     results = shards_to_json(asked, tally, summary)
     if output is not None:
@@ -120,6 +139,14 @@ def evaluate_in_shards(
         say(note)
     if objectives and not as_json:
         result_console().print(rescored_table(rescore_shards(asked, tally), harm_count))
+
+
+def _on_ray(address: str, jobs: int) -> Workers:
+    """A Ray, with all its cores where ``jobs`` is 1, which says nothing."""
+    from ethbrake_marl.studies.jobs.cluster import LOCAL, RayWorkers
+
+    most = None if jobs == 1 else jobs
+    return RayWorkers(address, len(os.sched_getaffinity(0)) if address == LOCAL and most is None else most)
 
 
 def _show(rows: Sequence[SummaryRow]) -> None:

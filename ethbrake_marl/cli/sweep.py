@@ -61,12 +61,13 @@ def sweep_command(
         if dry_run:
             _show_plan(plan, output, number, as_json)
             return
-        with closing(_workers(ray, jobs, number)) as workers:
+        with closing(workers_for(ray, jobs, number)) as workers:
             result = _run(plan, output, workers, retries, form)
     _show_result(result, output, as_json)
 
 
-def _workers(ray: str | None, jobs: int | None, number: int) -> Workers:
+def workers_for(ray: str | None, jobs: int | None, number: int) -> Workers:
+    """Where jobs run: ``number`` processes of this machine, or a Ray; of a cluster at most ``jobs`` at once."""
     if ray is None:
         from ethbrake_marl.studies.jobs.local import LocalWorkers
 

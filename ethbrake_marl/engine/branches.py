@@ -18,7 +18,19 @@ from ethbrake_marl.engine.stream import Roster
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.rows import command_at, gap_at, harm_at, has_news, params_at, previous_at, speed_at
+from ethbrake_marl.physics.messages import hear_rows
+from ethbrake_marl.physics.rows import (
+    TIME,
+    command_at,
+    gap_at,
+    harm_at,
+    has_messages,
+    has_news,
+    pack,
+    params_at,
+    previous_at,
+    speed_at,
+)
 
 ROUNDING_MPS2 = 1e-5  # a command that differs by less is the same: networks round by the size of their batch
 
@@ -64,7 +76,11 @@ def first_moments(engine: Engine, count: int) -> tuple[Worlds, Moment]:
     stream.restart(engine.seed)
     start = stream.take(count)
     packed = engine._kept(start.packed)
-    return start.alert, Moment(packed.state.copy(), packed.params.copy(), start.clock.copy(), start.wanted.copy())
+    params = packed.params.copy()
+    if has_messages(packed.state, params):
+        alert = engine._kept(pack(start.alert)).state
+        hear_rows(alert, params, start.wanted, packed.state[:, TIME], engine.scenario.time_step_s)
+    return start.alert, Moment(packed.state.copy(), params, start.clock.copy(), start.wanted.copy())
 
 
 def join_moments(moments: list[Moment]) -> Moment:
@@ -164,6 +180,8 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
     A policy that sees the same does the same, and no latency or news is left that could change what it sees.
     """
     N = engine.scenario.vehicles
+    if has_messages(engine._state, engine._params):
+        return np.zeros(len(rows), np.bool_)  # what is still on its way may change what it sees
     stands: Bools = (before[:, speed_at(N) : command_at(N)] == 0.0).all(axis=1)
     some = np.flatnonzero(stands)
     now, then, params = engine._state[rows[some]], before[some], engine._params[rows[some]]

@@ -33,12 +33,14 @@ from ethbrake_marl.harm import Ledger
 from ethbrake_marl.objectives import objective_harm
 from ethbrake_marl.observations import Observations, ObservationSpec, observation_for, observe_packed, plan_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.messages import hear_rows
 from ethbrake_marl.physics.rows import (
     NO_ROWS,
     TIME,
     Packed,
     command_at,
     gap_at,
+    has_messages,
     has_news,
     has_obstacle,
     ledger_columns,
@@ -330,10 +332,13 @@ class Engine:
             for vehicle, script in self._remembering.items():
                 self._wanted[:, vehicle] = within_capacity(ask_script(script, worlds, vehicle), worlds, vehicle, script)
         before = self._objective_harm() if self._objectives else None
+        was = self._state.copy() if has_messages(self._state, self._params) else None
         reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
         status = self._step_worlds(columns, reward, outcome)
         if status == BAD_ACTION:  # nothing was moved
             status = self._step_worlds(self._in_range(columns), reward, outcome)
+        if was is not None:
+            hear_rows(was, self._params, self._wanted, self._state[:, TIME], self.scenario.time_step_s)
         step = Step(reward, outcome, self.reward, {})
         if status != DONE:
             times = self._state[:, 0]
@@ -439,6 +444,10 @@ class Engine:
                     begin_script(script, alert, vehicle, rows)
             if self._remembering:
                 self._begin_with_memory(rows, alert, start.clock[:, START])
+        if has_messages(self._state, self._params):
+            moving, params = self._kept(pack(start.alert)).state, self._params[rows]
+            hear_rows(moving, params, self._wanted[rows], self._state[rows, TIME], self.scenario.time_step_s)
+            self._params[rows] = params
         if self.reward.shaping > 0.0:
             self._potential[rows] = self._potentials(unpack(Packed(self._state[rows], self._params[rows])))
 

@@ -16,6 +16,7 @@ from ethbrake_marl.physics.impact import GAP, MASS, SPEED
 from ethbrake_marl.physics.obstacle import obstacle_ahead, place_obstacle, with_post_ahead
 from ethbrake_marl.physics.sampled import sample_numbers, sample_worlds
 from ethbrake_marl.physics.segment import COMMAND, DONE, HIT, LIMIT, ONSET, ROW_WIDTH, TABLE_ROWS, advance_table
+from ethbrake_marl.physics.worlds import sum_rows
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.scenario.roles import constant_command
 
@@ -42,9 +43,9 @@ class ShovedFront:
             return None
         columns = (worlds.speeds_mps, vehicles.latency_s, vehicles.speed_limit_mps)
         speed, latency, limit = (column[:, 0] for column in columns)
-        alone = zip(speed, command, latency, limit, strict=True)
-        horizon_s = task.scenario.horizon_s
-        return cls(worlds, np.array([solo_motion(v, u, tau, most, horizon_s)[1] for v, u, tau, most in alone]))
+        way = np.empty(worlds.n)
+        find_own_ways(speed, np.asarray(command, np.float64), latency, limit, task.scenario.horizon_s, way)
+        return cls(worlds, way)
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Add the way of one step, by a post ahead: the world's own obstacle, or one out of reach."""
@@ -63,6 +64,13 @@ class ShovedFront:
         """How far Vehicle 1 was shoved in each world so far, [n]."""
         shoved: Floats = self._way_m - self._own_way_m
         return shoved
+
+
+@compiled
+def find_own_ways(speed: Floats, command: Floats, latency: Floats, limit: Floats, duration: float, way: Floats) -> None:
+    """How far each of n vehicles comes on its own, into ``way`` [n] (m)."""
+    for k in range(way.shape[0]):
+        way[k] = solo_motion(speed[k], command[k], latency[k], limit[k], duration)[1]
 
 
 @compiled
@@ -145,7 +153,7 @@ class SampledHarm:
             last, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, np.zeros(shape), harm,
             np.zeros(shape, np.int64),
         )  # fmt: skip
-        self._harm += harm.sum(axis=1)
+        self._harm += sum_rows(harm)
 
     def finish(self) -> Floats:
         """Go on to the horizon; gives the sum of each world, [n] m2/s2."""

@@ -1,4 +1,4 @@
-"""An episode as a film: the frames of the environment's own pictures, in real time, as the bytes of a GIF or MP4."""
+"""An episode as a film, in real time: the environment's own pictures as a GIF or MP4, or a moving drawing as SVG."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from ethbrake_marl.agents.rollout import episode_engine
 from ethbrake_marl.agents.team import Driver, team_of
+from ethbrake_marl.envs.drawing.animation import animate_films
 from ethbrake_marl.envs.drawing.scene import Scene
 from ethbrake_marl.envs.drawing.trace import Trace, kept_motions, scenes
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
@@ -20,6 +21,8 @@ from ethbrake_marl.scenario import Scenario
 
 if TYPE_CHECKING:
     from ethbrake_marl.envs.drawing.frame import Frame
+
+Films = Mapping[str, Sequence[Scene]]  # of one world, by title
 
 FILM_FPS = 25
 MOST_FILMS = 12  # one below the other
@@ -57,13 +60,13 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
     return shown
 
 
-def film_bytes(films: Mapping[str, Sequence[Scene]], ending: str, *, fps: int = FILM_FPS) -> bytes:
-    """Films of one world, titled and one below the other, in real time: an endless GIF, or an MP4.
+def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
+    """Films of one world, titled and one below the other, in real time: an endless GIF or SVG, or an MP4.
 
     A film that ends before the others shows its end. Raises ``InvalidInput`` without films, for more than
     ``MOST_FILMS`` or ``MOST_PICTURES``, for an ``ending`` that is
-    neither ``.gif`` nor ``.mp4``, for an ``fps`` whose frames do not last whole hundredths of a second, as a GIF needs,
-    and for an MP4 where the library that writes it is missing.
+    none of ``.gif``, ``.mp4`` and ``.svg``, for an ``fps`` whose frames do not last whole hundredths of a second, as a
+    GIF needs, and for an MP4 where the library that writes it is missing.
     """
     check_ending(ending)
     if not films or not all(films.values()):
@@ -77,7 +80,7 @@ def film_bytes(films: Mapping[str, Sequence[Scene]], ending: str, *, fps: int = 
             f"film of {len(films)} agents for {pictures // len(films) / fps:g} s: needs {pictures:,} pictures,"
             f" and at most {MOST_PICTURES:,} are kept; give fewer agents, or a scenario with a shorter horizon_s"
         )
-    return _WRITERS[ending](list(_stacked(films)), fps)
+    return _WRITERS[ending](films, fps)
 
 
 def check_number_of_films(films: int) -> None:
@@ -89,12 +92,12 @@ def check_number_of_films(films: int) -> None:
 def check_ending(ending: str) -> None:
     """Refuse, before any work, a film that cannot be written; raises as ``film_bytes``."""
     if ending not in _WRITERS:
-        raise InvalidInput(f"a film that ends in {ending!r}: films are written as {' or '.join(_WRITERS)}")
+        raise InvalidInput(f"a film that ends in {ending!r}: films are written as {', '.join(_WRITERS)}")
     if ending == ".mp4":
         need("imageio_ffmpeg")
 
 
-def _stacked(films: Mapping[str, Sequence[Scene]]) -> Iterator[Frame]:
+def _stacked(films: Films) -> Iterator[Frame]:
     """The frames of all films, one below the other."""
     from ethbrake_marl.envs.drawing.frame import draw_frame
 
@@ -103,18 +106,21 @@ def _stacked(films: Mapping[str, Sequence[Scene]]) -> Iterator[Frame]:
         yield np.concatenate([draw_frame(scene) for scene in each])
 
 
-def _write_gif(frames: Sequence[Frame], fps: int) -> bytes:
+def _write_gif(films: Films, fps: int) -> bytes:
     from PIL import Image
 
-    pictures = [Image.fromarray(frame).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE) for frame in frames]
+    pictures = [
+        Image.fromarray(frame).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE) for frame in _stacked(films)
+    ]
     buffer = io.BytesIO()
     pictures[0].save(buffer, "GIF", save_all=True, append_images=pictures[1:], duration=1000 // fps, loop=0)
     return buffer.getvalue()
 
 
-def _write_mp4(frames: Sequence[Frame], fps: int) -> bytes:
+def _write_mp4(films: Films, fps: int) -> bytes:
     from imageio_ffmpeg import write_frames
 
+    frames = list(_stacked(films))
     height, width, _ = frames[0].shape
     with TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
@@ -126,4 +132,8 @@ def _write_mp4(frames: Sequence[Frame], fps: int) -> bytes:
         return path.read_bytes()
 
 
-_WRITERS = {".gif": _write_gif, ".mp4": _write_mp4}
+def _write_svg(films: Films, fps: int) -> bytes:
+    return animate_films(films, fps=fps).encode()
+
+
+_WRITERS = {".gif": _write_gif, ".mp4": _write_mp4, ".svg": _write_svg}

@@ -18,6 +18,7 @@ from ethbrake_marl.files.html import html_table
 from ethbrake_marl.harm import HarmCount, Ledger
 from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.estimates import is_periodic
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.scenario.sample import Texts
 from ethbrake_marl.scenario.v2x import hidden_from
@@ -177,7 +178,7 @@ class Evaluation:
         """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
         hidden = np.zeros(self.worlds.n, np.bool_)
         for vehicle in self.vehicles:
-            hidden |= hidden_from(self.worlds.vehicles, vehicle)
+            hidden |= hidden_from(self.worlds.vehicles, vehicle) | is_periodic(self.worlds)
         return hidden
 
     def to_frame(self, library: str | None = None) -> Any:

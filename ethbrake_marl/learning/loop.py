@@ -39,6 +39,7 @@ EPISODE_COLUMNS = {
 }
 
 Evaluate = Callable[[Any], Mapping[str, float]]  # of what is trained: a ``Policy``, or a ``PolicyTeam``
+StopAt = Callable[[Mapping[str, float]], str | None]  # of an evaluation, a reason to stop there, or None
 
 
 class StopRequested(Exception):
@@ -60,7 +61,8 @@ class BetweenUpdates(BaseCallback):
     """Runs before the first rollout and after each update.
 
     ``stop`` is asked before every rollout; ``StopRequested`` is raised when it says yes, with everything saved. With
-    ``stop_when_lost`` also where the evaluation just before has found the training lost.
+    ``stop_when_lost`` also where the evaluation just before has found the training lost, with ``stop_at`` where that
+    gave a reason.
     """
 
     model: Model
@@ -74,6 +76,7 @@ class BetweenUpdates(BaseCallback):
         save: Save,
         stop: Callable[[], bool],
         stop_when_lost: bool,
+        stop_at: StopAt | None,
         evaluate: Evaluate | None,
         on_progress: OnProgress | None,
     ) -> None:
@@ -82,6 +85,8 @@ class BetweenUpdates(BaseCallback):
         self._stop, self._stop_when_lost, self._evaluate, self._on_progress = (
             stop, stop_when_lost, evaluate, on_progress,
         )  # fmt: skip
+        self._stop_at = stop_at
+        self._reason: str | None = None  # to stop at the next rest
         self.updates = 0
         self.course = Course(recipe.reward.harm_count)
         self.notes: list[str] = []  # to be told when the training begins
@@ -126,10 +131,11 @@ class BetweenUpdates(BaseCallback):
             self._after_update()
         self._resumed = False
         lost = self.course.lost if self._stop_when_lost else None
-        if self._stop() or lost is not None:
+        reason = lost or self._reason
+        if self._stop() or reason is not None:
             self._rest()
             self._save(self)
-            raise StopRequested(lost)
+            raise StopRequested(reason)
 
     def _on_step(self) -> bool:
         infos = self.locals["infos"]
@@ -179,6 +185,8 @@ class BetweenUpdates(BaseCallback):
         self.logger.record("eval/alarm", int(alarm is not None))
         if alarm is not None:
             self.tell(f"alarm: {alarm}")
+        if self._stop_at is not None:
+            self._reason = self._stop_at(self.course.evaluations[-1])
 
     def _recent_return(self) -> float | None:
         episodes = self.model.ep_info_buffer or ()

@@ -1,4 +1,4 @@
-"""What the keys of a recipe mean, and the text of a new one: every key with its value and a comment."""
+"""Meanings of the keys of a recipe, and the text of a new one: every key with its value and a comment."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from ethbrake_marl.files.json_schema import schema_lines
 from ethbrake_marl.files.yaml import flow_text
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.scenario.catalogue import check_file_name
 
 MEANINGS = {
@@ -68,15 +68,23 @@ def new_recipe_text(name: str, based_on: str = "ppo") -> str:
     """
     check_file_name("recipe", name)
     base = load_recipe(based_on)
-    values = {
-        **base.model_dump(mode="json"),
-        "name": name,
+    words = {
         "title": "One line for lists",
         "description": "What this recipe is for.",
         "source": f"Values of {base.name}, to be changed.",
     }
     head = f"# Recipe {name}, started from {base.name}. Train with it: ethbrake train --recipe {name}.yaml\n"
-    return head + schema_lines("recipe") + "".join(_entry(key, values.get(key)) for key in type(base).model_fields)
+    return recipe_text(base.replace(name=name, **words), head)
+
+
+def recipe_text(recipe: TrainingRecipe, head: str) -> str:
+    """Text of a commented YAML file of ``recipe`` below ``head``, all keys written out.
+
+    A key that it leaves out stands in a comment.
+    """
+    values = recipe.model_dump(mode="json")
+    lines = (_entry(key, values.get(key)) for key in type(recipe).model_fields)
+    return head + schema_lines("recipe") + "".join(lines)
 
 
 def _entry(key: str, value: Any) -> str:

@@ -12,14 +12,15 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.durable import remove_unfinished
 from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
 from ethbrake_marl.learning.checkpoint_fit import check_fits
-from ethbrake_marl.learning.loop import BetweenUpdates, Evaluate, measure_on_list
+from ethbrake_marl.learning.interruption import stop_on_signal
+from ethbrake_marl.learning.loop import BetweenUpdates, Evaluate, StopAt, measure_on_list
 from ethbrake_marl.learning.model_state import own_random_state
 from ethbrake_marl.learning.models import make_model, policy_maker
 from ethbrake_marl.learning.progress import Course
 from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe
 from ethbrake_marl.learning.registry import algorithm_named
 from ethbrake_marl.learning.run_folder import RunDirectory, create_run, has_finished, only_process, open_run
-from ethbrake_marl.learning.session import Ended, Session, stop_on_signal
+from ethbrake_marl.learning.session import Ended, Session
 from ethbrake_marl.learning.team_file import team_content
 from ethbrake_marl.learning.training import Training, check_run_plugins, resolve, training_in
 from ethbrake_marl.policies.manifest import installed_versions
@@ -88,6 +89,7 @@ def train(
     settings: Sequence[str] = (),
     measure: Measure | None = measure_on_list,
     stop_when_lost: bool = False,
+    stop_at: StopAt | None = None,
     on_progress: Told = "show",
 ) -> TrainResult:
     """Train the learners of ``scenario`` into the new ``directory``.
@@ -110,6 +112,8 @@ def train(
         measure: makes of the training what measures its policies before the first update, then as the recipe says, and
             at the end: by default on the recipe's fixed list. None: nothing is measured.
         stop_when_lost: stop, ``interrupted``, at an evaluation that finds the training lost (docs/learning.md).
+        stop_at: is given every evaluation, as it stands in ``TrainResult.evaluations``, and gives a reason to stop
+            there, ``interrupted``, or None.
         on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.
 
     Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` where recipe and scenario do
@@ -124,7 +128,7 @@ def train(
         config = {**training.config(), **({"settings": list(settings)} if settings else {})}
         return create_run(Path(directory), config, team=team, force=force), None
 
-    return _run(begin, training, measure, listener(on_progress), stop_when_lost)
+    return _run(begin, training, measure, listener(on_progress), stop_when_lost, stop_at)
 
 
 def resume(
@@ -132,6 +136,7 @@ def resume(
     *,
     measure: Measure | None = measure_on_list,
     stop_when_lost: bool = False,
+    stop_at: StopAt | None = None,
     on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
@@ -144,6 +149,7 @@ def resume(
         directory: the run's folder.
         measure: as it was given to ``train``.
         stop_when_lost: stop again at the next evaluation that finds the training lost.
+        stop_at: as it was given to ``train``; it hears of new evaluations only.
         on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.
         other_versions: go on from a checkpoint that other versions, or other plug-ins, wrote, although its numbers may
             differ.
@@ -168,7 +174,7 @@ def resume(
         run.write_json(run.team, team_content(training.scheme, training.scenario))  # a damaged one would stay
         return run, other_versions
 
-    return _run(begin, training, measure, listener(on_progress), stop_when_lost)
+    return _run(begin, training, measure, listener(on_progress), stop_when_lost, stop_at)
 
 
 def _run(
@@ -177,6 +183,7 @@ def _run(
     measure: Measure | None,
     on_progress: OnProgress | None,
     stop_when_lost: bool,
+    stop_at: StopAt | None,
 ) -> TrainResult:
     """Train in the folder that ``begin`` makes or finds, once nothing can be wrong with environment and model.
 
@@ -200,6 +207,7 @@ def _run(
                 save=session.save,
                 stop=stop,
                 stop_when_lost=stop_when_lost,
+                stop_at=stop_at,
                 evaluate=evaluate,
                 on_progress=on_progress,
             )

@@ -15,6 +15,7 @@ from ethbrake_marl.observations.contact import Contacts, contacts_of, observe_co
 from ethbrake_marl.observations.spec import ObservationSpec
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.estimates import estimate_rows
 from ethbrake_marl.physics.events import stopping_distance
 from ethbrake_marl.physics.rows import (
     RESTITUTION,
@@ -22,6 +23,7 @@ from ethbrake_marl.physics.rows import (
     Packed,
     command_at,
     gap_at,
+    has_messages,
     has_news,
     pack,
     params_at,
@@ -126,8 +128,20 @@ def observe_packed(
 ) -> Observations:
     """Observations of several vehicles in worlds given as rows of ``physics.rows``, [n, len(vehicles), F].
 
-    ``steps`` [n] is how many steps each world has made, for messages.
+    ``steps`` [n] is how many steps each world has made, for error texts. Over a channel of periodic messages a vehicle
+    sees the worlds as it takes them to be (``physics.estimates``).
     """
+    if not has_messages(state, params):
+        return _observe_present(state, params, vehicles, plan, steps)
+    estimate, seen = np.empty(state.shape), []
+    for vehicle in vehicles.tolist():
+        estimate_rows(state, params, vehicle, estimate)
+        seen.append(_observe_present(estimate, params, np.array([vehicle]), plan, steps))
+    return np.concatenate(seen, axis=1)
+
+
+def _observe_present(state: Floats, params: Floats, vehicles: Ints, plan: Plan, steps: Floats | None) -> Observations:
+    """The same where everything known is known as it is."""
     whole = np.empty((len(state), len(vehicles), plan.scaling.features.shape[1]), np.float32)
     _observe_rows(state, params, vehicles, *plan.scaling, whole)
     if plan.contacts is not None:

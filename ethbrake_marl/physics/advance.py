@@ -164,6 +164,7 @@ def _advance(worlds: Worlds, command: Floats, until: Floats, record: bool, threa
         after = Worlds(
             vehicles, worlds.gaps_m.copy(), worlds.speeds_mps.copy(), worlds.time_s.copy(), worlds.pair_hit.copy(),
             np.empty(worlds.speeds_mps.shape), worlds.obstacle_gap_m.copy(), worlds.obstacle_hit.copy(),
+            worlds.messages.copy(),
         )  # fmt: skip
         shape = worlds.gaps_m.shape
         first_harm, total_harm, count = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)

@@ -98,12 +98,27 @@ def compiled_within(function: Function) -> Function:
     return _compile(function, inline=False, within=True)
 
 
-def _compile(function: Function, *, inline: bool, within: bool = False) -> Function:
+def compiled_bare(function: Function) -> Function:
+    """Compile as ``compiled`` does, without any counting of references: for what makes no array and gives none back.
+
+    Whoever calls it holds the arrays. What is ``forceinline`` inside still counts them, unless it is bare, too.
+    """
+    return _compile(function, inline=True, bare=True)
+
+
+def compiled_bare_apart(function: Function) -> Function:
+    """Compile as ``compiled_bare`` does, but leave calls of it calls."""
+    return _compile(function, inline=False, bare=True)
+
+
+def _compile(function: Function, *, inline: bool, within: bool = False, bare: bool = False) -> Function:
     config: Any = numba_config  # its settings are made at run time
     before = config.CACHE_DIR
     config.CACHE_DIR = str(cache_folder())
     try:
         how: dict[str, Any] = {"inline": "always"} if within else {"forceinline": inline}
+        if bare:
+            how["_nrt"] = False
         compiler: Any = numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy", **how)
         return cast(Function, compiler(function))
     finally:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import compiled_bare
 from ethbrake_marl.physics.events import PLASTIC_SPEED_MPS, TOUCH_SPEED_MPS, settle
 from ethbrake_marl.physics.worlds import Floats
 
@@ -40,7 +40,7 @@ BLOCK_FIRST = 11
 IMPACT_ROWS = 12
 
 
-@compiled
+@compiled_bare
 def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
     """Mass-weighted isotonic regression of vehicles ``first..last`` (inclusive) into row ``out``; the number of blocks.
 
@@ -75,7 +75,7 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
     return count
 
 
-@compiled
+@compiled_bare
 def resolve_cluster(table: Floats, restitution: float, first: int, last: int) -> None:
     """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
 
@@ -108,7 +108,7 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
             table[SPEED, i] = min(table[SPEED, i], table[SPEED, i - 1])
 
 
-@compiled
+@compiled_bare
 def resolve_impacts(table: Floats, restitution: float) -> bool:
     """One round of impacts of one world: every cluster that holds an approaching pair, once. False if there is none.
 

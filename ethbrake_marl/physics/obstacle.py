@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.impact import GAP, MASS
 from ethbrake_marl.physics.segment import HIT
-from ethbrake_marl.physics.worlds import Bools, Floats, Vehicles, Worlds, vehicles_at_once
+from ethbrake_marl.physics.worlds import Bools, Floats, Vehicles, Worlds, sum_rows, vehicles_at_once
 
 UNMOVABLE_T = math.inf
 FAR_AWAY_M = 1e300  # stands for no obstacle where others of a batch have one: nothing comes near, no bit changes
@@ -48,6 +48,7 @@ def with_obstacle(worlds: Worlds) -> Worlds:
         ahead(0.0, worlds.command_mps2),
         np.full(worlds.n, np.inf),
         np.zeros(worlds.n, np.bool_),
+        worlds.messages,
     )
 
 
@@ -82,7 +83,7 @@ def _farthest(worlds: Worlds, duration_s: Floats) -> Floats:
     """
     vehicles = worlds.vehicles
     driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
-    energy = (vehicles.mass_t * (worlds.speeds_mps**2 / 2.0 + driving)).sum(axis=1)
+    energy = sum_rows(vehicles.mass_t * (worlds.speeds_mps**2 / 2.0 + driving))
     farthest: Floats = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
     return farthest
 

@@ -10,7 +10,8 @@ state   time, speeds N, commands in force N, commands in force before N, gaps P,
         (infinite: none), hit flag, and since the episode began: first-impact harm, total harm, impacts
 params  restitution, braking N, driving N, latency N, mass N, speed limit N; and, where news comes link by link: own
         latency N, and from when on vehicle i acts on news of vehicle j, N * N columns (without them latencies are all
-        own, and everything is known from them on)
+        own, and everything is known from them on); and, where messages are periodic, the columns of
+        ``physics.messages``, which change as messages come in
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ class Packed(NamedTuple):
     """Worlds by rows."""
 
     state: Floats  # [n, S]
-    params: Floats  # [n, 1 + 5 N] or [n, 1 + 6 N + N * N]
+    params: Floats  # [n, 1 + 5 N], [n, 1 + 6 N + N * N] or, with M columns of messages, [n, 1 + 6 N + N * N + M]
 
 
 def pack(worlds: Worlds) -> Packed:
@@ -106,6 +107,7 @@ def pack(worlds: Worlds) -> Packed:
     state[:, gap_at(N) : gap_at(N) + N - 1] = worlds.gaps_m
     state[:, gap_at(N) + N - 1 : harm_at(N)] = worlds.pair_hit
     v = worlds.vehicles
+    plain = is_known_at_once(v) and worlds.messages.shape[1] == 0
     params = np.concatenate(
         [
             v.restitution[:, np.newaxis],
@@ -114,7 +116,7 @@ def pack(worlds: Worlds) -> Packed:
             v.latency_s,
             v.mass_t,
             v.speed_limit_mps,
-            *(() if is_known_at_once(v) else (v.own_latency_s, v.known_from_s.reshape(n, N * N))),
+            *(() if plain else (v.own_latency_s, v.known_from_s.reshape(n, N * N), worlds.messages)),
         ],
         axis=1,
     )
@@ -150,30 +152,43 @@ def with_news_columns(params: Floats, vehicles: int) -> Floats:
     return np.concatenate([params, latency, latency.repeat(vehicles, axis=1)], axis=1)
 
 
+@compiled
+def messages_at(vehicles: int) -> int:
+    """First of the parameters' columns of periodic messages."""
+    return params_at(6, vehicles) + vehicles * vehicles
+
+
+def has_messages(state: Floats, params: Floats) -> bool:
+    """Whether these rows have columns of periodic messages. Not compiled: a call of a kernel costs more."""
+    vehicles = (state.shape[1] + 4) // 8
+    return bool(params.shape[1] > 1 + 6 * vehicles + vehicles * vehicles)
+
+
 def own_latency_and_news(params: Floats, vehicles: int) -> tuple[Floats, Floats]:
     """``own_latency_s`` [n, N] and ``known_from_s`` [n, N, N] of these rows' ``Vehicles``, in their own memory."""
     if not has_news(params, vehicles):
         latency = params[:, params_at(2, vehicles) : params_at(3, vehicles)].copy()
         return latency, known_at_once(latency)
-    own, news = params_at(5, vehicles), params_at(6, vehicles)
-    return params[:, own:news].copy(), params[:, news:].copy().reshape(-1, vehicles, vehicles)
+    own, news, end = params_at(5, vehicles), params_at(6, vehicles), messages_at(vehicles)
+    return params[:, own:news].copy(), params[:, news:end].copy().reshape(-1, vehicles, vehicles)
 
 
-def unpack(packed: Packed) -> Worlds:
-    """The worlds of these rows, in their own memory."""
+def unpack(packed: Packed, vehicles: Vehicles | None = None) -> Worlds:
+    """The worlds of these rows, in their own memory but for ``vehicles``, if they are given as they were unpacked."""
     state, params = packed
     N = vehicles_in(state)
-    gaps = gap_at(N)
-    obstacle = with_obstacle_columns(state, N)[:, state_width(N) :]
+    gaps, n = gap_at(N), len(state)
+    far = not has_obstacle(state, N)
     return Worlds(
-        _vehicles(params, N),
+        _vehicles(params, N) if vehicles is None else vehicles,
         state[:, gaps : gaps + N - 1].copy(),
         state[:, speed_at(N) : command_at(N)].copy(),
         state[:, TIME].copy(),
         state[:, gaps + N - 1 : harm_at(N)] == 1.0,
         state[:, command_at(N) : previous_at(N)].copy(),
-        obstacle[:, 0].copy(),
-        obstacle[:, 1] == 1.0,
+        np.full(n, np.inf) if far else state[:, state_width(N)].copy(),
+        np.zeros(n, np.bool_) if far else state[:, state_width(N) + 1] == 1.0,
+        params[:, messages_at(N) :].copy(),
     )
 
 

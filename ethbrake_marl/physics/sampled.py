@@ -182,7 +182,8 @@ def advance_sampled(
     )  # fmt: skip
     in_force = np.where(vehicles.latency_s <= time[:, None] + _ON_SAMPLE * step_s, command, 0.0)
     after = Worlds(
-        vehicles, gaps, speeds, time, hit, in_force, worlds.obstacle_gap_m.copy(), worlds.obstacle_hit.copy()
+        vehicles, gaps, speeds, time, hit, in_force, worlds.obstacle_gap_m.copy(), worlds.obstacle_hit.copy(),
+        worlds.messages.copy(),
     )  # fmt: skip
     return after, Impacts(first_harm, total_harm, count, *no_obstacle_harm(worlds.n))
 

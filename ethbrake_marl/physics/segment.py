@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import compiled_bare
 from ethbrake_marl.physics.events import contact, drift, force_range, settle, solo_motion, speed_event
 from ethbrake_marl.physics.impact import (
     BEFORE,
@@ -52,7 +52,7 @@ IMPACT, DONE, PENETRATED, STUCK = 0, 1, 2, 3
 ROW_WORLD, ROW_PAIR, ROW_TIME, ROW_CLOSING, ROW_FIRST, ROW_FRONT_CHANGE, ROW_REAR_CHANGE, ROW_WIDTH = range(8)
 
 
-@compiled
+@compiled_bare
 def advance_table(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
@@ -77,7 +77,7 @@ def advance_table(
     return recorded, STUCK
 
 
-@compiled
+@compiled_bare
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
     """Add the last round of impacts to the harm, and to the list of impacts."""
     for p in range(table.shape[1] - 1):
@@ -102,7 +102,7 @@ def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recor
     return recorded
 
 
-@compiled
+@compiled_bare
 def move_apart(table: Floats, duration: float) -> bool:
     """Move a world whose vehicles surely stay apart; leave it and return False when that is not sure.
 
@@ -134,7 +134,7 @@ def move_apart(table: Floats, duration: float) -> bool:
     return True
 
 
-@compiled
+@compiled_bare
 def start_events(table: Floats) -> None:
     """Make the table ready for ``to_next_impact`` from the start of a segment."""
     for i in range(table.shape[1]):
@@ -142,7 +142,7 @@ def start_events(table: Floats) -> None:
         table[CONTACT_SPEED, i] = 0.0
 
 
-@compiled
+@compiled_bare
 def to_next_impact(table: Floats, restitution: float, now: float, duration: float) -> tuple[int, float]:
     """Move from ``now`` event by event up to and through the next round of impacts, or to the end of the segment.
 
@@ -153,18 +153,26 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
             return IMPACT, now
         if now >= duration:
             return DONE, now
-        accelerate(table)
-        passed = next_event(table, now, duration)
-        if not move(table, passed):
+        sound, now = to_next_event(table, now, duration)
+        if not sound:
             return PENETRATED, now
-        for i in range(table.shape[1]):
-            if table[ONSET, i] - now <= passed:
-                table[ACTIVE, i] = 1.0
-        now = duration if passed >= duration - now else now + passed
     return STUCK, now
 
 
-@compiled
+@compiled_bare
+def to_next_event(table: Floats, now: float, duration: float) -> tuple[bool, float]:
+    """Move from ``now`` to the next event or to the end of the segment; False where a gap became impossible."""
+    accelerate(table)
+    passed = next_event(table, now, duration)
+    if not move(table, passed):
+        return False, now
+    for i in range(table.shape[1]):
+        if table[ONSET, i] - now <= passed:
+            table[ACTIVE, i] = 1.0
+    return True, duration if passed >= duration - now else now + passed
+
+
+@compiled_bare
 def accelerate(table: Floats) -> None:
     """Accelerations in force, touching vehicles coupled; marks the pairs that move as one body."""
     vehicles = table.shape[1]
@@ -188,7 +196,7 @@ def accelerate(table: Floats) -> None:
         first = last + 1
 
 
-@compiled
+@compiled_bare
 def next_event(table: Floats, now: float, end: float) -> float:
     """Time from ``now`` to the next event, at most ``end - now``; fills the candidates of each vehicle and pair."""
     vehicles = table.shape[1]
@@ -213,7 +221,7 @@ def next_event(table: Floats, now: float, end: float) -> float:
     return soonest
 
 
-@compiled
+@compiled_bare
 def move(table: Floats, duration: float) -> bool:
     """Move to the next event, putting event values exactly; False when a gap became impossible."""
     sound = True
@@ -232,7 +240,7 @@ def move(table: Floats, duration: float) -> bool:
     return sound
 
 
-@compiled
+@compiled_bare
 def move_speeds(table: Floats, duration: float) -> None:
     """Speeds after ``duration``: one value for each joined body, and a pair in contact differs by its closing speed."""
     vehicles = table.shape[1]

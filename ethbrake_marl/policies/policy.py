@@ -118,6 +118,11 @@ def save_policy(policy: Policy, folder: Path, *, replace: bool = False) -> None:
         write_file(partial / MANIFEST, policy.manifest.model_dump_json(indent=2).encode() + b"\n")
 
 
+def has_bundle(folder: Path) -> bool:
+    """Whether the files of a bundle stand in ``folder``; they are not read."""
+    return all((folder / name).is_file() for name in (MANIFEST, WEIGHTS))
+
+
 def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Read the bundle at ``path``: a bundle's own folder, or a run's folder (then its ``policy/``).
 

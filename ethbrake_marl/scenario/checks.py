@@ -16,6 +16,7 @@ from pydantic_core import PydanticCustomError
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import YamlPath, flow_text
 from ethbrake_marl.objectives import Declared, objectives_of
+from ethbrake_marl.physics.messages import MOST_SAMPLES
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.features import listed_features
 from ethbrake_marl.scenario.fields import LEFT_OUT, ScenarioFields
@@ -154,6 +155,9 @@ def _check_reactions(scenario: ScenarioFields) -> None:
             f"vehicle_{i + 1} may have no news until {latest[i]:g} s; it must be below horizon_s"
             f" ({scenario.horizon_s:g} s), which may be raised"
         )
+        refuse(("v2x",), scenario.v2x, right)
+    if not (samples := scenario.v2x.channel.samples(scenario.time_step_s)) <= MOST_SAMPLES:
+        right = f"a message is on its way for {samples - 3} time steps; at most {MOST_SAMPLES - 3} are possible"
         refuse(("v2x",), scenario.v2x, right)
 
 

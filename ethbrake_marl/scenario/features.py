@@ -15,7 +15,8 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.physics import Floats
+from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.physics.estimates import age_s
 
 MOST_NEIGHBOURS = 64  # on each side
 
@@ -125,7 +126,7 @@ _SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 @dataclass(frozen=True, slots=True)
 class RegisteredFeature:
-    """A feature that somebody registered."""
+    """A feature that somebody registered, or one of ours that belongs to no group."""
 
     feature: Feature
     function: Callable[..., Floats]
@@ -139,7 +140,16 @@ class RegisteredFeature:
         return np.clip(value * (1.0 / feature.scale), feature.low, feature.high)
 
 
-FEATURES: dict[str, RegisteredFeature] = {}
+def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
+    """Time since the sample that was last told of it, [n] s; 0 where the present is known."""
+    told = age_s(worlds)[:, vehicle, neighbour]
+    return np.where(np.isfinite(told), told, 0.0)
+
+
+_AGE = Feature(
+    "age", "s", 1.0, 0.0, 8.0, "time since the sample that was last told of it; 0 where the present is known"
+)
+FEATURES: dict[str, RegisteredFeature] = {"age": RegisteredFeature(_AGE, age, "neighbour", 0.0, (0.0, 0.0, 0.0))}
 
 
 def listed_features(listed: object) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import csv
 import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ from ethbrake_marl.files.messages import suggestion
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds, make_worlds
+from ethbrake_marl.scenario.channel import with_fixed_news
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.quantities import (
     ALTERNATIVES,
@@ -29,7 +30,6 @@ from ethbrake_marl.scenario.quantities import (
 )
 from ethbrake_marl.scenario.sampling import obstacle_gap
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.v2x import fixed_news
 
 Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
 
@@ -167,7 +167,7 @@ def _worlds(given: Mapping[Entry, Floats], scenario: Scenario, naming: _Naming) 
     _check_together(full, scenario, naming)
     of_world = {field: full.pop(field)[:, 0] for field, rule in rules.items() if rule.per == "world"}
     worlds = make_worlds(full.pop("gaps_m"), full.pop("speeds_mps"), **of_world, **full)
-    return replace(worlds, vehicles=fixed_news(scenario.v2x, worlds.vehicles, naming.where))
+    return with_fixed_news(scenario.v2x, worlds, scenario.time_step_s, naming.where)
 
 
 def _fixed(scenario: Scenario, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:

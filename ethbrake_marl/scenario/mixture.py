@@ -98,6 +98,12 @@ def _check_members(document: Document, members: Sequence[ScenarioFields]) -> Non
                 raise InvalidInput(
                     f"{where}: {key} must be the same in all: {first.name} has {one}, {member.name} has {other}{way}"
                 )
+        samples = [each.v2x.channel.samples(each.time_step_s) for each in (first, member)]
+        if samples[0] != samples[1]:
+            raise InvalidInput(
+                f"{where}: v2x.persistence must be the same in all, and so must the delay of periodic messages:"
+                f" {first.name} and {member.name} differ; give v2x beside mixture, and it holds for all"
+            )
         if member.has_obstacle != first.has_obstacle:
             one, other = ("one" if each.has_obstacle else "none" for each in (first, member))
             raise InvalidInput(

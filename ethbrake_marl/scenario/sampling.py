@@ -6,7 +6,6 @@ Speeds from the speed of the line, gaps from time gaps, the distance to an obsta
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -16,12 +15,13 @@ from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.episode import first_decision_s
 from ethbrake_marl.physics.events import stopping_distances
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, make_worlds
+from ethbrake_marl.scenario.channel import with_channel
 from ethbrake_marl.scenario.distributions import WithLoad, support, values
 from ethbrake_marl.scenario.fields import ScenarioFields
 from ethbrake_marl.scenario.quantities import BLOCK, DECLARED, QUANTITIES
 from ethbrake_marl.scenario.roles import constant_command
 from ethbrake_marl.scenario.sample import Sample, join_samples
-from ethbrake_marl.scenario.v2x import PER_LINK, with_news
+from ethbrake_marl.scenario.v2x import PER_LINK
 
 
 def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]) -> dict[str, Floats]:
@@ -104,6 +104,8 @@ V2X_NEWS = (1,)  # the stream of the links' delays and losses
 OBSTACLE = (2,)  # the stream of the obstacle's distance
 OBSTACLE_WIDTH = 4  # its numbers per world, of which the first is used
 TYPES = (3,)  # the stream of the vehicles' types and loads
+LATER_LOSSES = (5,)  # the stream of a world's key, from which its later messages are lost or not
+KEY_WIDTH = 4  # its numbers per world, of which the first is used
 PER_TYPE = 4  # its numbers per vehicle: type, load, and two that are free; one Philox counter
 MOST_ATTEMPTS = 1000  # draws of one world before its scenario is declared unusable
 _PATIENCE = 10  # attempts of a whole list before one world is tried to its end
@@ -226,7 +228,9 @@ def make_sample(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...
     )
     if scenario.v2x.by_link:
         u = numbers(PER_LINK * scenario.vehicles * scenario.vehicles, V2X_NEWS)
-        worlds = replace(worlds, vehicles=with_news(scenario.v2x, worlds.vehicles, u))
+        periodic = scenario.v2x.channel.persistence == "periodic"
+        key = numbers(KEY_WIDTH, LATER_LOSSES)[:, 0] if periodic else np.zeros(len(u))
+        worlds = with_channel(scenario.v2x, worlds, u, key, scenario.time_step_s)
     return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
 
 

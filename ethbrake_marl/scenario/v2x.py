@@ -14,10 +14,15 @@ on (nobody reacts to an emergency before its news: Vehicle 1's own message, or t
 brakes), and knows of vehicle j from ``max(latency_i, tau_ij)``, or ``max(latency_i, hop_ij)`` for a direct neighbour
 in sight if that is sooner. Of latencies themselves only the own parts are observed: what a channel has drawn shows when
 it happens. The rule of the paper, preset ``paper``: everything, from the own latency on.
+
+With ``persistence: first`` that is all: from its first message on j is known as it is. With ``periodic`` each message
+is one of many, T apart, and lost or not by the same Gilbert-Elliott channel; what i knows is as old as the newest that
+arrived (``physics.messages``).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -26,13 +31,14 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchema
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.messages import ring_length
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles
 
 PER_LINK = 4  # uniform numbers of one link: wait, burst, loss, hop; one Philox counter
 
 Hears = Literal["all", "front", "none"]
 Senses = Literal["both", "front", "none"]
+Persistence = Literal["first", "periodic"]
 Seconds = Annotated[float, Field(ge=0.0, le=60.0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
@@ -52,6 +58,18 @@ class Channel(NamedTuple):
     processing_s: float = 0.1  # t_proc
     actuation_s: float = 0.2  # t_act
     sensing_s: tuple[float, float] = (0.8, 1.1)  # a hop is drawn evenly from it
+    persistence: Persistence = "first"  # whether what was once heard stays present, or each message grows old
+
+    @property
+    def delay_s(self) -> float:
+        """Time from sending a message until it is of use (s); infinite where nobody sends any."""
+        if self.timing == "messages":
+            return self.radio_s + self.processing_s + self.actuation_s
+        return self.link_latency_s if self.timing == "fixed" else math.inf
+
+    def samples(self, time_step_s: float) -> int:
+        """Samples of its state that a vehicle keeps for messages on their way; 0 without periodic messages."""
+        return ring_length(self.delay_s, time_step_s) if self.persistence == "periodic" else 0
 
 
 CHANNELS = {
@@ -64,6 +82,7 @@ CHANNELS = {
 }
 PRESETS = tuple(CHANNELS)  # those that are built in; ``register_preset`` adds to the channels
 _LATEST = np.array([[1.0, 0.0, 1.0, 1.0]])  # uniform numbers of one link: a whole period, the longest burst, not lost
+_OF_LATER = ("message_period_s", "loss_begins", "loss_ends")  # of every message after the first one
 _OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
 
 
@@ -83,6 +102,10 @@ class _PresetSchema:
 Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
+def _not_given(value: Any) -> bool:
+    return value is None
+
+
 class V2X(BaseModel):
     """A preset, and what differs from it; see ``docs/cooperation.md``. Written as its name alone, or as a mapping."""
 
@@ -100,6 +123,7 @@ class V2X(BaseModel):
     processing_s: Seconds | None = None
     actuation_s: Seconds | None = None
     sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = None
+    persistence: Persistence | None = Field(default=None, exclude_if=_not_given)
 
     @model_validator(mode="before")
     @classmethod
@@ -112,10 +136,15 @@ class V2X(BaseModel):
     @model_validator(mode="after")
     def _possible(self) -> V2X:
         channel = self.channel
+        sent = channel.hears != "none" and channel.timing != "latency"
+        right = "nobody sends messages one by one here; give a preset that generates them, such as nominal"
+        _require(channel.persistence == "first" or sent, "persistence", self, right)
         if channel.hears == "none":
             self._leave_out(("link_latency_s", "lost", *_OF_MESSAGES), "hears none has no messages")
         elif channel.timing == "fixed":
-            self._leave_out(_OF_MESSAGES, "a fixed link_latency_s has no generated messages")
+            later = _OF_LATER if channel.persistence == "periodic" else ()
+            parts = tuple(name for name in _OF_MESSAGES if name not in later)
+            self._leave_out(parts, "a fixed link_latency_s has no generated messages")
         elif channel.timing == "latency":
             self._leave_out(_OF_MESSAGES, f"preset {self.preset} has no generated messages")
         if channel.senses == "none":
@@ -161,6 +190,7 @@ class V2X(BaseModel):
         low, high = channel.sensing_s
         by_messages = channel.timing == "messages" and channel.hears != "none"
         lossy = channel.hears != "none" and 0.0 < channel.lost < 1.0
+        lossy = lossy or (channel.persistence == "periodic" and channel.loss_begins > 0.0)
         return self.by_link and (by_messages or lossy or (channel.senses != "none" and low != high))
 
     def latest_reaction_s(self, own_latency_s: Floats) -> Floats:
@@ -216,6 +246,19 @@ def with_news(v2x: V2X, vehicles: Vehicles, u: Floats) -> Vehicles:
 
     Their latencies, so far all own, stay as ``own_latency_s``.
     """
+    (N, channel), (heard, seen) = (vehicles.latency_s.shape[1], v2x.channel), heard_and_seen(v2x, vehicles, u)
+    latency = vehicles.latency_s.copy()
+    if channel.timing != "latency":
+        for i in range(1, N):
+            told = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
+            latency[:, i] = np.maximum(latency[:, i], told)
+    known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
+    known[:, np.arange(N), np.arange(N)] = latency  # no vehicle waits for a message from itself
+    return replace(vehicles, latency_s=latency, known_from_s=known)
+
+
+def heard_and_seen(v2x: V2X, vehicles: Vehicles, u: Floats) -> tuple[Floats, Floats]:
+    """When the first message of vehicle j reaches vehicle i, and when i sees j, each [n, N, N] s; infinite: never."""
     n, N = vehicles.latency_s.shape
     channel, links = v2x.channel, u.reshape(n, N, N, PER_LINK)
     low, high = channel.sensing_s
@@ -227,15 +270,7 @@ def with_news(v2x: V2X, vehicles: Vehicles, u: Floats) -> Vehicles:
     heard[:, (sender >= receiver) if channel.hears == "front" else np.full((N, N), channel.hears == "none")] = np.inf
     ahead = sender == receiver - 1
     in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": np.zeros((N, N), np.bool_)}
-    seen = np.where(in_sight[channel.senses], hop, np.inf)
-    latency = vehicles.latency_s.copy()
-    if channel.timing != "latency":
-        for i in range(1, N):
-            told = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
-            latency[:, i] = np.maximum(latency[:, i], told)
-    known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
-    known[:, np.arange(N), np.arange(N)] = latency  # no vehicle waits for a message from itself
-    return replace(vehicles, latency_s=latency, known_from_s=known)
+    return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
 
 def hidden_from(vehicles: Vehicles, vehicle: int) -> Bools:
@@ -249,16 +284,3 @@ def hidden_from(vehicles: Vehicles, vehicle: int) -> Bools:
     hidden[:, vehicle] = False
     some: Bools = np.any(hidden, axis=1)
     return some
-
-
-def fixed_news(v2x: V2X, vehicles: Vehicles, where: str) -> Vehicles:
-    """The same for worlds that somebody gives, where nothing is left to chance; ``InvalidInput`` where it is."""
-    if not v2x.by_link:
-        return vehicles
-    if v2x.drawn:
-        raise InvalidInput(
-            f"{where}: the scenario draws what each vehicle knows when (v2x: {v2x.preset}); take one whose channel is"
-            " fixed, for instance scenario.replace(v2x='paper')"
-        )
-    n, N = vehicles.latency_s.shape
-    return with_news(v2x, vehicles, np.zeros((n, N * N * PER_LINK)))

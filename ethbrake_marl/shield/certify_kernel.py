@@ -1,176 +1,52 @@
-"""The compiled decisions of the step shield.
+"""The compiled decisions of the step shield, for one shielded vehicle or several of one line.
 
 Everything that is certified is advanced decision by decision by ``physics.episode.step_episode``, with the operations
 of the engine's step: what was certified is what will be executed, to the same bits. Only the search for a
 promising constant runs in one segment to the horizon; what it finds is certified step by step before it counts.
 
-A world has M members, worlds that must all keep the bound: one without uncertainty, then nothing here costs more.
+The members of a world, its K shielded vehicles, actions [K] and plans [L, K] are those of ``shield.members``.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.actions import command_of
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled, compiled_apart
-from ethbrake_marl.physics.episode import (
-    EPISODE_ROWS,
-    GOES_ON,
-    HARM_IS_TOTAL,
-    LAST_STEP,
-    LATENCY,
-    RESTITUTION,
-    grid_of,
-    harm_so_far,
-    restore,
-    save,
-    step_again,
+from ethbrake_marl.physics.episode import EPISODE_ROWS
+from ethbrake_marl.shield.members import (
+    Members,
+    gather,
+    hold_constant,
+    rows_of,
+    take_steps,
+    worst_of_plan,
+    worst_so_far,
 )
-from ethbrake_marl.physics.impact import MASS
-from ethbrake_marl.physics.segment import COMMAND, LIMIT
 
 # reasons of a decision, in the order of REASONS of shield.certify
 SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED = range(6)
+APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of what is told of each vehicle
 NEARLY = 1e-9  # a constant whose harm (m2/s2) in one segment is above the limit by less is certified step by step
 
 
-class Members(NamedTuple):
-    """The members of one world, and room to work in."""
-
-    table: Floats  # of physics.episode
-    clock: Floats  # [M, CLOCK_WIDTH]
-    bounds: Floats  # [M, 2] m/s2
-    command: Floats  # [M, N] of the others
-    latency: Floats  # [M, N]
-    mass: Floats  # [M, N]
-    limit: Floats  # [M, N]
-    vehicle: int
-    critical: Ints  # [1] the member that broke a limit last: it is tried first; no result depends on it
-
-
-@compiled
-def enter(world: Members, m: int, state: Floats) -> None:
-    """Member ``m`` in a saved state."""
-    table = world.table
-    for i in range(table.shape[1]):
-        table[COMMAND, i], table[LATENCY, i] = world.command[m, i], world.latency[m, i]
-        table[MASS, i], table[LIMIT, i] = world.mass[m, i], world.limit[m, i]
-    restore(table, state)
-
-
-@compiled
-def act(world: Members, m: int, action: float) -> None:
-    """The shielded vehicle's command of an action, in member ``m``."""
-    world.table[COMMAND, world.vehicle] = command_of(action, -world.bounds[m, 0], world.bounds[m, 1])
-
-
 @compiled_apart
-def take_step(world: Members, m: int, state: Floats, step: int, action: float, after: Floats) -> int:
-    """The step of one action from ``state``; fills ``after``. Returns as ``step_episode``."""
-    enter(world, m, state)
-    act(world, m, action)
-    outcome = step_again(
-        world.table, world.clock[m, RESTITUTION], grid_of(world.clock[m]), step, step + 1, world.table[:0]
-    )
-    save(world.table, after)
-    return outcome
-
-
-@compiled
-def take_steps(
-    world: Members, states: Floats, ended: Bools, step: int, action: float, after: Floats, over: Bools
-) -> int:
-    """The step of one action in every member; how many episodes go on, or -1 if the physics failed."""
-    going = 0
-    for m in range(ended.shape[0]):
-        if ended[m]:
-            after[m, :], over[m] = states[m], True
-            continue
-        outcome = take_step(world, m, states[m], step, action, after[m])
-        if outcome < GOES_ON:
-            return -1
-        over[m] = outcome != GOES_ON
-        going += 0 if over[m] else 1
-    return going
-
-
-@compiled
-def worst_so_far(world: Members, states: Floats) -> float:
-    """Largest harm so far over the members."""
-    worst = 0.0
-    for m in range(states.shape[0]):
-        restore(world.table, states[m])
-        worst = max(worst, harm_so_far(world.table, world.clock[m, HARM_IS_TOTAL]))
-    return worst
-
-
-@compiled_apart
-def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, plan: Floats, most: float) -> float:
-    """Harm of the episode if the plan's actions are executed from ``state`` at ``step`` on, as the engine does.
-
-    Gives up with infinity as soon as it is above ``most`` (harm never falls), or where the physics fails.
-    """
-    table, no_rows, total = world.table, world.table[:0], world.clock[m, HARM_IS_TOTAL]
-    restitution, grid = world.clock[m, RESTITUTION], grid_of(world.clock[m])
-    vehicle, braking, driving = world.vehicle, -world.bounds[m, 0], world.bounds[m, 1]
-    enter(world, m, state)
-    goes_on, value = not ended, harm_so_far(table, total)
-    while goes_on:
-        table[COMMAND, vehicle] = command_of(plan[step], braking, driving)
-        outcome = step_again(table, restitution, grid, step, step + 1, no_rows)
-        value = harm_so_far(table, total)
-        if outcome < GOES_ON or value > most:
-            return math.inf
-        goes_on = outcome == GOES_ON
-        step += 1
-    return value
-
-
-@compiled
-def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan: Floats, most: float) -> float:
-    """Largest harm of a plan over the members; infinity as soon as one of them is above ``most``."""
-    worst, first = 0.0, world.critical[0]
-    for j in range(ended.shape[0]):
-        m = (first + j) % ended.shape[0]
-        worst = max(worst, follow_plan(world, m, states[m], ended[m], step, plan, most))
-        if worst == math.inf:
-            world.critical[0] = m
-            break
-    return worst
-
-
-@compiled
-def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, action: float) -> float:
-    """Harm of the episode under a constant action from here, in one segment; infinity where the physics fails."""
-    table, clock = world.table, world.clock[m]
-    enter(world, m, state)
-    act(world, m, action)
-    if not ended:
-        last, grid = int(clock[LAST_STEP]), grid_of(clock)
-        if step_again(table, clock[RESTITUTION], grid, step, last, table[:0]) < GOES_ON:
-            return math.inf
-    return harm_so_far(table, clock[HARM_IS_TOTAL])
-
-
-@compiled_apart
-def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[float, float]:
-    """The constant action of least worst harm from here on, and that harm, each in one segment."""
-    best, least, critical = 0.0, math.inf, 0
+def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
+    """Which constant action [C, K] has the least worst harm from here on, and that harm, each in one segment."""
+    best, least, critical = 0, math.inf, 0
     for c in range(constants.shape[0]):
         worst, first = 0.0, critical
         for j in range(ended.shape[0]):
             m = (first + j) % ended.shape[0]
-            value = hold_constant(world, m, states[m], ended[m], step, constants[c])
+            value = hold_constant(world, m, states[m], ended[m], step, constants, c)
             if value > worst:
                 worst, critical = value, m
             if not worst < least:
                 break
         if worst < least:
-            best, least = constants[c], worst
+            best, least = c, worst
     return best, least
 
 
@@ -186,58 +62,135 @@ def better_plan(
     so_far = worst_so_far(world, states)
     if value <= so_far or so_far > most:  # nothing can be better
         return value, min(value, so_far) if value <= so_far else so_far
-    action, least = best_constant(world, states, ended, step, constants)
+    best, least = best_constant(world, states, ended, step, constants)
     if not least < value or least > most + NEARLY:
         return value, min(value, least)
     for j in range(step, trial.shape[0]):
-        trial[j] = action
+        copy_action(constants[best], trial[j])
     certified = worst_of_plan(world, states, ended, step, trial, most)
     if not certified < value:
         return value, min(value, least)
     for j in range(step, plan.shape[0]):
-        plan[j] = action
+        copy_action(constants[best], plan[j])
     return certified, certified
 
 
+@compiled
+def copy_action(action: Floats, to: Floats) -> None:
+    """Copy the actions of one decision, one for each vehicle."""
+    for c in range(to.shape[0]):
+        to[c] = action[c]
+
+
+@compiled
+def is_planned(action: Floats, planned: Floats) -> bool:
+    """Whether all vehicles do what the plan says."""
+    for c in range(planned.shape[0]):  # noqa: SIM110  # all() is not compiled
+        if action[c] != planned[c]:
+            return False
+    return True
+
+
 @compiled_apart
-def decide_world(
-    world: Members, states: Floats, ended: Bools, step: int, proposed: float, budget: float, certified: float,
-    constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools, out: Floats,
-) -> bool:  # fmt: skip
-    """Decide in one world, see ``certify``: fills ``after``, ``over`` (by member) and ``out`` (applied, reason, bound,
-    margin); the plan is the one whose harm is ``out``'s bound. A proposal from which the physics fails is not
-    certified. Returns whether the physics did not fail with what is applied.
+def try_action(
+    world: Members, states: Floats, ended: Bools, step: int, action: Floats, budget: float, certified: float,
+    constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools,
+) -> tuple[float, float, int]:  # fmt: skip
+    """Take the step of an action [K], and look for a plan after it: harm certified, least harm found, and the reason.
+
+    Where the harm is within the budget, action and plan are in ``plan`` afterwards; else that is as it was, and its
+    harm ``certified``. An action from which the physics fails is not certified.
     """
-    usable = not math.isnan(proposed)
-    proposal = min(max(proposed, -1.0), 1.0) if usable else plan[step]
-    going = take_steps(world, states, ended, step, proposal, after, over)
+    going = take_steps(world, states, ended, step, action, after, over)
     value = worst_so_far(world, after) if going >= 0 else math.inf
     reason, least = PLAN_REMAINS, value
-    if proposal == plan[step] and going >= 0:
-        reason, value = SAME_AS_PLAN if usable else NOT_A_NUMBER, certified
+    if is_planned(action, plan[step]) and going >= 0:
+        reason, value = SAME_AS_PLAN, certified
     elif going > 0:
-        room[0, :] = plan
+        for j in range(plan.shape[0]):
+            copy_action(plan[j], room[0, j])
         value = worst_of_plan(world, after, over, step + 1, plan, budget)
         reason = CONSTANT if value > budget else PLAN_REMAINS
         value, least = better_plan(world, after, over, step + 1, constants, value, budget, room[0], room[1])
         if value <= budget:
-            plan[:] = room[0]
+            for j in range(plan.shape[0]):
+                copy_action(room[0, j], plan[j])
     if value <= budget:
-        plan[step] = proposal
-        out[0], out[1], out[2], out[3] = proposal, reason, value, budget - value
+        copy_action(action, plan[step])
+    return value, least, reason
+
+
+@compiled
+def clip_proposals(proposed: Floats, planned: Floats, wanted: Floats, out: Floats) -> int:
+    """Fill ``wanted`` [K] with what is proposed, clipped; the plan's where it is no number. How many deviate from it.
+
+    Their reason is open (-1).
+    """
+    deviating = 0
+    for c in range(proposed.shape[0]):
+        usable = not math.isnan(proposed[c])
+        wanted[c] = min(max(proposed[c], -1.0), 1.0) if usable else planned[c]
+        out[c, REASON] = SAME_AS_PLAN if usable else NOT_A_NUMBER
+        if wanted[c] != planned[c]:
+            out[c, REASON] = -1
+            deviating += 1
+    return deviating
+
+
+@compiled
+def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
+    """Note in ``out`` [K, 4] what is applied, its bound, and the margin of those that did not deviate."""
+    for c in range(action.shape[0]):
+        out[c, APPLIED], out[c, BOUND] = action[c], bound
+        if out[c, REASON] != NO_CERTIFICATE:
+            out[c, MARGIN] = margin
+
+
+@compiled_apart
+def decide_world(
+    world: Members, states: Floats, ended: Bools, step: int, proposed: Floats, budget: float, certified: float,
+    constants: Floats, plan: Floats, room: Floats, tried: Floats, after: Floats, over: Bools, out: Floats,
+) -> bool:  # fmt: skip
+    """Decide in one world, see ``certify``: fills ``after``, ``over`` (by member) and ``out`` (by vehicle: applied,
+    reason, bound, margin); the plan is the one whose harm is ``out``'s bound. First all proposals [K] together; if they
+    have no certificate, one vehicle after the other, front to rear, each beside what is in the plan by then. Returns
+    whether the physics did not fail with what is applied.
+    """
+    deviating = clip_proposals(proposed, plan[step], tried[0], out)
+    value, least, reason = try_action(
+        world, states, ended, step, tried[0], budget, certified, constants, plan, room, after, over
+    )  # fmt: skip
+    if value <= budget:
+        for c in range(out.shape[0]):
+            out[c, REASON] = reason if out[c, REASON] == -1 else out[c, REASON]
+        tell_action(out, plan[step], value, budget - value)
         return True
+    bound, accepted = certified, 0
+    for c in range(out.shape[0]):
+        if out[c, REASON] != -1:
+            continue
+        if deviating > 1:
+            copy_action(plan[step], tried[1])
+            tried[1, c] = tried[0, c]
+            value, least, reason = try_action(
+                world, states, ended, step, tried[1], budget, bound, constants, plan, room, after, over
+            )  # fmt: skip
+        fits = value <= budget
+        out[c, REASON], out[c, MARGIN] = reason if fits else NO_CERTIFICATE, budget - least
+        if fits:
+            bound, accepted = value, accepted + 1
     going = take_steps(world, states, ended, step, plan[step], after, over)
-    out[0], out[1], out[2], out[3] = plan[step], NO_CERTIFICATE, certified, budget - least
-    if going > 0:
-        out[2], _ = better_plan(world, after, over, step + 1, constants, certified, certified, plan, room[1])
+    if going > 0 and accepted == 0:
+        bound, _ = better_plan(world, after, over, step + 1, constants, bound, bound, plan, room[1])
+    tell_action(out, plan[step], bound, budget - bound)
     return going >= 0
 
 
 @compiled
 def certify_worlds(
     states: Floats, steps: Ints, ended: Bools, clock: Floats, bounds: Floats, command: Floats, latency: Floats,
-    mass: Floats, limit: Floats, vehicle: int, proposed: Floats, budget: Floats, certified: Floats, constants: Floats,
-    plans: Floats, after: Floats, out: Floats, over: Bools, failed: Bools,
+    mass: Floats, limit: Floats, caps: Floats, vehicles: Ints, proposed: Floats, budget: Floats, certified: Floats,
+    constants: Floats, plans: Floats, after: Floats, out: Floats, over: Bools, failed: Bools,
 ) -> None:  # fmt: skip
     """``decide_world`` in every world whose episode runs; ``failed`` [n] where it did. ``plans`` change in place.
 
@@ -245,22 +198,24 @@ def certify_worlds(
     """
     N, n = mass.shape[1], steps.shape[0]
     table, critical = np.zeros((EPISODE_ROWS, N)), np.zeros(1, np.int64)
-    room = np.zeros((2, plans.shape[1]))
+    room, tried = np.zeros((2, plans.shape[1], plans.shape[2])), np.zeros((2, plans.shape[2]))
     M = states.shape[0] // max(n, 1)
+    lines = np.empty((M, rows_of(caps), N))
     for k in range(n):
         a, b = k * M, k * M + M
         if ended[a:b].all():
             after[a:b] = states[a:b]
             last = min(steps[k], plans.shape[1] - 1)
-            out[k, 0], out[k, 1], out[k, 2], out[k, 3] = plans[k, last], ENDED, certified[k], budget[k] - certified[k]
+            for c in range(plans.shape[2]):
+                out[k, c, APPLIED], out[k, c, REASON] = plans[k, last, c], ENDED
+                out[k, c, BOUND], out[k, c, MARGIN] = certified[k], budget[k] - certified[k]
             over[a:b] = True
             continue
-        world = Members(
-            table, clock[a:b], bounds[a:b], command[a:b], latency[a:b], mass[a:b], limit[a:b], vehicle, critical
-        )  # fmt: skip
+        gather(lines, a, command, latency, mass, limit, caps)
+        world = Members(table, clock[a:b], bounds[a:b], lines, vehicles, critical)
         good = decide_world(
             world, states[a:b], ended[a:b], steps[k], proposed[k], budget[k], certified[k], constants, plans[k], room,
-            after[a:b], over[a:b], out[k],
+            tried, after[a:b], over[a:b], out[k],
         )  # fmt: skip
         failed[k] = not good
 
@@ -268,7 +223,7 @@ def certify_worlds(
 @compiled
 def harm_of_plans(
     states: Floats, steps: Ints, ended: Bools, clock: Floats, bounds: Floats, command: Floats, latency: Floats,
-    mass: Floats, limit: Floats, vehicle: int, constants: Floats, plans: Floats, value: Floats,
+    mass: Floats, limit: Floats, caps: Floats, vehicles: Ints, constants: Floats, plans: Floats, value: Floats,
 ) -> None:  # fmt: skip
     """Fill ``value`` [n] with the worst harm of the episodes if the plans are executed from here; infinity: it failed.
 
@@ -276,13 +231,13 @@ def harm_of_plans(
     """
     N, n = mass.shape[1], steps.shape[0]
     table, critical = np.zeros((EPISODE_ROWS, N)), np.zeros(1, np.int64)
-    trial = np.zeros(plans.shape[1])
+    trial = np.zeros((plans.shape[1], plans.shape[2]))
     M = states.shape[0] // max(n, 1)
+    lines = np.empty((M, rows_of(caps), N))
     for k in range(n):
         a, b = k * M, k * M + M
-        world = Members(
-            table, clock[a:b], bounds[a:b], command[a:b], latency[a:b], mass[a:b], limit[a:b], vehicle, critical
-        )  # fmt: skip
+        gather(lines, a, command, latency, mass, limit, caps)
+        world = Members(table, clock[a:b], bounds[a:b], lines, vehicles, critical)
         value[k] = worst_of_plan(world, states[a:b], ended[a:b], steps[k], plans[k], math.inf)
         if constants.shape[0] > 0:
             value[k], _ = better_plan(

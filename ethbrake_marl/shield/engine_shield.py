@@ -222,7 +222,7 @@ class AttachedShield(Attached):
     def decide(self, proposed: Floats) -> Floats:
         """The actions [n] to apply instead of those proposed. Nothing changes until the engine applies them."""
         engine, shield = self.engine, self.shield
-        proposer = None if self.policy is None else Proposer(self.policy, engine.worlds)
+        proposer = None if self.policy is None else Proposer({self.vehicle: self.policy}, engine.worlds)
         certified = shield.propose(proposed, seen=seen_columns(engine.packed), only=~engine.ended, proposer=proposer)
         applied = certified.decision.applied
         self.sent = Sent(shield, engine.steps_made, applied, certified.asked, certified)

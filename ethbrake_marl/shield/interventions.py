@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ class Intervention(NamedTuple):
     """One decision in which something else than the proposal was applied."""
 
     world: int  # row of the batch
+    vehicle: int  # index of the shielded vehicle, 0 = front
     episode: int  # of that row, from 0
     step: int  # number of the decision
     time_s: float
@@ -23,21 +25,23 @@ class Intervention(NamedTuple):
     bound: float  # m2/s2, from now on
     margin: float  # m2/s2; negative: what the proposal would have cost beyond the budget at least
     state: Floats  # [S] at the decision
-    plan: Floats  # [L] that was held; before ``step`` what was applied
+    plan: Floats  # [L] that was held, of several vehicles [L, K]; before ``step`` what was applied
 
 
 def interventions(
-    now: Running, episode: Ints, proposed: Floats, decision: Decision, held: Backup
+    now: Running, episode: Ints, vehicles: Sequence[int], proposed: Floats, decision: Decision, held: Backup
 ) -> list[Intervention]:
     """What a decision made from ``now`` replaced; ``episode`` [n] numbers the rows' episodes."""
-    times, states = now.time_s, now.nominal().states
+    times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))
+    columns = (proposed, decision.applied, decision.reason, decision.margin, decision.intervened)
+    given, applied, reason, margin, replaced = (np.reshape(column, shape) for column in columns)
     return [
         Intervention(
-            k, int(episode[k]), int(now.steps[k]), float(times[k]), float(proposed[k]), float(decision.applied[k]),
-            int(decision.reason[k]), float(decision.bound[k]), float(decision.margin[k]), states[k].copy(),
+            k, vehicles[c], int(episode[k]), int(now.steps[k]), float(times[k]), float(given[k, c]),
+            float(applied[k, c]), int(reason[k, c]), float(decision.bound[k]), float(margin[k, c]), states[k].copy(),
             held.plan[k].copy(),
         )
-        for k in np.flatnonzero(decision.intervened).tolist()
+        for k, c in np.argwhere(replaced).tolist()
     ]  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from numbers import Real
 
 import numpy as np
@@ -41,6 +42,31 @@ def proposing_agent(policy: Agent | LearnedPolicy | None, where: str) -> Agent:
     raise InvalidInput(
         f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy), which says what it observes"
     )
+
+
+def checked_vehicles(vehicle: object, scenario: Scenario) -> int | tuple[int, ...]:
+    """An index as it is, several as a tuple; ``InvalidInput`` unless they are there, each once, front to rear."""
+    several = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
+    each = tuple(vehicle) if isinstance(vehicle, Sequence) and several else (vehicle,)
+    known = range(scenario.vehicles)
+    if not each or not all(isinstance(i, int | np.integer) and not isinstance(i, bool) and i in known for i in each):
+        raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
+    if list(each) != sorted(set(each)):
+        raise InvalidInput(f"shield: vehicle = {vehicle!r}: several are named front to rear, each once")
+    return tuple(map(int, each)) if several else int(each[0])
+
+
+def policies_of(
+    policy: Agent | Mapping[int, Agent] | None, vehicle: int | tuple[int, ...]
+) -> Mapping[int, Agent] | None:
+    """Who proposes, by vehicle, front to rear. Raises ``InvalidInput`` for another one than is shielded."""
+    if policy is None:
+        return None
+    vehicles = (vehicle,) if isinstance(vehicle, int) else vehicle
+    given = policy if isinstance(policy, Mapping) else dict.fromkeys(vehicles[:1], policy)
+    if set(given) != set(vehicles):
+        raise InvalidInput(f"shield: policies for vehicles {sorted(given)}, shielded are {list(vehicles)}")
+    return {i: given[i] for i in vehicles}
 
 
 def engine_of(env: object, interface: type, where: str, maker: str) -> Engine:

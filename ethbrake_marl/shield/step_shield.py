@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.actions import command_to_action
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.protocol import Agent, fixed_commands
+from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.engine.stream import Script
-from ethbrake_marl.errors import InvalidInput, renumbered
+from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.episode import number_of_decisions
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import PER_WORLD as OF_PROBLEM
-from ethbrake_marl.search.problem import profile_problem
+from ethbrake_marl.shield.alert import CAPS, Cap, Settings, Start, start_of
 from ethbrake_marl.shield.certify import (
     Backup,
     Decision,
     Running,
-    begin_running,
-    bettered_plan,
     certify,
     from_now,
     plan_harm,
@@ -35,14 +31,15 @@ from ethbrake_marl.shield.certify import (
 from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE
 from ethbrake_marl.shield.comparison import as_predicted
 from ethbrake_marl.shield.interventions import Intervention, interventions, write_down
-from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, merged, put, rolled_out
-from ethbrake_marl.shield.settings import check_amount, check_scenario
-from ethbrake_marl.shield.settling import plan_rests
+from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, merged, put
+from ethbrake_marl.shield.settings import check_amount, check_scenario, checked_vehicles, policies_of
+from ethbrake_marl.shield.shares import borne_under
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 BROKEN = ENDED + 1  # a reason that the kernel does not know
-PER_WORLD = ("first_bound", "alone_harm", "settles", "interventions", "distrusted", "episode")  # a shield's arrays [n]
-LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions, for the bound at the alert where there are several members
+PER_WORLD = (  # a shield's arrays [n, ...]
+    "first_bound", "alone_harm", "settles", "interventions", "distrusted", "episode", "baseline_shares",
+)  # fmt: skip
 
 
 class Certified(NamedTuple):
@@ -86,21 +83,27 @@ class StepShield:
     def __init__(
         self,
         scenario: Scenario,
-        vehicle: int,
+        vehicle: int | Sequence[int],
         *,
         harm_count: HarmCount = "first",
         allowance: float = 0.0,
         others: Mapping[int, Script] | None = None,
         uncertainty: Uncertainty | None = None,
+        cap: Cap | None = None,
         logging: bool = False,
     ) -> None:
         check_harm_count(harm_count)
         check_scenario(scenario, "shield")
         check_amount("allowance", allowance, "shield", " m2/s2")
-        if vehicle not in range(scenario.vehicles):
-            raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
-        self.scenario, self.vehicle, self.harm_count, self.allowance = scenario, vehicle, harm_count, allowance
-        self.uncertainty = uncertainty
+        self.vehicle = checked_vehicles(vehicle, scenario)
+        self.vehicles = (self.vehicle,) if isinstance(self.vehicle, int) else self.vehicle
+        if uncertainty is not None and (len(self.vehicles) > 1 or cap is not None):
+            what = "several vehicles" if cap is None else "a cap"
+            raise InvalidInput(f"shield: uncertainty: {what} with it: not covered; mode robust shields one vehicle")
+        if cap not in (None, *CAPS):
+            raise unknown_name("shield cap", cap, CAPS)
+        self.scenario, self.harm_count, self.allowance = scenario, harm_count, allowance
+        self.uncertainty, self.cap = uncertainty, cap
         self.log: list[Intervention] | None = [] if logging else None
         self.found: list[Intervention] = []  # in the last decision
         self.running: Running | None = None
@@ -111,7 +114,9 @@ class StepShield:
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
         self.episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode
         self.distrusted: Bools = np.zeros(0, np.bool_)
-        self._others = script_agents(scenario, except_for=vehicle) if others is None else others
+        self.baseline_shares: Floats = np.zeros((0, 0))  # [n, N] what each vehicle bears under the best constants
+        scripts = script_agents(scenario, except_for=self.vehicles) if others is None else others
+        self._others = {i: script for i, script in scripts.items() if i not in self.vehicles}
         self._width = int(number_of_decisions(np.zeros(1), scenario.time_step_s, scenario.horizon_s)[0]) + 1
 
     @property
@@ -122,47 +127,29 @@ class StepShield:
         granted = np.where(self.running.finished, 0.0, self.first_bound + self.allowance)
         return np.maximum(self.backup.harm, granted)
 
-    def begin(self, worlds: Worlds, rows: Ints, policy: Agent | None = None) -> None:
+    def shares(self) -> Floats:
+        """What each vehicle bears of the harm if the plan that is held now is executed, [n, N] m2/s2."""
+        if self.running is None:
+            raise InvalidInput("shield: shares, but no episode has begun; call begin first")
+        return borne_under(self.running.nominal(), self.backup.plan)[:, -self.scenario.vehicles :]
+
+    def begin(self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None = None) -> None:
         """New episodes start in these rows; ``worlds`` holds those rows only, at the alert, as they are believed.
 
+        The ``policy`` that proposes (of several vehicles: one for each, by index) is rolled out from there.
         Rows 0 to k - 1 together may also begin a larger batch. Raises ``InvalidInput`` for rows that are not there.
         """
-        scenario, vehicle, running_rows = self.scenario, self.vehicle, len(self.first_bound)
+        running_rows = len(self.first_bound)
         if not (rows < running_rows).all() and sorted(rows.tolist()) != list(range(len(rows))):
             raise InvalidInput(
                 f"shield: begin in row {rows.max()} of a batch of {running_rows}: a larger batch begins with all of its"
                 " rows at once"
             )
-        possible = worlds if self.uncertainty is None else self.uncertainty.members(worlds)
-        members = possible.n // worlds.n
-        latest = possible.vehicles.latency_s[:, vehicle].max()
-        if members > 1 and not latest < scenario.horizon_s:
-            raise InvalidInput(
-                f"uncertainty: {self.uncertainty}: vehicle_{vehicle + 1} may decide first at {latest:g} s; must be"
-                f" before the horizon, {scenario.horizon_s:g} s"
-            )
-        others = fixed_commands(self._others, possible, "shield", vehicle=vehicle)
-        best = optimise_coupled(
-            worlds, vehicle, harm_count=self.harm_count, horizon_s=scenario.horizon_s, others_mps2=others[::members]
-        ).deceleration_mps2
-        with renumbered(np.repeat(np.arange(worlds.n), members)):
-            problem = profile_problem(
-                possible, [vehicle], harm_count=self.harm_count, horizon_s=scenario.horizon_s,
-                time_step_s=scenario.time_step_s,
-                others_mps2=others,
-            )  # fmt: skip
-        running = begin_running(problem, members)
-        plan = np.repeat(command_to_action(-best, worlds.vehicles, vehicle)[:, np.newaxis], self._width, axis=1)
-        if members > 1:
-            plan = bettered_plan(running, plan, LOOKED_AT)[0]
-        harm, alone = plan_harm(running, plan), np.full(worlds.n, np.inf)
-        if policy is not None:
-            actions = rolled_out(worlds, policy, scenario, vehicle, running.nominal().problem, self._width)
-            alone = plan_harm(running, actions)
-            plan[alone <= harm] = actions[alone <= harm]
-            harm = np.minimum(alone, harm)
+        settings = Settings(
+            self.scenario, self.vehicle, self.harm_count, self._others, self.uncertainty, self.cap, self._width
+        )
         new = copy.copy(self)
-        new._place(rows, running, Backup(plan, harm), alone, plan_rests(running, plan))
+        new._place(rows, start_of(settings, worlds, policies_of(policy, self.vehicle)))
         self.__dict__.update(new.__dict__)
 
     def propose(
@@ -180,8 +167,8 @@ class StepShield:
         """
         if self.running is None:
             raise InvalidInput("shield: decide, but no episode has begun; call begin first")
-        if np.shape(proposed) != self.distrusted.shape:
-            raise InvalidInput(f"shield: proposed {np.shape(proposed)}; {self.distrusted.shape} is needed")
+        if np.shape(proposed) != (shape := (*self.distrusted.shape, *self.backup.plan.shape[2:])):
+            raise InvalidInput(f"shield: proposed {np.shape(proposed)}; {shape} is needed")
         asked = ~self.running.finished if only is None else only
         after = copy.copy(self)
         decision = after._decided(proposed, seen, asked, proposer)
@@ -215,18 +202,21 @@ class StepShield:
         asked = asked & ~before.finished
         each = np.repeat(asked, before.members)
         now = before._replace(ended=before.ended | ~each)
-        given = np.where(self.distrusted, np.nan, np.asarray(proposed, np.float64))
+        given = np.array(proposed, np.float64)
+        given[self.distrusted] = np.nan
         held, budget = self.backup, self.bound
         decision = certify(now, given, held, budget)
-        if proposer is not None and (rows := np.flatnonzero(decision.reason == NO_CERTIFICATE)).size:
+        rejected = (decision.reason == NO_CERTIFICATE).reshape(len(asked), -1).any(axis=1)
+        if proposer is not None and (rows := np.flatnonzero(rejected)).size:
             decision = merged(decision, rows, certify_rollouts(now, given, rows, budget, held.plan, proposer))
         decision.reason[asked & self.distrusted] = BROKEN
-        self.interventions = self.interventions + (decision.intervened & asked)
+        replaced = decision.intervened.reshape(len(asked), -1).sum(axis=1)
+        self.interventions = self.interventions + replaced * asked
         self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
         self.backup = decision.backup
         decision = decision._replace(bound=self.bound)
         if self.log is not None:
-            self.found = interventions(now, self.episode, proposed, decision, held)
+            self.found = interventions(now, self.episode, self.vehicles, proposed, decision, held)
         return decision
 
     def keep(self, n: int) -> None:
@@ -260,16 +250,18 @@ class StepShield:
             plan[better] = trial[better]
         self.backup = self.backup._replace(plan=plan, harm=harm)
 
-    def _place(self, rows: Ints, running: Running, backup: Backup, alone: Floats, settles: Bools) -> None:
+    def _place(self, rows: Ints, start: Start) -> None:
         """Keep new episodes in these rows."""
-        count, old = len(rows), self.running
+        count, old, running, backup = len(rows), self.running, start.running, start.backup
         new: dict[str, NDArray[Any]] = {
-            "first_bound": backup.harm, "alone_harm": alone, "settles": settles,
+            "first_bound": backup.harm, "alone_harm": start.alone, "settles": start.settles,
             "interventions": np.zeros(count, np.int64), "distrusted": np.zeros(count, np.bool_),
+            "baseline_shares": start.baseline,
         }  # fmt: skip
         if old is None or count >= old.n:
             order = np.argsort(rows)
-            self.running, self.backup = running.take(order), Backup(backup.plan[order], backup.harm[order])
+            self.running = running.take(order)
+            self.backup = backup._replace(plan=backup.plan[order], harm=backup.harm[order])
             self.episode = np.full(count, self.episode.max(initial=-1) + 1)
             for name, values in new.items():
                 setattr(self, name, values[order])
@@ -283,8 +275,10 @@ class StepShield:
             put(old.states, at, running.states),
             put(old.steps, rows, running.steps),
             put(old.ended, at, running.ended),
+            put(old.caps, at, running.caps) if old.caps.size else old.caps,
         )
-        self.backup = Backup(put(self.backup.plan, rows, backup.plan), put(self.backup.harm, rows, backup.harm))
+        plan, harm = put(self.backup.plan, rows, backup.plan), put(self.backup.harm, rows, backup.harm)
+        self.backup = self.backup._replace(plan=plan, harm=harm)
         for name, values in {**new, "episode": self.episode[rows] + 1}.items():
             setattr(self, name, put(getattr(self, name), rows, values))
 

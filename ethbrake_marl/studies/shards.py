@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import threading
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
-from multiprocessing import active_children, get_context, parent_process
-from multiprocessing.process import BaseProcess
 from operator import add
 from pathlib import Path
 from typing import Any
@@ -25,8 +20,10 @@ from ethbrake_marl.evaluation.shards.question import BLOCK, LEAF, Asked, answer_
 from ethbrake_marl.evaluation.shards.tally import Tally
 from ethbrake_marl.files.durable import remove_unfinished, write_file
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
-from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
 from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.studies.jobs.local import LocalWorkers
+from ethbrake_marl.studies.jobs.run import Attempt, run_jobs
+from ethbrake_marl.studies.jobs.work import Workers, pack
 
 MOST_JOBS = 256
 _LIMIT_BYTES = 64 << 20  # of the file of a shard: worlds that were left out are named there
@@ -80,7 +77,7 @@ class ShardFolder:
 
     def rows_of(self, bounds: Bounds) -> Path | None:
         """The file with the rows of a shard; None where none are kept."""
-        return self.path / f"worlds-{_name(bounds)}.parquet" if self.with_rows else None
+        return self.path.absolute() / f"worlds-{_name(bounds)}.parquet" if self.with_rows else None
 
     def keep(self, bounds: Bounds, tally: Tally) -> None:
         """Write the file of a finished shard, in one step."""
@@ -140,6 +137,7 @@ def evaluate_shards(
     *,
     shards: int,
     jobs: int = 1,
+    workers: Workers | None = None,
     folder: ShardFolder | None = None,
     block: int = BLOCK,
     tell: OnProgress | None = None,
@@ -150,51 +148,57 @@ def evaluate_shards(
         asked: the question.
         shards: parts of the list; finished ones are kept.
         jobs: processes; 1: this one.
+        workers: where shards are answered, of a cluster for instance, in place of ``jobs``; not closed here.
         folder: keeps finished shards, and those that it has are not driven again, whatever ``shards`` was then.
         block: worlds advanced together, a multiple of 1,000.
         tell: is told the worlds done so far.
 
-    Raises what ``answer_shard`` and ``ShardFolder`` raise.
+    Raises what ``answer_shard`` and ``ShardFolder`` raise, ``WorkerLost`` where a shard was lost again and again.
 
     """
     check_whole_number("jobs", jobs, 1, MOST_JOBS)
-    if folder is None:
-        return _merge(asked, {}, shards, jobs, None, block, tell)
-    with folder.alone():
-        folder.prepare()
-        folder.clear()
-        return _merge(asked, folder.finished(), shards, jobs, folder, block, tell)
-
-
-def _merge(
-    asked: Asked,
-    done: dict[Bounds, Tally],
-    shards: int,
-    jobs: int,
-    folder: ShardFolder | None,
-    block: int,
-    tell: OnProgress | None,
-) -> Tally:
-    episodes = asked.question.episodes
-    worlds = sum(end - first for first, end in done)
-    whole = reduce(add, done.values(), Tally())
-
-    def say() -> None:
-        if tell is not None:
-            tell(Progress("worlds", worlds, episodes))
-
-    say()
-    tasks = [
-        (asked, first, end, None if folder is None else folder.rows_of((first, end)), block)
-        for first, end in _missing(shard_bounds(episodes, shards), done)
-    ]
-    for bounds, tally in _answers(tasks, jobs):
+    with ExitStack() as stack:
+        done: dict[Bounds, Tally] = {}
         if folder is not None:
-            folder.keep(bounds, tally)
-        whole += tally
-        worlds += bounds[1] - bounds[0]
-        say()
-    return whole
+            stack.enter_context(folder.alone())
+            folder.prepare()
+            folder.clear()
+            done = folder.finished()
+        work = _Merging(asked, done, folder, tell)
+        left = _missing(shard_bounds(asked.question.episodes, shards), done)
+        tasks = [(asked, *bounds, None if folder is None else folder.rows_of(bounds), block) for bounds in left]
+        if workers is None and jobs > 1 and len(tasks) > 1:
+            workers = stack.enter_context(closing(LocalWorkers(min(jobs, len(tasks)))))
+        if workers is not None:
+            _answer_all(tasks, workers, work.add)
+        else:
+            for bounds, task in zip(left, tasks, strict=True):
+                work.add(bounds, _answer(task))
+        return work.whole
+
+
+class _Merging:
+    """The tally so far, and who is told of it."""
+
+    def __init__(
+        self, asked: Asked, done: dict[Bounds, Tally], folder: ShardFolder | None, tell: OnProgress | None
+    ) -> None:
+        self._episodes, self._folder, self._tell = asked.question.episodes, folder, tell
+        self._worlds = sum(end - first for first, end in done)
+        self.whole = reduce(add, done.values(), Tally())
+        self._say()
+
+    def add(self, bounds: Bounds, tally: Tally) -> None:
+        """Take in, and keep, a shard that is finished."""
+        if self._folder is not None:
+            self._folder.keep(bounds, tally)
+        self.whole += tally
+        self._worlds += bounds[1] - bounds[0]
+        self._say()
+
+    def _say(self) -> None:
+        if self._tell is not None:
+            self._tell(Progress("worlds", self._worlds, self._episodes))
 
 
 def _missing(bounds: Sequence[Bounds], done: dict[Bounds, Tally]) -> list[Bounds]:
@@ -215,41 +219,22 @@ def _missing(bounds: Sequence[Bounds], done: dict[Bounds, Tally]) -> list[Bounds
 _Task = tuple[Asked, int, int, Path | None, int]
 
 
-def _answer(task: _Task) -> tuple[Bounds, Tally]:
-    return (task[1], task[2]), answer_shard(*task)
+def _answer(task: _Task) -> Tally:
+    return answer_shard(*task)
 
 
-def _answers(tasks: Sequence[_Task], jobs: int) -> Iterator[tuple[Bounds, Tally]]:
-    """The tallies as they are finished; what is worked on is dropped when one fails, or on Ctrl-C."""
-    if jobs == 1 or len(tasks) < 2:
-        yield from map(_answer, tasks)
-        return
-    plugins, spawn = loaded_plugins(), get_context("spawn")
-    load_the_same(plugins)  # a file that was changed since is told here, in one line
-    workers = min(jobs, len(tasks))
-    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_begin_worker, initargs=(plugins,)) as pool:
-        try:
-            for future in as_completed([pool.submit(_answer, task) for task in tasks]):
-                yield future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for worker in active_children():
-                worker.terminate()
-            raise
+def _answer_all(tasks: Sequence[_Task], workers: Workers, note: Callable[[Bounds, Tally], None]) -> None:
+    """Tell every tally as it is finished; what is worked on is dropped when a shard fails, or on Ctrl-C."""
 
+    def take(attempt: Attempt) -> None:
+        if attempt.answer.error is not None and attempt.last:
+            raise attempt.answer.error
+        if attempt.answer.value is not None:
+            _, first, end, *_ = tasks[attempt.number]
+            note((first, end), attempt.answer.value)
 
-def _begin_worker(plugins: Sequence[Plugin]) -> None:
-    """Leave Ctrl-C to the parent, end with the parent however that ends, load its plug-ins."""
-    os.setpgrp()
-    parent = parent_process()
-    assert parent is not None
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    load_the_same(plugins)
-
-
-def _end_with(parent: BaseProcess) -> None:
-    parent.join()
-    os._exit(1)
+    if not run_jobs(lambda number: pack(_answer, tasks[number]), len(tasks), workers, take):
+        raise KeyboardInterrupt
 
 
 def _name(bounds: Bounds) -> str:

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents import believed
+from ethbrake_marl.agents.believed import told_to
 from ethbrake_marl.agents.knowledge import Source, combine, knowledge_of, knowledge_text, sees_through
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import agent_names, find_entry
@@ -18,6 +20,8 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.physics import Worlds
+from ethbrake_marl.physics.estimates import age_s, is_periodic, links_of
+from ethbrake_marl.physics.messages import KEY, LINK, TAKEN, TOLD_S, link_at, place_at, ring_at
 from ethbrake_marl.policies.policy import save_policy
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.v2x import hidden_from
@@ -26,7 +30,9 @@ from tests.test_contact_features import contact_policy
 PAPER = load_scenario("paper-random")
 BLOCKED = load_scenario("cooperation-2-blocked")
 
-SENSORS, MESSAGES, STATE, MODEL = Source.SENSORS, Source.MESSAGES, Source.STATE, Source.MODEL
+SENSORS, MESSAGES, BELIEFS, STATE, MODEL = (
+    Source.SENSORS, Source.MESSAGES, Source.BELIEFS, Source.STATE, Source.MODEL,
+)  # fmt: skip
 
 STATED = {  # every agent there is: all of the registry, and what ``make_lineup`` makes of policies
     "full_brake": (SENSORS,),
@@ -38,6 +44,14 @@ STATED = {  # every agent there is: all of the registry, and what ``make_lineup`
     "e_v2x_bm": (MODEL,),
     "planner:20": (MODEL,),
     "best_harm:100": (MODEL,),
+    "e_v2x_bm:believed": (BELIEFS,),
+    "e_v2x_bm:pairwise:believed": (BELIEFS,),
+    "planner:20:believed": (BELIEFS,),
+    "coast+step:believed": (SENSORS, BELIEFS),
+    "coast+robust:believed": (SENSORS, BELIEFS),
+    "ppo@shipped/ppo+step:believed": (MESSAGES, BELIEFS),
+    "ppo@shipped/ppo+episode:believed": (MESSAGES, BELIEFS),
+    "ppo@shipped/ppo+episode:pairwise:believed": (MESSAGES, BELIEFS),
     "ppo@shipped/ppo": (MESSAGES,),
     "sac@shipped/sac": (MESSAGES,),
     "policy@shipped": (MESSAGES,),
@@ -50,7 +64,13 @@ STATED = {  # every agent there is: all of the registry, and what ``make_lineup`
     "ppo@shipped/ppo+refined+step": (MESSAGES, MODEL),
 }
 HONEST = [spec for spec, knows in STATED.items() if not sees_through(knows)]
-CHANNELS = ["blocked", "sensors-only", {"preset": "paper", "hears": "front"}]
+CHANNELS = [
+    "blocked",
+    "sensors-only",
+    {"preset": "paper", "hears": "front"},
+    {"preset": "blocked", "persistence": "periodic"},
+    {"preset": "nominal", "persistence": "periodic", "senses": "front", "sensing_s": [1.5, 1.5]},
+]
 
 
 class Silent:
@@ -83,7 +103,7 @@ def test_knowledge__every_agent_of_the_registry_states_it():
     assert set(agent_names()) <= kinds, "an agent is registered that this test does not know"
     for spec, knows in STATED.items():
         assert knowledge_of(agent_of(spec)) == knows, spec
-        if "+" not in spec and spec != "e_v2x_bm:pairwise":
+        if "+" not in spec and spec != "e_v2x_bm:pairwise" and not spec.endswith(":believed"):
             assert find_entry(parse_spec(spec)).knows == knows, f"{spec}: `ethbrake agents` says something else"
 
 
@@ -111,7 +131,7 @@ def test_knowledge__an_agent_of_the_users_own_is_not_stated():
 def test_knowledge__another_word_is_refused(knows):
     agent = Silent()
     agent.knows = knows
-    with pytest.raises(InvalidInput, match=r"agent 'silent': knows = .*'messages', 'true state'"):
+    with pytest.raises(InvalidInput, match=r"agent 'silent': knows = .*'messages', 'believed model', 'true state'"):
         knowledge_of(agent)
 
 
@@ -121,10 +141,13 @@ def altered(worlds: Worlds, observer: int, rng: np.random.Generator) -> Worlds:
     n, N = worlds.speeds_mps.shape
     unknown = vehicles.known_from_s[:, observer] > now
     unknown[:, observer] = False  # of itself it knows
+    stale = unknown.copy()  # whose present it does not know
+    if is_periodic(worlds).all():
+        stale |= age_s(worlds)[:, observer] > 0.0
     beside = np.zeros((n, N - 1), np.bool_)
     for pair in range(N - 1):
         far = pair if pair < observer else pair + 1
-        beside[:, pair] = unknown[:, far]
+        beside[:, pair] = stale[:, far]
 
     def other(values, low, high, where):
         return np.where(where, rng.uniform(low, high, values.shape), values)
@@ -144,14 +167,35 @@ def altered(worlds: Worlds, observer: int, rng: np.random.Generator) -> Worlds:
         own_latency_s=other(vehicles.own_latency_s, 0.0, 2.0, unknown),
         known_from_s=news,
     )
+    of_pair = beside.copy()
+    of_pair[:, [pair for pair in (observer - 1, observer) if 0 <= pair < N - 1]] &= unknown[:, [
+        far for far in (observer - 1, observer + 1) if 0 <= far < N]]  # fmt: skip
     return replace(
         worlds,
         vehicles=changed,
+        messages=unheard(worlds, observer, rng),
         gaps_m=other(worlds.gaps_m, 2.0, 15.0, beside),
-        speeds_mps=other(worlds.speeds_mps, 5.0, 30.0, unknown),
-        command_mps2=other(worlds.command_mps2, -6.0, 6.0, unknown),
-        pair_hit=worlds.pair_hit ^ (beside & (now > 0.0)),  # at the alert nobody has hit anything
+        speeds_mps=other(worlds.speeds_mps, 5.0, 30.0, stale),
+        command_mps2=other(worlds.command_mps2, -6.0, 6.0, stale),
+        pair_hit=worlds.pair_hit ^ (of_pair & (now > 0.0)),  # at the alert nobody has hit anything
     )
+
+
+def unheard(worlds: Worlds, observer: int, rng: np.random.Generator) -> np.ndarray:
+    """The columns of messages with all changed that ``observer`` has not heard: chance, what is on its way, others'."""
+    columns, N = worlds.messages.copy(), worlds.N
+    if not columns.shape[1]:
+        return columns
+    kept = links_of(worlds)[:, observer].copy()
+    own = columns[:, place_at(N) + observer].copy()
+    columns[:, [KEY, TAKEN]] += 5.0
+    columns[:, place_at(N) :] += rng.uniform(0.5, 3.0, columns[:, place_at(N) :].shape)
+    links = columns[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK)
+    heard = (worlds.vehicles.known_from_s[:, observer] <= worlds.time_s[:, np.newaxis])[..., np.newaxis]
+    told = np.arange(LINK) >= TOLD_S
+    links[:, observer] = np.where(heard & told, kept, links[:, observer])
+    columns[:, place_at(N) + observer] = own
+    return columns
 
 
 def changed_actions(agent: Agent, scenario: Scenario, vehicle: int = 1, *, steps: int = 8, n: int = 40) -> int:
@@ -177,7 +221,8 @@ def changed_actions(agent: Agent, scenario: Scenario, vehicle: int = 1, *, steps
 @pytest.mark.parametrize("spec", HONEST)
 def test_own_sensors_and_messages__what_was_not_received_changes_no_action(spec, channel):
     scenario = BLOCKED.replace(v2x=channel)
-    assert hidden_from(scenario.sample(60, 11).worlds.vehicles, 1).sum() > 20
+    worlds = scenario.sample(60, 11).worlds
+    assert (hidden_from(worlds.vehicles, 1) | is_periodic(worlds)).sum() > 20
     assert changed_actions(agent_of(spec, scenario), scenario) == 0
 
 
@@ -192,6 +237,20 @@ def test_messages__contact_features_tell_nothing_that_was_not_received(channel, 
 
 def test_own_sensors_and_messages__a_planted_leak_is_found():
     assert changed_actions(Leaking(), BLOCKED) > 50
+
+
+@pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo@shipped/ppo+episode:believed"])
+@pytest.mark.parametrize("leak", ["known", "speed_mps"])
+def test_believed_model__a_planted_leak_is_found(spec, leak, monkeypatch):
+    def leaking(worlds, vehicle):
+        told = told_to(worlds, vehicle)
+        if leak == "known":
+            return told._replace(known=np.ones_like(told.known))
+        return told._replace(speed_mps=worlds.speeds_mps.copy())
+
+    scenario = BLOCKED.replace(v2x=CHANNELS[3])
+    monkeypatch.setattr(believed, "told_to", leaking)
+    assert changed_actions(agent_of(spec, scenario), scenario) > 0
 
 
 @pytest.mark.parametrize("spec", [spec for spec in STATED if spec not in HONEST])

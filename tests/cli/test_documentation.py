@@ -29,7 +29,18 @@ def names(typer_app) -> set[str]:
 
 
 def test_cli_page__has_every_command_and_agent():
-    training = {"run", "train", "resume", "learning-curves", "sweep", "ablate", "generalise", "export", "import-legacy"}
+    training = {
+        "run",
+        "train",
+        "resume",
+        "learning-curves",
+        "sweep",
+        "tune",
+        "ablate",
+        "generalise",
+        "export",
+        "import-legacy",
+    }
     measuring = {"evaluate", "compare", "falsify", "shield", "best-harm", "equal-time", "benchmark", "leaderboard"}
     looking = {"agents", "record", "replay", "explore", "reproduce"}
     assert names(app) == training | measuring | looking | {"doctor", "bench", "dataset"}

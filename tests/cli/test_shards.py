@@ -36,6 +36,7 @@ def test_evaluate_shards__prints_the_same_in_any_parts_and_the_figures_of_one_pi
     ("more", "said"),
     [
         (("--jobs", "2"), "--jobs: is for an evaluation in parts"),
+        (("--ray", "local"), "--ray: is for an evaluation in parts"),
         (("--output", "kept"), "--output: is for an evaluation in parts"),
         (("--rows",), "--rows: is for an evaluation in parts"),
         (("--shards", "2", "--rows"), "--rows: needs a folder"),

@@ -27,6 +27,7 @@ def test_version__is_the_same_wherever_it_stands() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
     assert project["version"] == eb.__version__ == citation["version"]
+    assert f"version = {{{eb.__version__}}}" in (ROOT / "README.md").read_text("utf-8")
     assert citation["license"] == project["license"]
     assert [author["name"] for author in citation["authors"]] == [author["name"] for author in project["authors"]]
 

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import io
+import re
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -16,6 +18,8 @@ from ethbrake_marl.evaluation import film
 from ethbrake_marl.evaluation.film import film_bytes, film_scenes
 from tests.envs.lines import CRASH
 
+SVG = "{http://www.w3.org/2000/svg}"
+README = Path(__file__).resolve().parents[2] / "README.md"
 WORLD = CRASH.sample(1, seed=0).worlds
 
 
@@ -76,6 +80,35 @@ def test_film__as_mp4_without_its_library_says_what_installs_it(monkeypatch: pyt
         film.check_ending(".mp4")
 
 
+def test_film__as_svg_moves_every_vehicle_as_its_scenes_say() -> None:
+    shown = film_scenes(WORLD, eb.make_agent("coast"), scenario=CRASH)
+    drawn = ElementTree.fromstring(film_bytes({"<b>": shown, "c": shown[:5]}, ".svg"))
+    assert not [each for each in drawn.iter() if each.tag.endswith("script") or "href" in str(each.attrib)]
+    left, right = shown[0].view
+    moved = [each.attrib["values"].split(";") for each in drawn.iter(f"{SVG}animateTransform")]
+    assert len(moved) == 2 * len(shown[0].front_m)
+    for i, values in enumerate(moved[: len(shown[0].front_m)]):
+        places = [800 * (scene.front_m[i] - left) / (right - left) for scene in shown]
+        held = [float(value.split()[0]) for value in values]
+        assert held == pytest.approx(places + places[-1:] * (len(held) - len(places)), abs=0.051)
+    told = [each.text for each in drawn.iter(f"{SVG}text")]
+    assert "<b>" in told and "harm 36.0 by first impacts, 36.0 in total" in told
+    assert "Vehicles 1 and 2: 6.0 m/s" in told
+
+
+def test_film__of_the_readme_is_that_of_its_command(tmp_path: Path) -> None:
+    made = tmp_path / "made.svg"
+    text = " ".join(README.read_text("utf-8").split())
+    command = re.search(r"`ethbrake (record .*?) --output docs/figures/emergency.svg`", text)
+    assert command is not None
+    assert run_command([*command[1].split(), "--output", str(made)]) == 0
+    kept = (README.parent / "docs" / "figures" / "emergency.svg").read_text("utf-8")
+    number = re.compile(r"-?\d+\.\d+")
+    assert number.split(made.read_text("utf-8")) == number.split(kept)
+    now, then = (np.array(number.findall(text), float) for text in (made.read_text("utf-8"), kept))
+    assert now == pytest.approx(then, abs=0.21)
+
+
 def test_record_command__writes_the_film_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "film.gif"
     arguments = ["record", "--agents", "full_brake", "--world", "2", "--output", str(path)]
@@ -83,7 +116,7 @@ def test_record_command__writes_the_film_once(tmp_path: Path, capsys: pytest.Cap
     assert path.read_bytes()[:6] == b"GIF89a"
     assert run_command(arguments) == 2
     assert run_command(["record", "--output", str(tmp_path / "film.avi")]) == 2
-    assert "films are written as .gif or .mp4" in capsys.readouterr().err
+    assert "films are written as .gif, .mp4, .svg" in capsys.readouterr().err
 
 
 def test_film__has_a_limit_of_agents_and_of_pictures(monkeypatch):

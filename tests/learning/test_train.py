@@ -5,7 +5,7 @@ import json
 import os
 import random
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -212,6 +212,28 @@ def test_train__stops_when_lost_and_goes_on_to_the_same_bits(recipe: TrainingRec
     )
     assert (result.status, result.alarms) == ("finished", whole.alarms)
     assert _bytes(tmp_path / "run" / "policy-last") == _bytes(tmp_path / "whole" / "policy-last")
+
+
+def test_train__stops_at_an_evaluation_that_is_not_good_enough_and_goes_on_to_the_same_bits(
+    recipe: TrainingRecipe, tmp_path: Path
+) -> None:
+    harms, heard = (90.0, 50.0, 8.0, 7.0, 6.0), []
+
+    def judge(evaluation: Mapping[str, float]) -> str | None:
+        heard.append((evaluation["updates"], evaluation["first_impact_harm"]))
+        return "8 will not do" if evaluation["first_impact_harm"] == 8.0 else None
+
+    whole = train(recipe, SCENARIO, tmp_path / "whole", steps=8 * ROLLOUT, measure=lambda training: _Planted(*harms))
+    stopped = train(
+        recipe, SCENARIO, tmp_path / "run", steps=8 * ROLLOUT, measure=lambda training: _Planted(*harms), stop_at=judge
+    )
+    assert (stopped.status, stopped.updates) == ("interrupted", 4) and whole.updates == 8
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["reason"] == "8 will not do"
+    result = train_module.resume(
+        tmp_path / "run", measure=lambda training: _Planted(*harms[3:]), on_progress=None, stop_at=judge
+    )
+    assert result.status == "finished" and heard == [(0, 90.0), (2, 50.0), (4, 8.0), (6, 7.0), (8, 6.0)]
+    assert _bytes(tmp_path / "run" / "policy") == _bytes(tmp_path / "whole" / "policy")
 
 
 def test_train__measures_how_many_episodes_the_horizon_cuts_off(recipe: TrainingRecipe, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from typing import Any
 
 from tests.libraries.library import FOLDER, NAMES, ROOT, Library, load
@@ -14,18 +15,24 @@ COLUMNS = ("library", "version", "way", "what was run", "harm", "full braking", 
 HEAD = """\
 # Other libraries
 
-Each block below is at most ten lines: copy it, and it trains. Where a library leaves networks or settings to its
-user, those of the run stand before it; the loops that follow in CleanRL and TorchRL, and what turns each model into a
-policy, stand in its file. The page is made from `tests/libraries/`, one file per library; a test compares the two.
-What comes out drives in this project's tables and under its shields: `eb.policy_agent(model)` in Python, `--agents
-full_brake,my_file.py:make_agent` on the [command line](cli.md).
+How do you train with the library that you know? Each block below is at most ten lines: copy it, and
+it trains. What comes out drives in this project's tables and under its shields:
+`eb.policy_agent(model)` in Python, `--agents full_brake,my_file.py:make_agent` on the [command
+line](cli.md).
 
-`make test-libraries` makes an environment for each library below `.venvs/`, runs every block there, and prints this
-table; `ARGS="skrl --write"` runs one of them and writes the page anew. *Harm* is first-impact harm, mean of 500
-worlds of `paper-random` (seed 7), beside full braking's. A way that learns enough within about a minute has to beat
-full braking (*beats full braking*), the others run two iterations or so (*runs*). *Own rollout*: the policy drove 50
-worlds in its library's own loop, too; the largest difference of any world's harm from ours, m2/s2. Seconds are
-processor time of one thread.
+Where a library leaves networks or settings to its user, those of the run stand before the block.
+The loops that follow in CleanRL and TorchRL, and what turns each model into a policy, stand in its
+file. The page is made from `tests/libraries/`, one file per library; a test compares the two.
+
+`make test-libraries` makes an environment for each library below `.venvs/`, runs every block there,
+and prints the table below. `ARGS="skrl --write"` runs one of them and writes the page anew.
+
+- *Harm* is first-impact harm, mean of 500 worlds of `paper-random` (seed 7), beside full braking's.
+- *Verdict*: a way that learns enough within about a minute has to beat full braking (*beats full
+  braking*), the others run two iterations or so (*runs*).
+- *Own rollout*: the policy drove 50 worlds in its library's own loop, too; the largest difference
+  of any world's harm from ours, m2/s2.
+- Seconds are processor time of one thread.
 """
 
 
@@ -33,10 +40,15 @@ TABLE_HEADS = ("who drives Vehicle 2", "collisions", "first-impact harm", "total
 ONE_TABLE = """\
 ## Four libraries in one table
 
-Policies that the blocks of Stable-Baselines3 (native), CleanRL, TorchRL and BenchMARL have left, each by a function
-of `tests/libraries/one_table.py`, in one environment and on the same 500 worlds: `ethbrake evaluate --episodes 500
---agents full_brake,e_v2x_bm,one_table.py:cleanrl,...,ppo@shipped`. They were trained for about a minute of processor
-time.
+Do they learn equally well? These are the policies that the blocks of Stable-Baselines3 (native),
+CleanRL, TorchRL and BenchMARL have left, trained for about a minute of processor time. Each is made
+by a function of `tests/libraries/one_table.py`, and all drive in one environment on the same 500
+worlds:
+
+```sh
+ethbrake evaluate --episodes 500 --agents \\
+  full_brake,e_v2x_bm,one_table.py:cleanrl,...,ppo@shipped
+```
 """
 
 
@@ -76,7 +88,8 @@ def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 
 def _section(library: Library) -> str:
-    lines = [f"## {library.title}\n", f"{library.about}\n", f"`pip install . {library.install}`\n"]
+    about = textwrap.fill(library.about, 100, break_long_words=False, break_on_hyphens=False)
+    lines = [f"## {library.title}\n", f"{about}\n", f"`pip install . {library.install}`\n"]
     for way in library.ways:
         lines.append(f"{way.title[0].upper()}{way.title[1:]} ({way.ran}):\n")
         if way.needed:

@@ -71,10 +71,11 @@ def test_make_worlds__broadcasts_every_parameter_to_its_shape():
     assert shapes["gaps_m"] == shapes["pair_hit"] == (4, 2)
     of_worlds = {"time_s", "restitution", "obstacle_gap_m", "obstacle_hit"}
     assert all(shapes[name] == (4,) for name in of_worlds)
-    assert wide == set(shapes) - {"gaps_m", "pair_hit", "known_from_s"} - of_worlds
+    assert wide == set(shapes) - {"gaps_m", "pair_hit", "known_from_s", "messages"} - of_worlds
     assert shapes["known_from_s"] == (4, 3, 3)
     assert worlds.vehicles.mass_t[3].tolist() == [1.0, 2.0, 3.0]
-    own = [column for name, column in columns(worlds).items() if name != "known_from_s"]
+    assert shapes["messages"] == (4, 0)
+    own = [column for name, column in columns(worlds).items() if name not in ("known_from_s", "messages")]
     assert all(column.flags.c_contiguous and column.flags.owndata for column in own)
     assert worlds.vehicles.own_latency_s.tolist() == [[0.25] * 3] * 4
 

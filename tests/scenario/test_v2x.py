@@ -164,7 +164,7 @@ def test_with_news__is_what_a_loop_over_the_links_gives(given):
 
 def test_channels__are_those_of_the_page():
     usual = ("all", "both", 0.0)
-    rest = (0.1, 0.02, 0.1, 0.2, (0.8, 1.1))
+    rest = (0.1, 0.02, 0.1, 0.2, (0.8, 1.1), "first")
     assert {name: tuple(channel) for name, channel in CHANNELS.items()} == {
         "paper": ("latency", "all", "none", 0.0, 0.0, 1.0, 0.0, *rest),
         "clear": ("messages", *usual, 0.01, 0.5, 0.0, *rest),

@@ -1,15 +1,16 @@
 """Trying to break the step shield: ``make test-shield`` (``python -m tests.shield.programme``).
 
-Five gates, one line each, exit status 1 if one fails:
+Six gates, one line each, exit status 1 if one fails:
 
 bound   random worlds against every adversary of ``tests.shield.lines``, both counts, N = 3 and 5, e from 0 to 0.3
+joint   teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5 (``tests.shield.joint_attack``)
 interfaces   worlds through every wrapped interface (``tests.shield.interface_attack``)
 interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
 search  restarts of a search against the shield, and against twelve leaks of it (``tests.shield.search``)
 speed   decisions per second in a batch, and the latency of one decision
 
-No realised harm may be above the bound at the alert (tolerance 1e-9). Bound and interfaces run in chunks; each finished
-chunk is a file in ``--results``, so what was stopped goes on, and several processes (``--part 1/2``, ``--part 2/2``)
+No realised harm may be above the bound at the alert (tolerance 1e-9; of teams none at all, and it must be the last bound,
+as the same double). Bound, joint and interfaces run in chunks; each finished chunk is a file in ``--results``, so what was stopped goes on, and several processes (``--part 1/2``, ``--part 2/2``)
 share the work. ``--results`` of other code, or of another seed, are refused.
 """
 
@@ -22,6 +23,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,8 @@ from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.shield.interface_attack import INTERFACES
 from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
+from tests.shield.joint_attack import ADVERSARIES as JOINT_ADVERSARIES
+from tests.shield.joint_attack import joint_attack, scenario_of
 from tests.shield.lines import ADVERSARIES, attack, line
 from tests.shield.sabotage import LEAKS
 from tests.shield.search import search
@@ -46,6 +50,14 @@ TOLERANCE = 1e-9  # m2/s2
 CHUNK = 2_000  # worlds
 CHUNKS = {3: 36, 5: 12}  # of each cell, for a million worlds: lines of five take five times as long
 SLOW_CHUNKS = {"worst_case": 5}  # of a search in every step
+JOINT_CHUNKS = {
+    (3, 3): 19,
+    (4, 3): 4,
+    (3, 5): 2,
+    (4, 5): 1,
+}  # of each cell, of ``JOINT_CHUNK`` worlds: by what they cost
+JOINT_CHUNK = {(3, 3): 500, (4, 3): 500, (3, 5): 500, (4, 5): 200}
+JOINT_P50_S = 200e-6
 RATE, P50_S, P99_S = 100_000, 100e-6, 300e-6
 
 
@@ -68,6 +80,36 @@ def attack_chunk(seed: int, *, N: int, harm_count: Any, who: str, first: int, wo
         scenario, scenario.sample(worlds, seed, first=first).worlds, ADVERSARIES[who], harm_count=harm_count, seed=seed
     )
     return _outcome(found.realised, found.bound, found.decisions) | {"accepted": int(found.accepted.sum())}
+
+
+def joint_chunks(worlds: int) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Likewise for teams; 300,000 worlds are 624 chunks."""
+    first = 0
+    for level, N in JOINT_CHUNKS:
+        for count, hostile, name in product(("first", "total"), ("all", "one"), JOINT_ADVERSARIES):
+            chunks = max(1, round(JOINT_CHUNKS[level, N] * worlds / 300_000))
+            for k in range(chunks):
+                size = min(JOINT_CHUNK[level, N], worlds)
+                given = {"level": level, "N": N, "harm_count": count, "hostile": hostile, "who": name}
+                yield (
+                    f"joint-{N}-{level}-{count}-{hostile}-{name}-{k:03d}",
+                    given | {"cap": (None, "baseline")[k % 2], "first": first, "worlds": size},
+                )
+                first += size
+
+
+def joint_chunk(
+    seed: int, *, level: int, N: int, harm_count: Any, hostile: str, who: str, cap: Any, first: int, worlds: int
+) -> dict[str, Any]:
+    """One kind of hostile team in some worlds."""
+    scenario = scenario_of(level, N)
+    found = joint_attack(
+        scenario, scenario.sample(worlds, seed, first=first).worlds, JOINT_ADVERSARIES[who], hostile=hostile,
+        harm_count=harm_count, cap=cap, seed=first,
+    )  # fmt: skip
+    told = _outcome(found.realised, found.bound, found.decisions) | {"accepted": found.accepted}
+    other = int((found.realised != found.last_bound).sum()) + found.rises + found.over_cap
+    return told | {"above": int((found.realised > found.bound).sum()) + other}
 
 
 def interface_chunks(worlds: int) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -119,7 +161,8 @@ def _there(given: argparse.Namespace, name: str) -> bool:
 def _tell(rows: list[dict[str, Any]], wanted: int) -> bool:
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
-        groups[" ".join(str(row[key]) for key in ("N", "harm_count", "who") if key in row)].append(row)
+        keys = ("N", "level", "harm_count", "hostile", "who")
+        groups[" ".join(str(row[key]) for key in keys if key in row)].append(row)
     for name, members in groups.items():
         total = {key: sum(m[key] for m in members) for key in ("worlds", "decisions", "above", "cpu_s")}
         print(
@@ -252,13 +295,14 @@ def main() -> int:
     """All gates."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--worlds", type=int, default=1_000_000, help="of the gate 'bound', all cells together")
+    parser.add_argument("--joint-worlds", type=int, default=300_000, help="of the gate 'joint', all cells together")
     parser.add_argument("--interface-worlds", type=int, default=10_000, help="through each interface")
     parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each interface")
     parser.add_argument("--restarts", type=int, default=1_000, help="of the search")
     parser.add_argument("--decisions", type=int, default=5_000, help="timed one by one")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
-        "--only", default="speed,interference,search,interfaces,bound", help="gates, with commas between them"
+        "--only", default="speed,interference,search,interfaces,joint,bound", help="gates, with commas between them"
     )
     parser.add_argument("--results", type=Path, default=ROOT / "runs" / "test-shield", help="folder of finished chunks")
     parser.add_argument("--part", default="1/1", help="this process's share of the chunks, for instance 1/2")
@@ -268,6 +312,7 @@ def main() -> int:
         "speed": lambda: speed(given.decisions),
         "search": lambda: search_gate(given.restarts, given.seed),
         "interference": lambda: interference_gate(given.interfered, given.seed),
+        "joint": lambda: run_chunks(list(joint_chunks(given.joint_worlds)), joint_chunk, given, code),
         "interfaces": lambda: run_chunks(list(interface_chunks(given.interface_worlds)), interface_chunk, given, code),
         "bound": lambda: run_chunks(list(bound_chunks(given.worlds)), attack_chunk, given, code),
     }

@@ -79,7 +79,7 @@ def test_by_hand__the_policy_certifies_what_plan_and_constants_do_not():
     shield, worlds = tight()
     assert REASONS[shield.decide(np.zeros(1)).reason[0]] == "no certificate"
     shield, worlds = tight()
-    decision = shield.decide(np.zeros(1), proposer=Proposer(make_agent("full_brake"), worlds))
+    decision = shield.decide(np.zeros(1), proposer=Proposer({1: make_agent("full_brake")}, worlds))
     assert REASONS[decision.reason[0]] == "policy rollout" and not decision.intervened[0]
     assert decision.applied.tolist() == [0.0] and decision.bound.tolist() == [0.0]
     assert (shield.backup.plan[0, 0], shield.backup.plan[0, 1]) == (0.0, -1.0)
@@ -88,7 +88,7 @@ def test_by_hand__the_policy_certifies_what_plan_and_constants_do_not():
 
 def test_by_hand__a_policy_that_would_collide_certifies_nothing():
     shield, worlds = tight()
-    decision = shield.decide(np.zeros(1), proposer=Proposer(make_agent("constant:3.5"), worlds))
+    decision = shield.decide(np.zeros(1), proposer=Proposer({1: make_agent("constant:3.5")}, worlds))
     assert REASONS[decision.reason[0]] == "no certificate" and decision.applied.tolist() == [-0.7]
     # 14 m are left, 10^2 / (2 * 3.5) = 14.29 m are needed: 2 * 3.5 * 0.2857 = 2 m2/s2
     assert decision.margin[0] == pytest.approx(-2.0)

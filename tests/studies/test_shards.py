@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
+from dataclasses import replace
+from multiprocessing import active_children
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +16,7 @@ from ethbrake_marl.evaluation.shards.question import Asked, Question, ask
 from ethbrake_marl.evaluation.shards.tally import Tally
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies import shards as studied
+from ethbrake_marl.studies.jobs.local import LocalWorkers
 from ethbrake_marl.studies.shards import ShardFolder, evaluate_shards
 
 N = 4_500
@@ -63,6 +67,42 @@ def test_killed__goes_on_with_what_is_left_in_any_number_of_shards(asked, tally,
     driven.clear()
     assert evaluate_shards(asked, shards=3, folder=folder) == tally
     assert driven == []
+
+
+def test_processes__give_the_same_tally_and_a_shard_whose_process_was_killed_is_driven_again(
+    asked, tally, tmp_path: Path
+) -> None:
+    folder, told = ShardFolder(tmp_path / "kept", asked), []
+
+    class Killing(LocalWorkers):
+        def wait(self):
+            if not told:
+                for worker in self._workers:
+                    worker.process.kill()
+                    worker.process.join()
+            told.append(super().wait())
+            return told[-1]
+
+    with closing(Killing(2)) as workers:
+        assert evaluate_shards(asked, shards=4, workers=workers, folder=folder) == tally
+    lost = [answer for answers in told for _, answer in answers if answer.value is None]
+    assert 1 <= len(lost) <= 2 and all("was killed by signal 9" in str(answer.error) for answer in lost)
+    assert len(list(folder.path.glob("shard-*.json"))) == 4
+
+
+def test_processes__are_ended_where_a_shard_fails_or_on_ctrl_c(asked, monkeypatch, tmp_path: Path) -> None:
+    changed = replace(asked, identity={**asked.identity, "seed": 12})
+    with pytest.raises(InvalidInput, match="seed changed since the evaluation began"):
+        evaluate_shards(changed, shards=4, jobs=2)
+    folder = ShardFolder(tmp_path / "kept", asked)
+
+    def stop(progress) -> None:
+        if progress.done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_shards(asked, shards=4, jobs=2, folder=folder, tell=stop)
+    assert 1 <= len(list(folder.path.glob("shard-*.json"))) < 4 and not active_children()
 
 
 def test_another_question__is_refused_and_told(asked, paper_random, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from ethbrake_marl.agents.believing import Believing, split_believed
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.agents.knowledge import Source
@@ -80,10 +81,11 @@ class EV2XBM:
 
 
 def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """``e_v2x_bm``, the same as ``e_v2x_bm:coupled``, or ``e_v2x_bm:pairwise``."""
-    match argument:
-        case None | "coupled":
-            return EV2XBM("coupled", harm_count=settings.harm_count, horizon_s=settings.horizon_s)
-        case "pairwise":
-            return EV2XBM("pairwise", harm_count=settings.harm_count, horizon_s=settings.horizon_s)
-    raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise'")
+    """``e_v2x_bm``, the same as ``e_v2x_bm:coupled``, or ``e_v2x_bm:pairwise``; ``:believed`` behind: believing."""
+    mode, believes = split_believed(argument)
+    if mode not in (None, "coupled", "pairwise"):
+        raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise', then 'believed'")
+    agent = EV2XBM(
+        "pairwise" if mode == "pairwise" else "coupled", harm_count=settings.harm_count, horizon_s=settings.horizon_s
+    )
+    return Believing(agent, settings.needed_scenario()) if believes else agent

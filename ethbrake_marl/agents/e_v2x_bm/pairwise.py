@@ -199,4 +199,10 @@ def _onset_s(worlds: Worlds, vehicle: int) -> Floats:
     if not np.all(worlds.speeds_mps >= 0.0):
         k, i = (int(x) for x in np.argwhere(~(worlds.speeds_mps >= 0.0))[0])
         raise InvalidInput(f"speeds_mps[{k}, {i}] = {worlds.speeds_mps[k, i]:g}: the closed form needs speeds >= 0")
-    return np.maximum(worlds.vehicles.latency_s - worlds.time_s[:, None], 0.0)
+    return onset_after_s(worlds)
+
+
+def onset_after_s(worlds: Worlds) -> Floats:
+    """Time from now until each vehicle may brake, [n, N]."""
+    onset: Floats = np.maximum(worlds.vehicles.latency_s - worlds.time_s[:, None], 0.0)
+    return onset

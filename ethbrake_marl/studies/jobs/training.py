@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from ethbrake_marl.learning.loop import StopAt
 from ethbrake_marl.learning.run_folder import RunDirectory, is_finished
 from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.learning.training import Training
@@ -24,16 +25,26 @@ class TrainingJob:
     noted: tuple[str, ...] = ()  # by which scenario and recipe differ from their files, for ``config.json``
 
 
-def finish_training(job: TrainingJob, tell: OnProgress | None = None) -> bool | None:
-    """Bring a training to its end; None where it was stopped before. Raises what ``train`` and ``resume`` raise."""
+def finish_training(job: TrainingJob, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
+    """Bring a training to its end; None where it was stopped before, by ``stop_at`` too, as ``train`` has it.
+
+    Raises what ``train`` and ``resume`` raise.
+    """
     if is_finished(job.folder):
         return True
     if RunDirectory(job.folder).status.is_file():
-        ended = resume(job.folder, on_progress=tell).status
+        ended = resume(job.folder, stop_at=stop_at, on_progress=tell).status
     else:
         job.folder.parent.mkdir(parents=True, exist_ok=True)
         training = job.training
-        ended = train(training.recipe, training.scenario, job.folder, settings=job.noted, on_progress=tell).status
+        ended = train(
+            training.recipe,
+            training.scenario,
+            job.folder,
+            settings=job.noted,
+            stop_at=stop_at,
+            on_progress=tell,
+        ).status
     return True if ended == "finished" else None
 
 

@@ -10,10 +10,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.files.durable import remove_folder
+from ethbrake_marl.learning.loop import StopAt
 from ethbrake_marl.learning.progress import HARM_METRIC
-from ethbrake_marl.learning.run_folder import RunDirectory, progress_rows, wait_for_others
+from ethbrake_marl.learning.run_folder import RunDirectory, is_finished, progress_rows, wait_for_others
 from ethbrake_marl.learning.training import Training, check_same
-from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.policy import Policy, has_bundle
 from ethbrake_marl.policies.team import read_trained
 from ethbrake_marl.studies.jobs.training import TrainingJob, finish_training
 
@@ -28,8 +30,8 @@ RESULTS = (
 _FREE_S = 60.0  # a worker that has lost its driver may hold the folder for a moment
 
 
-def do_job(job: TrainingJob, log: Path) -> tuple[str, ...] | None:
-    """The values of ``RESULTS``, as text; None where the training was stopped before its end.
+def do_job(job: TrainingJob, log: Path, stop_at: StopAt | None = None) -> tuple[str, ...] | None:
+    """The values of ``RESULTS``, as text; None where the training was stopped before its end, by ``stop_at`` too.
 
     What is printed goes to ``log``, which is deleted at a good end. Raises what a training raises, ``InvalidInput``
     where the sweep's folder cannot be seen or the run's folder holds another training, and ``BlockingIOError`` where
@@ -44,14 +46,20 @@ def do_job(job: TrainingJob, log: Path) -> tuple[str, ...] | None:
         if RunDirectory(job.folder).status.is_file():
             wait_for_others(job.folder, _FREE_S)
             check_same(job.folder, job.training)
+            if is_finished(job.folder) and not _keeps_policies(job):
+                remove_folder(job.folder)  # a finished run has no checkpoint: it is trained anew
         try:
-            finished = finish_training(job)
+            finished = finish_training(job, stop_at=stop_at)
         except AlreadyExists as error:  # begun in this moment by a worker that has lost its driver
             raise BlockingIOError(str(error)) from None
         found = read_results(job.training, job.folder) if finished else None
     if found is not None:
         log.unlink(missing_ok=True)
     return found
+
+
+def _keeps_policies(job: TrainingJob) -> bool:
+    return all(has_bundle(job.folder / place) for place in job.training.drivers.values())
 
 
 def read_results(training: Training, folder: Path) -> tuple[str, ...]:

@@ -14,10 +14,11 @@ from filelock import FileLock, Timeout
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.durable import remove_unfinished
 from ethbrake_marl.learning.run_folder import RunDirectory
+from ethbrake_marl.policies.policy import has_bundle
 from ethbrake_marl.studies.jobs.run import RETRIES, Attempt, run_jobs
 from ethbrake_marl.studies.jobs.training import TrainingJob
 from ethbrake_marl.studies.jobs.work import Workers, pack
-from ethbrake_marl.studies.sweep.job import do_job
+from ethbrake_marl.studies.sweep.job import RESULTS, do_job
 from ethbrake_marl.studies.sweep.journal import Failure, Journal, Results, last_lines, read_journal, reason_of
 from ethbrake_marl.studies.sweep.plan import Row, SweepPlan
 from ethbrake_marl.studies.sweep.table import TableFormat, write_tables
@@ -112,17 +113,25 @@ def run_sweep(
 def kept_results(plan: SweepPlan, folder: Path) -> tuple[Results, list[Row], int]:
     """What the finished jobs of this plan found, the others in their order, and the damaged lines of the journal.
 
-    A job whose run's folder was taken away is to be done again.
+    A job whose run's folder was taken away, or the kept policy in it, is to be done again.
     """
     found, damaged = read_journal(folder)
     results: Results = {}
     left = []
     for row in plan.rows:
-        if row.identity in found and RunDirectory(folder / RUNS / row.name).status.is_file():
-            results[row.identity] = found[row.identity]
+        values = found.get(row.identity)
+        if values is not None and _is_whole(RunDirectory(folder / RUNS / row.name), values):
+            results[row.identity] = values
         else:
             left.append(row)
     return results, left, damaged
+
+
+def _is_whole(run: RunDirectory, values: tuple[str, ...]) -> bool:
+    """Whether a run still has its record and every policy whose hash the job gave."""
+    hashes = values[RESULTS.index("policy_sha256")].split()
+    named = [text.rpartition("=")[0] for text in hashes]  # vehicle_i of several, of one policy nothing
+    return run.status.is_file() and all(has_bundle(run.policy / name) for name in named)
 
 
 class _Course:

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm import coupled
-from ethbrake_marl.agents.e_v2x_bm.coupled import Samples, cell_bounds, choose, lowest_minima, optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, forecast, make_worlds
@@ -92,10 +91,9 @@ def test_coupled__takes_the_middle_of_a_collision_free_interval():
     assert np.array_equal(best.harm == 0, free)
 
 
-def test_coupled__a_world_alone_gives_the_same_bits(monkeypatch):
+def test_coupled__a_world_alone_gives_the_same_bits():
     worlds = random_worlds(30, seed=26)
     together = optimise_coupled(worlds, 1)
-    monkeypatch.setattr(coupled, "_SIMULATIONS_AT_ONCE", 700)  # many small batches
     for k in (0, 7, 29):
         alone = optimise_coupled(worlds.take([k]), 1)
         assert [column[0] for column in alone] == [column[k] for column in together]
@@ -141,39 +139,6 @@ def test_coupled__no_world_is_fine():
 def test_coupled__refuses_an_unknown_count():
     with pytest.raises(InvalidInput, match="'first' or 'total'"):
         optimise_coupled(random_worlds(1, seed=1), 1, harm_count="both")
-
-
-def samples(at, harm, other=None) -> Samples:
-    one = np.array([harm], dtype=float)
-    rest = one if other is None else np.array([other], dtype=float)
-    return Samples(np.array([at], dtype=float), one, rest, np.zeros_like(one))
-
-
-@pytest.mark.parametrize(
-    ("harm", "other", "expected"),
-    [
-        ([3, 1, 2, 2, 4], [0, 9, 0, 0, 0], 1.0),  # the harm decides
-        ([3, 1, 1, 2, 4], [0, 9, 8, 0, 0], 2.0),  # a tie: the other count decides
-        ([3, 0, 0, 0, 4], [0, 0, 0, 0, 0], 2.0),  # still a tie: the middle one
-    ],
-)
-def test_choose__order_of_preference(harm, other, expected):
-    assert choose(samples([0, 1, 2, 3, 4], harm, other)).tolist() == [expected]
-
-
-def test_lowest_minima__brackets_in_order_of_depth_whatever_the_order_of_samples():
-    looked = samples([4, 0, 1, 3, 2], [1, 5, 2, 6, 3])  # sorted: 5 2 3 6 1
-    bracket, harm, _ = lowest_minima(looked)
-    assert bracket[:2].tolist() == [[3, 4, 4], [0, 1, 2]]
-    assert harm[:2].tolist() == [1, 2]
-    assert np.all(bracket[2:, 0] == bracket[2:, 2])  # no third minimum: nothing to narrow
-
-
-def test_cell_bounds__let_a_falling_side_run_on():
-    # Middle cell: falling by 2 on its left, rising by 3 on its right, each up to twice as fast inside: 3 - 4, 1 - 6.
-    assert cell_bounds(np.arange(4.0)[None], np.array([[5.0, 3.0, 1.0, 4.0]])).tolist() == [[3.0, -5.0, -3.0]]
-    # With uneven samples the slope counts: falling by 2 over 1, then a cell twice as wide: 3 - 2 * 2 * 2.
-    assert cell_bounds(np.array([[0.0, 1.0, 3.0]]), np.array([[5.0, 3.0, 4.0]]))[0, 1] == -5.0
 
 
 def test_coupled__finds_a_kink_to_nine_digits():
@@ -223,14 +188,6 @@ def test_coupled__is_steady_around_its_optimum():
     for off in (-1e-9, 1e-9):
         beside = np.clip(best.deceleration_mps2 + off, 0, 7)
         assert np.abs(realised(worlds, 1, beside).first_impact_harm.sum(axis=1) - best.harm).max() < 1e-6
-
-
-def test_lowest_minima__keeps_the_six_lowest():
-    depths = [7, 3, 6, 1, 5, 2, 4]
-    zigzag = [value for depth in depths for value in (9, depth)] + [9]
-    bracket, harm, _ = lowest_minima(samples(range(len(zigzag)), zigzag))
-    assert harm.tolist() == [1, 2, 3, 4, 5, 6]
-    assert bracket[:, 1].tolist() == [2 * depths.index(depth) + 1 for depth in harm]
 
 
 def test_coupled__is_not_worse_than_a_grid_when_the_others_brake_gently():

@@ -33,6 +33,9 @@ def count(folder: Path, seed: int, steps: int, sleep_s: float) -> tuple[str, ...
             done, text = done + 1, hashlib.sha256(text.encode()).hexdigest()
             (folder / "new.json").write_text(json.dumps([done, text]))
             os.replace(folder / "new.json", checkpoint)
+        (folder / "policy").mkdir(exist_ok=True)
+        for name in ("manifest.json", "weights.safetensors"):
+            (folder / "policy" / name).touch()
         (folder / "run.json").write_text("{}")
     return (str(steps), str(seed), *["0.0"] * (RESULTS - 3), text)
 

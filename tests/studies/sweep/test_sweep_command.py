@@ -79,6 +79,29 @@ def test_finished_jobs__are_not_repeated_and_the_table_is_the_same(finished_swee
     assert all(path.stat().st_mtime_ns == then for path, then in kept.items() if gone not in path.parents)
 
 
+@pytest.mark.parametrize("gone", ["policy", "policy/weights.safetensors"])
+def test_job__whose_policy_was_taken_away_is_done_again(finished_sweep, small, tmp_path, gone):
+    folder, file = tmp_path / "again", tmp_path / "sweep.yaml"
+    shutil.copytree(finished_sweep, folder)
+    file.write_text(yaml.safe_dump(small))
+    run = folder / "runs" / journal(finished_sweep)[1]["job"]
+    (shutil.rmtree if gone == "policy" else Path.unlink)(run / gone)
+    assert sweep(file, folder) == 0 and len(journal(folder)) == 5
+    assert (folder / TABLE).read_bytes() == (finished_sweep / TABLE).read_bytes()
+    assert load_policy(run).manifest.manifest_sha256 in (folder / TABLE).read_text()
+
+
+def test_team__that_has_lost_a_policy_is_trained_again(write_sweep, tiny, tmp_path):
+    job = {"level": "3-pair", "recipe": str(tiny), "set": {"scheme": "independent", "total_steps": 1}}
+    folder, file = tmp_path / "out", write_sweep(jobs=[job])
+    assert sweep(file, folder) == 0
+    whole = (folder / TABLE).read_bytes()
+    (lost,) = folder.glob("runs/*/policy/vehicle_3")
+    shutil.rmtree(lost)
+    assert sweep(file, folder) == 0 and len(journal(folder)) == 2
+    assert (folder / TABLE).read_bytes() == whole and (lost / "manifest.json").is_file()
+
+
 def test_more_jobs__can_be_added_to_a_folder(finished_sweep, small, tmp_path):
     folder, file = tmp_path / "more", tmp_path / "sweep.yaml"
     shutil.copytree(finished_sweep, folder)
@@ -123,6 +146,29 @@ def test_bad_options__are_refused(write_sweep, small, tmp_path, options):
     file = write_sweep(**small)
     assert run_command(["sweep", str(file), "--output", str(tmp_path / "new"), *options]) == 2
     assert not (tmp_path / "new").exists()
+
+
+GOOD = {"scenario": "paper-random", "recipe": "ppo"}
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ({"jobs": [GOOD, {**GOOD, "recipe": "pppo"}]}, "unknown recipe 'pppo'"),
+        ({"grid": {}}, "grid.recipe: missing"),
+        ({"grid": None}, "asks for 0 jobs"),
+        ({"grid": {**GOOD, "seed": []}, "jobs": [GOOD]}, "must not be empty"),
+        ({"jobs": [GOOD, {**GOOD, "seed": 1}, {**GOOD, "set": {"gamma": 0.995}}]}, "is the same training as jobs[0]"),
+        ({"jobs": [GOOD, {**GOOD, "seed": 1, "set": {"gama": 0.9}}]}, "unknown setting 'gama'"),
+        ({"jobs": [GOOD, {**GOOD, "seed": 1, "set": {"reward.harmm": 0.9}}]}, "reward.harmm: unknown key"),
+        ({"jobs": [GOOD, {**GOOD, "set": {"network.policy.9": 4}}]}, "'9' must be an entry from 0 to 1"),
+        ({"jobs": [GOOD, {**GOOD, "set": {"gamma.x": 4}}]}, "there is nothing inside 0.995"),
+    ],
+)
+def test_bad_files__begin_no_job_and_make_nothing(write_sweep, tmp_path, capsys, content, reason):
+    file = write_sweep(**content)
+    assert sweep(file, tmp_path / "new") == 2
+    assert reason in capsys.readouterr().err and [*tmp_path.iterdir()] == [file]
 
 
 @pytest.mark.long

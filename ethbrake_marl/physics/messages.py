@@ -1,0 +1,231 @@
+"""Periodic messages: what has been told to whom, how old it is, and where it lets a vehicle think the others are.
+
+A vehicle samples its state at every decision moment, back to the alert. A message carries its sender's newest sample.
+On each link one is sent every period, and the channel of the link is good or bad (Gilbert-Elliott): after the first
+message that arrived it turns bad with probability p and good again with r, per message; one that is sent while it is
+bad is lost. Chance is a pure function of the world's key, the link and the number of the message, whatever the batch
+and the step. A neighbour in sight is measured: what is known of it is the present.
+
+Columns, for N vehicles, behind the news in the parameters of ``physics.rows``; they are the memory of the channel and
+change as it speaks. The period is 0 in a world without periodic messages: there the present is known.
+
+head    period (s), delay from sending to use (s), p, r, key (a whole number below 2^53), samples taken, place of the
+        obstacle ahead (m; infinite: there is none)
+place   N, where each vehicle is now (m; 0 is the front of Vehicle 1 at the alert, lengths not counted)
+links   N * N times LINK columns, receiver by receiver
+ring    the newest samples: RING_HEAD + 3 N columns each: time, whether Vehicle 1 has hit the obstacle, and the places,
+        speeds and commands in force of all vehicles
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.episode import command_in_force, onset_s
+from ethbrake_marl.physics.impact import GAP, MASS, SPEED
+from ethbrake_marl.physics.obstacle import place_obstacle
+from ethbrake_marl.physics.rows import (
+    RESTITUTION,
+    TIME,
+    command_at,
+    gap_at,
+    messages_at,
+    params_at,
+    speed_at,
+    state_width,
+    vehicles_in,
+)
+from ethbrake_marl.physics.segment import COMMAND, DONE, HIT, LIMIT, ONSET, ROW_WIDTH, TABLE_ROWS, advance_table
+from ethbrake_marl.physics.worlds import Floats
+
+# the head
+PERIOD, DELAY, LOSS_BEGINS, LOSS_ENDS, KEY, TAKEN, OBSTACLE_PLACE = range(7)
+HEAD = 7
+# of a link
+NEXT_SENT = 0  # when its next message is sent that is not dealt with (s); infinite: it carries none
+NUMBER = 1  # of that message, counted from the first one that arrives, which is 0
+BAD = 2  # 1 while the channel is bad
+SEEN_FROM = 3  # from when on the receiver measures the sender (s); infinite: never
+TOLD_S = 4  # when the newest state that arrived was sampled (s); below 0: none has
+TOLD_PLACE = 5
+TOLD_SPEED = 6
+TOLD_COMMAND = 7
+TOLD_HIT = 8  # whether Vehicle 1 had hit the obstacle by then
+LINK = 9
+RING_HEAD = 2
+
+POST_M = 1e6  # so far ahead of Vehicle 1 an obstacle is out of reach; it makes the way of Vehicle 1 the change of a gap
+MOST_SAMPLES = 1_000  # in the ring
+_ON_GRID = 1e-9
+
+
+@compiled
+def place_at(vehicles: int) -> int:
+    """First column of the places, counted from the head."""
+    return HEAD
+
+
+@compiled
+def link_at(receiver: int, sender: int, vehicles: int) -> int:
+    """First column of a link, counted from the head."""
+    return HEAD + vehicles + LINK * (receiver * vehicles + sender)
+
+
+@compiled
+def ring_at(vehicles: int) -> int:
+    """First column of the ring, counted from the head."""
+    return HEAD + vehicles + LINK * vehicles * vehicles
+
+
+def message_columns(vehicles: int, samples: int) -> int:
+    """How many columns M the messages of a line take, with so many samples in the ring."""
+    return ring_at(vehicles) + samples * (RING_HEAD + 3 * vehicles)
+
+
+def ring_length(delay_s: float, time_step_s: float) -> int:
+    """Samples that a message may still carry when it arrives: those of its delay, and one at each end."""
+    return math.ceil(delay_s / time_step_s - _ON_GRID) + 3
+
+
+@compiled
+def chance(key: float, link: int, number: float) -> float:
+    """A number in [0, 1) of message ``number`` of a link in the world of this key: 53 bits of a SplitMix64 hash."""
+    z = np.uint64(key) ^ (np.uint64(link + 1) * np.uint64(0x9E3779B97F4A7C15))
+    z ^= np.uint64(number + 1.0) * np.uint64(0xD1342543DE82EF95)
+    for _ in range(2):
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z ^= z >> np.uint64(31)
+    return float(z >> np.uint64(11)) * 2.0**-53
+
+
+@compiled
+def hear_rows(moving: Floats, params: Floats, wanted: Floats, until_s: Floats, time_step_s: float) -> None:
+    """Take the messages' columns of every world from its time in ``moving`` to ``until_s`` [n], in place.
+
+    ``moving`` [n, S] are the worlds as they were, and go along; ``wanted`` [n, N] is what the vehicles want meanwhile.
+    Samples are taken every ``time_step_s``, counted back from ``until_s``. A world that cannot be advanced hears
+    nothing.
+    """
+    N = vehicles_in(moving)
+    head = messages_at(N)
+    table = np.zeros((TABLE_ROWS, N + 1))
+    no_rows = np.empty((0, ROW_WIDTH))
+    for k in range(moving.shape[0]):
+        if params[k, head + PERIOD] == 0.0:
+            continue
+        told = params[k, head:]
+        if told[TAKEN] == 0.0:
+            _start(moving[k], told, N, wanted[k], params[k, params_at(2, N) :])
+        while moving[k, TIME] < until_s[k]:
+            left = math.ceil((until_s[k] - moving[k, TIME]) / time_step_s - 1e-6) - 1.0
+            end = until_s[k] - max(left, 0.0) * time_step_s
+            if not _move(moving[k], params[k], wanted[k], end, table, no_rows):
+                break
+            _sample(moving[k], told, N)
+            _receive(moving[k], told, N)
+
+
+@compiled
+def _start(state: Floats, told: Floats, N: int, wanted: Floats, latency: Floats) -> None:
+    """Places and the first sample, at the alert."""
+    place, gap = place_at(N), gap_at(N)
+    told[place] = 0.0
+    told[OBSTACLE_PLACE] = state[state_width(N)] if state.shape[0] > state_width(N) else math.inf
+    for p in range(N - 1):
+        told[place + p + 1] = told[place + p] - state[gap + p]
+    for i in range(N):
+        state[command_at(N) + i] = command_in_force(wanted[i], latency[i], state[TIME])
+    _sample(state, told, N)
+    _receive(state, told, N)
+
+
+@compiled
+def _move(state: Floats, params: Floats, wanted: Floats, end: float, table: Floats, no_rows: Floats) -> bool:
+    """One world moved to ``end``, its places included; False, and nothing moved, where the kernel cannot."""
+    N, time = wanted.shape[0], state[TIME]
+    speed, command, gap, obstacle = speed_at(N), command_at(N), gap_at(N), state_width(N)
+    with_obstacle = state.shape[0] > obstacle and state[obstacle] < math.inf
+    ahead = state[obstacle] if with_obstacle else POST_M
+    place_obstacle(table, ahead, state[obstacle + 1] if with_obstacle else 0.0)
+    latency = params_at(2, N)
+    for i in range(N):
+        table[SPEED, i + 1] = state[speed + i]
+        table[COMMAND, i + 1] = wanted[i]
+        table[MASS, i + 1] = params[params_at(3, N) + i]
+        table[LIMIT, i + 1] = params[params_at(4, N) + i]
+        table[ONSET, i + 1] = onset_s(params[latency + i], time)
+    for p in range(N - 1):
+        table[GAP, p + 1] = state[gap + p]
+        table[HIT, p + 1] = state[gap + N - 1 + p]
+    if advance_table(table, params[RESTITUTION], end - time, time, 0, no_rows, 0)[1] != DONE:
+        return False
+    place = messages_at(N) + place_at(N)
+    params[place] += ahead - table[GAP, 0]
+    state[TIME] = end
+    for i in range(N):
+        state[speed + i] = table[SPEED, i + 1]
+        state[command + i] = command_in_force(wanted[i], params[latency + i], end)
+    for p in range(N - 1):
+        state[gap + p] = table[GAP, p + 1]
+        state[gap + N - 1 + p] = table[HIT, p + 1]
+        params[place + p + 1] = params[place + p] - table[GAP, p + 1]
+    if with_obstacle:
+        state[obstacle] = table[GAP, 0]
+        state[obstacle + 1] = table[HIT, 0]
+    return True
+
+
+@compiled
+def _sample(state: Floats, told: Floats, N: int) -> None:
+    """Every vehicle takes a sample of its state, over the oldest one."""
+    width, first = RING_HEAD + 3 * N, ring_at(N)
+    at = first + width * (int(told[TAKEN]) % ((told.shape[0] - first) // width))
+    told[at] = state[TIME]
+    told[at + 1] = state[state_width(N) + 1] if state.shape[0] > state_width(N) else 0.0
+    for i in range(N):
+        told[at + RING_HEAD + i] = told[place_at(N) + i]
+        told[at + RING_HEAD + N + i] = state[speed_at(N) + i]
+        told[at + RING_HEAD + 2 * N + i] = state[command_at(N) + i]
+    told[TAKEN] += 1.0
+
+
+@compiled
+def _receive(state: Floats, told: Floats, N: int) -> None:
+    """Deal with every message that is of use by now, and measure who is in sight."""
+    time = state[TIME]
+    for i in range(N):
+        for j in range(N):
+            link = link_at(i, j, N)
+            while told[link + NEXT_SENT] + told[DELAY] <= time + _ON_GRID:
+                u, bad = chance(told[KEY], i * N + j, told[link + NUMBER]), told[link + BAD] == 1.0
+                if told[link + NUMBER] > 0.0:  # the first one did arrive
+                    bad = u >= told[LOSS_ENDS] if bad else u < told[LOSS_BEGINS]
+                    told[link + BAD] = 1.0 if bad else 0.0
+                if not bad:
+                    _take(told, link, j, told[link + NEXT_SENT], N)
+                told[link + NUMBER] += 1.0
+                told[link + NEXT_SENT] += told[PERIOD]
+            if told[link + SEEN_FROM] <= time:
+                _take(told, link, j, time, N)
+
+
+@compiled
+def _take(told: Floats, link: int, sender: int, sent_s: float, N: int) -> None:
+    """A message that was sent at ``sent_s`` arrives: the sender's newest sample of then."""
+    width, first = RING_HEAD + 3 * N, ring_at(N)
+    length = (told.shape[0] - first) // width
+    taken = int(told[TAKEN])
+    for back in range(min(length, taken)):
+        at = first + width * ((taken - 1 - back) % length)
+        if told[at] <= sent_s + _ON_GRID:
+            if told[at] >= told[link + TOLD_S]:
+                told[link + TOLD_S] = told[at]
+                told[link + TOLD_HIT] = told[at + 1]
+                told[link + TOLD_PLACE] = told[at + RING_HEAD + sender]
+                told[link + TOLD_SPEED] = told[at + RING_HEAD + N + sender]
+                told[link + TOLD_COMMAND] = told[at + RING_HEAD + 2 * N + sender]
+            return

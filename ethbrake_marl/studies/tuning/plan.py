@@ -1,0 +1,178 @@
+"""A tuning, resolved: the training that every trial changes, and a search space all of which can be trained."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.inputs import load_runnable
+from ethbrake_marl.files.plugins import noted_plugins
+from ethbrake_marl.files.yaml import flow_text
+from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.learning.settings import read_settings
+from ethbrake_marl.learning.training import Training, resolve, training_content
+from ethbrake_marl.policies.manifest import installed_versions
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.studies.tuning.file import Choices, Range, TuningFile
+
+Values = Mapping[str, Any]  # of a trial: key -> value, as YAML has it
+
+_NOT_SEARCHED = {  # key -> why; what is inside it, too
+    "seed": "a seed is luck; give one for all trials, as seed",
+    "evaluation": "trials are judged on one list; give it as measure",
+    "algorithm": "each algorithm has a recipe of its own; tune one at a time",
+    "total_steps": "every trial gets the same number of decisions; give it in set",
+    "checkpoint_every_updates": "it changes no result",
+    "reward.harm_count": "it says which harm is least; give it in set",
+}
+_NOT_SET = ("seed", "evaluation")
+_TRIED = 200  # points of the space that are checked before anything starts
+
+
+@dataclass(frozen=True)
+class TuningPlan:
+    """What every trial has in common."""
+
+    file: TuningFile
+    recipe: TrainingRecipe  # with the file's settings, its seed and its list
+    scenario: Scenario
+    identity: str  # SHA-256 of all that makes a trial's harm what it is, versions and plug-ins included
+
+    def training(self, values: Values) -> Training:
+        """The training of a trial; raises ``InvalidInput`` where the values do not go together."""
+        given = read_settings(texts_of(values), [self.recipe])
+        recipe = self._measured(given.change(self.recipe))
+        return resolve(recipe, self.scenario)
+
+    def updates(self, recipe: TrainingRecipe) -> int:
+        """Updates of a whole training."""
+        return -(-recipe.total_steps // (recipe.n_envs * len(self.scenario.learners) * recipe.rounds))
+
+    def own_values(self) -> dict[str, Any] | None:
+        """The values that the recipe has, None where one of them is not in the space."""
+        content = self.recipe.model_dump(mode="json")
+        own = {key: _as_searched(dimension, _value_at(content, key)) for key, dimension in self.file.search.items()}
+        return None if None in own.values() else own
+
+    def _measured(self, recipe: TrainingRecipe) -> TrainingRecipe:
+        """The recipe with the tuning's list, measured so often that all trials can be compared on the way."""
+        asked = self.file.measure
+        every = -(-self.updates(recipe) // asked.times)
+        return recipe.replace(evaluation={"every_updates": every, "worlds": asked.worlds, "seed": asked.seed})
+
+
+def plan_tuning(file: TuningFile) -> TuningPlan:
+    """Resolve the file and try its space.
+
+    Raises ``InvalidInput``: an unknown scenario or recipe, a key that the recipe does not have or that is not to be
+    searched, a value that it does not allow, values that do not go together.
+    """
+    recipe = load_recipe(file.recipe)
+    for key in file.search:
+        _check_searched(key, recipe, file)
+    _check_set(file)
+    given = read_settings(texts_of(file.settings), [recipe])
+    scenario = load_runnable(file.scenario, given.scenario)
+    changed = given.change(recipe).replace(seed=file.seed)
+    resolve(changed, scenario)
+    content = training_content(changed, scenario)
+    told = {"training": content, **file.model_dump(mode="json", include={"search", "measure", "prune", "sampler"})}
+    told |= {"order": [*file.search], "versions": installed_versions(), "plugins": noted_plugins()}
+    identity = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    plan = TuningPlan(file, changed, scenario, identity)
+    _check_space(plan)
+    return plan
+
+
+def texts_of(values: Values) -> tuple[str, ...]:
+    """The values as ``KEY=VALUE``."""
+    return tuple(f"{key}={flow_text(value)}" for key, value in values.items())
+
+
+def _check_searched(key: str, recipe: TrainingRecipe, file: TuningFile) -> None:
+    bare = key.removeprefix("recipe.")
+    for inner, reason in _NOT_SEARCHED.items():
+        if bare == inner or bare.startswith(f"{inner}."):
+            raise InvalidInput(f"search.{key}: is not searched: {reason}")
+    for other in (*file.settings, *(each for each in file.search if each != key)):
+        if f"{bare}.".startswith(f"{other.removeprefix('recipe.')}."):
+            raise InvalidInput(f"search.{key}: {other} stands there too; leave one of them out")
+    if read_settings([f"{key}=0"], [recipe]).scenario:
+        raise InvalidInput(
+            f"search.{key}: is the scenario's; a search changes the recipe, so that harms can be compared"
+        )
+
+
+def _check_set(file: TuningFile) -> None:
+    for key in file.settings:
+        if key.removeprefix("recipe.").partition(".")[0] in _NOT_SET:
+            raise InvalidInput(f"set.{key}: is no setting here; give seed and measure beside it")
+
+
+def _check_space(plan: TuningPlan) -> None:
+    """Raise ``InvalidInput`` for an end that the recipe does not allow, and for ends or points that do not fit."""
+    for key, dimension in plan.file.search.items():
+        for value in _ends(dimension):
+            _check_point(plan, {key: value})
+    for point in _points(plan):
+        _check_point(plan, point)
+
+
+def _check_point(plan: TuningPlan, values: Values) -> None:
+    try:
+        plan.training(values)
+    except InvalidInput as error:
+        raise InvalidInput(f"search, at {', '.join(texts_of(values))}: {error}") from None
+
+
+def _points(plan: TuningPlan) -> Iterator[dict[str, Any]]:
+    """All low, all high, and points by chance, the same ones each time."""
+    search = plan.file.search
+    for end in (0, -1):
+        yield {key: _ends(dimension)[end] for key, dimension in search.items()}
+    random = np.random.default_rng(0)
+    for _ in itertools.repeat(None, _TRIED):
+        yield {key: _draw(dimension, random) for key, dimension in search.items()}
+
+
+def _ends(dimension: Range | Choices) -> tuple[Any, ...]:
+    return dimension.choices if isinstance(dimension, Choices) else (dimension.low, dimension.high)
+
+
+def _draw(dimension: Range | Choices, random: np.random.Generator) -> Any:
+    if isinstance(dimension, Choices):
+        return dimension.choices[int(random.integers(len(dimension.choices)))]
+    if dimension.whole:
+        return int(random.integers(int(dimension.low), int(dimension.high), endpoint=True))
+    low, high = float(dimension.low), float(dimension.high)
+    return min(low * (high / low) ** random.random(), high) if dimension.log else float(random.uniform(low, high))
+
+
+def _as_searched(dimension: Range | Choices, value: Any) -> Any:
+    """The value as the dimension has it; None where it is not in it."""
+    if isinstance(dimension, Choices):
+        return next((each for each in dimension.choices if flow_text(each) == flow_text(value)), None)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not dimension.low <= value <= dimension.high:
+        return None
+    if not dimension.whole:
+        return float(value)
+    return int(value) if value == int(value) else None
+
+
+def _value_at(content: Any, key: str) -> Any:
+    """What stands at a dotted key; None where nothing does."""
+    for part in key.removeprefix("recipe.").split("."):
+        if isinstance(content, list) and part.isdecimal() and int(part) < len(content):
+            content = content[int(part)]
+        elif isinstance(content, Mapping):
+            content = content.get(part)
+        else:
+            return None
+    return content

@@ -1,0 +1,170 @@
+"""Believed worlds by hand, and the agents that drive by them: nothing of what was not received, all of what was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.believed import believed_worlds, ranges_of, told_to
+from ethbrake_marl.agents.believing import Odometer
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import drive, script_agents
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.scenario import Scenario, load_scenario
+
+BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
+DEAF = {"preset": "paper", "hears": "front"}
+PERIODIC = {"preset": "blocked", "persistence": "periodic"}
+
+
+def engine_of(scenario: Scenario, n: int = 40, vehicle: int = 1, seed: int = 7) -> Engine:
+    scripts = script_agents(scenario, except_for=vehicle)
+    return Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=scenario.sample(n, seed).worlds)
+
+
+def believed(engine: Engine, vehicle: int = 1, odometer: Odometer | None = None) -> Worlds:
+    worlds, scenario = engine.worlds, engine.scenario
+    way = worlds.speeds_mps[:, vehicle] * worlds.time_s if odometer is None else odometer.look(worlds, vehicle)
+    scripts = script_agents(scenario, except_for=vehicle)
+    return believed_worlds(worlds, vehicle, ranges_of(scenario, vehicle), scripts, way)
+
+
+def test_believed__is_the_world_where_everything_is_known() -> None:
+    engine = engine_of(BASE)
+    for _ in range(10):
+        now, taken = engine.worlds, believed(engine)
+        for name in ("gaps_m", "speeds_mps", "pair_hit", "time_s"):
+            np.testing.assert_array_equal(getattr(taken, name), getattr(now, name))
+        np.testing.assert_array_equal(taken.vehicles.mass_t, now.vehicles.mass_t)
+        waiting = now.vehicles.latency_s > now.time_s[:, np.newaxis]
+        np.testing.assert_array_equal(taken.vehicles.latency_s[waiting], now.vehicles.latency_s[waiting])
+        engine.step(np.full((40, 1), -0.5))
+
+
+def test_believed__who_is_not_known_is_in_the_middle_of_the_ranges_and_follows_its_script() -> None:
+    # Vehicle 3 is never heard: at the alert 7.5 m behind, at 20 m/s; it coasts to 0.8 s, then brakes with 6. At 1 s it
+    # has made 20 m less 0.5 * 6 * 0.2^2 = 0.12 m, and Vehicle 2, with 20 m/s and no command, 20 m.
+    scenario = BASE.replace(
+        v2x=DEAF, gaps_m=[7.0, {"uniform": [5, 10]}], speeds_mps=[20.0, 20.0, {"uniform": [18, 22]}]
+    )
+    engine = engine_of(scenario)
+    for _ in range(5):
+        engine.step(np.zeros((40, 1)))
+    taken = believed(engine)
+    np.testing.assert_allclose(engine.worlds.time_s, 1.0)
+    free = ~engine.worlds.pair_hit[:, 0] & (engine.worlds.speeds_mps[:, 1] == 20.0)
+    assert free.sum() > 20
+    np.testing.assert_allclose(taken.gaps_m[free, 1], 7.5 + 0.12)
+    np.testing.assert_allclose(taken.speeds_mps[:, 2], 20.0 - 6.0 * 0.2)
+    np.testing.assert_array_equal(taken.gaps_m[:, 0], engine.worlds.gaps_m[:, 0])
+    assert (taken.command_mps2[:, 2] == -6.0).all() and not taken.pair_hit[:, 1].any()
+
+
+def test_believed__an_old_message_is_moved_on_by_the_script_to_the_truth() -> None:
+    channel = {
+        "preset": "paper",
+        "link_latency_s": 0.2,
+        "persistence": "periodic",
+        "senses": "front",
+        "sensing_s": [5, 5],
+    }
+    engine = engine_of(BASE.replace(v2x=channel))
+    odometer = Odometer()
+    odometer.begin(engine.scenario.sample(40, 7).worlds, 1, np.arange(40))
+    for _ in range(12):
+        now, told = engine.worlds, told_to(engine.worlds, 1)
+        assert told.known.all() and (told.at_s[:, [0, 2]] < now.time_s[:, np.newaxis] - 0.19).all()
+        taken = believed(engine, odometer=odometer)
+        free = ~now.pair_hit.any(axis=1)
+        np.testing.assert_allclose(taken.gaps_m[free], now.gaps_m[free], atol=1e-9)
+        np.testing.assert_allclose(taken.speeds_mps[free], now.speeds_mps[free], atol=1e-9)
+        engine.step(np.full((40, 1), -0.85))
+    assert free.sum() > 3
+
+
+def test_odometer__is_exact_without_impacts() -> None:
+    scenario = BASE.replace(gaps_m=[500.0, 500.0])
+    engine, odometer = engine_of(scenario, n=5), Odometer()
+    alert = scenario.sample(5, 7).worlds
+    odometer.begin(alert, 1, np.arange(5))
+    v = alert.speeds_mps[:, 1]
+    while not engine.ended.all():
+        way = odometer.look(engine.worlds, 1)
+        t = np.minimum(engine.worlds.time_s - 0.5, v / 7.0)
+        np.testing.assert_allclose(way, 0.5 * v + v * t - 3.5 * t * t, atol=1e-9)
+        engine.step(np.full((5, 1), -1.0))
+
+
+@pytest.mark.parametrize("vehicles", [2, 3, 5])
+@pytest.mark.parametrize("v2x", [DEAF, PERIODIC, "blocked", "sensors-only"])
+def test_believing__drives_every_line_and_no_world_depends_on_the_batch(vehicles: int, v2x: object) -> None:
+    scenario = load_scenario("paper-random").replace(
+        vehicles=vehicles, braking_capacity_mps2=6.0, driving_capacity_mps2=6.0, mass_t=5.0, latency_s=0.1, v2x=v2x,
+        roles={"vehicle_2": "learner"}, horizon_s=12.0,
+    )  # fmt: skip
+    sample = scenario.sample(6, 3)
+    for spec in ("e_v2x_bm:believed", "planner:8:believed"):
+        whole = drive(sample.worlds, make_agent(spec, scenario=scenario), scenario, 1)
+        alone = drive(sample.worlds.take([4]), make_agent(spec, scenario=scenario), scenario, 1)
+        assert whole.ledger.world_harm("first")[4] == alone.ledger.world_harm("first")[0]
+        np.testing.assert_array_equal(whole.final.speeds_mps[4], alone.final.speeds_mps[0])
+
+
+@pytest.mark.parametrize("v2x", ["paper", PERIODIC])
+def test_believing__knows_of_the_obstacle_what_it_was_told(v2x: object) -> None:
+    scenario = load_scenario("cooperation-4-all").replace(early_impacts="keep", v2x=v2x).with_learners(["vehicle_2"])
+    engine = engine_of(scenario)
+    for _ in range(15):
+        engine.step(np.full((40, 1), -0.9))
+    told, now = told_to(engine.worlds, 1), engine.worlds
+    heard = told.known[:, 0]
+    assert heard.sum() > 20
+    np.testing.assert_allclose(told.obstacle_m[heard], (now.obstacle_gap_m + now.gaps_m[:, 0])[heard], atol=1e-9)
+    assert np.isinf(told.obstacle_m[~heard]).all()
+    assert np.isfinite(believed(engine).obstacle_gap_m).all()
+    drive(scenario.sample(5, 3).worlds, make_agent("e_v2x_bm:believed", scenario=scenario), scenario, 1)
+
+
+def test_believing__is_the_omniscient_one_where_everything_is_known_at_once() -> None:
+    sample = BASE.sample(40, 7)
+    harm = {
+        spec: drive(sample.worlds, make_agent(spec, scenario=BASE), BASE, 1).ledger.world_harm("first")
+        for spec in ("e_v2x_bm", "e_v2x_bm:believed")
+    }
+    np.testing.assert_allclose(harm["e_v2x_bm:believed"], harm["e_v2x_bm"], atol=1e-4)
+
+
+def test_believing__a_later_batch_of_another_size_and_renewed_rows_begin_anew() -> None:
+    scenario = BASE.replace(v2x=PERIODIC)
+    agent = make_agent("e_v2x_bm:believed", scenario=scenario)
+    first = drive(scenario.sample(9, 3).worlds, agent, scenario, 1).ledger.world_harm("first")
+    fewer = drive(scenario.sample(4, 3).worlds, agent, scenario, 1).ledger.world_harm("first")
+    np.testing.assert_array_equal(first[:4], fewer)
+
+
+@pytest.mark.parametrize(
+    ("spec", "scenario", "words"),
+    [
+        ("e_v2x_bm:believed", None, "needs a scenario"),
+        ("e_v2x_bm:all:believed", BASE, "must be 'coupled' or 'pairwise', then 'believed'"),
+        ("planner:0:believed", BASE, "the argument must be a number of candidates"),
+    ],
+)
+def test_believing__what_cannot_be_is_refused(spec: str, scenario: Scenario | None, words: str) -> None:
+    with pytest.raises(InvalidInput, match=words):
+        make_agent(spec, scenario=scenario)
+
+
+def test_believing__a_mixture_says_too_little() -> None:
+    names = ("paper-random", "paper-random-brake-only")
+    members = [{"scenario": load_scenario(name).declared()} for name in names]
+    mixture = Scenario(name="mixed", mixture=members)
+    with pytest.raises(InvalidInput, match="is a mixture, and a vehicle that is not known could be of any of"):
+        make_agent("e_v2x_bm:believed", scenario=mixture)
+
+
+def test_believing__act_without_begin_is_an_error() -> None:
+    with pytest.raises(InvalidInput, match="begin was not called"):
+        make_agent("e_v2x_bm:believed", scenario=BASE).act(BASE.sample(3, 7).worlds, 1)

@@ -1,0 +1,233 @@
+"""The joint shield: several shielded vehicles of one line, decided together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.search.problem import profile_problem
+from ethbrake_marl.shield import StepShield
+from ethbrake_marl.shield.alert import joint_constants
+from ethbrake_marl.shield.certify import REASONS, Backup, begin_running, certify, plan_harm
+from ethbrake_marl.shield.shares import borne_under
+from tests.shield.joint_attack import ADVERSARIES, joint_attack, scenario_of
+
+STEPS = 81
+PAIR = load_scenario("cooperation-3-pair")
+
+
+def three(**changes):
+    """Vehicle 1 stands; 10 m and 10 m behind it two vehicles come at 5 and 10 m/s that brake with at most 5 m/s2."""
+    given = {
+        "name": "three", "vehicles": 3, "gaps_m": [10, 10], "speeds_mps": [0, 5, 10], "braking_capacity_mps2": 5,
+        "driving_capacity_mps2": 5, "mass_t": [1, 1, 3], "latency_s": 0,
+        "roles": {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "learner"},
+    }  # fmt: skip
+    scenario = Scenario(**{**given, **changes})
+    return scenario, scenario.sample(1, 0).worlds
+
+
+def start(worlds, plan, vehicles=(1, 2), **settings):
+    running = begin_running(profile_problem(worlds, vehicles, **settings))
+    return running, Backup(plan, plan_harm(running, plan), np.zeros((0, len(vehicles))))
+
+
+def told(decision):
+    return [REASONS[each] for each in decision.reason[0]]
+
+
+def test_by_hand__of_two_proposals_the_harmless_one_is_accepted_the_other_replaced():
+    # Braking fully they stop after 2.5 m and 10 m; Vehicle 3 then stands 2.5 m behind Vehicle 2.
+    _, worlds = three(gaps_m=[2.6, 10])
+    running, backup = start(worlds, np.full((1, STEPS, 2), -1.0))
+    assert backup.harm.tolist() == [0.0]
+    # Vehicle 2 has 0.1 m to spare, Vehicle 3 2.5 m: 0.1 s of coasting costs 0.5 m and 1 m.
+    decision = certify(running, np.zeros((1, 2)), backup, backup.harm)
+    assert decision.applied.tolist() == [[-1.0, 0.0]] and decision.intervened.tolist() == [[True, False]]
+    assert told(decision) == ["no certificate", "plan remains"] and decision.bound.tolist() == [0.0]
+    assert decision.margin[0, 0] < 0.0 == decision.margin[0, 1]
+    assert decision.backup.plan[0, :2].tolist() == [[-1.0, 0.0], [-1.0, -1.0]]
+
+
+def test_by_hand__proposals_that_are_harmless_alone_and_collide_together_go_to_the_front_one():
+    # Vehicle 2 may brake sooner than planned, or Vehicle 3 later, but not both: 12 m/s need 14.4 m to stop.
+    _, worlds = three(gaps_m=[4.9, 12.0], speeds_mps=[0, 5, 12])
+    plan = np.full((1, STEPS, 2), -1.0)
+    plan[0, :4, 0] = 0.0  # coasts 2 m first, then stops after 2.5 m, 0.4 m before Vehicle 1
+    running, backup = start(worlds, plan)
+    assert backup.harm.tolist() == [0.0]  # Vehicle 3 stops 12 + 4.5 - 14.4 = 2.1 m behind
+    front, rear = np.array([[-1.0, -1.0]]), np.array([[0.0, 0.0]])
+    for each in (front, rear):
+        assert not certify(running, each, backup, backup.harm).intervened.any()
+    several = np.array([[-1.0, 0.8]])  # 0.9 m sooner, and about 1.5 m later
+    assert plan_harm(certify(running, several, backup, np.full(1, 1e9)).after, plan)[0] > 0.0
+    decision = certify(running, several, backup, backup.harm)
+    assert told(decision) == ["plan remains", "no certificate"] and decision.applied[0].tolist() == [-1.0, -1.0]
+
+
+def test_by_hand__who_says_no_number_keeps_the_plan_and_the_other_is_clipped():
+    _, worlds = three()
+    running, backup = start(worlds, np.full((1, STEPS, 2), -0.9))
+    decision = certify(running, np.array([[np.nan, -7.0]]), backup, backup.harm)
+    assert told(decision) == ["not a number", "plan remains"]
+    assert decision.applied.tolist() == [[-0.9, -1.0]] and decision.intervened.tolist() == [[True, False]]
+
+
+def test_certify__changes_nothing_it_is_given_and_refuses_other_shapes():
+    _, worlds = three()
+    running, backup = start(worlds, np.full((1, STEPS, 2), -0.8))
+    before = running.states.copy(), backup.plan.copy(), backup.harm.copy()
+    certify(running, np.array([[0.3, 0.9]]), backup, backup.harm)
+    assert [a.tolist() for a in before] == [running.states.tolist(), backup.plan.tolist(), backup.harm.tolist()]
+    with pytest.raises(InvalidInput, match=r"proposed \(1,\).*\(1, 2\)"):
+        certify(running, np.zeros(1), backup, backup.harm)
+    with pytest.raises(InvalidInput, match=r"plan \(1, 81\); \(1, at least 80, 2\) is needed"):
+        plan_harm(running, np.zeros((1, STEPS)))
+
+
+def test_shares__are_those_of_the_ledger_and_the_light_one_bears_more():
+    _, worlds = three(speeds_mps=[0, 10, 20])
+    running, backup = start(worlds, np.full((1, STEPS, 2), -1.0))
+    borne = borne_under(running, backup.plan)[0]
+    assert borne.sum() == pytest.approx(backup.harm[0]) and borne[1] > borne[2] > 0.0
+
+
+def test_caps__reject_what_only_moves_harm_to_another():
+    _, worlds = three(gaps_m=[3.0, 10.0], speeds_mps=[0, 5, 16])
+    running, backup = start(worlds, np.full((1, STEPS, 2), -1.0))
+    assert backup.harm[0] > 0.0  # Vehicle 3 runs into Vehicle 2, which stands before Vehicle 1
+    proposed, budget = np.array([[0.0, -1.0]]), backup.harm + 50.0
+    assert not certify(running, proposed, backup, budget).intervened.any()
+    capped = running._replace(caps=borne_under(running, backup.plan))
+    decision = certify(capped, proposed, backup, budget)
+    assert decision.intervened.tolist() == [[True, False]] and decision.applied[0, 0] == -1.0
+
+
+@pytest.mark.parametrize(("level", "N"), [(3, 3), (4, 3), (3, 5)])
+@pytest.mark.parametrize("harm_count", ["first", "total"])
+def test_engine__realises_the_last_bound_to_the_bit_and_the_bound_never_rises(level, N, harm_count):
+    scenario = scenario_of(level, N)
+    cap = "baseline" if harm_count == "first" else None
+    worlds = scenario.sample(12, 5).worlds
+    for name, adversary in ADVERSARIES.items():
+        for hostile in ("all", "one"):
+            found = joint_attack(scenario, worlds, adversary, hostile=hostile, harm_count=harm_count, cap=cap, seed=1)
+            assert found.realised.tolist() == found.last_bound.tolist(), name
+            assert (found.realised <= found.bound).all() and found.rises == 0 and found.over_cap == 0
+            assert found.accepted > 0 or name == "full_drive"
+
+
+def test_one_vehicle_in_a_list__is_the_single_shield_bit_for_bit():
+    scenario = load_scenario("paper-random")
+    worlds, rng = scenario.sample(20, 4).worlds, np.random.default_rng(4)
+    single, listed = StepShield(scenario, 1), StepShield(scenario, [1])
+    for shield in (single, listed):
+        shield.begin(worlds, np.arange(20))
+    listed.backup = listed.backup._replace(constants=single.backup.constants[:, np.newaxis])
+    listed.backup = listed.backup._replace(plan=single.backup.plan[:, :, np.newaxis], harm=single.backup.harm)
+    while not single.running.finished.all():
+        proposed = rng.uniform(-1.2, 1.2, 20)
+        one, other = single.decide(proposed), listed.decide(proposed[:, np.newaxis])
+        for a, b in ((one.applied, other.applied), (one.reason, other.reason), (one.margin, other.margin)):
+            assert a.tolist() == b[:, 0].tolist()
+        assert one.bound.tolist() == other.bound.tolist()
+
+
+def test_bound_at_the_alert__is_at_most_full_braking_and_any_single_constant():
+    worlds = PAIR.sample(40, 8).worlds
+    joint = StepShield(PAIR, (1, 2))
+    joint.begin(worlds, np.arange(40))
+    braking = plan_harm(joint.running, np.full((40, STEPS, 2), -1.0))
+    assert (joint.first_bound <= braking).all() and joint.first_bound.mean() < 0.8 * braking.mean()
+    for vehicle, other in ((1, 2), (2, 1)):
+        single = StepShield(PAIR, vehicle, others={0: make_agent("full_brake"), other: make_agent("full_brake")})
+        single.begin(worlds, np.arange(40))
+        assert (joint.first_bound <= single.first_bound + 1e-6).all()
+
+
+def test_team__whose_rollout_keeps_the_bound_is_left_alone_and_one_that_does_not_is_not():
+    worlds, bounds = PAIR.sample(30, 2).worlds, {}
+    for name in ("full_brake", "constant:5"):
+        shield = StepShield(PAIR, (1, 2))
+        team = {i: make_agent(name) for i in (1, 2)}
+        shield.begin(worlds, np.arange(30), team)
+        bounds[name] = shield.first_bound
+        drives = shield.alone_harm <= shield.first_bound
+        command = [team[i].act(worlds, i) / worlds.vehicles.braking_capacity_mps2[:, i] for i in (1, 2)]
+        decision = shield.decide(np.stack(command, axis=1))
+        assert not decision.intervened[drives].any() and drives.any()
+    without = StepShield(PAIR, (1, 2))
+    without.begin(worlds, np.arange(30))
+    assert all((bound <= without.first_bound).all() for bound in bounds.values())
+
+
+def test_begin__of_some_rows_keeps_the_others_with_their_caps():
+    worlds = PAIR.sample(6, 3).worlds
+    shield = StepShield(PAIR, (1, 2), cap="baseline")
+    shield.begin(worlds, np.arange(6))
+    shield.decide(np.zeros((6, 2)))
+    caps, shares = shield.running.caps.copy(), shield.baseline_shares.copy()
+    shield.begin(worlds.take([0]), np.array([4]))
+    assert shield.running.steps.tolist() == [1, 1, 1, 1, 0, 1]
+    assert (
+        shield.running.caps[4].tolist() == caps[0].tolist() and shield.baseline_shares[4].tolist() == shares[0].tolist()
+    )
+    assert np.delete(shield.running.caps, 4, axis=0).tolist() == np.delete(caps, 4, axis=0).tolist()
+    shield.keep(3)
+    assert shield.running.caps.tolist() == caps[:3].tolist()
+
+
+def test_constants__hold_all_alike_and_ladders_each_once():
+    constants = joint_constants(3)
+    assert len({tuple(row) for row in constants.tolist()}) == len(constants) == 31
+    assert constants.min() == -1.0 and constants.max() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: StepShield(PAIR, (2, 1)), "several are named front to rear, each once"),
+        (lambda: StepShield(PAIR, (1, 1)), "front to rear, each once"),
+        (lambda: StepShield(PAIR, ()), "must be an index from 0 to 2"),
+        (lambda: StepShield(PAIR, (1, 3)), "must be an index from 0 to 2"),
+        (lambda: StepShield(PAIR, (1, 2), cap="mine"), "cap 'mine'"),
+    ],
+)
+def test_bad_input__is_refused_by_name(make, message):
+    with pytest.raises(InvalidInput, match=message):
+        make()
+
+
+def test_policies__of_other_vehicles_are_refused():
+    shield = StepShield(PAIR, (1, 2))
+    with pytest.raises(InvalidInput, match=r"policies for vehicles \[1\], shielded are \[1, 2\]"):
+        shield.begin(PAIR.sample(1, 0).worlds, np.arange(1), make_agent("coast"))
+
+
+def test_surprise__of_one_world_hands_the_whole_team_to_the_fallback():
+    scenario = scenario_of(4, 3)
+    worlds = scenario.sample(3, 1).worlds
+    shield = StepShield(scenario, scenario.learners)
+    shield.begin(worlds, np.arange(3))
+    seen = shield.running.states.copy()
+    seen[1, 1] -= 0.5  # a vehicle is slower than it can be
+    decision = shield.decide(np.ones((3, 3)), seen=seen)
+    assert shield.distrusted.tolist() == [False, True, False]
+    assert [REASONS[each] for each in decision.reason[1]] == ["assumption broken"] * 3
+    assert decision.intervened[1].all() and (decision.applied[1] <= 0.0).all()
+
+
+def test_engine__steps_the_team_as_it_was_certified():
+    worlds = PAIR.sample(4, 6).worlds
+    engine = Engine(PAIR, 4, learners=(1, 2), scripts={0: make_agent("full_brake")}, worlds=worlds)
+    shield = StepShield(PAIR, (1, 2))
+    shield.begin(worlds, np.arange(4))
+    while not engine.ended.all():
+        decision = shield.decide(np.ones((4, 2)), only=~engine.ended)
+        engine.step(decision.applied)
+        assert decision.after.states[:, :3].tolist() == engine.worlds.speeds_mps.tolist()
+    assert shield.shares().tolist() == engine.ledger.vehicle_harm("first").tolist()
