@@ -214,11 +214,15 @@ class UncertifiedStep(EthBrakeError):
     """An engine that a shield follows was made to do something else than was certified; the step was not made."""
 
 
-def unknown_name(kind: str, name: object, known: Iterable[str]) -> UnknownName:
-    """Build the error for an unknown ``name``, with a suggestion when one is close."""
+def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
+    """Build the error for an unknown ``name``, with a suggestion when one is close.
+
+    ``may_be_own``: users register some of their own, so that a plug-in may have been forgotten.
+    """
     names = sorted(known)
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
-    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}"
+    own = "; one of your own file needs --plugin FILE.py (eb.load_plugin)" if may_be_own else ""
+    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{own}"
     return UnknownName(f"unknown {kind} {name!r}; {hint}")
 
 

@@ -74,7 +74,7 @@ def parse_objective(text: str) -> Objective:
     """
     kind, colon, argument = text.partition(":")
     if kind not in KINDS:
-        raise unknown_name("objective", kind, KINDS)
+        raise unknown_name("objective", kind, KINDS, may_be_own=True)
     if ":" not in KINDS[kind].form:
         if colon:
             raise InvalidInput(f"objective {text!r}: {kind} takes no argument")

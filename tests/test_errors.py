@@ -37,6 +37,14 @@ def test_unknown_name__says_where_nothing_is_known() -> None:
     assert str(unknown_name("term", "mine", [])) == "unknown term 'mine'; known: none"
 
 
+def test_unknown_name__reminds_of_the_plug_in_where_nothing_is_close() -> None:
+    told = str(unknown_name("agent", "mine", ["coast"], may_be_own=True))
+    assert told == "unknown agent 'mine'; known: coast; one of your own file needs --plugin FILE.py (eb.load_plugin)"
+    assert (
+        str(unknown_name("agent", "cost", ["coast"], may_be_own=True)) == "unknown agent 'cost'; did you mean 'coast'?"
+    )
+
+
 def test_one_line__is_the_same_the_second_time() -> None:
     for text in ("plain", "\x1b[2J", "x" * 5000, "a" * LINE_LIMIT):
         assert one_line(one_line(text)) == one_line(text)

@@ -58,16 +58,19 @@ class Told(NamedTuple):
         return reacts
 
 
+class Foretold(NamedTuple):
+    """How worlds were expected to be by now, and of which vehicles that tells more than was told of them."""
+
+    worlds: Worlds
+    keeps: Bools  # [n, N]
+
+
 def told_to(worlds: Worlds, vehicle: int) -> Told:
     """What has reached ``vehicle`` of the others."""
     n, N = worlds.speeds_mps.shape
     known = worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis]
     known[:, vehicle] = True
-    ahead = np.concatenate([np.zeros((n, 1)), -np.cumsum(worlds.gaps_m, axis=1)], axis=1)
-    place = ahead - ahead[:, [vehicle]]
-    for j, step in ((vehicle - 1, -1), (vehicle + 1, 1)):  # direct neighbours: the gap itself, without rounding
-        if 0 <= j < N:
-            place[:, j] = -step * worlds.gaps_m[:, min(vehicle, j)]
+    place = _places_of(worlds, vehicle)
     hit = np.zeros((n, N - 1), np.bool_)
     at_s = np.repeat(worlds.time_s[:, np.newaxis], N, axis=1)
     told = Told(
@@ -82,6 +85,16 @@ def told_to(worlds: Worlds, vehicle: int) -> Told:
     unheard = ~told.known[:, 0]
     told.obstacle_m[unheard], told.obstacle_hit[unheard] = np.inf, False
     return told
+
+
+def _places_of(worlds: Worlds, vehicle: int) -> Floats:
+    """Where all vehicles are ahead of one, [n, N] m; direct neighbours to the bits of their gaps."""
+    ahead = np.concatenate([np.zeros((worlds.n, 1)), -np.cumsum(worlds.gaps_m, axis=1)], axis=1)
+    place: Floats = ahead - ahead[:, [vehicle]]
+    for j, step in ((vehicle - 1, -1), (vehicle + 1, 1)):
+        if 0 <= j < worlds.N:
+            place[:, j] = -step * worlds.gaps_m[:, min(vehicle, j)]
+    return place
 
 
 def _told_by_messages(worlds: Worlds, vehicle: int, told: Told, periodic: Bools) -> Told:
@@ -179,6 +192,7 @@ def believed_worlds(
     way_m: Floats,
     *,
     share: Mapping[tuple[str, int], float] | None = None,
+    foretold: Foretold | None = None,
 ) -> Worlds:
     """The worlds as ``vehicle`` believes them to be now, at their time.
 
@@ -189,6 +203,8 @@ def believed_worlds(
         others: scripts that the other vehicles are known to follow; without one they brake fully.
         way_m: [n] the vehicle's own way since the alert, m.
         share: where in its range each uncertain number lies, 0 to 1; None: in the middle.
+        foretold: how these worlds were expected to be by now, with the impacts on the way, and whose state that tells
+            better than a message from before.
 
     """
     n, N = worlds.speeds_mps.shape
@@ -217,13 +233,19 @@ def believed_worlds(
     command = fixed_commands(others, line, "believed", vehicle=vehicle)
     speed, way = move_on(line.speeds_mps, command, latency - at_s, of["speed_limit_mps"], worlds.time_s[:, None] - at_s)
     speed[:, vehicle], way[:, vehicle] = line.speeds_mps[:, vehicle], 0.0
-    place = _in_order(place + way, told.known, vehicle)
+    place, hit = place + way, told.hit
+    if foretold is not None:
+        expected, keeps, hit = foretold.worlds, foretold.keeps, hit | foretold.worlds.pair_hit
+        place = np.where(keeps, _places_of(expected, vehicle), place)
+        speed = np.where(keeps, np.maximum(expected.speeds_mps, 0.0), speed)
+    place = _in_order(place, told.known, vehicle)
     gaps = np.maximum(place[:, :-1] - place[:, 1:], 0.0)
     usual_obstacle = ranges.obstacle_gap_m + ranges.middle["place"][0] - way_m
     obstacle = np.where(np.isfinite(told.obstacle_m), told.obstacle_m, usual_obstacle)
     command[:, own] = worlds.command_mps2[:, own]
     return replace(
         line,
+        pair_hit=hit,
         speeds_mps=speed,
         gaps_m=np.where(gaps < TOUCHING_M, 0.0, gaps),
         command_mps2=np.where((latency <= worlds.time_s[:, np.newaxis]), command, 0.0),

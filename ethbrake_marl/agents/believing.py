@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ethbrake_marl.agents.believed import Ranges, believed_worlds, ranges_of, told_to
-from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.protocol import Agent, AgentAround, place
+from ethbrake_marl.agents.knowledge import Knowledge, Source
+from ethbrake_marl.agents.protocol import Agent, AgentAround, PredictingAgent, place
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
@@ -55,9 +53,9 @@ class Believing(AgentAround):
     """Drives by ``policy``, any agent that reads the line, in the world that its vehicle believes in.
 
     The policy begins when it is first asked, from what was received by then. It begins anew in the worlds in which it
-    hears what nothing foretold: of another vehicle for the first time or, over a channel, that one reacts. Its
-    ``predicted_harm`` is what it expects from then on. ``shows``: the policy is shown the believed world at every
-    decision, not only where it begins. Raises ``InvalidInput`` for a mixture.
+    hears what nothing foretold: of another vehicle for the first time or, over a channel, that one reacts.
+    ``predicted_harm`` [n] is what it expected when it was first asked. ``shows``: the policy is shown the believed
+    world at every decision, not only where it begins. Raises ``InvalidInput`` for a mixture.
     """
 
     def __init__(self, policy: Agent, scenario: Scenario, *, name: str | None = None, shows: bool = False) -> None:
@@ -65,24 +63,21 @@ class Believing(AgentAround):
         self.scenario = scenario
         self._shows = shows
         self._odometer = Odometer()
+        self.predicted_harm: Floats = np.zeros(0)
         self._signature: Floats = np.zeros((0, 0))  # NaN where the policy has not begun
         self._ranges: tuple[int, Ranges] | None = None
         self._ranges_of(0)  # refuses a mixture at once
 
     @property
-    def knows(self) -> Source:  # type: ignore[override]
+    def knows(self) -> Knowledge:
         """What it received, and the model of the line filled in from the scenario."""
-        return Source.BELIEFS
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "predicted_harm":
-            return self.policy.predicted_harm  # type: ignore[attr-defined]
-        raise AttributeError(name)
+        return (Source.BELIEFS,)
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Remember where these episodes start; nothing has been received yet."""
         self._odometer.begin(worlds, vehicle, rows)
         self._signature = place(self._signature, rows, np.full((len(rows), 2 * worlds.N), np.nan))
+        self.predicted_harm = place(self.predicted_harm, rows, np.full(len(rows), np.nan))
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The policy's command, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
@@ -97,7 +92,9 @@ class Believing(AgentAround):
         rows = np.flatnonzero(changed)
         if rows.size:
             self._begin_policy(self._believe(worlds.take(rows), vehicle, way[rows]), vehicle, rows)
-            self._signature[rows] = signature[rows]
+            first, self._signature[rows] = rows[np.isnan(self._signature[rows, 0])], signature[rows]
+            if isinstance(self.policy, PredictingAgent):
+                self.predicted_harm[first] = self.policy.predicted_harm[first]
         shown = self._believe(worlds, vehicle, way) if self._shows else worlds
         return self.policy.act(shown, vehicle)
 

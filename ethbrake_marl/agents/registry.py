@@ -150,17 +150,22 @@ _WRAPPERS: dict[str, Entry] = {
         "agents.refined:refine",
     ),
     "episode": Entry(
-        "+episode[:pairwise]",
-        "behind Algorithm 1: it or E-V2X-BM drives the episode, whichever harms less",
+        "+episode[:pairwise][:believed]",
+        "behind Algorithm 1: it or E-V2X-BM drives the episode, whichever harms less; believed: as far as is received",
         (Source.MODEL,),
-        "shield.agents:shield_episodes",
+        "shield.factories:shield_episodes",
     ),
-    "step": Entry("+step", "every action certified, or replaced", (Source.MODEL,), "shield.agents:shield_steps"),
-    "robust": Entry(
-        "+robust",
-        "the same where not everything is known: against an uncertainty",
+    "step": Entry(
+        "+step[:believed]",
+        "every action certified, or replaced; believed: certified in the world that the vehicle believes in",
         (Source.MODEL,),
-        "shield.agents:shield_steps_robustly",
+        "shield.factories:shield_steps",
+    ),
+    "robust": Entry(
+        "+robust[:believed]",
+        "the same where not everything is known: against an uncertainty; believed: against all that was not received",
+        (Source.MODEL,),
+        "shield.factories:shield_steps_robustly",
     ),
 }
 
@@ -244,7 +249,7 @@ def find_entry(written: AgentSpec) -> Entry:
     if written.file is not None:
         return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", (Source.UNSTATED,), _FROM_FILE)
     if written.name not in _ENTRIES:
-        raise unknown_name("agent", written.name, {*_ENTRIES, "ladder"})
+        raise unknown_name("agent", written.name, {*_ENTRIES, "ladder"}, may_be_own=True)
     entry = _ENTRIES[written.name]
     if written.argument is not None and ":" not in entry.form:
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")

@@ -1,8 +1,8 @@
 """The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
 
 ``+refined``, ``+refined:profile`` or, at every decision, ``+refined:50`` or ``+refined:200us`` comes first, then one
-shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``. A name may be a function of a Python file,
-``my_file.py:make_agent``.
+shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``, each also with ``:believed`` behind it. A name
+may be a function of a Python file, ``my_file.py:make_agent``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from ethbrake_marl.scenario.roles import parse_agent_spec
 
 REFINED = ("refined", "refined:profile")
 SHIELDS = ("episode", "episode:pairwise", "step", "robust")
-AROUND = (*REFINED, *SHIELDS)  # in the order in which they are put around an agent
+BELIEVED = ("episode:believed", "episode:pairwise:believed", "step:believed", "robust:believed")  # on what was received
+AROUND = (*REFINED, *SHIELDS, *BELIEVED)  # in the order in which they are put around an agent
 
 OLD_SPELLINGS = {  # of a policy; ``hybrid@PATH`` is ``ppo@PATH+episode`` now
     "rehearsed": "+refined",
@@ -60,7 +61,7 @@ class AgentSpec:
     @property
     def shield(self) -> str | None:
         """The shield around it, if there is one."""
-        return self.around[-1] if self.around and self.around[-1] in SHIELDS else None
+        return self.around[-1] if self.around and self.around[-1] in (*SHIELDS, *BELIEVED) else None
 
     def __str__(self) -> str:
         return "".join([self.core, *(f"+{each}" for each in self.around)])
@@ -99,8 +100,8 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
         core, around = before, [last, *around]
     if plus and _is_meant_around(before, core, last):
         raise unknown_name("shield or refinement", last, AROUND)
-    shields = [each for each in around if each in SHIELDS]
-    if len(shields) > 1 or any(each not in SHIELDS for each in around[1:]):
+    shields = [each for each in around if each in (*SHIELDS, *BELIEVED)]
+    if len(shields) > 1 or any(each not in shields for each in around[1:]):
         raise InvalidInput(
             f"agent {spec!r}: +{REFINED[0]} comes first and once, then one shield of +{', +'.join(SHIELDS)}; for"
             " instance ppo@shipped+refined+step"

@@ -12,6 +12,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.durable import remove_unfinished
 from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
 from ethbrake_marl.learning.checkpoint_fit import check_fits
+from ethbrake_marl.learning.interruption import stop_on_signal
 from ethbrake_marl.learning.loop import BetweenUpdates, Evaluate, StopAt, measure_on_list
 from ethbrake_marl.learning.model_state import own_random_state
 from ethbrake_marl.learning.models import make_model, policy_maker
@@ -19,7 +20,7 @@ from ethbrake_marl.learning.progress import Course
 from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe
 from ethbrake_marl.learning.registry import algorithm_named
 from ethbrake_marl.learning.run_folder import RunDirectory, create_run, has_finished, only_process, open_run
-from ethbrake_marl.learning.session import Ended, Session, stop_on_signal
+from ethbrake_marl.learning.session import Ended, Session
 from ethbrake_marl.learning.team_file import team_content
 from ethbrake_marl.learning.training import Training, check_run_plugins, resolve, training_in
 from ethbrake_marl.policies.manifest import installed_versions

@@ -95,7 +95,7 @@ def settled_weights(given: dict[str, float]) -> dict[str, float]:
     known = registered_terms()
     for name in given:
         if name not in known:
-            raise unknown_name("reward term", name, known)
+            raise unknown_name("reward term", name, known, may_be_own=True)
     every = {name: given.get(name, term.weight) for name, term in known.items()}
     return {name: weight for name, weight in every.items() if weight > 0.0 or known[name].weight > 0.0}
 

@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from typing import Annotated, Literal
 
 import numpy as np
@@ -238,4 +239,7 @@ def _unknown(name: str) -> InvalidInput:
         return InvalidInput(f"feature {name!r} is of a neighbour: write front_1.{name} or rear_1.{name}")
     side = name.partition(".")[0]
     sides = ["front_1", "rear_1"] + ([side] if _is_side(side) else [])
-    return unknown_name("feature", name, choices(dict.fromkeys(sides)))
+    known = choices(dict.fromkeys(sides))
+    if not get_close_matches(name, known, n=1):
+        known = [each for each in known if "." not in each]  # a hundred single ones would hide the groups
+    return unknown_name("feature", name, known, may_be_own=True)

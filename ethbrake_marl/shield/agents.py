@@ -19,7 +19,6 @@ from ethbrake_marl.agents.e_v2x_bm.agent import EV2XBM
 from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place, recall
 from ethbrake_marl.agents.refined import Refined
-from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, script_agents, set_others
 from ethbrake_marl.engine.stream import ask_script, begin_script
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of
@@ -33,7 +32,7 @@ from ethbrake_marl.shield.comparison import as_predicted, difference, seen_colum
 from ethbrake_marl.shield.rollouts import Proposer, proposed_action
 from ethbrake_marl.shield.settings import check_scenario
 from ethbrake_marl.shield.step_shield import Certified, StepShield
-from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty, mode_uncertainty
+from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
 
 Bound = Literal["coupled", "pairwise"]
 
@@ -277,21 +276,3 @@ class StepShieldAgent(AgentAround):
 
     def _make(self, vehicle: int) -> StepShield:
         return StepShield(self.scenario, vehicle, **self._settings)  # type: ignore[arg-type]
-
-
-def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """``+episode`` or ``+episode:pairwise`` around an agent."""
-    bound: Bound = "coupled" if argument is None else "pairwise"
-    return HybridAgent(policy, settings.needed_scenario(), bound=bound, harm_count=settings.harm_count)
-
-
-def shield_steps(policy: Agent, argument: None, settings: AgentSettings) -> Agent:
-    """``+step`` around an agent."""
-    return StepShieldAgent(policy, settings.needed_scenario(), harm_count=settings.harm_count)
-
-
-def shield_steps_robustly(policy: Agent, argument: None, settings: AgentSettings) -> Agent:
-    """``+robust`` around an agent, against the uncertainty of the settings."""
-    scenario, where = settings.needed_scenario(), f"agent {settings.spec!r}"
-    uncertainty = mode_uncertainty("robust", settings.uncertainty, where)
-    return StepShieldAgent(policy, scenario, harm_count=settings.harm_count, uncertainty=uncertainty)

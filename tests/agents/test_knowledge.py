@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents import believed
+from ethbrake_marl.agents.believed import told_to
 from ethbrake_marl.agents.knowledge import Source, combine, knowledge_of, knowledge_text, sees_through
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import agent_names, find_entry
@@ -45,6 +47,11 @@ STATED = {  # every agent there is: all of the registry, and what ``make_lineup`
     "e_v2x_bm:believed": (BELIEFS,),
     "e_v2x_bm:pairwise:believed": (BELIEFS,),
     "planner:20:believed": (BELIEFS,),
+    "coast+step:believed": (SENSORS, BELIEFS),
+    "coast+robust:believed": (SENSORS, BELIEFS),
+    "ppo@shipped/ppo+step:believed": (MESSAGES, BELIEFS),
+    "ppo@shipped/ppo+episode:believed": (MESSAGES, BELIEFS),
+    "ppo@shipped/ppo+episode:pairwise:believed": (MESSAGES, BELIEFS),
     "ppo@shipped/ppo": (MESSAGES,),
     "sac@shipped/sac": (MESSAGES,),
     "policy@shipped": (MESSAGES,),
@@ -230,6 +237,20 @@ def test_messages__contact_features_tell_nothing_that_was_not_received(channel, 
 
 def test_own_sensors_and_messages__a_planted_leak_is_found():
     assert changed_actions(Leaking(), BLOCKED) > 50
+
+
+@pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo@shipped/ppo+episode:believed"])
+@pytest.mark.parametrize("leak", ["known", "speed_mps"])
+def test_believed_model__a_planted_leak_is_found(spec, leak, monkeypatch):
+    def leaking(worlds, vehicle):
+        told = told_to(worlds, vehicle)
+        if leak == "known":
+            return told._replace(known=np.ones_like(told.known))
+        return told._replace(speed_mps=worlds.speeds_mps.copy())
+
+    scenario = BLOCKED.replace(v2x=CHANNELS[3])
+    monkeypatch.setattr(believed, "told_to", leaking)
+    assert changed_actions(agent_of(spec, scenario), scenario) > 0
 
 
 @pytest.mark.parametrize("spec", [spec for spec in STATED if spec not in HONEST])

@@ -103,6 +103,8 @@ TABLES: dict[str, How] = {
         "ethbrake shield --scenario paper-random-brake-only --agents ppo@shipped --json",
         "ethbrake shield --scenario paper-random-obstacle --harm-count total --agents ppo@shipped --json",
     ),
+    "| what | first-impact harm | of the best known": TRAINED,
+    "| what the vehicles do | first-impact harm": TRAINED,
     # lists of worlds
     "| Agent | Knows | Collisions": _by(
         NIGHTLY,
@@ -173,6 +175,7 @@ TABLES: dict[str, How] = {
     "| | full braking | E-V2X-BM | this policy": _by(TRAINING, "make run"),
     "| library | version": _by(TRAINING, "make test-libraries"),
     # speeds
+    "| what | processor time | a whole job": _by(SPEED),
     "| agent | knows | CPU, ms per world": _by(SPEED),
     "| agent | CPU time | first": _by(SPEED),
     "| | CPU-seconds per million worlds": _by(SPEED),
@@ -189,6 +192,8 @@ TABLES: dict[str, How] = {
 }
 
 PICTURES: dict[str, How] = {
+    "emergency.svg": _by(NIGHTLY, "ethbrake record --agents full_brake,counterfactual@shipped --output emergency.svg"),
+    "model-": _by(SUITE, "tests/docs/test_drawings.py"),
     "criticality.png": _by(
         NIGHTLY, "ethbrake picture criticality --scenario paper-distance --agent e_v2x_bm --output criticality.png"
     ),

@@ -284,6 +284,14 @@ def test_observation__that_cannot_be_one_is_refused(listed: Any, message: str, m
         eb.choose_observation(listed)
 
 
+def test_feature__that_is_not_registered_is_told_with_groups_and_the_plug_in_in_a_short_line() -> None:
+    with pytest.raises(
+        UnknownName, match=r"known: .*front_1, .*own, .*; one of your own file needs --plugin"
+    ) as caught:
+        eb.choose_observation(["own", "zzz"])
+    assert len(str(caught.value)) < 400
+
+
 def test_observation__has_its_place_in_the_schema_and_none_in_the_plain_dump(mine: Any) -> None:
     items = scenario_json_schema()["properties"]["observation"]["items"]["anyOf"][0]["enum"]
     assert {"urgency", "front_1.load", "own"} <= set(items)

@@ -16,7 +16,7 @@ from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import kernel as search_kernel
 from ethbrake_marl.search.problem import profile_problem
 from ethbrake_marl.search.profiles import Profiles, follow_profiles
-from ethbrake_marl.shield import certify_kernel
+from ethbrake_marl.shield import certify_kernel, members
 
 RULES = ("step_end_s", "onset_s", "command_in_force", "stands")
 PAPER = load_scenario("paper-random")
@@ -46,14 +46,14 @@ def test_rules__are_the_same_objects_in_engine_search_and_shield():
     assert all(used[name] is getattr(episode, name) for name in RULES)
     assert used["advance_table"] is segment.advance_table
     assert used["advance_table"] is episode.step_episode.py_func.__globals__["advance_table"]
-    assert certify_kernel.step_again is episode.step_again
+    assert members.step_again is episode.step_again
     assert episode.follow.py_func.__globals__["step_again"] is episode.step_again
     assert search_kernel.follow is episode.follow
 
 
 def test_rules__stand_nowhere_else():
     # who plays an episode by calling the kernel of segments itself would have a step of its own
-    for module in (search_kernel, certify_kernel):
+    for module in (search_kernel, certify_kernel, members):
         assert "advance_table" not in inspect.getsource(module)
     source = inspect.getsource(engine_step.step_worlds.py_func)
     assert all(f"{name}(" in source for name in (*RULES, "advance_table"))

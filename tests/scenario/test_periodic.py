@@ -226,7 +226,10 @@ def test_given_states__need_a_channel_without_chance() -> None:
 def test_mixture__its_scenarios_share_the_persistence() -> None:
     members = [
         {"scenario": {**load_scenario(name).declared(), "v2x": v2x}}
-        for name, v2x in (("paper-random", {"preset": "nominal", "persistence": "periodic"}), ("paper-slow", "nominal"))
+        for name, v2x in (
+            ("paper-random", {"preset": "nominal", "persistence": "periodic"}),
+            ("paper-random-brake-only", "nominal"),
+        )
     ]
     with pytest.raises(InvalidInput, match=r"v2x\.persistence must be the same in all"):
         Scenario(name="mixed", mixture=members)

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ethbrake_marl.learning.session import stop_on_signal
+from ethbrake_marl.learning.interruption import stop_on_signal
 from ethbrake_marl.studies.jobs.work import Answer, Workers
 
 RETRIES = 2  # further attempts at a job whose worker was lost

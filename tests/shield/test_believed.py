@@ -1,0 +1,135 @@
+"""Shields over believed worlds: the bound where the world is a corner of what is open, and what they are without it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.shield.believed import BelievedShieldAgent
+
+BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
+ENDS = BASE.replace(  # every world is a corner of its ranges: what is open is one of two numbers. None are round: in a
+    # world of equal gaps and speeds two impacts fall on one moment, and the last bit decides which of them is first
+    gaps_m=[{"choice": [5.13, 9.71]}, {"choice": [5.37, 9.58]}],
+    speeds_mps=[{"choice": [18.23, 21.87]}, {"choice": [18.11, 21.93]}, {"choice": [18.41, 22.19]}],
+    v2x={"preset": "paper", "hears": "front"}, mass_t=[4.5, 5.5, {"choice": [3.0, 9.0]}],
+)  # fmt: skip
+LATE = ENDS.replace(  # heard one after the other, a while after the first decision, by messages 0.6 to 0.9 s old
+    v2x={"preset": "paper", "link_latency_s": 0.6, "persistence": "periodic", "senses": "front", "sensing_s": [3, 3]},
+    latency_s=[0.0, 0.2, 0.6],
+)
+PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
+
+
+class Hostile:
+    """Proposes whatever does most harm: full driving, coasting, or chance."""
+
+    knows = "own sensors"
+
+    def __init__(self, way: str) -> None:
+        self.name, self.rng = way, np.random.default_rng(5)
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: np.ndarray) -> None:
+        pass
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        low, high = (
+            -worlds.vehicles.braking_capacity_mps2[:, vehicle],
+            worlds.vehicles.driving_capacity_mps2[:, vehicle],
+        )
+        if self.name == "chance":
+            return self.rng.uniform(low, high)
+        return high.copy() if self.name == "drive" else np.zeros(worlds.n)
+
+
+def driven(agent: object, scenario: Scenario, n: int, seed: int = 7, vehicle: int = 1) -> tuple[Floats, Floats]:
+    """Harm realised, and the first bound, [n] each."""
+    harm = drive(scenario.sample(n, seed).worlds, agent, scenario, vehicle).ledger.world_harm("first")
+    return harm, agent.predicted_harm
+
+
+@pytest.mark.parametrize("scenario", [ENDS, LATE], ids=["never heard", "heard late"])
+@pytest.mark.parametrize("way", ["coast", "drive", "chance"])
+def test_robust__at_the_corners_no_world_is_above_the_first_bound(scenario: Scenario, way: str) -> None:
+    agent = BelievedShieldAgent(Hostile(way), scenario, robust=True)
+    harm, bound = driven(agent, scenario, 60)
+    assert (harm <= bound + 1e-6).all()
+    assert agent.interventions.sum() > 60
+
+
+def test_step__in_the_middle_promises_nothing_of_the_corners() -> None:
+    harm, bound = driven(BelievedShieldAgent(Hostile("coast"), ENDS), ENDS, 60)
+    assert (harm > bound + 1.0).any()
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_believed__where_everything_is_known_the_bound_is_that_of_the_best_constant(robust: bool) -> None:
+    harm, bound = driven(BelievedShieldAgent(Hostile("drive"), BASE, robust=robust), BASE, 40)
+    _, best = driven(make_agent("e_v2x_bm", scenario=BASE), BASE, 40)
+    np.testing.assert_allclose(bound, best, atol=1e-4)
+    assert (harm <= bound + 1e-6).all()
+
+
+@pytest.mark.parametrize("spec", ["coast+step:believed", "coast+robust:believed", "ppo@shipped/ppo+episode:believed"])
+def test_believed__no_world_depends_on_the_batch(spec: str) -> None:
+    worlds = PERIODIC.sample(6, 3).worlds
+    whole = drive(worlds, make_agent(spec, scenario=PERIODIC), PERIODIC, 1).final
+    alone = drive(worlds.take([4]), make_agent(spec, scenario=PERIODIC), PERIODIC, 1).final
+    np.testing.assert_allclose(whole.speeds_mps[4], alone.speeds_mps[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("vehicles", [2, 4])
+def test_believed__shields_lines_of_other_lengths(vehicles: int) -> None:
+    scenario = load_scenario("paper-random").replace(
+        vehicles=vehicles, braking_capacity_mps2=6.0, driving_capacity_mps2=6.0, mass_t=5.0, latency_s=0.1,
+        roles={"vehicle_2": "learner"}, v2x={"preset": "nominal", "persistence": "periodic"}, horizon_s=10.0,
+    )  # fmt: skip
+    for robust in (False, True):
+        harm, bound = driven(BelievedShieldAgent(Hostile("coast"), scenario, robust=robust), scenario, 4)
+        assert np.isfinite(bound).all() and np.isfinite(harm).all()
+
+
+def test_believed__shields_beside_an_obstacle() -> None:
+    scenario = load_scenario("cooperation-4-all").replace(
+        early_impacts="keep", v2x=PERIODIC.v2x.model_dump(exclude_none=True)
+    )
+    scenario = scenario.with_learners(["vehicle_2"])
+    harm, bound = driven(BelievedShieldAgent(Hostile("coast"), scenario), scenario, 10)
+    assert np.isfinite(bound).all() and np.isfinite(harm).all()
+
+
+def test_believed__asked_again_says_the_same_and_a_later_smaller_batch_begins_anew() -> None:
+    agent, worlds = make_agent("coast+step:believed", scenario=PERIODIC), PERIODIC.sample(5, 3).worlds
+    later = drive(worlds, make_agent("full_brake", scenario=PERIODIC), PERIODIC, 1).final
+    agent.begin(worlds, 1, np.arange(5))
+    first = drive(worlds, agent, PERIODIC, 1).ledger.world_harm("first")
+    assert np.array_equal(agent.act(later, 1), agent.act(later, 1))
+    fewer = drive(worlds.take(np.arange(3)), agent, PERIODIC, 1).ledger.world_harm("first")
+    np.testing.assert_allclose(fewer, first[:3], atol=1e-6)
+
+
+def test_robust__too_many_open_numbers_are_refused() -> None:
+    wide = load_scenario("paper-random").replace(
+        vehicles=4, braking_capacity_mps2={"uniform": [3, 9]}, driving_capacity_mps2=3.0, mass_t={"uniform": [2, 9]},
+        latency_s=0.1, v2x="nominal", roles={"vehicle_2": "learner"},
+    )  # fmt: skip
+    with pytest.raises(InvalidInput, match="scenario 'paper-random' leaves 14 numbers of the other vehicles open"):
+        make_agent("coast+robust:believed", scenario=wide)
+
+
+@pytest.mark.parametrize(
+    ("spec", "words"),
+    [
+        ("coast+step:pairwise:believed", "step:pairwise:believed"),
+        ("coast+step:believed+robust", "then one shield"),
+        ("e_v2x_bm:believed+episode:believed", "decides on what was received itself"),
+    ],
+)
+def test_believed__what_cannot_be_is_refused(spec: str, words: str) -> None:
+    with pytest.raises(InvalidInput, match=words):
+        make_agent(spec, scenario=BASE)
