@@ -23,7 +23,7 @@ NOT_YET = {
         "shield",
     )
 }  # fmt: skip
-PAGES = sorted([ROOT / "README.md", *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")])
+PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")])
 
 FENCE = re.compile(r"\s*(```+|~~~+|:::+)")
 FREE = re.compile(r"\s*(\||#|<|!\[)|\[[\w-]+\]: |\s*([-*] )?\S+$")  # tables, headings, HTML, pictures, one word
