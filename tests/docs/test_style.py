@@ -81,6 +81,15 @@ def test_page__has_short_lines_and_short_paragraphs(path: Path) -> None:
         assert not any(wrong.values()), wrong
 
 
+def test_readme__is_short_and_begins_with_a_moving_picture_of_less_than_300_kb() -> None:
+    text = (ROOT / "README.md").read_text("utf-8")
+    assert len(text.splitlines()) <= 120
+    found = re.search(r"!\[[^\]]*\]\(([^)]*\.svg)\)", text)
+    assert found is not None and found.start() < text.index("\n## ")
+    picture = (ROOT / found[1]).read_bytes()
+    assert b"<animate" in picture and len(picture) < 300_000
+
+
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_page__has_code_blocks_that_begin_and_end_on_lines_of_their_own(path: Path) -> None:
     lines = path.read_text("utf-8").splitlines()
