@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
+from numba.core.errors import NumbaError
 
 import ethbrake_marl
 from ethbrake_marl.physics import compiled
-from ethbrake_marl.physics.compiled import cache_folder, compiled_apart
+from ethbrake_marl.physics.compiled import (
+    cache_folder,
+    compiled_apart,
+    compiled_bare,
+    compiled_bare_apart,
+    compiled_within,
+)
 from ethbrake_marl.physics.compiled import compiled as compile_kernel
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
@@ -32,8 +41,17 @@ def test_compiled__is_strict_and_releases_the_lock():
     assert options["nopython"] is True and "parallel" not in options
 
 
-@pytest.mark.parametrize(("way", "inline"), [(compile_kernel, True), (compiled_apart, False)])
-def test_compiled__asks_for_these_options_and_for_its_own_folder(monkeypatch, way, inline):
+@pytest.mark.parametrize(
+    ("way", "more"),
+    [
+        (compile_kernel, {"forceinline": True}),
+        (compiled_apart, {"forceinline": False}),
+        (compiled_within, {"inline": "always"}),
+        (compiled_bare, {"forceinline": True, "_nrt": False}),
+        (compiled_bare_apart, {"forceinline": False, "_nrt": False}),
+    ],
+)
+def test_compiled__asks_for_these_options_and_for_its_own_folder(monkeypatch, way, more):
     asked = []
 
     def compiler(**options):
@@ -42,8 +60,22 @@ def test_compiled__asks_for_these_options_and_for_its_own_folder(monkeypatch, wa
 
     monkeypatch.setattr(numba, "njit", compiler)
     assert way(len) is len
-    options = {"cache": True, "fastmath": False, "nogil": True, "error_model": "numpy", "forceinline": inline}
+    options = {"cache": True, "fastmath": False, "nogil": True, "error_model": "numpy", **more}
     assert asked == [(options, str(cache_folder()))]
+
+
+@needs_compiler
+def test_compiled_bare__leaves_the_counts_of_references_alone():
+    @compiled_bare
+    def first(values):
+        return values[1:][0]
+
+    values = np.arange(3.0)
+    before = sys.getrefcount(values)
+    assert [first(values) for _ in range(5)] == [1.0] * 5
+    assert sys.getrefcount(values) == before
+    with pytest.raises(NumbaError, match="NRT required"):
+        compiled_bare(lambda n: np.zeros(n))(3)  # it can make no array: told at once
 
 
 @needs_compiler
