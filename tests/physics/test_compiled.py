@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -156,3 +158,15 @@ def test_cache_folder__changes_with_any_kernel_source_and_with_numba_and_with_no
     before = folder()
     monkeypatch.setattr(numba, "__version__", "0.0")
     assert folder() != before
+
+
+def test_compiled_bare__gives_no_array_back():
+    bare = []
+    for source in sorted(Path(ethbrake_marl.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(source.read_text())):
+            names = {d.id for d in getattr(node, "decorator_list", ()) if isinstance(d, ast.Name)}
+            if names & {"compiled_bare", "compiled_bare_apart"}:
+                bare.append(f"{source.name}: {node.name}")
+                words = set(re.findall(r"\w+", ast.unparse(node.returns)))
+                assert words <= {"None", "bool", "int", "float", "tuple"}, bare[-1]
+    assert len(bare) > 30
