@@ -56,7 +56,7 @@ class AgentSettings:
 Factory = Callable[[str | None, AgentSettings], Driver]
 """Makes the agent of an argument (what stands after the colon, or None)."""
 
-Wrapper = Callable[[Agent, str | None, AgentSettings], Agent]
+Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
 """Makes the agent around an agent."""
 
 
@@ -152,14 +152,19 @@ _WRAPPERS: dict[str, Entry] = {
         "+episode[:pairwise]",
         "behind Algorithm 1: it or E-V2X-BM drives the episode, whichever harms less",
         (Source.MODEL,),
-        "shield.agents:shield_episodes",
+        "shield.around:shield_episodes",
     ),
-    "step": Entry("+step", "every action certified, or replaced", (Source.MODEL,), "shield.agents:shield_steps"),
+    "step": Entry(
+        "+step",
+        "every action certified, or replaced; of a team together",
+        (Source.MODEL,),
+        "shield.around:shield_steps",
+    ),
     "robust": Entry(
         "+robust",
         "the same where not everything is known: against an uncertainty",
         (Source.MODEL,),
-        "shield.agents:shield_steps_robustly",
+        "shield.around:shield_steps_robustly",
     ),
 }
 
@@ -298,13 +303,14 @@ def _make(entry: Entry, argument: str | None, settings: AgentSettings) -> Driver
     return driver
 
 
-def _put_around(driver: Driver, around: str, settings: AgentSettings) -> Agent:
+def _put_around(driver: Driver, around: str, settings: AgentSettings) -> Driver:
     assert is_around(around)
-    if isinstance(driver, Team):
+    if isinstance(driver, Team) and around != "step":
         raise InvalidInput(
             f"agent {settings.spec!r}: is a team, and +{around} is for one driven vehicle, the others following"
-            " scripts; name that vehicle (--vehicle vehicle_2) and one policy of the team (ppo@RUN/policy/vehicle_2)"
+            " scripts; +step goes around a team; else name that vehicle (--vehicle vehicle_2) and one policy of the"
+            " team (ppo@RUN/policy/vehicle_2)"
         )
     name, _, argument = around.partition(":")
-    agent: Agent = _WRAPPERS[name].load()(driver, argument or None, settings)
-    return agent
+    wrapped: Driver = _WRAPPERS[name].load()(driver, argument or None, settings)
+    return wrapped

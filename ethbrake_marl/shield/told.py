@@ -1,4 +1,4 @@
-"""What a shield tells in ``infos``."""
+"""Infos of a shield: the keys, and their values before anything is decided."""
 
 from __future__ import annotations
 

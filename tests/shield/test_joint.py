@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search.problem import profile_problem
-from ethbrake_marl.shield import HybridShield, StepShield, shielded_aec
+from ethbrake_marl.shield import HybridShield, ShieldedTeam, StepShield, shielded_aec
 from ethbrake_marl.shield.alert import joint_constants
 from ethbrake_marl.shield.certify import REASONS, Backup, begin_running, certify, plan_harm
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
@@ -322,3 +324,66 @@ def test_sb3__rows_of_one_world_are_decided_together_over_automatic_resets():
             assert [each["first_impact_harm"] for each in pair] <= caps[k // 2, 1:].tolist()
             ended += 1
     assert ended >= 5
+
+
+def test_evaluation__a_team_behind_the_shield_keeps_its_bound_and_is_never_worse_than_told():
+    worlds = PAIR.sample(40, 7)
+    agents = {name: make_agent(name, scenario=PAIR) for name in ("constant:3+step", "full_brake+step", "full_brake")}
+    found = evaluate(worlds, agents, scenario=PAIR, seed=7).outcomes
+    for name in ("constant:3+step", "full_brake+step"):
+        harm = found[name].ledger.world_harm("first")
+        assert (harm <= found[name].predicted_harm).all() and found[name].chosen_policy.shape == (40,)
+    mean = {name: found[name].ledger.world_harm("first").mean() for name in agents}
+    assert mean["full_brake+step"] < mean["full_brake"] - 1.0 and found["full_brake"].predicted_harm is None
+
+
+def test_evaluation__members_ask_once_and_the_engine_is_followed_to_the_end():
+    team = ShieldedTeam(Team.copies(make_agent("coast"), (1, 2)), PAIR, logging=True)
+    worlds = PAIR.sample(20, 9).worlds
+    harm = drive(worlds, team, PAIR).ledger
+    shield = team.shield
+    assert harm.world_harm("first").tolist() == shield.bound.tolist() and not shield.distrusted.any()
+    assert len(shield.log) == shield.interventions.sum() > 0
+    assert {entry.vehicle for entry in shield.log} == {1, 2}
+    again = drive(PAIR.sample(20, 9).worlds, team, PAIR).ledger  # a second batch begins anew
+    assert again.world_harm("first").tolist() == harm.world_harm("first").tolist()
+
+
+class Coasting:
+    """Coasts."""
+
+    name = "coasting"
+
+    def begin(self, worlds, vehicle, rows):
+        pass
+
+    def act(self, worlds, vehicle):
+        return np.zeros(worlds.n)
+
+
+def test_evaluation__later_rollouts_of_the_team_let_more_of_it_through():
+    class Late(Coasting):
+        """Coasts for 0.3 s, then brakes fully."""
+
+        def act(self, worlds, vehicle):
+            return np.where(worlds.time_s < 0.8, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+    worlds, replaced = PAIR.sample(60, 11).worlds, {}
+    for later in (True, False):
+        team = ShieldedTeam(Team({1: Late(), 2: Late()}, "late"), PAIR, later_rollouts=later)
+        harm = drive(worlds, team, PAIR).ledger.world_harm("first")
+        assert (harm <= team.predicted_harm).all()
+        replaced[later] = team.shield.interventions.sum()
+    assert replaced[True] < replaced[False]
+
+
+@pytest.mark.parametrize("around", ["episode", "robust"])
+def test_evaluation__other_shields_refuse_a_team(around):
+    with pytest.raises(InvalidInput, match=r"can drive one learner|needs an uncertainty"):
+        team = make_agent(f"full_brake+{around}", scenario=PAIR)
+        evaluate(PAIR.sample(2, 1), {"one": team}, scenario=PAIR)
+
+
+def test_evaluation__a_team_that_leaves_a_learner_alone_is_refused():
+    with pytest.raises(InvalidInput, match=r"does not drive vehicle_3.*follows a script"):
+        ShieldedTeam(Team({1: make_agent("coast")}, "half"), PAIR)
