@@ -47,7 +47,7 @@ def test_entry__is_written_and_printed_list_by_list(small, tmp_path):
 
 
 def test_lists_that_are_not_driven__are_said_and_there_is_no_overall_score(small):
-    found = small("benchmark", "small", "--agent", "full_brake+step")
+    found = small("benchmark", "small", "--agent", "full_brake+episode")
     assert found.status == 0 and "no overall score, as it drives 1 of 2 lists" in found.out
     assert "cooperation-3-pair: " in found.out and "not driven" in found.out
 
