@@ -56,7 +56,7 @@ class AgentSettings:
 Factory = Callable[[str | None, AgentSettings], Driver]
 """Makes the agent of an argument (what stands after the colon, or None)."""
 
-Wrapper = Callable[[Agent, str | None, AgentSettings], Agent]
+Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
 """Makes the agent around an agent."""
 
 
@@ -157,7 +157,7 @@ _WRAPPERS: dict[str, Entry] = {
     ),
     "step": Entry(
         "+step[:believed]",
-        "every action certified, or replaced; believed: certified in the world that the vehicle believes in",
+        "every action certified, or replaced; of a team together; believed: certified in the world that is believed",
         (Source.MODEL,),
         "shield.factories:shield_steps",
     ),
@@ -304,13 +304,14 @@ def _make(entry: Entry, argument: str | None, settings: AgentSettings) -> Driver
     return driver
 
 
-def _put_around(driver: Driver, around: str, settings: AgentSettings) -> Agent:
+def _put_around(driver: Driver, around: str, settings: AgentSettings) -> Driver:
     assert is_around(around)
-    if isinstance(driver, Team):
+    if isinstance(driver, Team) and around != "step":
         raise InvalidInput(
             f"agent {settings.spec!r}: is a team, and +{around} is for one driven vehicle, the others following"
-            " scripts; name that vehicle (--vehicle vehicle_2) and one policy of the team (ppo@RUN/policy/vehicle_2)"
+            " scripts; +step goes around a team; else name that vehicle (--vehicle vehicle_2) and one policy of the"
+            " team (ppo@RUN/policy/vehicle_2)"
         )
     name, _, argument = around.partition(":")
-    agent: Agent = _WRAPPERS[name].load()(driver, argument or None, settings)
-    return agent
+    wrapped: Driver = _WRAPPERS[name].load()(driver, argument or None, settings)
+    return wrapped

@@ -70,7 +70,7 @@ def episode_engine(worlds: Worlds, agent: Agent | Team, scenario: Scenario, vehi
         raise InvalidInput(
             f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
             f" {', '.join(undriven)} of scenario {scenario.name!r} must be driven too. An agent that rolls itself out"
-            " (+refined, +episode, +step) can drive one learner, the others need scripts: --vehicle NAME"
+            " (+refined, +episode, +robust) can drive one learner, the others need scripts: --vehicle NAME"
         )
     scripts = script_agents(scenario, except_for=drivers)
     for i, driver in drivers.items():

@@ -32,7 +32,7 @@ from ethbrake_marl.scenario.catalogue import SHIPPED
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 DISTRIBUTION = "ethbrake-marl"
-EXTRAS = ("train", "marl", "export", "data", "render", "explore", "cluster")
+EXTRAS = ("train", "marl", "export", "data", "render", "explore", "cluster", "tune")
 _WARM_UP = ("ladder", "ppo@shipped", "ppo@shipped+refined+episode", "full_brake+step", "full_brake+robust")
 OLDEST_PYTHON = (3, 11)
 _PACKAGE = Path(__file__).resolve().parents[1]

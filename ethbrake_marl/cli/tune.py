@@ -53,7 +53,7 @@ def tune_command(
         from ethbrake_marl.studies.ablation.plan import check_folder
         from ethbrake_marl.studies.tuning.file import read_tuning
         from ethbrake_marl.studies.tuning.plan import plan_tuning
-        from ethbrake_marl.studies.tuning.run import check_tuning
+        from ethbrake_marl.studies.tuning.run import check_tuning, run_tuning
 
         _check_numbers(trials, jobs, retries)
         if ray is not None:
@@ -71,7 +71,6 @@ def tune_command(
             _show_plan(plan, output, trials, jobs, as_json)
             return
         with closing(workers_for(ray, jobs, jobs)) as workers, progress_bars() as bars:
-            from ethbrake_marl.studies.tuning.run import run_tuning
 
             def tell(state: TuningState) -> None:
                 _show_state(bars, state)
@@ -126,6 +125,7 @@ def _show_plan(plan: TuningPlan, output: Path, trials: int, jobs: int, as_json: 
 
 def _show_result(plan: TuningPlan, result: TuningResult, export: Path | None, force: bool, as_json: bool) -> None:
     best = result.best
+    export = None if best is None or result.interrupted else export  # what goes on exports at its end
     if best is not None and export is not None:
         from ethbrake_marl.evaluation.per_world import write_output
         from ethbrake_marl.studies.tuning.table import best_recipe
@@ -135,14 +135,14 @@ def _show_result(plan: TuningPlan, result: TuningResult, export: Path | None, fo
     if as_json:
         shown = None if best is None else {"trial": best.number, "harm": best.harm, "values": best.values}
         counts = {"trials": result.counts, "interrupted": result.interrupted, "table": str(result.table)}
-        write_json({"best": shown, **counts, "exported": None if best is None or export is None else str(export)})
+        write_json({"best": shown, **counts, "exported": None if export is None else str(export)})
     elif best is not None:
         show(f"best: trial {best.number}, harm {best.harm:.4f}")
         for key, value in best.values.items():
             show(f"  {key} = {value}")
     counted = ", ".join(f"{number:,} {state}" for state, number in sorted(result.counts.items()))
     told = f"trials: {counted or 'none'}; table: {result.table}"
-    told += f"; recipe: {export}" if best is not None and export is not None else ""
+    told += f"; recipe: {export}" if export is not None else ""
     say(f"interrupted; {told}; {KEPT}" if result.interrupted else told)
     if result.interrupted:
         raise typer.Exit(INTERRUPTED)

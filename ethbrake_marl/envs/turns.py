@@ -29,7 +29,7 @@ class InTurns(parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is u
             if action is not None:
                 raise InvalidInput(f"step: the episode of {agent} is over; only None may follow, or reset")
         elif engine.scenario.vehicle_names.index(agent) in engine.learners:
-            left_out = action is None and agent == getattr(self.env, "shielded", None)  # a shield may choose alone
+            left_out = action is None and agent in getattr(self.env, "shielded", ())  # a shield may choose alone
             if not left_out:
                 checked_action(action, (1,), agent)
         super().step(action)

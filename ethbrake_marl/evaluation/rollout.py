@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.knowledge import knowledge_of
-from ethbrake_marl.agents.protocol import Agent, check_agent
+from ethbrake_marl.agents.protocol import check_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.engine.stream import check_alert
@@ -33,6 +33,7 @@ from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Ints, Worlds, concatenate, leaving_out_failed
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.scenario.sample import kind_columns
+from ethbrake_marl.shield.team_agent import drives_alone
 
 CHUNK = 10_000  # worlds advanced together: bounds memory, changes no result
 
@@ -229,7 +230,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     sampled = SampledHarm.of(worlds, task) if aftermath else None
     impacts = ImpactWatch.of(worlds) if aftermath else None
     episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled, impacts) if w is not None])
-    alone = next(iter(team.drivers.values())) if len(team.drivers) == 1 else None
+    alone = drives_alone(team)
     predicted, chosen = (_read_column(alone, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
     return Outcome(
         episodes.ledger,
@@ -245,7 +246,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     )
 
 
-def _read_column(agent: Agent | None, attribute: str, n: int) -> NDArray[np.generic] | None:
+def _read_column(agent: Driver | None, attribute: str, n: int) -> NDArray[np.generic] | None:
     """What the agent says about each world of the batch, or None when it says nothing."""
     value = getattr(agent, attribute, None)
     if agent is None or value is None:

@@ -5,6 +5,7 @@ from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
 from ethbrake_marl.shield.engine_shield import MovingAtHorizon
 from ethbrake_marl.shield.options import ShieldOptions
 from ethbrake_marl.shield.step_shield import Certified, StepShield
+from ethbrake_marl.shield.team_agent import ShieldedTeam
 from ethbrake_marl.shield.uncertainty import Interval, Uncertainty, parse_uncertainty
 from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 
@@ -19,6 +20,7 @@ __all__ = [
     "Running",
     "ShieldOptions",
     "ShieldedEnv",
+    "ShieldedTeam",
     "ShieldedVectorEnv",
     "StepShield",
     "StepShieldAgent",

@@ -10,6 +10,7 @@ independent, that does not hold: the pairwise figure is about half of what the s
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -29,9 +30,10 @@ from ethbrake_marl.physics.rows import TIME, Packed
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import state_columns
 from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
-from ethbrake_marl.shield.rollouts import Proposer, proposed_action
+from ethbrake_marl.shield.rollouts import Proposer, proposed_actions
 from ethbrake_marl.shield.settings import check_scenario
 from ethbrake_marl.shield.step_shield import Certified, StepShield
+from ethbrake_marl.shield.told import by_vehicle
 from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
 
 Bound = Literal["coupled", "pairwise"]
@@ -182,6 +184,19 @@ class StepShieldAgent(AgentAround):
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Find the bound of these rows; ``worlds`` holds those rows only, at the alert."""
+        self.begin_all(worlds, vehicle, {vehicle: self.policy}, rows)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The certified command, [n] m/s2. Asked again at the same moment, it says the same.
+
+        Raises ``UncertifiedStep`` where a decision was left out.
+        """
+        return self.act_all(worlds, vehicle, {vehicle: self.policy})
+
+    def begin_all(
+        self, worlds: Worlds, vehicle: int | tuple[int, ...], policies: Mapping[int, Agent], rows: Ints
+    ) -> None:
+        """``begin`` for one vehicle or several, each with the policy that proposes for it."""
         if self._believed is not None and not (rows < self._believed.n).all():
             raise InvalidInput(
                 f"step: believed holds {count_of(self._believed.n, 'world')}, but row {rows.max()} begins"
@@ -190,20 +205,19 @@ class StepShieldAgent(AgentAround):
             self.shield, self._asked = self._make(vehicle), None
         if self._asked is not None and len(rows) < len(self._wanted):
             self._commit(self._asked)  # some episodes of a batch are renewed: that step was made
-        set_others(self.policy, vehicle, script_agents(self.scenario, except_for=vehicle))
-        begin_script(self.policy, worlds, vehicle, rows)
-        self.shield.begin(worlds if self._believed is None else self._believed.take(rows), rows, self.policy)
+        scripts = script_agents(self.scenario, except_for=list(policies))
+        for i, policy in policies.items():
+            set_others(policy, i, scripts)
+            begin_script(policy, worlds, i, rows)
+        self.shield.begin(worlds if self._believed is None else self._believed.take(rows), rows, policies)
         bound = self.shield.first_bound[rows] + self.shield.allowance
         self.predicted_harm = place(self.predicted_harm, rows, bound)
-        self._wanted = place(self._wanted, rows, np.zeros(worlds.n))
-        self._first_s = place(self._first_s, rows, first_decision_s(worlds, [vehicle]))
+        self._wanted = place(self._wanted, rows, np.zeros((worlds.n, *self.shield.backup.plan.shape[2:])))
+        self._first_s = place(self._first_s, rows, first_decision_s(worlds, list(policies)))
         self._asked = None
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """The certified command, [n] m/s2. Asked again at the same moment, it says the same.
-
-        Raises ``UncertifiedStep`` where a decision was left out.
-        """
+    def act_all(self, worlds: Worlds, vehicle: int | tuple[int, ...], policies: Mapping[int, Agent]) -> Floats:
+        """``act`` for one vehicle, [n], or several, [n, K] m/s2."""
         shield = self.shield
         if shield is None or shield.running is None or len(self._wanted) < worlds.n:
             raise InvalidInput(
@@ -217,11 +231,15 @@ class StepShieldAgent(AgentAround):
         self._follow(worlds.time_s)
         if self._asked is None:
             due = self._due(worlds)
-            proposed = proposed_action(self.policy, worlds, vehicle)
-            proposer = Proposer({vehicle: self.policy}, worlds) if self._later_rollouts else None
+            proposed = proposed_actions(policies, worlds, isinstance(vehicle, int))
+            proposer = Proposer(policies, worlds) if self._later_rollouts else None
             certified = shield.propose(proposed, seen=state_columns(worlds), only=due, proposer=proposer)
-            command = action_to_command(certified.decision.applied, worlds.vehicles, vehicle)
-            self._asked = _Asked(worlds.time_s, certified, np.where(due, command, self._wanted))
+            applied = by_vehicle(certified.decision.applied, shield.vehicles)
+            columns = [action_to_command(applied[:, c], worlds.vehicles, i) for c, i in enumerate(shield.vehicles)]
+            command = columns[0] if isinstance(vehicle, int) else np.stack(columns, axis=1)
+            wanted = self._wanted.copy()
+            wanted[due] = command[due]
+            self._asked = _Asked(worlds.time_s, certified, wanted)
         return self._asked.wanted.copy()
 
     def after_step(self, packed: Packed) -> None:
@@ -274,5 +292,5 @@ class StepShieldAgent(AgentAround):
             self.shield.commit(asked.certified)
         self.__dict__.update(_wanted=asked.wanted, _asked=None)
 
-    def _make(self, vehicle: int) -> StepShield:
+    def _make(self, vehicle: int | tuple[int, ...]) -> StepShield:
         return StepShield(self.scenario, vehicle, **self._settings)  # type: ignore[arg-type]

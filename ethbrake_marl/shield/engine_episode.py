@@ -8,14 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.actions import command_to_action
-from ethbrake_marl.agents.learned import LearnedPolicy
-from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.shield.agents import HybridAgent
-from ethbrake_marl.shield.engine_shield import Attached, AttachedShield, Sent
+from ethbrake_marl.shield.engine_shield import Attached, AttachedShield, Proposing, Sent
 from ethbrake_marl.shield.options import ShieldOptions
-from ethbrake_marl.shield.settings import proposing_agent
+from ethbrake_marl.shield.settings import proposing_agent, shielded_vehicles
 
 ROUNDING = 1e-6  # of an action in 32 bits
 
@@ -29,7 +27,10 @@ class EpisodeChoice(NamedTuple):
 class AttachedHybrid(Attached):
     """Episode mode on a running engine: ``HybridAgent`` chooses at each alert, and its action alone may be applied."""
 
-    def __init__(self, engine: Engine, policy: Agent | LearnedPolicy | None, options: ShieldOptions) -> None:
+    vehicle: int
+
+    def __init__(self, engine: Engine, policy: Proposing | None, options: ShieldOptions) -> None:
+        shielded_vehicles(engine, options.where, options.mode)
         agent = proposing_agent(policy, options.where)
         hybrid = HybridAgent(agent, engine.scenario, bound=options.bound, harm_count=options.harm_count)
         super().__init__(engine, options, EpisodeChoice(hybrid))
@@ -71,7 +72,7 @@ class AttachedHybrid(Attached):
         hybrid.begin(alert, self.vehicle, rows)
         return EpisodeChoice(hybrid)
 
-    def info(self, k: int, proposed: float) -> dict[str, Any]:
+    def info(self, k: int, proposed: float, c: int = 0) -> dict[str, Any]:
         """Who drives the episode of world ``k``; ``proposed_action`` is NaN when nothing was proposed.
 
         A proposal counts as replaced where it differs by more than the rounding of its 32 bits.
@@ -104,7 +105,7 @@ class AttachedHybrid(Attached):
         return EpisodeChoice(memory.hybrid)  # another one: the next decision is another one, too
 
 
-def attach(engine: Engine, policy: Agent | LearnedPolicy | None, options: ShieldOptions) -> Attached:
+def attach(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> Attached:
     """The shield of the options' mode on a running engine."""
     if options.mode == "episode":
         return AttachedHybrid(engine, policy, options)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import copy
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.actions import commands_of
 from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.stream import begin_script
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
@@ -32,15 +34,20 @@ from ethbrake_marl.physics.rows import params_at
 from ethbrake_marl.shield.certify import REASONS, Decision
 from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
 from ethbrake_marl.shield.options import ShieldOptions
-from ethbrake_marl.shield.rollouts import Proposer, proposed_action
-from ethbrake_marl.shield.settings import only_shielded, proposing_agent
+from ethbrake_marl.shield.rollouts import Proposer, proposed_actions
+from ethbrake_marl.shield.settings import proposing_agents, shielded_vehicles
 from ethbrake_marl.shield.step_shield import Certified, StepShield
+from ethbrake_marl.shield.told import by_vehicle, columns_of, told_before
 from ethbrake_marl.shield.uncertainty import checked_uncertainty
 
 ADVICE = (
     "what stands between the shield and the environment must pass each action on unchanged, exactly once; put wrappers"
     " that skip frames, change actions or step by themselves around the shield, not inside it"
 )
+
+
+Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
+"""Who proposes: one for every shielded vehicle, a team, or one for each by its vehicle's name."""
 
 
 class MovingAtHorizon(UserWarning):
@@ -60,13 +67,14 @@ class Sent(NamedTuple):
 class Attached(ABC):
     """A shield that follows an engine, and lets it do nothing but what was certified.
 
-    Raises ``InvalidInput`` for another number of learners than one.
+    Every learner is shielded: one, or in mode ``step`` several. Raises ``InvalidInput`` for another number.
     """
 
     def __init__(self, engine: Engine, options: ShieldOptions, memory: object) -> None:
         self.engine = engine
         self.options = options
-        self.vehicle = only_shielded(engine, options.where)
+        self.vehicle = shielded_vehicles(engine, options.where, options.mode)
+        self.vehicles = (self.vehicle,) if isinstance(self.vehicle, int) else self.vehicle
         self.sent: Sent | None = None
         self._left = memory
         self.closed = False
@@ -110,30 +118,31 @@ class Attached(ABC):
                 f"shield: the engine was to make a step that nothing was certified for (a second one in one call, or"
                 f" one past the shield); step through the shield, or close() it first; {ADVICE}"
             )
-        wanted = after.wanted_mps2[:, self.vehicle]
-        certified = self._commands(sent.applied)
-        wrong = np.flatnonzero(sent.asked & ~(wanted == certified))
-        if wrong.size:
-            k = int(wrong[0])
-            raise UncertifiedStep(
-                f"shield: in world {k} the applied command, {wanted[k]:g} m/s2, is not the certified one,"
-                f" {certified[k]:g} m/s2; {ADVICE}"
-            )
+        for c, vehicle in enumerate(self.vehicles):
+            wanted = after.wanted_mps2[:, vehicle]
+            certified = self._commands(by_vehicle(sent.applied, self.vehicles)[:, c], vehicle)
+            wrong = np.flatnonzero(sent.asked & ~(wanted == certified))
+            if wrong.size:
+                k = int(wrong[0])
+                raise UncertifiedStep(
+                    f"shield: in world {k} the applied command, {wanted[k]:g} m/s2, is not the certified one,"
+                    f" {certified[k]:g} m/s2; {ADVICE}"
+                )
         return self._carried_out(memory, sent, after)
 
-    def _commands(self, actions: Floats) -> Floats:
-        """Wanted signed accelerations of the shielded vehicle for its actions, to the bits of the engine, [n] m/s2."""
+    def _commands(self, actions: Floats, vehicle: int) -> Floats:
+        """Wanted signed accelerations of a shielded vehicle for its actions, to the bits of the engine, [n] m/s2."""
         params, vehicles = self.engine.packed.params, self.engine.scenario.vehicles
-        braking, driving = (params[:, params_at(group, vehicles) + self.vehicle] for group in range(2))
-        return commands_of(actions, braking, driving)
+        braking, driving = (params[:, params_at(group, vehicles) + vehicle] for group in range(2))
+        return commands_of(np.ascontiguousarray(actions), braking, driving)
 
     def infos(self, proposed: Floats) -> dict[str, NDArray[Any]]:
         """``info`` of every world, one array per key."""
-        return _columns([self.info(k, float(proposed[k])) for k in range(len(proposed))])
+        return columns_of([self.info(k, float(proposed[k])) for k in range(len(proposed))])
 
     def start_infos(self) -> dict[str, NDArray[Any]]:
         """``start_info`` of every world, one array per key."""
-        return _columns([self.start_info(k) for k in range(self.engine.n)])
+        return columns_of([self.start_info(k) for k in range(self.engine.n)])
 
     @property
     @abstractmethod
@@ -149,8 +158,8 @@ class Attached(ABC):
         """The actions [n] to apply instead of those proposed. Nothing changes until the engine applies them."""
 
     @abstractmethod
-    def info(self, k: int, proposed: float) -> dict[str, Any]:
-        """What the shield decided in world ``k``, for ``infos[agent]["shield"]``."""
+    def info(self, k: int, proposed: float, c: int = 0) -> dict[str, Any]:
+        """What the shield decided in world ``k`` for its vehicle number ``c``, for ``infos[agent]["shield"]``."""
 
     @abstractmethod
     def start_info(self, k: int) -> dict[str, Any]:
@@ -165,10 +174,6 @@ class Attached(ABC):
         """The memory after the certified command was applied."""
 
 
-def _columns(rows: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
-    return {key: np.array([row[key] for row in rows]) for key in rows[0]}
-
-
 class AttachedShield(Attached):
     """A ``StepShield`` that begins with the engine's episodes and sees the engine's worlds.
 
@@ -179,15 +184,15 @@ class AttachedShield(Attached):
     def __init__(
         self,
         engine: Engine,
-        policy: Agent | LearnedPolicy | None,
+        policy: Proposing | None,
         options: ShieldOptions,
     ) -> None:
-        vehicle = only_shielded(engine, options.where)
-        self.policy = None if policy is None else proposing_agent(policy, options.where)
+        vehicle = shielded_vehicles(engine, options.where, options.mode)
         shield = StepShield(
             engine.scenario, vehicle, harm_count=options.harm_count, allowance=options.allowance, others=engine.scripts,
-            uncertainty=checked_uncertainty(options.uncertainty), logging=options.logging,
+            uncertainty=checked_uncertainty(options.uncertainty), cap=options.cap, logging=options.logging,
         )  # fmt: skip
+        self.policies = None if policy is None else proposing_agents(policy, shield.vehicles, options.where)
         self._warned = False
         super().__init__(engine, options, shield)
 
@@ -204,9 +209,11 @@ class AttachedShield(Attached):
 
     @property
     def stepped_in(self) -> Bools:
-        """Where the proposal was replaced, [n]."""
+        """Where a proposal was replaced, [n]."""
         decision = self.decision
-        return np.zeros(self.engine.n, np.bool_) if decision is None else decision.intervened
+        if decision is None:
+            return np.zeros(self.engine.n, np.bool_)
+        return np.asarray(by_vehicle(decision.intervened, self.vehicles).any(axis=1), np.bool_)
 
     @property
     def decision(self) -> Decision | None:
@@ -214,60 +221,44 @@ class AttachedShield(Attached):
         return None if self.sent is None or self.sent.certified is None else self.sent.certified.decision
 
     def proposal(self) -> Floats:
-        """What the policy itself would do now, as actions [n]."""
-        if self.policy is None:
+        """What the policies themselves would do now, as actions, [n] of one vehicle or [n, K]."""
+        if self.policies is None:
             raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
-        return proposed_action(self.policy, self.engine.worlds, self.vehicle)
+        return proposed_actions(self.policies, self.engine.worlds, isinstance(self.vehicle, int))
 
     def decide(self, proposed: Floats) -> Floats:
-        """The actions [n] to apply instead of those proposed. Nothing changes until the engine applies them."""
+        """The actions to apply instead of those proposed, [n] of one vehicle or [n, K]; the engine applies them."""
         engine, shield = self.engine, self.shield
-        proposer = None if self.policy is None else Proposer({self.vehicle: self.policy}, engine.worlds)
+        proposer = None if self.policies is None else Proposer(self.policies, engine.worlds)
         certified = shield.propose(proposed, seen=seen_columns(engine.packed), only=~engine.ended, proposer=proposer)
         applied = certified.decision.applied
         self.sent = Sent(shield, engine.steps_made, applied, certified.asked, certified)
         return applied
 
-    def info(self, k: int, proposed: float) -> dict[str, Any]:
-        """What the shield decided in world ``k``, for ``infos[agent]["shield"]``."""
+    def info(self, k: int, proposed: float, c: int = 0) -> dict[str, Any]:
+        """What the shield decided in world ``k`` for its vehicle number ``c``, for ``infos[agent]["shield"]``."""
         assert self.sent is not None and self.sent.certified is not None
         decision, after = self.sent.certified.decision, self.sent.certified.after
-        return {
-            "mode": "step" if after.uncertainty is None else "robust",
+        at = k if isinstance(self.vehicle, int) else (k, c)
+        return told_before(after, k) | {
             "proposed_action": proposed,
-            "chosen_action": float(decision.applied[k]),
-            "intervened": bool(decision.intervened[k]),
-            "reason": REASONS[decision.reason[k]],
+            "chosen_action": float(decision.applied[at]),
+            "intervened": bool(decision.intervened[at]),
+            "reason": REASONS[int(decision.reason[at])],
             "bound_harm": float(decision.bound[k]),
-            "margin": float(decision.margin[k]),
-            "trusted": not after.distrusted[k],
-            "settles": bool(after.settles[k]),
-            **({} if after.uncertainty is None else {"members": decision.after.members}),
+            "margin": float(decision.margin[at]),
         }
 
     def start_info(self, k: int) -> dict[str, Any]:
         """The bound that was told at the alert of world ``k``, before anything was decided."""
-        shield = self.shield
-        assert shield.running is not None
-        return {
-            "mode": "step" if shield.uncertainty is None else "robust",
-            "proposed_action": 0.0,
-            "chosen_action": 0.0,
-            "intervened": False,
-            "reason": "",
-            "bound_harm": float(shield.bound[k]),
-            "margin": 0.0,
-            "trusted": not shield.distrusted[k],
-            "settles": bool(shield.settles[k]),
-            **({} if shield.uncertainty is None else {"members": shield.running.members}),
-        }
+        return told_before(self.shield, k)
 
     def begun(self, memory: StepShield, alert: Worlds, rows: Ints) -> StepShield:
         """The shield once episodes start in these rows."""
-        if self.policy is not None:
-            begin_script(self.policy, alert, self.vehicle, rows)
+        for vehicle, policy in (self.policies or {}).items():
+            begin_script(policy, alert, vehicle, rows)
         shield = copy.copy(memory)
-        shield.begin(alert, rows, self.policy)
+        shield.begin(alert, rows, self.policies)
         moving = int((~shield.settles[rows]).sum())
         if moving and not self._warned:
             self._warned = True

@@ -10,11 +10,13 @@ from ethbrake_marl.agents.believing import Believing, split_believed
 from ethbrake_marl.agents.knowledge import Knowledge, Source, combine
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.team import Driver, Team
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Ints, Worlds
 from ethbrake_marl.physics.worlds import vehicles_at_once
 from ethbrake_marl.shield.agents import Bound, HybridAgent, StepShieldAgent
 from ethbrake_marl.shield.believed import BelievedShieldAgent
+from ethbrake_marl.shield.team_agent import ShieldedTeam
 from ethbrake_marl.shield.uncertainty import mode_uncertainty
 
 
@@ -53,11 +55,16 @@ def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings
     return BelievingHybrid(hybrid, scenario) if believes else hybrid
 
 
-def shield_steps(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """``+step`` or ``+step:believed`` around an agent."""
-    scenario, believes = settings.needed_scenario(), split_believed(argument)[1]
-    make = BelievedShieldAgent if believes else StepShieldAgent
-    return make(policy, scenario, harm_count=settings.harm_count)
+def shield_steps(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
+    """``+step`` around an agent or a team, where several vehicles learn around a copy for each; ``+step:believed``."""
+    scenario, harm_count, believes = settings.needed_scenario(), settings.harm_count, split_believed(argument)[1]
+    if not isinstance(policy, Team) and len(scenario.learners) <= 1:
+        make = BelievedShieldAgent if believes else StepShieldAgent
+        return make(policy, scenario, harm_count=harm_count)
+    if believes:
+        raise InvalidInput(f"agent {settings.spec!r}: :believed shields one learner, not several; take +step")
+    team = policy if isinstance(policy, Team) else Team.copies(policy, scenario.learners)
+    return ShieldedTeam(team, scenario, harm_count=harm_count)
 
 
 def shield_steps_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:

@@ -56,7 +56,7 @@ def rolled_out(
     scripts = script_agents(scenario, except_for=list(recorders))
     for i, recorder in recorders.items():
         set_others(recorder.policy, i, scripts)
-    drive(worlds, Team(recorders, "rollout"), scenario)
+    drive(worlds, Team(recorders, next(iter(policies.values())).name), scenario)
     if isinstance(vehicle, int):
         return recorders[vehicle].actions
     return np.stack([recorders[i].actions for i in vehicle], axis=2)

@@ -10,22 +10,21 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from ethbrake_marl.actions import checked_action
-from ethbrake_marl.agents.learned import LearnedPolicy
-from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, Rewards
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
 from ethbrake_marl.shield.engine_episode import attach
+from ethbrake_marl.shield.engine_shield import Proposing
 from ethbrake_marl.shield.options import read_options
 from ethbrake_marl.shield.settings import engine_of
 
 
 class ShieldedVecEnv(VecEnvWrapper):
-    """``make_sb3_vec_env`` with one learner behind a shield, by default in mode ``step``.
+    """``make_sb3_vec_env`` behind a shield, by default in mode ``step``, in which the rows of a world decide together.
 
     The ``options`` are those of ``ShieldOptions``; the penalty is not taken off the return in
     ``infos[row]["episode"]``. Without a ``policy`` the bound is the coupled optimum's harm. Each row's infos hold
-    ``shield`` in every step. Raises ``InvalidInput`` for another environment or number of learners.
+    ``shield`` in every step. Raises ``InvalidInput`` for another environment, or several learners in another mode.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -40,7 +39,7 @@ class ShieldedVecEnv(VecEnvWrapper):
     def __init__(
         self,
         venv: EthBrakeVecEnv,
-        policy: Agent | LearnedPolicy | None = None,
+        policy: Proposing | None = None,
         **options: Any,
     ) -> None:
         settings = read_options("ShieldedVecEnv", options)
@@ -61,16 +60,19 @@ class ShieldedVecEnv(VecEnvWrapper):
         if not self.attached.running:
             self.venv.step_async(actions)
             return
+        attached = self.attached
         self._proposed = checked_action(actions, (self.num_envs, 1), "the learners")[:, 0]
-        self.venv.step_async(self.attached.decide(self._proposed)[:, np.newaxis])
+        several = (attached.engine.n, len(attached.vehicles)) if len(attached.vehicles) > 1 else (self.num_envs,)
+        self.venv.step_async(attached.decide(self._proposed.reshape(several)).reshape(-1, 1))
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
         """Advance every world by one step."""
         shield = self.attached
         observation, reward, done, infos = self.venv.step_wait()
         shield.confirm()
-        for k, info in enumerate(infos):
-            info["shield"] = shield.info(k, float(self._proposed[k]))
+        learners = len(shield.vehicles)
+        for row, info in enumerate(infos):
+            info["shield"] = shield.info(row // learners, float(self._proposed[row]), row % learners)
         intervened = np.array([info["shield"]["intervened"] for info in infos], np.float32)
         paid = reward - np.float32(shield.options.intervention_penalty) * intervened
         return observation, paid, done, infos  # type: ignore[return-value]

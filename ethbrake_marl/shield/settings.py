@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from numbers import Real
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from ethbrake_marl.agents.learned import LearnedAgent, LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, check_one_learner
 from ethbrake_marl.observations import ObservationSpec
@@ -32,13 +34,13 @@ def check_scenario(scenario: object, where: str) -> None:
         raise InvalidInput(f"{where}: scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")
 
 
-def proposing_agent(policy: Agent | LearnedPolicy | None, where: str) -> Agent:
+def proposing_agent(policy: object, where: str) -> Agent:
     """An agent as it is, a loaded policy as an agent. Raises ``InvalidInput`` for anything else."""
     if not isinstance(policy, type):
         if isinstance(policy, Agent):
             return policy
         if callable(policy) and isinstance(getattr(policy, "observation", None), ObservationSpec):
-            return LearnedAgent(policy)
+            return LearnedAgent(policy)  # type: ignore[arg-type]  # it is callable, and says what it observes
     raise InvalidInput(
         f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy), which says what it observes"
     )
@@ -77,12 +79,38 @@ def engine_of(env: object, interface: type, where: str, maker: str) -> Engine:
     return engine
 
 
-def only_shielded(engine: Engine, where: str) -> int:
-    """Index of the one learner, which is shielded; ``InvalidInput`` when there is none or more than one."""
+def shielded_vehicles(engine: Engine, where: str, mode: str | None) -> int | tuple[int, ...]:
+    """Index of the learner, which is shielded, or indices of all of them, front to rear.
+
+    Raises ``InvalidInput`` when there is none, or more than one in another mode than ``step``.
+    """
+    if mode == "step" and len(engine.learners) > 1:
+        return tuple(sorted(engine.learners))
     check_one_learner(
         engine.scenario.name,
         [engine.scenario.vehicle_names[i] for i in engine.learners],
-        f"{where} needs exactly one learner: what is certified is known only if every other vehicle follows a script;"
-        " pass learners=['vehicle_2'] to the environment",
+        f"{where} needs exactly one learner in mode {mode}: what it certifies is known only if every other vehicle"
+        " follows a script; mode step shields several together; or pass learners=['vehicle_2'] to the environment",
     )
     return engine.learners[0]
+
+
+def proposing_agents(
+    policy: Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy], vehicles: Sequence[int], where: str
+) -> dict[int, Agent]:
+    """Who proposes for each shielded vehicle: a team, policies by name of vehicle, or copies of one for all.
+
+    Raises ``InvalidInput`` for what is none of these, and for a team of other vehicles.
+    """
+    if isinstance(policy, Team):
+        given: dict[int, Agent] = policy.drivers
+    elif isinstance(policy, Mapping):
+        by_name = {f"vehicle_{i + 1}": i for i in vehicles}
+        given = {by_name.get(name, -1): proposing_agent(each, where) for name, each in policy.items()}
+    else:
+        agent = proposing_agent(policy, where)
+        return {i: agent if k == 0 else copy.deepcopy(agent) for k, i in enumerate(vehicles)}
+    if set(given) != set(vehicles):
+        names = ", ".join(f"vehicle_{i + 1}" for i in vehicles)
+        raise InvalidInput(f"{where}: policy: one for each of {names} is needed, and for nobody else")
+    return {i: given[i] for i in vehicles}

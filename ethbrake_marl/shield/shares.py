@@ -1,4 +1,4 @@
-"""Shares of harm by vehicle under a plan: the harm of its pairs, shared by mass as in the ledger, to the same bits."""
+"""Each vehicle's share under a plan: the harm of its pairs, split by mass as in the ledger, to the same bits."""
 
 from __future__ import annotations
 

@@ -23,24 +23,27 @@ from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.shield.agents import HybridAgent
 from ethbrake_marl.shield.engine_episode import AttachedHybrid, attach
+from ethbrake_marl.shield.engine_shield import Proposing
 from ethbrake_marl.shield.options import read_options
-from ethbrake_marl.shield.settings import engine_of, only_shielded
+from ethbrake_marl.shield.settings import engine_of, shielded_vehicles
 
 Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
 
 
 class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
-    """Shield the learner of a parallel environment, which is driven by the caller's actions or by a policy.
+    """Shield the learners of a parallel environment, who are driven by the caller's actions or by a policy.
 
     Mode ``episode`` is the paper's Algorithm 1: policy or E-V2X-BM drives a whole episode, whatever is proposed. Mode
-    ``step`` certifies every action, or replaces it; ``robust`` does so in every member of an uncertainty. Bounds hold
-    where the other vehicles follow their scripts. ``infos[agent]["shield"]`` says what was done. See docs/shield.md.
+    ``step`` certifies every action, or replaces it, of several learners together; ``robust`` does so in every member of
+    an uncertainty. Bounds hold where the other vehicles follow their scripts. ``infos[agent]["shield"]`` says what was
+    done. See docs/shield.md.
 
     Args:
-        env: ``eb.parallel_env(...)`` with one learner, or what wraps it.
-        policy: an agent or a policy; mode ``episode`` needs one, the others take its harm as bound where that is lower.
+        env: ``eb.parallel_env(...)`` with one learner (mode ``step``: or more), or what wraps it.
+        policy: an agent or a policy, a ``Team``, or one for each learner by its name; mode ``episode`` needs one, the
+            others take its harm as bound where that is lower.
         mode: ``episode``, ``step`` or ``robust``.
-        agents: the one learner that is shielded, as a list of names; None: the environment's learner.
+        agents: the learners that are shielded, as a list of names: all there are, which None also says.
         options: keywords of ``ShieldOptions``; raises ``InvalidInput`` for one that the mode does not take.
 
     >>> import ethbrake_marl as eb
@@ -55,7 +58,7 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
     def __init__(
         self,
         env: ParallelEnv[str, Observations, NDArray[Any]],
-        policy: Agent | LearnedPolicy | None = None,
+        policy: Proposing | None = None,
         *,
         mode: str = "episode",
         agents: Sequence[str] | None = None,
@@ -71,12 +74,16 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         super().__init__(env)
         self._engine = engine
         names = engine.scenario.vehicle_names
-        shielded = tuple(names[i] for i in engine.learners) if agents is None else _names(agents)
-        only_shielded(engine, "HybridShield")
-        if len(shielded) != 1 or shielded[0] not in names or names.index(shielded[0]) not in engine.learners:
-            raise InvalidInput(f"HybridShield: shields exactly one learner in mode {mode!r}; got {shielded}")
+        learners = tuple(names[i] for i in sorted(engine.learners))
+        given = learners if agents is None else _names(agents)
+        shielded_vehicles(engine, "HybridShield", settings.mode)
+        if len(given) != len(learners) or set(given) != set(learners):
+            raise InvalidInput(
+                f"HybridShield: shields every learner, {learners}, and nobody else; got {given}. What an unshielded one"
+                " does is an assumption that nothing checks: give it a script (learners=[...] of the environment)"
+            )
         self.mode = mode
-        self.shielded = shielded[0]
+        self.shielded = learners  # names, front to rear
         self.attached: Any = attach(engine, policy, settings)  # what it is depends on the mode
 
     @property
@@ -92,29 +99,32 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         """Start an episode; the bound stands in ``infos[agent]["shield"]`` already."""
         self.attached.check_open()
         observations, infos = super().reset(seed=seed, options=options)
-        infos[self.shielded]["shield"] = self.attached.start_info(0)
+        for agent in self.shielded:
+            infos[agent]["shield"] = self.attached.start_info(0)
         return observations, infos
 
     def step(self, actions: Mapping[str, Any]) -> Told:
-        """Advance by one step with the shielded agent's action replaced; it may also be left out."""
-        self.attached.check_open()
-        agent = self.shielded
+        """Advance by one step with the shielded agents' actions certified or replaced; they may also be left out."""
+        attached, agents = self.attached, self.shielded
+        attached.check_open()
         if not isinstance(actions, Mapping):
             raise InvalidInput(
-                f"HybridShield: actions = {actions!r}: must be a dict, for instance {{{agent!r}: [0.0]}}"
+                f"HybridShield: actions = {actions!r}: must be a dict, for instance {{{agents[0]!r}: [0.0]}}"
             )
-        proposed = actions.get(agent)
-        if proposed is not None:
-            checked_action(proposed, (1,), agent)
+        given = {a: checked_action(actions[a], (1,), a) for a in agents if actions.get(a) is not None}
         if not self.env.agents:
             return self.env.step(actions)  # type: ignore[no-any-return]  # says that no episode is running
-        attached = self.attached
-        given = attached.proposal() if proposed is None else checked_action(proposed, (1,), agent)
-        told: Told = super().step({**actions, agent: attached.decide(given)})
+        if len(given) < len(agents):
+            own = attached.proposal().reshape(len(agents), 1)
+            given = {a: given.get(a, own[c]) for c, a in enumerate(agents)}
+        whole = given[agents[0]] if len(agents) == 1 else np.stack([given[a][0] for a in agents])[np.newaxis]
+        applied = attached.decide(whole).reshape(len(agents), 1)
+        told: Told = super().step({**actions, **dict(zip(agents, applied, strict=True))})
         attached.confirm()
-        shown = told[4][agent]["shield"] = attached.info(0, float(given[0]))
-        if shown["intervened"]:
-            told[1][agent] -= attached.options.intervention_penalty
+        for c, agent in enumerate(agents):
+            shown = told[4][agent]["shield"] = attached.info(0, float(given[agent][0]), c)
+            if shown["intervened"]:
+                told[1][agent] -= attached.options.intervention_penalty
         return told
 
     def close(self) -> None:
@@ -182,7 +192,7 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
         shield.check_open()
         if not shield.running or shield.engine.ended[0]:
             return self.env.step(action)  # type: ignore[return-value]  # says what is wrong
-        proposed = checked_action(action, (1,), shield.engine.scenario.vehicle_names[shield.vehicle])
+        proposed = checked_action(action, (1,), shield.engine.scenario.vehicle_names[shield.vehicles[0]])
         observation, reward, terminated, truncated, info = self.env.step(shield.decide(proposed))
         shield.confirm()
         told = info["shield"] = shield.info(0, float(proposed[0]))

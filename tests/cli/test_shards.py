@@ -54,6 +54,14 @@ def test_options_that_do_not_go_together__are_refused_in_one_line(ethbrake, more
     assert said in answer.err and answer.err.count("\n") == 1
 
 
+@pytest.mark.long
+def test_ray__answers_the_same(ethbrake, tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    found = ethbrake(*SHARDED, "--ray", "local", "--output", tmp_path / "kept", "--json")
+    assert found.status == 0 and found.out == ethbrake(*SHARDED, "--json").out
+    assert len(list((tmp_path / "kept").glob("shard-*.json"))) == 3
+
+
 def test_compare__takes_two_sharded_results_and_no_mixture(ethbrake, tmp_path: Path) -> None:
     whole, one, other = (tmp_path / f"{name}.json" for name in ("whole", "one", "other"))
     whole.write_text(ethbrake(*LIST, "--json").out)

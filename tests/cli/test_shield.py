@@ -86,12 +86,15 @@ def test_evaluate__a_shield_that_nobody_gets_is_refused(ethbrake, shield):
     assert list(lineup) == ["full_brake", f"ppo@shipped+{shield}"]
 
 
-def test_evaluate__a_team_behind_a_shield_is_refused(monkeypatch):
+def test_evaluate__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch):
     scenario, team = load_scenario("cooperation-3-pair"), Team.copies(make_agent("coast"), [1, 2])
     monkeypatch.setitem(registry._ENTRIES, "team", Entry("team@RUN", "", (), lambda argument, settings: team))
     assert list(make_lineup(["team@run"], scenario)) == ["team@run"]
-    with pytest.raises(InvalidInput, match=r"agent 'team@run\+step': is a team, and \+step is for one driven vehicle"):
-        make_lineup(["team@run+step"], scenario)
+    with pytest.raises(
+        InvalidInput, match=r"agent 'team@run\+robust': is a team, and \+robust is for one driven vehicle"
+    ):
+        make_lineup(["team@run+robust"], scenario)
+    assert sorted(make_lineup(["team@run+step"], scenario)["team@run+step"].drivers) == [1, 2]
 
 
 def test_horizon__what_still_moves_then_is_told_by_both_commands(ethbrake, tmp_path):

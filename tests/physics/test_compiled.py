@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import shutil
+import sys
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
+from numba.core.errors import NumbaError
 
 import ethbrake_marl
 from ethbrake_marl.physics import compiled
-from ethbrake_marl.physics.compiled import cache_folder, compiled_apart
+from ethbrake_marl.physics.compiled import (
+    cache_folder,
+    compiled_apart,
+    compiled_bare,
+    compiled_bare_apart,
+    compiled_within,
+)
 from ethbrake_marl.physics.compiled import compiled as compile_kernel
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
@@ -32,8 +43,17 @@ def test_compiled__is_strict_and_releases_the_lock():
     assert options["nopython"] is True and "parallel" not in options
 
 
-@pytest.mark.parametrize(("way", "inline"), [(compile_kernel, True), (compiled_apart, False)])
-def test_compiled__asks_for_these_options_and_for_its_own_folder(monkeypatch, way, inline):
+@pytest.mark.parametrize(
+    ("way", "more"),
+    [
+        (compile_kernel, {"forceinline": True}),
+        (compiled_apart, {"forceinline": False}),
+        (compiled_within, {"inline": "always"}),
+        (compiled_bare, {"forceinline": True, "_nrt": False}),
+        (compiled_bare_apart, {"forceinline": False, "_nrt": False}),
+    ],
+)
+def test_compiled__asks_for_these_options_and_for_its_own_folder(monkeypatch, way, more):
     asked = []
 
     def compiler(**options):
@@ -42,8 +62,22 @@ def test_compiled__asks_for_these_options_and_for_its_own_folder(monkeypatch, wa
 
     monkeypatch.setattr(numba, "njit", compiler)
     assert way(len) is len
-    options = {"cache": True, "fastmath": False, "nogil": True, "error_model": "numpy", "forceinline": inline}
+    options = {"cache": True, "fastmath": False, "nogil": True, "error_model": "numpy", **more}
     assert asked == [(options, str(cache_folder()))]
+
+
+@needs_compiler
+def test_compiled_bare__leaves_the_counts_of_references_alone():
+    @compiled_bare
+    def first(values):
+        return values[1:][0]
+
+    values = np.arange(3.0)
+    before = sys.getrefcount(values)
+    assert [first(values) for _ in range(5)] == [1.0] * 5
+    assert sys.getrefcount(values) == before
+    with pytest.raises(NumbaError, match="NRT required"):
+        compiled_bare(lambda n: np.zeros(n))(3)  # it can make no array: told at once
 
 
 @needs_compiler
@@ -124,3 +158,15 @@ def test_cache_folder__changes_with_any_kernel_source_and_with_numba_and_with_no
     before = folder()
     monkeypatch.setattr(numba, "__version__", "0.0")
     assert folder() != before
+
+
+def test_compiled_bare__gives_no_array_back():
+    bare = []
+    for source in sorted(Path(ethbrake_marl.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(source.read_text())):
+            names = {d.id for d in getattr(node, "decorator_list", ()) if isinstance(d, ast.Name)}
+            if names & {"compiled_bare", "compiled_bare_apart"}:
+                bare.append(f"{source.name}: {node.name}")
+                words = set(re.findall(r"\w+", ast.unparse(node.returns)))
+                assert words <= {"None", "bool", "int", "float", "tuple"}, bare[-1]
+    assert len(bare) > 30

@@ -1,7 +1,7 @@
-"""Nineteen bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
+"""Twenty-seven bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
-applied to a temporary copy. There ``test_certify``, ``test_step_shield`` and one test of ``test_robust`` run with
+applied to a temporary copy. There ``test_certify``, ``test_step_shield``, one test of ``test_robust`` and some of ``test_joint`` run with
 compilation switched off, and where they stay green, the other tests of the shield, compiled. Those must be green
 without any bug.
 """
@@ -14,54 +14,76 @@ import sys
 from tests.programme.planting import Patch, misfits, red_with
 
 BY_HAND = "test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner"
-QUICK = ("tests/shield/test_certify.py", "tests/shield/test_step_shield.py", f"tests/shield/test_robust.py::{BY_HAND}")
+OF_TEAMS = tuple(
+    f"tests/shield/test_joint.py::test_{name}"
+    for name in (
+        "by_hand__of_two_proposals_the_harmless_one_is_accepted_the_other_replaced",
+        "by_hand__proposals_that_are_harmless_alone_and_collide_together_go_to_the_front_one",
+        "by_hand__who_says_no_number_keeps_the_plan_and_the_other_is_clipped",
+        "shares__are_those_of_the_ledger_and_the_light_one_bears_more",
+        "caps__reject_what_only_moves_harm_to_another",
+    )
+)
+QUICK = (
+    "tests/shield/test_certify.py", "tests/shield/test_step_shield.py", f"tests/shield/test_robust.py::{BY_HAND}",
+    *OF_TEAMS,
+)  # fmt: skip
 WHOLE = tuple(
-    f"tests/shield/test_{name}.py" for name in ("engine_shield", "step", "rollouts", "interfaces", "interference")
+    f"tests/shield/test_{name}.py"
+    for name in ("joint", "engine_shield", "step", "rollouts", "interfaces", "interference")
 )
-KERNEL, CERTIFY, GUARD, ROLLOUTS, ATTACHED, COMPARISON = (
+KERNEL, MEMBERS, CERTIFY, ALERT, GUARD, ROLLOUTS, ATTACHED, COMPARISON, TEAM = (
     f"ethbrake_marl/shield/{name}.py"
-    for name in ("certify_kernel", "certify", "step_shield", "rollouts", "engine_shield", "comparison")
-)
+    for name in (
+        "certify_kernel", "members", "certify", "alert", "step_shield", "rollouts", "engine_shield", "comparison",
+        "team_agent",
+    )
+)  # fmt: skip
 
 BUGS: dict[str, tuple[Patch, ...]] = {
     "pairwise bound used as if it were coupled": (
         Patch(
-            GUARD,
+            ALERT,
             "harm, alone = plan_harm(running, plan), np.full(worlds.n, np.inf)",
             "harm, alone = plan_harm(running, plan) / 2.0, np.full(worlds.n, np.inf)",
         ),
     ),
     "the budget may rise": (
         Patch(
-            KERNEL, "    if value <= budget:\n        plan[step]", "    if value <= 2.0 * budget:\n        plan[step]"
+            KERNEL,
+            "    if value <= budget:\n        copy_action(action, plan[step])",
+            "    if value <= 2.0 * budget:\n        copy_action(action, plan[step])",
         ),
+        Patch(KERNEL, "    if value <= budget:\n        for c in", "    if value <= 2.0 * budget:\n        for c in"),
     ),
     "clipped after certifying": (
-        Patch(KERNEL, "min(max(proposed, -1.0), 1.0) if usable", "max(proposed, -1e300) if usable"),
+        Patch(KERNEL, "min(max(proposed[c], -1.0), 1.0) if usable", "max(proposed[c], -1e300) if usable"),
         Patch(
-            CERTIFY, "applied, bound, margin = out[:, 0].copy(),", "applied, bound, margin = np.clip(out[:, 0], -1, 1),"
+            CERTIFY,
+            "applied, bound, margin = out[:, :, 0].reshape(shape),",
+            "applied, bound, margin = np.clip(out[:, :, 0], -1, 1).reshape(shape),",
         ),
     ),
     "an impact counted again where the pair was hit before": (
         Patch(
-            KERNEL, "    save(world.table, after)\n", "    world.table[HIT, 0] = 0.0\n    save(world.table, after)\n"
+            MEMBERS, "    save(world.table, after)\n", "    world.table[HIT, 0] = 0.0\n    save(world.table, after)\n"
         ),
-        Patch(KERNEL, "import COMMAND, LIMIT\n", "import COMMAND, HIT, LIMIT\n"),
+        Patch(MEMBERS, "import COMMAND, LIMIT\n", "import COMMAND, HIT, LIMIT\n"),
     ),
     "harm so far forgotten": (
-        Patch(KERNEL, "    save(world.table, after)\n", "    world.table[-2:] = 0.0\n    save(world.table, after)\n"),
+        Patch(MEMBERS, "    save(world.table, after)\n", "    world.table[-2:] = 0.0\n    save(world.table, after)\n"),
     ),
     "latency ignored": (
         Patch(
-            GUARD,
-            "problem = profile_problem(\n                possible,",
-            "problem = profile_problem(\n                _at_once(possible),",
+            ALERT,
+            "problem = profile_problem(\n            possible,",
+            "problem = profile_problem(\n            _at_once(possible),",
         ),
         Patch(
-            GUARD,
-            "def _harm_of(",
-            "def _at_once(worlds: Worlds) -> Worlds:\n    v = worlds.vehicles\n"
-            "    return replace(worlds, vehicles=replace(v, latency_s=0.0 * v.latency_s))\n\n\ndef _harm_of(",
+            ALERT,
+            "def held(",
+            "def _at_once(worlds: Worlds) -> Worlds:\n    from dataclasses import replace\n\n    v = worlds.vehicles\n"
+            "    return replace(worlds, vehicles=replace(v, latency_s=0.0 * v.latency_s))\n\n\ndef held(",
         ),
     ),
     "the rest of the plan begins one decision late": (
@@ -74,8 +96,8 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "the plan of a rejected proposal is kept": (
         Patch(
             KERNEL,
-            "        if value <= budget:\n            plan[:] = room[0]",
-            "        if value < math.inf:\n            plan[:] = room[0]",
+            "        if value <= budget:\n            for j in",
+            "        if value < math.inf:\n            for j in",
         ),
         Patch(KERNEL, "plan, budget)\n        reason", "plan, math.inf)\n        reason"),
         Patch(KERNEL, "constants, value, budget, room[0]", "constants, value, math.inf, room[0]"),
@@ -91,7 +113,7 @@ BUGS: dict[str, tuple[Patch, ...]] = {
         Patch(ROLLOUTS, "    harm = plan_harm(part, plan)\n", "    harm = 0.0 * plan_harm(part, plan)\n"),
     ),
     "a rollout disturbs the policy's memory": (
-        Patch(ROLLOUTS, "return copy.deepcopy(policy), np.arange(n)", "return policy, np.arange(n)"),
+        Patch(ROLLOUTS, "return copy.deepcopy(dict(policies)), np.arange(n)", "return dict(policies), np.arange(n)"),
     ),
     "a rollout writes another past into the plan": (
         Patch(ROLLOUTS, "from_now(held[batch], -1.0, episodes.steps)", "np.full_like(held[batch], -1.0)"),
@@ -103,7 +125,7 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     ),
     "only the world as told is certified, not its corners": (
         Patch(
-            KERNEL,
+            MEMBERS,
             "m = (first + j) % ended.shape[0]\n        worst = max(worst, follow_plan",
             "m = 0\n        worst = max(worst, follow_plan",
         ),
@@ -126,6 +148,60 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     ),
     "a step that was not made is not noticed": (
         Patch(ATTACHED, "if self.engine.steps_made != self.sent.steps_made + 1:", "if self.engine.steps_made < 0:"),
+    ),
+    "each proposal of a team is certified beside the plan as it was, not as it is by then": (
+        Patch(KERNEL, "copy_action(plan[step], tried[1])", "copy_action(tried[2], tried[1])"),
+        Patch(
+            KERNEL,
+            "    bound, accepted = certified, 0\n",
+            "    bound, accepted = certified, 0\n    copy_action(plan[step], tried[2])\n",
+        ),
+        Patch(KERNEL, "np.zeros((2, plans.shape[2]))", "np.zeros((3, plans.shape[2]))"),
+    ),
+    "of a team only the first vehicle's action is certified": (
+        Patch(
+            KERNEL,
+            "going = take_steps(world, states, ended, step, action, after, over)\n    value",
+            "copy_action(plan[step], room[1, 0])\n    room[1, 0, 0] = action[0]\n"
+            "    going = take_steps(world, states, ended, step, room[1, 0].copy(), after, over)\n    value",
+        ),
+    ),
+    "a team's accepted action keeps the bound of the plan before it": (
+        Patch(KERNEL, "bound, accepted = value, accepted + 1", "bound, accepted = bound, accepted + 1"),
+    ),
+    "a team's plan is followed with the first vehicle's actions for all": (
+        Patch(MEMBERS, "command_of(plan[step, c], -bounds", "command_of(plan[step, 0], -bounds"),
+    ),
+    "one acceptable proposal lets the whole team's through": (
+        Patch(
+            KERNEL,
+            "    bound, accepted = certified, 0\n",
+            "    bound, accepted = certified, 0\n    first = tried[0].copy()\n",
+        ),
+        Patch(
+            KERNEL,
+            "    tell_action(out, plan[step], bound, budget - bound)\n    return going >= 0",
+            "    if accepted > 0:\n        copy_action(first, plan[step])\n"
+            "        going = take_steps(world, states, ended, step, first, after, over)\n"
+            "    tell_action(out, plan[step], bound, budget - bound)\n    return going >= 0",
+        ),
+    ),
+    "what the rear one of a pair bears is forgotten by its cap": (
+        Patch(
+            MEMBERS,
+            "        value += table[row, i - 1] - front_share(table[row, i - 1], table[MASS, i - 1], table[MASS, i])\n",
+            "        value += 0.0\n",
+        ),
+    ),
+    "a cap is looked at in none of the plans": (
+        Patch(MEMBERS, "return value if within_caps(world, m) else math.inf", "return value"),
+    ),
+    "each member of a team is certified alone": (
+        Patch(
+            TEAM,
+            "self.vehicles = tuple(team.drivers)",
+            "self.vehicles = tuple(team.drivers)[:1] * len(team.drivers)",
+        ),
     ),
     "a surprise is not flagged": (Patch(GUARD, "if not surprising.any():", "if surprising.any() or True:"),),
 }

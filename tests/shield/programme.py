@@ -9,9 +9,10 @@ interference  refused calls, exceptions and interrupts at random lines on every 
 search  restarts of a search against the shield, and against twelve leaks of it (``tests.shield.search``)
 speed   decisions per second in a batch, and the latency of one decision
 
-No realised harm may be above the bound at the alert (tolerance 1e-9; of teams none at all, and it must be the last bound,
-as the same double). Bound, joint and interfaces run in chunks; each finished chunk is a file in ``--results``, so what was stopped goes on, and several processes (``--part 1/2``, ``--part 2/2``)
-share the work. ``--results`` of other code, or of another seed, are refused.
+No realised harm may be above the bound at the alert (tolerance 1e-9; of teams none, and harm must be the last bound, as
+the same double). Bound, joint and interfaces run in chunks; each finished chunk is a file in ``--results``, so what was
+stopped goes on, and several processes (``--part 1/2``, ``--part 2/2``) share the work. ``--results`` of other code, or
+of another seed, are refused.
 """
 
 from __future__ import annotations

@@ -219,9 +219,11 @@ def test_gymnasium__a_penalty_that_is_none_is_refused(penalty):
         ShieldedEnv(gymnasium.make("EthBrake-v0"), intervention_penalty=penalty)
 
 
-def test_learners__exactly_one_is_needed():
+def test_learners__exactly_one_is_needed_against_an_uncertainty():
     with pytest.raises(InvalidInput, match=r"2 learners \(vehicle_2, vehicle_3\)"):
-        ShieldedVecEnv(make_sb3_vec_env("paper-random", 2, learners=["vehicle_2", "vehicle_3"]))
+        ShieldedVecEnv(
+            make_sb3_vec_env("paper-random", 2, learners=["vehicle_2", "vehicle_3"]), uncertainty="gaps_m=0.5"
+        )
     with pytest.raises(InvalidInput, match="not one of this package's environments"):
         ShieldedEnv(None)
 

@@ -6,13 +6,19 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.sb3 import make_sb3_vec_env
+from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search.problem import profile_problem
-from ethbrake_marl.shield import StepShield
+from ethbrake_marl.shield import HybridShield, ShieldedTeam, StepShield, shielded_aec
 from ethbrake_marl.shield.alert import joint_constants
 from ethbrake_marl.shield.certify import REASONS, Backup, begin_running, certify, plan_harm
+from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from ethbrake_marl.shield.shares import borne_under
 from tests.shield.joint_attack import ADVERSARIES, joint_attack, scenario_of
 
@@ -231,3 +237,153 @@ def test_engine__steps_the_team_as_it_was_certified():
         engine.step(decision.applied)
         assert decision.after.states[:, :3].tolist() == engine.worlds.speeds_mps.tolist()
     assert shield.shares().tolist() == engine.ledger.vehicle_harm("first").tolist()
+
+
+@pytest.fixture
+def pair_env():
+    return HybridShield(parallel_env("cooperation-3-pair"), mode="step")
+
+
+def test_parallel__every_learner_is_told_its_own_decision_and_the_common_bound(pair_env):
+    _, infos = pair_env.reset(seed=3)
+    bound = infos["vehicle_2"]["shield"]["bound_harm"]
+    assert pair_env.shielded == ("vehicle_2", "vehicle_3") and "shield" not in infos["vehicle_1"]
+    while pair_env.agents:
+        *_, infos = pair_env.step({"vehicle_2": [1.0], "vehicle_3": [-1.0]})
+        told = [infos[agent]["shield"] for agent in pair_env.shielded]
+        assert told[0]["bound_harm"] == told[1]["bound_harm"] <= bound
+        assert [each["proposed_action"] for each in told] == [1.0, -1.0] and all(each["trusted"] for each in told)
+        bound = told[0]["bound_harm"]
+    assert pair_env.unwrapped.engine.ledger.world_harm("first")[0] == bound
+
+
+def test_parallel__a_team_proposes_where_nobody_does_and_one_may_be_left_out():
+    team = {"vehicle_2": make_agent("full_brake"), "vehicle_3": make_agent("coast")}
+    env = HybridShield(parallel_env("cooperation-3-pair"), team, mode="step")
+    env.reset(seed=1)
+    *_, infos = env.step({"vehicle_3": [0.5]})
+    assert [infos[agent]["shield"]["proposed_action"] for agent in env.shielded] == [-1.0, 0.5]
+    for policy in (make_agent("full_brake"), Team.copies(make_agent("full_brake"), (1, 2))):
+        alike = HybridShield(parallel_env("cooperation-3-pair"), policy, mode="step")
+        alike.reset(seed=1)
+        *_, infos = alike.step({})
+        assert [infos[agent]["shield"]["proposed_action"] for agent in alike.shielded] == [-1.0, -1.0]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda env: HybridShield(env, mode="step", agents=["vehicle_2"]), "shields every learner.*give it a script"),
+        (lambda env: HybridShield(env, mode="step", agents=["vehicle_1", "vehicle_2"]), "shields every learner"),
+        (lambda env: HybridShield(env, mode="robust", uncertainty="gaps_m=0.5"), "exactly one learner in mode robust"),
+        (lambda env: HybridShield(env, make_agent("coast")), "exactly one learner in mode episode"),
+        (
+            lambda env: HybridShield(env, {"vehicle_2": make_agent("coast")}, mode="step"),
+            "one for each of vehicle_2, v",
+        ),
+        (lambda env: HybridShield(env, mode="step", cap="mine"), "cap = 'mine': must be baseline or None"),
+        (lambda env: HybridShield(env, make_agent("coast"), cap="baseline"), "mode step alone takes one"),
+    ],
+)
+def test_parallel__what_is_not_covered_is_refused_in_one_line(make, message):
+    with pytest.raises(InvalidInput, match=message):
+        make(parallel_env("cooperation-3-pair"))
+
+
+def test_parallel__a_changed_action_of_any_of_them_is_refused(pair_env):
+    pair_env.reset(seed=0)
+    step = pair_env._engine.step
+    pair_env._engine.step = lambda actions: step(np.where(np.arange(2) == 1, -0.123, actions))
+    with pytest.raises(UncertifiedStep, match="not the certified one"):
+        pair_env.step({"vehicle_2": [-1.0], "vehicle_3": [-1.0]})
+
+
+def test_aec__decides_for_all_when_the_last_has_acted():
+    env = shielded_aec(parallel_env("cooperation-4-all"), mode="step")
+    env.reset(seed=5)
+    for _ in env.agent_iter():
+        *_, terminated, truncated, info = env.last()
+        if "shield" in info:
+            assert info["shield"]["trusted"]
+        env.step(None if terminated or truncated else np.array([1.0], np.float32))
+    engine = env.unwrapped.engine
+    assert engine.ledger.world_harm("first")[0] == info["shield"]["bound_harm"]
+
+
+def test_sb3__rows_of_one_world_are_decided_together_over_automatic_resets():
+    env = ShieldedVecEnv(make_sb3_vec_env("cooperation-3-pair", 5, seed=3), cap="baseline", intervention_penalty=1.0)
+    env.reset()
+    rng, ended = np.random.default_rng(0), 0
+    for _ in range(120):
+        caps = env.attached.shield.baseline_shares
+        _, _, done, infos = env.step(rng.uniform(-1.0, 1.0, (10, 1)).astype(np.float32))
+        for k in np.flatnonzero(done)[::2]:
+            pair = [infos[k], infos[k + 1]]
+            assert pair[0]["shield"]["bound_harm"] == pair[1]["shield"]["bound_harm"]
+            assert pair[0]["world_first_impact_harm"] == pair[0]["shield"]["bound_harm"]
+            assert [each["first_impact_harm"] for each in pair] <= caps[k // 2, 1:].tolist()
+            ended += 1
+    assert ended >= 5
+
+
+def test_evaluation__a_team_behind_the_shield_keeps_its_bound_and_is_never_worse_than_told():
+    worlds = PAIR.sample(40, 7)
+    agents = {name: make_agent(name, scenario=PAIR) for name in ("constant:3+step", "full_brake+step", "full_brake")}
+    found = evaluate(worlds, agents, scenario=PAIR, seed=7).outcomes
+    for name in ("constant:3+step", "full_brake+step"):
+        harm = found[name].ledger.world_harm("first")
+        assert (harm <= found[name].predicted_harm).all() and found[name].chosen_policy.shape == (40,)
+    mean = {name: found[name].ledger.world_harm("first").mean() for name in agents}
+    assert mean["full_brake+step"] < mean["full_brake"] - 1.0 and found["full_brake"].predicted_harm is None
+
+
+def test_evaluation__members_ask_once_and_the_engine_is_followed_to_the_end():
+    team = ShieldedTeam(Team.copies(make_agent("coast"), (1, 2)), PAIR, logging=True)
+    worlds = PAIR.sample(20, 9).worlds
+    harm = drive(worlds, team, PAIR).ledger
+    shield = team.shield
+    assert harm.world_harm("first").tolist() == shield.bound.tolist() and not shield.distrusted.any()
+    assert len(shield.log) == shield.interventions.sum() > 0
+    assert {entry.vehicle for entry in shield.log} == {1, 2}
+    again = drive(PAIR.sample(20, 9).worlds, team, PAIR).ledger  # a second batch begins anew
+    assert again.world_harm("first").tolist() == harm.world_harm("first").tolist()
+
+
+class Coasting:
+    """Coasts."""
+
+    name = "coasting"
+
+    def begin(self, worlds, vehicle, rows):
+        pass
+
+    def act(self, worlds, vehicle):
+        return np.zeros(worlds.n)
+
+
+def test_evaluation__later_rollouts_of_the_team_let_more_of_it_through():
+    class Late(Coasting):
+        """Coasts for 0.3 s, then brakes fully."""
+
+        def act(self, worlds, vehicle):
+            return np.where(worlds.time_s < 0.8, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+    worlds, replaced = PAIR.sample(60, 11).worlds, {}
+    for later in (True, False):
+        team = ShieldedTeam(Team({1: Late(), 2: Late()}, "late"), PAIR, later_rollouts=later)
+        harm = drive(worlds, team, PAIR).ledger.world_harm("first")
+        assert (harm <= team.predicted_harm).all()
+        replaced[later] = team.shield.interventions.sum()
+    assert replaced[True] < replaced[False]
+
+
+@pytest.mark.parametrize("around", ["episode", "robust"])
+def test_evaluation__other_shields_refuse_a_team(around):
+    with pytest.raises(InvalidInput, match=r"can drive one learner|needs an uncertainty"):
+        team = make_agent(f"full_brake+{around}", scenario=PAIR)
+        evaluate(PAIR.sample(2, 1), {"one": team}, scenario=PAIR)
+
+
+def test_evaluation__a_team_that_leaves_a_learner_alone_is_refused():
+    with pytest.raises(InvalidInput, match=r"does not drive vehicle_3.*follows a script"):
+        ShieldedTeam(Team({1: make_agent("coast")}, "half"), PAIR)

@@ -38,7 +38,7 @@ from ethbrake_marl.scenario.sample import quantity, quantity_rules
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 LEAF = 1_000  # worlds that are hashed together; shards and blocks begin at a multiple of it
-BLOCK = 2 * LEAF  # worlds advanced together: bounds memory, changes no result
+BLOCK = 4 * LEAF  # worlds advanced together: bounds memory, changes no result
 MOST_EPISODES = 10**12
 _TRIED = 100  # worlds at each end of a list that say whether best known harms may be had for all of it
 

@@ -92,7 +92,8 @@ def test_trials__that_ended_are_kept_and_more_go_on_as_if_they_had_been_asked_fo
 
 def test_disturbed_tuning__has_the_same_table(finished_tuning, write_tuning, tmp_path):
     file, folder = write_tuning(), tmp_path / "out"
-    command = [*PROGRAM, "tune", str(file), "--output", str(folder), "--trials", str(TRIALS)]
+    export = tmp_path / "best.yaml"
+    command = [*PROGRAM, "tune", str(file), "--output", str(folder), "--trials", str(TRIALS), "--export", str(export)]
     for trial, end in ((1, signal.SIGKILL), (3, signal.SIGINT)):
         driver = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         try:
@@ -100,13 +101,15 @@ def test_disturbed_tuning__has_the_same_table(finished_tuning, write_tuning, tmp
                 assert driver.poll() is None
                 time.sleep(0.01)
             driver.send_signal(end)
-            assert driver.wait(timeout=300) in (-signal.SIGKILL, 130, 0)
+            assert driver.wait(timeout=300) in (-signal.SIGKILL, 130)
         finally:
             driver.kill()
             driver.wait()
+    assert not export.exists()  # or the same command could not go on
     done = subprocess.run(command, cwd=ROOT, stderr=subprocess.PIPE, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
     assert (folder / TABLE).read_bytes() == (finished_tuning / TABLE).read_bytes()
+    assert export.read_text() == (finished_tuning.parent / "best.yaml").read_text()
 
 
 def test_broken_trials__are_marked_failed_and_others_done_in_their_place(write_tuning, tmp_path):

@@ -1,0 +1,38 @@
+"""Infos of a shield: the keys, and their values before anything is decided."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.shield.step_shield import StepShield
+
+
+def told_before(shield: StepShield, k: int) -> dict[str, Any]:
+    """What a shield says of world ``k`` where nothing is decided."""
+    assert shield.running is not None
+    return {
+        "mode": "step" if shield.uncertainty is None else "robust",
+        "proposed_action": 0.0,
+        "chosen_action": 0.0,
+        "intervened": False,
+        "reason": "",
+        "bound_harm": float(shield.bound[k]),
+        "margin": 0.0,
+        "trusted": not shield.distrusted[k],
+        "settles": bool(shield.settles[k]),
+        **({} if shield.uncertainty is None else {"members": shield.running.members}),
+    }
+
+
+def by_vehicle(columns: NDArray[Any], vehicles: Sequence[int]) -> NDArray[Any]:
+    """What is decided, [n] of one vehicle or [n, K], with the axis of vehicles: [n, K]."""
+    return columns.reshape(len(columns), len(vehicles))
+
+
+def columns_of(rows: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
+    """What is told of each row, one array per key."""
+    return {key: np.array([row[key] for row in rows]) for key in rows[0]}

@@ -1,0 +1,35 @@
+"""Statistics of evaluations that were recorded before the search and the loop of episodes were made faster."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import pytest
+
+from ethbrake_marl.evaluation.shards.question import Question, answer_shard, ask
+from ethbrake_marl.scenario import load_scenario
+
+AGENTS = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
+
+# SHA-256 of the tally of 1,200 worlds of seed 11, its first 16 digits, by the code of 20 November 2026 (6d87c15).
+RECORDED = {
+    ("paper-random", "first"): "5ae559be31df8505",
+    ("paper-random", "total"): "29b0ca9c08a04ae9",
+    ("stress-wide", "first"): "3a14a16f14f147c5",
+    ("stress-wide", "total"): "61a9130a7381a6a9",
+    ("cooperation-2-five", "first"): "1922c828a6f1ea16",
+    ("cooperation-2-five", "total"): "e9edef37a4098d2f",
+    ("paper-random-obstacle", "first"): "e7a03a0982bc18ea",
+    ("paper-random-obstacle", "total"): "10f6acd3dcfedde5",
+    ("realistic-mixed", "first"): "4eae36e96d34d923",
+    ("realistic-mixed", "total"): "0cd6591f18e350eb",
+}
+
+
+@pytest.mark.parametrize(("scenario", "harm_count"), RECORDED)
+def test_tally__is_the_one_that_was_recorded(scenario, harm_count):
+    asked = ask(Question(load_scenario(scenario), AGENTS, 1_200, 11, harm_count))
+    tally = answer_shard(asked, 0, 1_000) + answer_shard(asked, 1_000, 1_200)
+    digest = hashlib.sha256(json.dumps(tally.to_json(), sort_keys=True).encode()).hexdigest()[:16]
+    assert digest == RECORDED[scenario, harm_count]
