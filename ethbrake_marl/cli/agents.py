@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich import box
 from rich.table import Table
 
-from ethbrake_marl.agents.knowledge import knowledge_text
+from ethbrake_marl.agents.knowledge import knowledge_text, sees_through
 from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.cli.options import JsonOption
 from ethbrake_marl.cli.terminal import result_console, show, write_json
@@ -18,7 +18,12 @@ def agents_command(as_json: JsonOption = False) -> None:
     """
     entries = agent_entries()
     if as_json:
-        write_json([{"agent": e.form, "about": e.about, "knows": list(e.knows)} for e in entries])
+        write_json(
+            [
+                {"agent": e.form, "about": e.about, "knows": list(e.knows), "omniscient": sees_through(e.knows)}
+                for e in entries
+            ]
+        )
         return
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("Agent", no_wrap=True)
@@ -26,6 +31,8 @@ def agents_command(as_json: JsonOption = False) -> None:
     table.add_column("Knows", overflow="fold")
     for entry in entries:
         added = "also " if entry.form.startswith("+") else ""
-        table.add_row(entry.form, entry.about, added + knowledge_text(entry.knows))
+        mark = " †" if sees_through(entry.knows) else ""
+        table.add_row(entry.form, entry.about, added + knowledge_text(entry.knows) + mark)
     result_console().print(table)
+    show("† omniscient: reads what no channel brought. With :believed behind it, it decides on what was received.")
     show("ladder stands for coast to best_harm; a typo gets a suggestion. See docs/baselines.md and docs/shield.md.")

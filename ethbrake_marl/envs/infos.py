@@ -6,7 +6,9 @@ of the harm so far under both counts, the same for the whole world, and whether 
 step: ``cost`` (the harm it added to the line, as the reward counts impacts; for safe-RL libraries) and
 ``reward_NAME``, each term of the reward before its weight; after a reset they are 0. ``world_seed`` and ``world`` name
 the world, so that it can be played again (-1: it was given). Where the scenario has a ``v2x`` channel also
-``known_from_s`` [N]: from when on this vehicle acts on news of each one (infinite: never; of itself: its latency).
+``known_from_s`` [N]: from when on this vehicle acts on news of each one (infinite: never; of itself: its latency);
+and where its messages are periodic ``age_s`` [N]: how old the newest sample is that it was told of each (infinite:
+none).
 """
 
 from __future__ import annotations
@@ -22,11 +24,14 @@ from ethbrake_marl.engine.step import Step
 from ethbrake_marl.harm import front_share
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.estimates import age_by_rows
 from ethbrake_marl.physics.rows import (
     TIME,
     command_at,
     harm_at,
+    has_messages,
     has_news,
+    messages_at,
     own_latency_and_news,
     params_at,
     state_width,
@@ -55,6 +60,7 @@ class Report(NamedTuple):
     world_seed: int
     world: Ints  # [n] numbers in the stream of that seed
     known_from_s: Floats | None  # [n, N, N] where there is a channel
+    age_s: Floats | None  # [n, N, N] where its messages are periodic
 
 
 def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
@@ -68,7 +74,8 @@ def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -
     N = wanted.shape[1]
     known = own_latency_and_news(params, N)[1] if has_news(params, N) else None
     cost, terms = _of_the_step(engine, step, rows)
-    return Report(values, cost, terms, engine.roster.seed, world, known)
+    age = age_by_rows(state[:, TIME], params[:, messages_at(N) :], N) if has_messages(state, params) else None
+    return Report(values, cost, terms, engine.roster.seed, world, known, age)
 
 
 def _of_the_step(engine: Engine, step: Step | None, rows: Ints | None) -> tuple[Floats, dict[str, Floats]]:
@@ -145,10 +152,11 @@ def plain_infos(told: Report, vehicles: Ints | None = None) -> list[dict[str, An
             for name, term in terms:
                 info[name] = term[k][v]
             infos.append(info)
-    if told.known_from_s is not None:
-        news = told.known_from_s.take(shown, axis=1)
-        for info, known in zip(infos, news.reshape(-1, news.shape[2]), strict=True):
-            info["known_from_s"] = known.copy()
+    for name, news in (("known_from_s", told.known_from_s), ("age_s", told.age_s)):
+        if news is not None:
+            of_shown = news.take(shown, axis=1)
+            for info, row in zip(infos, of_shown.reshape(-1, of_shown.shape[2]), strict=True):
+                info[name] = row.copy()
     return infos
 
 
@@ -173,6 +181,8 @@ def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools) -> dict[
         columns[f"reward_{name}"] = np.where(stepped, term if term.ndim == 1 else term[:, vehicle], 0.0)
     if told.known_from_s is not None:
         columns["known_from_s"] = told.known_from_s[:, vehicle]
+    if told.age_s is not None:
+        columns["age_s"] = told.age_s[:, vehicle]
     return _mask(columns, rows)
 
 

@@ -105,12 +105,18 @@ def age_s(worlds: Worlds) -> Floats:
     0 without periodic messages, where the present is known; infinite where nothing has been told yet. Whether i may act
     on it is another question (``Vehicles.known_from_s``).
     """
-    n, N = worlds.speeds_mps.shape
-    periodic, age = is_periodic(worlds), np.zeros((n, N, N))
-    if periodic.any():
-        told_s, now = links_of(worlds)[..., TOLD_S], worlds.time_s[:, np.newaxis, np.newaxis]
-        age[periodic] = np.where(told_s >= 0.0, now - told_s, np.inf)[periodic]
-        age[:, np.arange(N), np.arange(N)] = 0.0
+    return age_by_rows(worlds.time_s, worlds.messages, worlds.N)
+
+
+def age_by_rows(time_s: Floats, messages: Floats, vehicles: int) -> Floats:
+    """``age_s`` of worlds at ``time_s`` [n] by their columns of ``messages`` [n, M]."""
+    age = np.zeros((len(time_s), vehicles, vehicles))
+    if messages.shape[1] == 0:
+        return age
+    links = messages[:, link_at(0, 0, vehicles) : ring_at(vehicles)].reshape(-1, vehicles, vehicles, LINK)
+    periodic, told_s = messages[:, PERIOD] > 0.0, links[..., TOLD_S]
+    age[periodic] = np.where(told_s >= 0.0, time_s[:, np.newaxis, np.newaxis] - told_s, np.inf)[periodic]
+    age[:, np.arange(vehicles), np.arange(vehicles)] = 0.0
     return age
 
 

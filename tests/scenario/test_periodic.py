@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
 from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import worlds_sha256
 from ethbrake_marl.observations import choose_observation
@@ -189,8 +191,18 @@ def test_interfaces__see_the_same() -> None:
     engine = env.unwrapped.engine
     assert is_periodic(engine.worlds).all() and not (engine.worlds.messages[:, KEY] == 0.0).any()
     for _ in range(5):
-        seen, *_ = env.step({"vehicle_2": np.array([-0.5], np.float32)})
+        seen, *_, infos = env.step({"vehicle_2": np.array([-0.5], np.float32)})
     np.testing.assert_array_equal(seen["vehicle_2"], engine.observe(1)[0])
+    np.testing.assert_array_equal(infos["vehicle_2"]["age_s"], age_s(engine.worlds)[0, 1])
+    many = gymnasium.make_vec("EthBrake-v0", num_envs=3, scenario=scenario)
+    _, told = many.reset(seed=5)
+    assert told["age_s"].shape == (3, 3) and (told["age_s"][:, 1] == 0.0).all()
+    vec = make_sb3_vec_env(scenario, 3, seed=5)
+    alike = vec.reset()
+    for _ in range(90):  # through an automatic reset
+        alike, _, _, _ = vec.step(np.full((3, 1), -0.5, np.float32))
+    np.testing.assert_array_equal(alike, vec.engine.observe(1))
+    assert np.isfinite(alike).all() and vec.reset_infos[0]["age_s"].shape == (3,)
 
 
 @pytest.mark.parametrize(
