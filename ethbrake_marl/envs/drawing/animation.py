@@ -83,7 +83,7 @@ class _Strip:
             yield f'<rect x="{self._x(obstacle):.1f}" y="{top}" width="9" height="{2 * _HALF_ROAD}" fill="var(--ink)"/>'
         for i in range(len(self._film[0].front_m)):
             yield from self._vehicle(i)
-        yield from self._impacts()
+        yield from self._labels()
 
     def _vehicle(self, i: int) -> Iterator[str]:
         """The body that moves, with its number and the lights of its command."""
@@ -104,6 +104,7 @@ class _Strip:
                     f'<rect x="{x:.1f}" y="{top}" width="5" height="{2 * _HALF_BODY}" fill="var(--{name})"'
                     f' opacity="0">{self._switched(lit)}</rect>'
                 )
+        yield from self._stars(i)
         values = ";".join(f"{place:.1f} 0" for place in places)
         yield (
             '<animateTransform attributeName="transform" type="translate" repeatCount="indefinite"'
@@ -122,36 +123,47 @@ class _Strip:
                 f'<text x="{WIDTH - 12}" y="22" text-anchor="end" opacity="{shown}">{words}{self._switched(lit)}</text>'
             )
 
-    def _impacts(self) -> Iterator[str]:
-        """A star where two vehicles meet, and their closing speed, until the next impact takes its place."""
-        events = self._events()
-        begins = [start for start, _ in events] + [len(self._film)]
-        for number, (start, struck) in enumerate(events, 1):
-            until = min(start + round(_SHOWN_S * self._fps), begins[number])
-            lit = [start <= k < until for k in range(len(self._film))]
-            scene = self._film[start]
-            front = scene.front_m[max(struck.pair, 0)] - (BODY_M if struck.pair >= 0 else 0.0)
-            x = self._x(front)
+    def _labels(self) -> Iterator[str]:
+        """Above the road, the closing speed of each impact while it is shown."""
+        for start, until, struck in self._events():
+            x = self._x(self._film[start].front_m[struck.pair + 1])
             words = f"{pair_words(struck.pair)}: {speed_words(struck.closing_mps)}"
-            star = " ".join(
-                f"{x + r * math.cos(k * math.pi / 8):.1f},{_LANE + r * math.sin(k * math.pi / 8):.1f}"
-                for k, r in enumerate([17, 8] * 8)
-            )
+            lit = [start <= k < until for k in range(len(self._film))]
             yield (
-                f'<g opacity="0"><polygon points="{star}" fill="var(--flash)" stroke="#c1121f"/>'
-                f'<text class="impact" x="{min(max(x, 90), WIDTH - 90):.1f}" y="46">{words}</text>'
-                f"{self._switched(lit)}</g>"
+                f'<text class="impact" x="{min(max(x, 90), WIDTH - 90):.1f}" y="46" opacity="0">{words}'
+                f"{self._switched(lit)}</text>"
             )
 
-    def _events(self) -> list[tuple[int, Struck]]:
-        """The hardest impact that is new in each scene, and the number of that scene."""
+    def _stars(self, i: int) -> Iterator[str]:
+        """At the front of Vehicle ``i + 1``, a star for each of its impacts with what is ahead, while it is shown."""
+        for start, until, struck in self._events():
+            if struck.pair + 1 == i:
+                star = " ".join(
+                    f"{r * math.cos(k * math.pi / 8):.1f},{_LANE + r * math.sin(k * math.pi / 8):.1f}"
+                    for k, r in enumerate([17, 8] * 8)
+                )
+                lit = [start <= k < until for k in range(len(self._film))]
+                yield (
+                    f'<polygon points="{star}" fill="var(--flash)" stroke="#c1121f" opacity="0">'
+                    f"{self._switched(lit)}</polygon>"
+                )
+
+    def _events(self) -> list[tuple[int, int, Struck]]:
+        """Impacts that are shown: the number of the first scene, that behind the last one, and the impact.
+
+        One that is lighter than the one before it is left out while that one is shown.
+        """
         known: set[tuple[int, float]] = set()
-        found: list[tuple[int, Struck]] = []
+        found: list[tuple[int, int, Struck]] = []
         for k, scene in enumerate(self._film):
             new = [struck for struck in scene.struck if (struck.pair, struck.time_s) not in known]
             known |= {(struck.pair, struck.time_s) for struck in new}
-            if new:
-                found.append((k, max(new, key=lambda struck: struck.closing_mps)))
+            hardest = max(new, key=lambda struck: struck.closing_mps, default=None)
+            if hardest is None or (found and k < found[-1][1] and hardest.closing_mps < found[-1][2].closing_mps):
+                continue
+            if found:
+                found[-1] = (found[-1][0], min(found[-1][1], k), found[-1][2])
+            found.append((k, k + round(_SHOWN_S * self._fps), hardest))
         return found
 
     def _switched(self, lit: Sequence[bool]) -> str:

@@ -64,9 +64,9 @@ def test_page__its_example_of_a_training_runs(tmp_path, monkeypatch):
 def test_page__its_examples_run():
     names: dict[str, object] = {}
     blocks = [b for b in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "result = eb.train(" not in b]
-    assert len(blocks) == 3
-    exec(blocks[0], names)
-    exec(blocks[2].replace("1000", "20"), names)
+    assert len(blocks) == 4 and "for preset in PRESETS" in blocks[1]  # 100,000 worlds of each
+    for block in (blocks[0], *blocks[2:]):
+        exec(block.replace("1000", "20"), names)
     assert names["columns"]["social:45"].shape == (20, 3)
     assert names["columns"].keys() == scored(names["result"].outcome("full_brake").ledger, "first").keys()
 
