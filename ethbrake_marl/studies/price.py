@@ -81,7 +81,7 @@ def price_report(
     *,
     scenario: str = "cooperation-2-paper",
     presets: Sequence[str] = CHANNELS,
-    n: int = 500,
+    n: int = 100,
     seed: int = 7,
 ) -> str:
     """Run the whole study, write its figure and return its table as Markdown; an older figure is overwritten."""

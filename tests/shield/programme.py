@@ -7,6 +7,7 @@ joint   teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5 (``
 interfaces   worlds through every wrapped interface (``tests.shield.interface_attack``)
 interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
 search  restarts of a search against the shield, and against twelve leaks of it (``tests.shield.search``)
+believed  worlds that are corners of what was not received (``tests.shield.corners``)
 speed   decisions per second in a batch, and the latency of one decision
 
 No realised harm may be above the bound at the alert (tolerance 1e-9; of teams none, and harm must be the last bound, as
@@ -38,6 +39,7 @@ from ethbrake_marl.shield import StepShieldAgent
 from ethbrake_marl.shield.certify import certify
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from tests.shield.corners import corners_gate
 from tests.shield.interface_attack import INTERFACES
 from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
 from tests.shield.joint_attack import ADVERSARIES as JOINT_ADVERSARIES
@@ -299,11 +301,12 @@ def main() -> int:
     parser.add_argument("--joint-worlds", type=int, default=300_000, help="of the gate 'joint', all cells together")
     parser.add_argument("--interface-worlds", type=int, default=10_000, help="through each interface")
     parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each interface")
+    parser.add_argument("--corner-worlds", type=int, default=60_000, help="of the gate 'believed'")
     parser.add_argument("--restarts", type=int, default=1_000, help="of the search")
     parser.add_argument("--decisions", type=int, default=5_000, help="timed one by one")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
-        "--only", default="speed,interference,search,interfaces,joint,bound", help="gates, with commas between them"
+        "--only", default="speed,interference,search,believed,interfaces,joint,bound", help="gates, with commas between them"
     )
     parser.add_argument("--results", type=Path, default=ROOT / "runs" / "test-shield", help="folder of finished chunks")
     parser.add_argument("--part", default="1/1", help="this process's share of the chunks, for instance 1/2")
@@ -314,6 +317,7 @@ def main() -> int:
         "search": lambda: search_gate(given.restarts, given.seed),
         "interference": lambda: interference_gate(given.interfered, given.seed),
         "joint": lambda: run_chunks(list(joint_chunks(given.joint_worlds)), joint_chunk, given, code),
+        "believed": lambda: corners_gate(given.corner_worlds, given.seed),
         "interfaces": lambda: run_chunks(list(interface_chunks(given.interface_worlds)), interface_chunk, given, code),
         "bound": lambda: run_chunks(list(bound_chunks(given.worlds)), attack_chunk, given, code),
     }

@@ -8,43 +8,13 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield.believed import BelievedShieldAgent
+from tests.shield.corners import ABOVE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded
 
 BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
-ENDS = BASE.replace(  # every world is a corner of its ranges: what is open is one of two numbers. None are round: in a
-    # world of equal gaps and speeds two impacts fall on one moment, and the last bit decides which of them is first
-    gaps_m=[{"choice": [5.13, 9.71]}, {"choice": [5.37, 9.58]}],
-    speeds_mps=[{"choice": [18.23, 21.87]}, {"choice": [18.11, 21.93]}, {"choice": [18.41, 22.19]}],
-    v2x={"preset": "paper", "hears": "front"}, mass_t=[4.5, 5.5, {"choice": [3.0, 9.0]}],
-)  # fmt: skip
-LATE = ENDS.replace(  # heard one after the other, a while after the first decision, by messages 0.6 to 0.9 s old
-    v2x={"preset": "paper", "link_latency_s": 0.6, "persistence": "periodic", "senses": "front", "sensing_s": [3, 3]},
-    latency_s=[0.0, 0.2, 0.6],
-)
 PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
-
-
-class Hostile:
-    """Proposes whatever does most harm: full driving, coasting, or chance."""
-
-    knows = "own sensors"
-
-    def __init__(self, way: str) -> None:
-        self.name, self.rng = way, np.random.default_rng(5)
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: np.ndarray) -> None:
-        pass
-
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        low, high = (
-            -worlds.vehicles.braking_capacity_mps2[:, vehicle],
-            worlds.vehicles.driving_capacity_mps2[:, vehicle],
-        )
-        if self.name == "chance":
-            return self.rng.uniform(low, high)
-        return high.copy() if self.name == "drive" else np.zeros(worlds.n)
 
 
 def driven(agent: object, scenario: Scenario, n: int, seed: int = 7, vehicle: int = 1) -> tuple[Floats, Floats]:
@@ -53,17 +23,16 @@ def driven(agent: object, scenario: Scenario, n: int, seed: int = 7, vehicle: in
     return harm, agent.predicted_harm
 
 
-@pytest.mark.parametrize("scenario", [ENDS, LATE], ids=["never heard", "heard late"])
-@pytest.mark.parametrize("way", ["coast", "drive", "chance"])
+@pytest.mark.parametrize("scenario", LISTS.values(), ids=list(LISTS))
+@pytest.mark.parametrize("way", WAYS)
 def test_robust__at_the_corners_no_world_is_above_the_first_bound(scenario: Scenario, way: str) -> None:
-    agent = BelievedShieldAgent(Hostile(way), scenario, robust=True)
-    harm, bound = driven(agent, scenario, 60)
-    assert (harm <= bound + 1e-6).all()
-    assert agent.interventions.sum() > 60
+    harm, bound, replaced = shielded(way, scenario, 60, 7)
+    assert (harm <= bound + ABOVE).all()
+    assert replaced > 60
 
 
 def test_step__in_the_middle_promises_nothing_of_the_corners() -> None:
-    harm, bound = driven(BelievedShieldAgent(Hostile("coast"), ENDS), ENDS, 60)
+    harm, bound, _ = shielded("coast", NEVER_HEARD, 60, 7, robust=False)
     assert (harm > bound + 1.0).any()
 
 

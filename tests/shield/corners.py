@@ -1,0 +1,75 @@
+"""Worlds that are corners of what a vehicle does not know, and attacks on ``+robust:believed`` in them.
+
+Every quantity of another vehicle that is open is one of two numbers, so each world of these lists is a member of what
+is certified at its first decision. None of the numbers are round: in a world of equal gaps and equal speeds two impacts
+fall on one moment, and the last bit decides which of them is first.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.shield.believed import BelievedShieldAgent
+
+WAYS = ("coast", "drive", "chance")
+ABOVE = 1e-6  # m2/s2; what is told is moved on with rounding
+
+_BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
+NEVER_HEARD = _BASE.replace(
+    gaps_m=[{"choice": [5.13, 9.71]}, {"choice": [5.37, 9.58]}],
+    speeds_mps=[{"choice": [18.23, 21.87]}, {"choice": [18.11, 21.93]}, {"choice": [18.41, 22.19]}],
+    v2x={"preset": "paper", "hears": "front"},
+    mass_t=[4.5, 5.5, {"choice": [3.0, 9.0]}],
+)
+HEARD_LATE = NEVER_HEARD.replace(  # a while after the first decision, by messages 0.6 to 0.9 s old
+    v2x={"preset": "paper", "link_latency_s": 0.6, "persistence": "periodic", "senses": "front", "sensing_s": [3, 3]},
+    latency_s=[0.0, 0.2, 0.6],
+)
+LISTS = {"never heard": NEVER_HEARD, "heard late": HEARD_LATE}
+
+
+class Hostile:
+    """Proposes what does harm: full driving, nothing at all, or chance."""
+
+    knows = "own sensors"
+
+    def __init__(self, way: str, seed: int = 5) -> None:
+        self.name, self.rng = way, np.random.default_rng(seed)
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Nothing to prepare."""
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The proposal, [n] m/s2."""
+        vehicles = worlds.vehicles
+        low, high = -vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
+        if self.name == "chance":
+            return self.rng.uniform(low, high)
+        return high.copy() if self.name == "drive" else np.zeros(worlds.n)
+
+
+def shielded(way: str, scenario: Scenario, n: int, seed: int, *, robust: bool = True) -> tuple[Floats, Floats, int]:
+    """Harm realised and first bound of ``n`` worlds [n] m2/s2, and how many proposals were replaced."""
+    agent = BelievedShieldAgent(Hostile(way, seed), scenario, robust=robust)
+    harm = drive(scenario.sample(n, seed).worlds, agent, scenario, 1).ledger.world_harm("first")
+    return harm, agent.predicted_harm, int(agent.interventions.sum())
+
+
+def corners_gate(worlds: int, seed: int) -> bool:
+    """Where the world is a corner of what is not known, no harm is above the first bound, whatever is proposed."""
+    good, each = True, max(1, worlds // (len(LISTS) * len(WAYS)))
+    for name, scenario in LISTS.items():
+        for way in WAYS:
+            harm, bound, replaced = shielded(way, scenario, each, seed)
+            above = int((harm > bound + ABOVE).sum())
+            good = good and above == 0 and replaced > 0
+            excess = float(np.maximum(harm - bound, 0.0).max())
+            print(
+                f"  {name:12s} {way:7s} {each:7,} worlds {replaced:9,} replaced  above the bound: {above}, largest"
+                f" excess {excess:.2g}",
+                flush=True,
+            )
+    return good
