@@ -48,19 +48,19 @@ BUGS = {
         "bounce = restitution", statements.plastic,
     ),
     "the budget may rise": Bug(
-        certify_kernel, "decide_world", "    if value <= budget:\n        plan[step]",
-        "    if value <= 2.0 * budget:\n        plan[step]", statements.decision,
+        certify_kernel, "decide_world", "    if value <= budget:\n        for c in",
+        "    if value <= 2.0 * budget:\n        for c in", statements.decision,
     ),
     "later proposals are not certified": Bug(
-        certify_kernel, "decide_world", "    if value <= budget:\n        plan[step]",
-        "    if value <= budget or step > 0:\n        plan[step]", statements.decision,
+        certify_kernel, "decide_world", "    if value <= budget:\n        for c in",
+        "    if value <= budget or step > 0:\n        for c in", statements.decision,
     ),
     "the fallback is the plan's first action": Bug(
         certify_kernel, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
         "take_steps(world, states, ended, step, plan[0], after, over)", statements.decision,
     ),
     "the plan is followed from the second decision on": Bug(
-        certify_kernel, "decide_world", "value = worst_of_plan(world, after, over, step + 1,",
+        certify_kernel, "try_action", "value = worst_of_plan(world, after, over, step + 1,",
         "value = worst_of_plan(world, after, over, 1,", statements.decision,
     ),
     "a constant begins one decision late": Bug(
@@ -78,15 +78,27 @@ BUGS = {
         statements.stopping,
     ),
     "the plan that was certified with a proposal is not kept": Bug(
-        certify_kernel, "decide_world", "            plan[:] = room[0]", "            pass", statements.decision
+        certify_kernel, "try_action", "                copy_action(room[0, j], plan[j])", "                pass",
+        statements.decision,
     ),
     "a constant counts without being certified": Bug(
         certify_kernel, "better_plan", "certified = worst_of_plan(world, states, ended, step, trial, most)",
         "certified = least", statements.decision,
     ),
     "the bound of the plan is told for the proposal": Bug(
-        certify_kernel, "decide_world", "proposal, reason, value, budget - value",
-        "proposal, reason, certified, budget - value", statements.decision,
+        certify_kernel, "decide_world", "tell_action(out, plan[step], value, budget - value)",
+        "tell_action(out, plan[step], certified, budget - value)", statements.decision,
+    ),
+    "of two proposals the second is certified beside the plan as it was": Bug(
+        certify_kernel, "decide_world", "copy_action(plan[step], tried[1])",
+        "copy_action(tried[1] if accepted else plan[step], tried[1])", statements.decision_of_two,
+    ),
+    "the first of two that is accepted keeps the bound from before": Bug(
+        certify_kernel, "decide_world", "bound, accepted = value, accepted + 1", "accepted = accepted + 1",
+        statements.decision_of_two,
+    ),
+    "a plan for two is written for the first alone": Bug(
+        certify_kernel, "copy_action", "for c in range(to.shape[0]):", "for c in range(1):", statements.decision_of_two
     ),
 }  # fmt: skip
 

@@ -25,6 +25,7 @@ STATEMENTS: dict[str, Statement] = {}
 
 BOUNCING, PLASTIC = 1.0, 0.01  # m/s, closing speeds above and below ``PLASTIC_SPEED_MPS``
 DECISIONS = ((0, 3), (2, 3), (2, 1))  # in the statements about the shield: how many were made, how many are left
+TEAM_DECISIONS = ((0, 2), (1, 1))  # ... about two shielded vehicles
 
 
 def states(text: str) -> Callable[[Statement], Statement]:
@@ -165,55 +166,83 @@ def settling() -> int:
 
 
 class _Line:
-    """A world as the shield sees it: what each action leads to, and the harm of each sequence of actions, unknown."""
+    """A world as the shield sees it: what each action leads to, and the harm of each sequence of actions, unknown.
 
-    def __init__(self, made: int, left: int) -> None:
+    An action is one number for each of the shielded ``vehicles``. Of several, a step before the last ends nothing.
+    """
+
+    def __init__(self, made: int, left: int, vehicles: int = 1) -> None:
         number = z3.RealSort()
-        self.made = made
-        self.harm = z3.Function("harm", *[number] * left, number)  # of the whole episode
-        self.so_far = z3.Function("so_far", number, number)  # after the first action
-        self.going = z3.Function("going", number, z3.IntSort())  # after the first action: -1, 0 or 1
-        self.plan = symbols(" ".join(f"plan{k}" for k in range(made + left)))  # of the whole episode
-        self.proposed, self.budget, self.certified = symbols("proposed budget certified")
+        self.made, self.goes_on = made, vehicles > 1 and left > 1
+        self.harm = z3.Function("harm", *[number] * (left * vehicles), number)  # of the whole episode
+        self.so_far = z3.Function("so_far", *[number] * vehicles, number)  # after the first action
+        self.going = z3.Function("going", *[number] * vehicles, z3.IntSort())  # after the first action: -1, 0 or 1
+        self.plan = np.array(  # of the whole episode
+            [symbols(" ".join(f"plan{k}_{c}" for c in range(vehicles))) for k in range(made + left)], object
+        )
+        self.proposed = symbols(" ".join(f"proposed{c}" for c in range(vehicles)))
+        self.budget, self.certified = symbols("budget certified")
+        self.constants = np.array(  # more than are asked for on any path
+            [symbols(" ".join(f"constant{k}_{c}" for c in range(vehicles))) for k in range(9)], object
+        )
         self.fresh = 0
 
     def known(self) -> list[Any]:
         """The invariant: the plan's harm is certified, and within the budget; its first step does not fail."""
-        plan = [exact(each) for each in self.plan[self.made :]]
+        plan, first = _exact(self.plan[self.made :]), _exact(self.plan[self.made])
         return [
             self.harm(*plan) == exact(self.certified),
             exact(self.certified) <= exact(self.budget),
             exact(self.certified) >= 0,
-            self.going(plan[0]) >= 0,
-            z3.Implies(self.going(plan[0]) == 0, self.so_far(plan[0]) == exact(self.certified)),
+            self.going(*first) >= 0,
+            z3.Implies(self.going(*first) == 0, self.so_far(*first) == exact(self.certified)),
         ]
 
     def take_steps(self, _: Any, __: Any, ___: Any, step: int, action: Any, after: Any, ____: Any) -> int:
         """The step of one action: it fails, ends the episode, or leaves it going; the same each time it is asked."""
         assert step == self.made, "another step is taken"
-        after[0] = action
-        going = self.going(exact(action))
+        after[0] = np.array(action, object)
+        going = self.going(*_exact(action))
+        if self.goes_on:
+            return 1
         if Condition(going < 0):
             return -1
         return 0 if Condition(going == 0) else 1
 
     def worst_so_far(self, _: Any, after: Any) -> Any:
         """Harm after the action."""
-        return Symbol(self.so_far(exact(after[0])))
+        return Symbol(self.so_far(*_exact(after[0])))
 
     def worst_of_plan(self, _: Any, after: Any, __: Any, step: int, plan: Any, most: Any) -> Any:
         """Harm of the action and then the plan; infinite above ``most``."""
         assert step == self.made + 1, "the plan is followed from another step on"
-        harm = self.harm(exact(after[0]), *(exact(each) for each in plan[step:]))
+        harm = self.harm(*_exact(after[0]), *_exact(plan[step:]))
         if isinstance(most, float) and most == math.inf:
             return Symbol(harm)
         return Symbol(harm) if Condition(harm <= exact(most)) else math.inf
 
-    def best_constant(self, *_: Any) -> tuple[Symbol, Symbol]:
+    def best_constant(self, *_: Any) -> tuple[int, Symbol]:
         """Some constant, and what a search says of it, which need not be true."""
         self.fresh += 1
-        constant, least = symbols(f"constant{self.fresh} least{self.fresh}")
-        return constant, least
+        (least,) = symbols(f"least{self.fresh}")
+        return self.fresh - 1, least
+
+    def better_plan(self, *given: Any) -> tuple[Any, Any]:
+        """What ``better_plan`` is proven to do for one vehicle: another plan where it is better, or nothing."""
+        _, after, __, step, constants, value, most, plan, ___ = given
+        constant, least = self.best_constant()
+        rest = [_exact(constants[constant])] * (len(plan) - step)
+        harm = self.harm(*_exact(after[0]), *itertools.chain(*rest))
+        within = [harm <= exact(most)] if not is_infinite(most) else []
+        if Condition(z3.And(*within, *([] if is_infinite(value) else [harm < exact(value)]))):
+            plan[step:] = constants[constant]
+            return Symbol(harm), Symbol(harm)
+        return value, least
+
+
+def _exact(actions: Any) -> list[Any]:
+    """The expressions of some actions."""
+    return [exact(each) for each in np.ravel(actions)]
 
 
 @states(
@@ -224,40 +253,52 @@ def decision() -> int:
 
     What the physics does is an unknown function of the actions: the same for the same actions, which is all it needs.
     """
-    count = 0
-    for usable, (made, left) in product((True, False), DECISIONS):
-        line = _Line(made, left)
+    return sum(_decided(_Line(*when), (usable,)) for usable, when in product((True, False), DECISIONS))
 
-        def decide(line: _Line = line, usable: bool = usable) -> tuple[Any, Any, Any]:
-            line.fresh = 0
-            plan, room = np.array(line.plan, object), np.zeros((2, len(line.plan)), object)
-            after, out = np.zeros(1, object), np.zeros(4, object)
-            proposed = line.proposed if usable else math.nan
-            good = certify_kernel.decide_world(
-                None, None, np.zeros(1, bool), line.made, proposed, line.budget, line.certified, np.zeros(1), plan,
-                room, after, np.zeros(1, bool), out,
-            )  # fmt: skip
-            return good, plan, out
 
-        found = list(_run(certify_kernel, decide, line.known(), line))
-        for end in found:
-            good, plan, out = end.result
-            assert good
-            assert not is_infinite(out[2]), "the bound is infinite"
-            applied, bound = exact(out[0]), exact(out[2])
-            prove(end, bound <= exact(line.budget), "the bound is within the budget")
-            assert exact(plan[made]).eq(applied), "what is applied is not in the plan"
-            rest = [exact(each) for each in plan[made + 1 :]]
-            goes_on = line.going(applied) > 0
-            prove(end, line.harm(applied, *rest) == bound, "the plan that is kept has the bound", goes_on)
-            prove(end, line.so_far(applied) == bound, "so has the harm, if the episode is over", z3.Not(goes_on))
-        count += len(found)
-    return count
+@states("a decision about two shielded vehicles: the same of the vector of their actions, taken one after the other")
+def decision_of_two() -> int:
+    """``decide_world`` for two vehicles, each with a proposal or with none; ``better_plan`` by what it is to do."""
+    usable = product((True, False), repeat=2)
+    return sum(_decided(_Line(*when, 2), both) for both, when in product(usable, TEAM_DECISIONS))
+
+
+def _decided(line: _Line, usable: tuple[bool, ...]) -> int:
+    """Prove the induction step of a decision on which these vehicles propose a number; the number of paths."""
+    vehicles, made = len(usable), line.made
+
+    def decide() -> tuple[Any, Any, Any]:
+        line.fresh = 0
+        plan, room = line.plan.copy(), np.zeros((2, *line.plan.shape), object)
+        after, out, tried = np.zeros(1, object), np.zeros((vehicles, 4), object), np.zeros((2, vehicles), object)
+        proposed = np.array([p if use else math.nan for p, use in zip(line.proposed, usable, strict=True)], object)
+        good = certify_kernel.decide_world(
+            None, None, np.zeros(1, bool), made, proposed, line.budget, line.certified, line.constants, plan, room,
+            tried, after, np.zeros(1, bool), out,
+        )  # fmt: skip
+        return good, plan, out
+
+    found = list(_run(certify_kernel, decide, line.known(), line))
+    for end in found:
+        good, plan, out = end.result
+        assert good
+        assert not is_infinite(out[0, 2]), "the bound is infinite"
+        applied, bound = _exact(out[:, 0]), exact(out[0, 2])
+        assert all(exact(each).eq(bound) for each in out[:, 2]), "two vehicles are told two bounds"
+        prove(end, bound <= exact(line.budget), "the bound is within the budget")
+        assert all(a.eq(b) for a, b in zip(_exact(plan[made]), applied, strict=True)), "what is applied is not planned"
+        goes_on = z3.BoolVal(True) if line.goes_on else line.going(*applied) > 0
+        rest = _exact(plan[made + 1 :])
+        prove(end, line.harm(*applied, *rest) == bound, "the plan that is kept has the bound", goes_on)
+        prove(end, line.so_far(*applied) == bound, "so has the harm, if the episode is over", z3.Not(goes_on))
+    return len(found)
 
 
 def _run(module: ModuleType, function: Callable[[], Any], known: list[Any], line: _Line | None = None) -> Any:
     """The paths of a function of ``module``, with symbolic roots, and ``line`` in the place of the physics."""
     names = ("take_steps", "worst_so_far", "worst_of_plan", "best_constant") if line else ()
+    if line and len(line.proposed) > 1:
+        names = (*names, "better_plan")
     before = {name: getattr(module, name) for name in (*names, "math")}
     try:
         module.math = SymbolicMath  # type: ignore[attr-defined]

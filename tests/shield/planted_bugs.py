@@ -1,7 +1,7 @@
 """Twenty-seven bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
-applied to a temporary copy. There ``test_certify``, ``test_step_shield``, one test of ``test_robust`` and some of ``test_joint`` run with
+applied to a temporary copy. There ``test_certify``, ``test_step_shield`` and some other tests run with
 compilation switched off, and where they stay green, the other tests of the shield, compiled. Those must be green
 without any bug.
 """
