@@ -19,6 +19,7 @@ from ethbrake_marl.shield.enclosure_impact import Stack, branch, keep_worst
 from ethbrake_marl.shield.enclosure_motion import (
     FREE,
     MAY_STOP,
+    MOVES,
     ROUNDING,
     STANDS,
     TOUCHES,
@@ -28,7 +29,7 @@ from ethbrake_marl.shield.enclosure_motion import (
     Path,
     move_alone,
 )
-from ethbrake_marl.shield.enclosure_touch import move_together
+from ethbrake_marl.shield.enclosure_touch import embrace, is_blurred, move_together
 from ethbrake_marl.shield.forms import (
     add,
     high,
@@ -68,12 +69,16 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
         length = cell.times[piece + 1] - cell.times[piece]
         move_alone(cell, path.forms, piece, motion)
         for p in range(P):
+            if path.marks[P + p] == FREE and path.marks[p] == 1 and may_meet(cell, path, motion, p, length):
+                if is_blurred(path, motion, N, p, length):
+                    embrace(cell, path, p)
             if path.marks[P + p] == TOUCHES:
                 move_together(cell, path, motion, p, length)
         for p in range(P):
             if path.marks[P + p] == FREE and may_meet(cell, path, motion, p, length):
-                motion.speed[p, -1] += TOUCH_SPEED_MPS  # by a touch, which is no impact
-                motion.speed[p + 1, -1] += TOUCH_SPEED_MPS
+                for i in range(p, p + 2):
+                    if motion.rest[i] == MOVES:
+                        motion.speed[i, -1] += TOUCH_SPEED_MPS  # by a touch, which is no impact
                 for stands in range(2):
                     if (motion.rest[p] == STANDS) == (stands == 1) or motion.rest[p] == MAY_STOP:
                         how, there = approach(cell, path, motion, p, length, stands == 1)

@@ -22,6 +22,7 @@ from ethbrake_marl.shield.enclosure_motion import (
     Motion,
     Path,
 )
+from ethbrake_marl.shield.enclosure_touch import part_of
 from ethbrake_marl.shield.forms import (
     add,
     between,
@@ -55,9 +56,9 @@ def noise(cell: Cell, path: Path, p: int, column: int) -> float:
     """By how much speeds (or gap) of a pair may differ because a neighbouring pair is in contact."""
     P, most = cell.gap.shape[0], 0.0
     if p > 0 and path.marks[P + p - 1] != FREE:
-        most += high(cell.share[p - 1, 1]) * path.touch[p - 1, column]
+        most += part_of(cell, path, p - 1, 1) * path.touch[p - 1, column]
     if p < P - 1 and path.marks[P + p + 1] != FREE:
-        most += high(cell.share[p + 1, 0]) * path.touch[p + 1, column]
+        most += part_of(cell, path, p + 1, 0) * path.touch[p + 1, column]
     return most
 
 

@@ -40,7 +40,7 @@ from ethbrake_marl.shield.forms import (
     square_root,
 )
 
-STACK = 64  # most paths that wait to be followed
+STACK = 256  # most paths that wait to be followed
 
 
 class Stack(NamedTuple):
@@ -150,8 +150,8 @@ def strike(
         jump[-1] = abs(jump[-1]) + (bounces - returns) * PLASTIC_SPEED_MPS
         spring_apart(cell, path, motion, p, how, jump, left, after, way)
     else:
-        stay(cell, path, motion, p, how, speed, left, after, way)
         settle_down(motion, p, bounces * high(speed), length, after.touch[p])
+        stay(cell, path, motion, p, how, speed, left, after, way)
         after.marks[P + p] = TOUCHES
     for q in range(P):
         add(after.forms[N + q], 1.0, way[q])
@@ -159,9 +159,27 @@ def strike(
         if after.marks[P + q] == PARTS:
             after.marks[P + q] = FREE
     stack.size[0] = size + 1
-    if after.marks[P + p] == TOUCHES and path.marks[p] == 0 and low(how.squared) <= 2.0 * NEVER:
+    if after.marks[P + p] == TOUCHES and path.marks[p] == 0 and may_only_touch(cell, path, motion, p):
         return touch_only(path, stack, p)
     return True
+
+
+@compiled_apart
+def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int) -> bool:
+    """Whether a pair may have come to gap 0 at closing speed 0 just when it begins to be pressed together.
+
+    Before, it was not: so a command changed.
+    """
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    piece = path.marks[2 * P]
+    changed = piece == 0 or motion.vague[p] + motion.vague[p + 1] > 0.0
+    for i in range(p, p + 2):
+        if i != cell.vehicle:
+            changed = changed or high(cell.onset[i]) == cell.times[piece]
+        elif piece > 0:
+            changed = changed or cell.action[piece] != cell.action[piece - 1]
+    closing = difference(path.forms[p + 1], path.forms[p])
+    return changed and low(closing) <= 1e-4 and high(closing) >= -1e-4 and low(path.forms[N + p]) <= 1e-6
 
 
 @compiled_apart
@@ -247,6 +265,8 @@ def stay(
         after.forms[p] = common(cell, p, motion.onward[p], motion.onward[p + 1])
         way[p] = common(cell, p, motion.reach[p], motion.reach[p + 1])
         add(way[p], -1.0, product(cell.share[p, 0], gap))
+    if low(after.forms[p]) < 0.0:  # one of them may stand before the other
+        way[p, -1] += after.touch[p, APART] * high(left)
     stand_still(pull, after.forms[p], way[p])
     after.forms[p + 1], way[p + 1] = after.forms[p], way[p]
     add(way[p + 1], 1.0, gap)

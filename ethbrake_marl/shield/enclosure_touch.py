@@ -15,13 +15,14 @@ from ethbrake_marl.shield.enclosure_motion import (
     SINCE,
     SOFTEST,
     STANDS,
+    TOUCHES,
     WIDE,
     Cell,
     Motion,
     Path,
     stop,
 )
-from ethbrake_marl.shield.forms import add, between, high, low, product
+from ethbrake_marl.shield.forms import add, between, cut, difference, high, low, product, radius
 
 
 @compiled_apart
@@ -50,6 +51,8 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
     least, most = pressing_together(motion, p)
     if motion.rest[front] == STANDS and motion.rest[rear] == STANDS:
         brakes = -max(high(motion.pull[front]), high(motion.pull[rear]))
+        motion.way[front, -1] += touch[APART] * length
+        motion.way[rear, -1] += touch[APART] * length
         touch[APART] = max(touch[APART] - max(brakes, 0.0) * length, 0.0)
         return
     if touch[APART] + most * length < 0.0:
@@ -62,10 +65,20 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
     motion.speed[front], motion.way[front] = motion.onward[front], motion.reach[front]
     if low(motion.onward[front]) < 0.0 and high(motion.pull[front]) - vague < 0.0:
         stop(path.forms[front], front, length, motion)
+        motion.way[front, -1] += touch[APART] * length  # one of them may stand before the other
     for rows in (motion.pull, motion.onward, motion.reach, motion.speed, motion.way):
         rows[rear] = rows[front]
     motion.rest[rear], motion.vague[rear] = motion.rest[front], vague
     bounce(touch, least, most, length, cell.restitution)
+
+
+@compiled_apart
+def part_of(cell: Cell, path: Path, p: int, side: int) -> float:
+    """Share of the difference of speeds of a pair in contact that one of them has against their common speed.
+
+    All of it, where one may stand while the other one still moves: then it is not their commands that act on both.
+    """
+    return 1.0 if low(path.forms[p]) <= path.touch[p, APART] else high(cell.share[p, side])
 
 
 @compiled_apart
@@ -76,7 +89,7 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     path.marks[P + p] = PARTS
     path.forms[N + p] = between(-apart * length, wide + apart * length, width)
     for side in range(2):
-        share = high(cell.share[p, side])
+        share = part_of(cell, path, p, side)
         for rows in (motion.onward, motion.speed):
             rows[p + side, -1] += share * apart
         for rows in (motion.reach, motion.way):
@@ -115,3 +128,31 @@ def bounce(touch: Floats, least: float, most: float, length: float, restitution:
         ratio = 0.0
     if ratio < 1.0 and touch[SINCE] * touch[SOFTEST] * (1.0 - ratio) > 2.0 * touch[APART] * (1.0 + 1e-9) + 1e-9:
         touch[APART], touch[WIDE] = 0.0, 0.0
+
+
+@compiled_apart
+def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> bool:
+    """Whether a moving pair may meet again at so many different times that they are better taken together."""
+    if motion.rest[p] != MOVES or motion.rest[p + 1] != MOVES:
+        return False
+    closing = difference(path.forms[p + 1], path.forms[p])
+    return radius(path.forms[N + p]) > max(high(closing), 0.0) * length
+
+
+@compiled_apart
+def embrace(cell: Cell, path: Path, p: int) -> None:
+    """Take a pair that may or may not be in contact as one that is."""
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    front, rear, gap = path.forms[p].copy(), path.forms[p + 1].copy(), path.forms[N + p]
+    closing = difference(rear, front)
+    touch = path.touch[p]
+    touch[APART], touch[WIDE] = max(abs(low(closing)), abs(high(closing))), max(high(gap), 0.0)
+    touch[SOFTEST], touch[HARDEST], touch[SINCE] = math.inf, 0.0, 0.0
+    path.forms[p] = common(cell, p, front, rear)
+    path.forms[p + 1] = path.forms[p]
+    inside = cut(gap, 0.0, math.inf)
+    if p > 0:
+        add(path.forms[N + p - 1], 1.0, product(cell.share[p, 0], inside))
+    if p < P - 1:
+        add(path.forms[N + p + 1], 1.0, product(cell.share[p, 1], inside))
+    path.marks[P + p] = TOUCHES
