@@ -23,7 +23,6 @@ from ethbrake_marl.shield.enclosure_motion import (
     ROUNDING,
     STANDS,
     TOUCHES,
-    WIDE,
     Cell,
     Motion,
     Path,
@@ -63,7 +62,10 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats) -> float:
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Follow a path to its end; the larger one of ``worst`` and its harm and that of the paths that end with it."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
-    pieces = cell.action.shape[0]
+    pieces, quiet = cell.action.shape[0], 0
+    for j in range(pieces):
+        if cell.action[j] > 0.0:
+            quiet = j + 1
     while path.marks[2 * P] < pieces:
         piece = path.marks[2 * P]
         length = cell.times[piece + 1] - cell.times[piece]
@@ -86,6 +88,8 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
                             worst = branch(cell, path, stack, motion, p, how, worst, out)
         if not go_on(cell, path, motion):
             return worst
+        if path.marks[2 * P] >= quiet and (motion.rest == STANDS).all() and path.touch[:, :2].max() <= 0.0:
+            break
         path.marks[2 * P] += 1
     return keep_worst(path.forms[N + P], worst, out)
 
@@ -101,7 +105,7 @@ def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
         add(gap, 1.0, motion.way[p])
         add(gap, -1.0, motion.way[p + 1])
         gap[-1] += ROUNDING * (1.0 + abs(gap[0]))
-        if high(gap) + noise(cell, path, p, WIDE) < -1e-9:
+        if high(gap) + noise(cell, path, p, True) < -1e-9:
             return False
         path.marks[P + p] = FREE
     for i in range(N):

@@ -12,7 +12,6 @@ from ethbrake_marl.physics import Floats
 from ethbrake_marl.physics.compiled import compiled_apart
 from ethbrake_marl.physics.events import TOUCH_SPEED_MPS
 from ethbrake_marl.shield.enclosure_motion import (
-    APART,
     FREE,
     MAY_STOP,
     MOVES,
@@ -22,7 +21,7 @@ from ethbrake_marl.shield.enclosure_motion import (
     Motion,
     Path,
 )
-from ethbrake_marl.shield.enclosure_touch import part_of
+from ethbrake_marl.shield.enclosure_touch import apart, part_of
 from ethbrake_marl.shield.forms import (
     add,
     between,
@@ -52,13 +51,13 @@ class Approach(NamedTuple):
 
 
 @compiled_apart
-def noise(cell: Cell, path: Path, p: int, column: int) -> float:
+def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
     """By how much speeds (or gap) of a pair may differ because a neighbouring pair is in contact."""
     P, most = cell.gap.shape[0], 0.0
     if p > 0 and path.marks[P + p - 1] != FREE:
-        most += part_of(cell, path, p - 1, 1) * path.touch[p - 1, column]
+        most += part_of(cell, path, p - 1, 1) * (path.touch[p - 1, WIDE] if of_gap else apart(path.touch[p - 1]))
     if p < P - 1 and path.marks[P + p + 1] != FREE:
-        most += part_of(cell, path, p + 1, 0) * path.touch[p + 1, column]
+        most += part_of(cell, path, p + 1, 0) * (path.touch[p + 1, WIDE] if of_gap else apart(path.touch[p + 1]))
     return most
 
 
@@ -80,7 +79,7 @@ def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> b
     N = cell.speed.shape[0]
     gap = path.forms[N + p]
     softest, hardest = pressing(motion, p)
-    slack, wide = noise(cell, path, p, APART), noise(cell, path, p, WIDE)
+    slack, wide = noise(cell, path, p, False), noise(cell, path, p, True)
     begin, end = difference(path.forms[p + 1], path.forms[p]), difference(motion.speed[p + 1], motion.speed[p])
     fastest = max(high(begin), high(end)) + slack
     if motion.rest[p] == MAY_STOP or motion.rest[p + 1] == MAY_STOP or motion.vague[p] + motion.vague[p + 1] > 0.0:
@@ -104,9 +103,9 @@ def approach(
     ``2 g / (w + w')`` the time until then, w' being the speed at contact. A front that stops first gives its way on top.
     """
     N, width = cell.speed.shape[0], cell.speed.shape[1]
-    slack, vague = noise(cell, path, p, APART), motion.vague[p] + motion.vague[p + 1]
-    gap, closing = path.forms[N + p].copy(), path.forms[p + 1].copy()
-    gap[-1] += noise(cell, path, p, WIDE)
+    slack, vague = noise(cell, path, p, False), motion.vague[p] + motion.vague[p + 1]
+    gap, closing = cut(path.forms[N + p], 0.0, math.inf).copy(), path.forms[p + 1].copy()
+    gap[-1] += noise(cell, path, p, True)
     press = motion.pull[p + 1].copy()
     if front_stands:
         if motion.rest[p] == MAY_STOP:
@@ -122,7 +121,10 @@ def approach(
         opening = max(-low(closing), 0.0) + length * (vague + radius(press) + abs(press[0]))
         squared[-1] += 2.0 * vague * (max(high(gap), 0.0) + 2.0 * length * opening)
     squared[-1] += NEVER
-    if high(squared) <= TOUCH_SPEED_MPS * TOUCH_SPEED_MPS:
+    there = high(squared) > TOUCH_SPEED_MPS * TOUCH_SPEED_MPS
+    fastest = max(high(closing), 0.0) + (max(high(press), 0.0) + vague) * length
+    squared = cut(squared, 0.0, fastest * fastest + NEVER)
+    if not there or fastest <= TOUCH_SPEED_MPS:
         return Approach(closing, squared, gap, front_stands), False
     speed = square_root(squared)
     time, whole = between(0.0, length, width), closing.copy()

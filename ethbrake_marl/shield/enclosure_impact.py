@@ -12,9 +12,10 @@ from ethbrake_marl.physics.compiled import compiled_apart
 from ethbrake_marl.physics.events import PLASTIC_SPEED_MPS
 from ethbrake_marl.shield.enclosure_contact import NEVER, Approach, pressing
 from ethbrake_marl.shield.enclosure_motion import (
-    APART,
+    CLOSING,
     FREE,
     HARDEST,
+    OPENING,
     PARTS,
     SINCE,
     SOFTEST,
@@ -25,7 +26,7 @@ from ethbrake_marl.shield.enclosure_motion import (
     Motion,
     Path,
 )
-from ethbrake_marl.shield.enclosure_touch import common, pressing_together
+from ethbrake_marl.shield.enclosure_touch import apart, common, pressing_together
 from ethbrake_marl.shield.forms import (
     add,
     between,
@@ -266,20 +267,19 @@ def stay(
         way[p] = common(cell, p, motion.reach[p], motion.reach[p + 1])
         add(way[p], -1.0, product(cell.share[p, 0], gap))
     if low(after.forms[p]) < 0.0:  # one of them may stand before the other
-        way[p, -1] += after.touch[p, APART] * high(left)
+        way[p, -1] += apart(after.touch[p]) * high(left)
     stand_still(pull, after.forms[p], way[p])
     after.forms[p + 1], way[p + 1] = after.forms[p], way[p]
     add(way[p + 1], 1.0, gap)
 
 
 @compiled_apart
-def settle_down(motion: Motion, p: int, apart: float, length: float, touch: Floats) -> None:
-    """Largest difference of speeds and gap of a pair in contact, which leaves its first impact with ``apart`` at most."""
+def settle_down(motion: Motion, p: int, most_apart: float, length: float, touch: Floats) -> None:
+    """Largest difference of speeds and gap of a pair in contact; its first impact opens it by ``most_apart`` at most."""
     least, most = pressing_together(motion, p)
     touch[SOFTEST], touch[HARDEST], touch[SINCE] = math.inf, 0.0, 0.0
+    touch[OPENING], touch[CLOSING] = most_apart - min(least, 0.0) * length, max(most, 0.0) * length
+    touch[WIDE] = touch[OPENING] * length
     if least > 0.0 and motion.vague[p] + motion.vague[p + 1] == 0.0:
-        touch[APART], touch[WIDE] = apart, min(0.5 * apart * apart / least, apart * length)
+        touch[CLOSING], touch[WIDE] = most_apart, min(0.5 * most_apart * most_apart / least, most_apart * length)
         touch[SOFTEST], touch[HARDEST] = least, most
-        return
-    touch[APART] = apart + max(abs(least), abs(most)) * length
-    touch[WIDE] = touch[APART] * length

@@ -32,8 +32,8 @@ from ethbrake_marl.shield.forms import (
 MOVES, MAY_STOP, STANDS = 0, 1, 2  # in this piece of time
 FREE, TOUCHES, PARTS = 0, 1, 2  # what a pair does; the last: it was in contact when this piece of time began
 ROUNDING = 1e-12  # of a number and of 1: added to the remainders in each piece of time, far above the engine's own
-APART, WIDE, SOFTEST, HARDEST, SINCE = range(5)  # columns of Path.touch
-TOUCH_WIDTH = 5
+OPENING, CLOSING, WIDE, SOFTEST, HARDEST, SINCE = range(6)  # columns of Path.touch
+TOUCH_WIDTH = 6
 
 
 class Cell(NamedTuple):
@@ -57,7 +57,7 @@ class Path(NamedTuple):
     """Worlds of a cell that have gone one way so far."""
 
     forms: Floats  # [N + P + 1, W] speeds, gaps, harm so far
-    # [P, TOUCH_WIDTH] of pairs in contact: largest difference of speeds (m/s) and gap (m), least and largest pressing
+    # [P, TOUCH_WIDTH] of pairs in contact: by how much they open and close at most (m/s), largest gap (m), least and largest pressing
     # acceleration (m/s2) and time since contact began (s). Their two speeds are that of their common centre of mass,
     # from which their neighbours' gaps are counted
     touch: Floats
