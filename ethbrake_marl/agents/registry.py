@@ -156,8 +156,8 @@ _WRAPPERS: dict[str, Entry] = {
     ),
     "step": Entry("+step", "every action certified, or replaced", (Source.MODEL,), "shield.agents:shield_steps"),
     "robust": Entry(
-        "+robust",
-        "the same where not everything is known: against an uncertainty",
+        "+robust[:interior]",
+        "the same where not everything is known: against the corners of an uncertainty; interior: all it leaves possible",
         (Source.MODEL,),
         "shield.agents:shield_steps_robustly",
     ),

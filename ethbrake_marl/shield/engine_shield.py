@@ -186,7 +186,7 @@ class AttachedShield(Attached):
         self.policy = None if policy is None else proposing_agent(policy, options.where)
         shield = StepShield(
             engine.scenario, vehicle, harm_count=options.harm_count, allowance=options.allowance, others=engine.scripts,
-            uncertainty=checked_uncertainty(options.uncertainty), logging=options.logging,
+            uncertainty=checked_uncertainty(options.uncertainty), robust=options.robust, logging=options.logging,
         )  # fmt: skip
         self._warned = False
         super().__init__(engine, options, shield)

@@ -12,7 +12,7 @@ from ethbrake_marl.physics.compiled import compiled_apart
 from ethbrake_marl.shield.enclosure import most_harm
 from ethbrake_marl.shield.enclosure_impact import Stack, new_stack
 from ethbrake_marl.shield.enclosure_motion import Cell, Motion, new_motion
-from ethbrake_marl.shield.forms import add, difference, high, low, product, reciprocal
+from ethbrake_marl.shield.forms import add, difference, high, low, negative, product, radius, reciprocal, square
 
 # groups of the numbers of a box, N of each but P gaps
 BRAKING, DRIVING, LATENCY, MASS, SPEED, GAP = range(6)
@@ -69,7 +69,6 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
         front, rear = form_of(low_, high_, MASS * N + p, free), form_of(low_, high_, MASS * N + p + 1, free)
         whole = front.copy()
         add(whole, 1.0, rear)
-        # m_r / M falls with m_f: 1 - m_f / M keeps both shares' slopes opposite
         share[p, 0] = product(rear, reciprocal(whole))
         share[p, 1] = -share[p, 0]
         share[p, 1, 0] += 1.0
@@ -80,7 +79,45 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
     cell = Cell(
         speed, gap, brake, drive, share, onset, known.constant, known.limit, v, known.restitution, times, action
     )  # fmt: skip
-    return cell, high(first) <= known.begin_s + (earliest - known.begin_s) + 1e-12
+    late = first.copy()
+    late[0] -= earliest
+    return cell, wait(cell, known, late)
+
+
+@compiled_apart
+def wait(cell: Cell, known: Known, late: Floats) -> bool:
+    """Move a cell's worlds on by ``late`` (s), each by its own; False where a pair may meet until then."""
+    if high(late) <= 1e-12:
+        return True
+    if low(late) < -1e-12:
+        return False
+    N, slowest = cell.speed.shape[0], np.empty(cell.speed.shape[0])
+    for i in range(N):
+        pull = np.zeros_like(late)
+        if i != cell.vehicle:
+            acts = cell.onset[i].copy()  # after the alert
+            add(acts, 1.0, late)
+            acts[0] -= cell.times[0]
+            if high(acts) <= 1e-12:
+                pull[0] = cell.constant[i]
+                if math.isnan(cell.constant[i]):
+                    pull = negative(cell.brake[i])
+            elif low(acts) < high(late):
+                return False
+        way = product(cell.speed[i], late)
+        add(way, 0.5, product(pull, square(late)))
+        add(cell.speed[i], 1.0, product(pull, late))
+        slowest[i] = low(cell.speed[i])
+        if slowest[i] < 0.0:
+            return False
+        if i > 0:
+            closing = max(high(cell.speed[i]) - slowest[i - 1], 0.0)
+            if low(cell.gap[i - 1]) <= (closing + radius(pull) + abs(pull[0])) * high(late):
+                return False
+            add(cell.gap[i - 1], -1.0, way)
+        if i < N - 1:
+            add(cell.gap[i], 1.0, way)
+    return True
 
 
 @compiled_apart
@@ -88,8 +125,8 @@ def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[
     """Where commands may change, s after the first decision, and the shielded vehicle's action between."""
     N = onset.shape[0]
     before = earliest - known.begin_s
-    first = int(math.ceil(before / LONGEST_PIECE_S)) if before > 0.0 else 0
-    last = int(math.ceil((known.horizon_s - earliest) / known.time_step_s - 1e-9))
+    first = math.ceil(before / LONGEST_PIECE_S) if before > 0.0 else 0
+    last = math.ceil((known.horizon_s - earliest) / known.time_step_s - 1e-9)
     points = np.empty(first + last + 1 + 2 * N)
     count = 0
     for k in range(first):
@@ -126,22 +163,15 @@ def bound_of(
 
 @compiled_apart
 def bound_box(
-    low_: Floats,
-    high_: Floats,
-    free: Ints,
-    known: Known,
-    plan: Floats,
-    enough: float,
-    cells: int,
+    low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int
 ) -> tuple[float, int]:
     """Upper bound on the harm of a plan [L] over a box [Q], and the cells looked at.
 
     The box is halved where the bound is largest, until that is at most ``enough`` or ``cells`` were looked at.
     """
-    N = known.limit.shape[0]
-    K = free.shape[0]
+    N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
     stack, motion = new_stack(N, K + 2), new_motion(N, K + 2)
-    lows, highs = np.empty((cells + 1, low_.shape[0])), np.empty((cells + 1, low_.shape[0]))
+    lows, highs = np.empty((cells + 1, Q)), np.empty((cells + 1, Q))
     bounds, slopes = np.full(cells + 1, -math.inf), np.zeros((cells + 1, K + 2))
     lows[0], highs[0] = low_, high_
     bounds[0] = bound_of(low_, high_, free, known, plan, stack, motion, slopes[0])
@@ -150,10 +180,9 @@ def bound_box(
         at = int(np.argmax(bounds[:size]))
         if bounds[at] <= enough:
             break
-        k = 1 + int(np.argmax(np.abs(slopes[at, 1:-1])))
-        if bounds[at] == math.inf:
-            k = 1 + int(np.argmax((highs[at] - lows[at])[free] / np.maximum((high_ - low_)[free], 1e-300)))
-        which = free[k - 1]
+        share = (highs[at] - lows[at])[free] / (high_ - low_)[free]
+        weight = share if bounds[at] == math.inf else np.abs(slopes[at, 1:-1])
+        which = free[int(np.argmax(weight))]
         middle = 0.5 * (lows[at, which] + highs[at, which])
         lows[size], highs[size] = lows[at], highs[at]
         highs[at, which], lows[size, which] = middle, middle

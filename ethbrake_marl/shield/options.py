@@ -9,6 +9,7 @@ from typing import Any
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.shield.agents import Bound
+from ethbrake_marl.shield.interior import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.shield.settings import check_amount
 from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
 
@@ -27,6 +28,7 @@ class ShieldOptions:
         harm_count: the harm that is guaranteed, ``first`` or ``total``.
         allowance: how far above the bound is allowed, m2/s2; not in mode ``episode``.
         uncertainty: what mode ``robust`` does not know, such as ``"gaps_m=0.5"``.
+        robust: which worlds of an uncertainty mode ``robust`` certifies: its ``corners`` (fast), or the whole ``interior``.
         intervention_penalty: taken off the reward of a step in which something else than the proposal was applied.
         logging: keep every intervention in ``shield.log``; not in mode ``episode``.
         where: who is given them, for messages.
@@ -44,6 +46,7 @@ class ShieldOptions:
     harm_count: HarmCount = "first"
     allowance: float = 0.0
     uncertainty: Uncertainty | str | None = None
+    robust: str = CORNERS
     intervention_penalty: float = 0.0
     logging: bool = False
     where: str = field(default="shield", compare=False)
@@ -60,6 +63,8 @@ class ShieldOptions:
             )
         if mode != "episode" and self.bound != "coupled":
             raise InvalidInput(f"{self.where}: bound = {self.bound!r}: mode {mode} takes none; episode does")
+        if checked_robust(self.robust, self.where) == INTERIOR and mode != "robust":
+            raise InvalidInput(f"{self.where}: robust = {self.robust!r}: mode {mode} takes none; robust does")
         check_amount("intervention_penalty", self.intervention_penalty, self.where)
         object.__setattr__(self, "mode", mode)
         object.__setattr__(self, "uncertainty", uncertainty)

@@ -34,6 +34,18 @@ from ethbrake_marl.shield.certify import (
 )
 from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE
 from ethbrake_marl.shield.comparison import as_predicted
+from ethbrake_marl.shield.interior import (
+    CELLS_AT_ALERT,
+    CORNERS,
+    INTERIOR,
+    NEAR,
+    NEARLY_NOTHING,
+    Boxes,
+    bound_plans,
+    boxes_of,
+    certify_inside,
+    checked_robust,
+)
 from ethbrake_marl.shield.interventions import Intervention, interventions, write_down
 from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, merged, put, rolled_out
 from ethbrake_marl.shield.settings import check_amount, check_scenario
@@ -92,6 +104,7 @@ class StepShield:
         allowance: float = 0.0,
         others: Mapping[int, Script] | None = None,
         uncertainty: Uncertainty | None = None,
+        robust: str = CORNERS,
         logging: bool = False,
     ) -> None:
         check_harm_count(harm_count)
@@ -100,7 +113,8 @@ class StepShield:
         if vehicle not in range(scenario.vehicles):
             raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
         self.scenario, self.vehicle, self.harm_count, self.allowance = scenario, vehicle, harm_count, allowance
-        self.uncertainty = uncertainty
+        self.uncertainty, self.robust = uncertainty, checked_robust(robust, "shield")
+        self.boxes: Boxes | None = None  # of the running episodes, where every world of them is certified
         self.log: list[Intervention] | None = [] if logging else None
         self.found: list[Intervention] = []  # in the last decision
         self.running: Running | None = None
@@ -162,6 +176,10 @@ class StepShield:
             plan[alone <= harm] = actions[alone <= harm]
             harm = np.minimum(alone, harm)
         new = copy.copy(self)
+        if members > 1 and self.robust == INTERIOR:
+            boxes = boxes_of(possible, worlds.n, scenario, vehicle, self._others, others, self.harm_count)
+            harm = bound_plans(boxes, plan, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
+            new.boxes = boxes if self.boxes is None or len(rows) >= running_rows else self.boxes.put(rows, boxes)
         new._place(rows, running, Backup(plan, harm), alone, plan_rests(running, plan))
         self.__dict__.update(new.__dict__)
 
@@ -220,6 +238,8 @@ class StepShield:
         decision = certify(now, given, held, budget)
         if proposer is not None and (rows := np.flatnonzero(decision.reason == NO_CERTIFICATE)).size:
             decision = merged(decision, rows, certify_rollouts(now, given, rows, budget, held.plan, proposer))
+        if self.boxes is not None:
+            decision = certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
         decision.reason[asked & self.distrusted] = BROKEN
         self.interventions = self.interventions + (decision.intervened & asked)
         self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
@@ -234,6 +254,8 @@ class StepShield:
         assert self.running is not None
         backup = self.backup._replace(plan=self.backup.plan[:n], harm=self.backup.harm[:n])
         rows = {name: getattr(self, name)[:n] for name in PER_WORLD}
+        if self.boxes is not None:
+            self.boxes = self.boxes.take(np.arange(n))
         self.__dict__.update(rows | {"running": self.running.take(np.arange(n)), "backup": backup})
 
     def _compare(self, seen: Floats, asked: Bools) -> None:
