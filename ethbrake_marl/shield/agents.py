@@ -30,7 +30,6 @@ from ethbrake_marl.physics.rows import TIME, Packed
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import state_columns
 from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
-from ethbrake_marl.shield.interior import CORNERS, INTERIOR
 from ethbrake_marl.shield.rollouts import Proposer, proposed_action
 from ethbrake_marl.shield.settings import check_scenario
 from ethbrake_marl.shield.step_shield import Certified, StepShield
@@ -136,7 +135,7 @@ class StepShieldAgent(AgentAround):
         harm_count, allowance, logging: as ``ShieldOptions``.
         later_rollouts: whether the policy itself may certify an action.
         uncertainty: robust mode: what is certified must hold in every member.
-        robust: ``corners``: the members are the corners of the intervals; ``interior``: every world of their box.
+        robust: as ``ShieldOptions``.
         believed: worlds at the alert as the shield takes them to be; None: as they are, which is what the policy sees.
 
     """
@@ -153,15 +152,15 @@ class StepShieldAgent(AgentAround):
         logging: bool = False,
         later_rollouts: bool = True,
         uncertainty: Uncertainty | str | None = None,
-        robust: str = CORNERS,
+        robust: str = "corners",
         believed: Worlds | None = None,
     ) -> None:
         check_agent(policy, "step")
         if not (believed is None or isinstance(believed, Worlds)):
             raise InvalidInput(f"step: believed = {believed!r}: must be worlds at the alert, or None")
         uncertainty = checked_uncertainty(uncertainty)
-        inside = ":interior" if robust == INTERIOR else ""
-        super().__init__(policy, f"{policy.name}+{'step' if uncertainty is None else 'robust' + inside}")
+        mode = "step" if uncertainty is None else "robust" if robust == "corners" else f"robust:{robust}"
+        super().__init__(policy, f"{policy.name}+{mode}")
         self.scenario = scenario
         self.shield: StepShield | None = None
         self.predicted_harm: Floats = np.zeros(0)
@@ -299,5 +298,5 @@ def shield_steps_robustly(policy: Agent, argument: str | None, settings: AgentSe
     """``+robust`` or ``+robust:interior`` around an agent, against the uncertainty of the settings."""
     scenario, where = settings.needed_scenario(), f"agent {settings.spec!r}"
     uncertainty = mode_uncertainty("robust", settings.uncertainty, where)
-    robust = CORNERS if argument is None else argument
+    robust = "corners" if argument is None else argument
     return StepShieldAgent(policy, scenario, harm_count=settings.harm_count, uncertainty=uncertainty, robust=robust)

@@ -38,8 +38,8 @@ MOST_PATHS = 4000  # of one cell
 
 
 @compiled_apart
-def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats) -> float:
-    """Upper bound on the harm of every world of the cell (m2/s2); ``out`` [W] is the form that reaches it."""
+def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
+    """Upper bound on the harm of every world of the cell (m2/s2), unless it is above ``most``; ``out`` [W] is the form that reaches it."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     worst, paths = -math.inf, 0
     first = Path(stack.forms[0], stack.touch[0], stack.marks[0])
@@ -53,7 +53,9 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats) -> float:
         top = stack.size[0]
         here.forms[:], here.touch[:], here.marks[:] = stack.forms[top], stack.touch[top], stack.marks[top]
         worst = follow(cell, here, stack, motion, worst, out)
-        if worst == math.inf or paths > MOST_PATHS:
+        if worst > most or worst == math.inf:
+            return worst
+        if paths > MOST_PATHS:
             return math.inf
     return worst
 

@@ -100,7 +100,7 @@ def approach(
     """How a pair meets, its front standing at contact or not; and whether it may do so at all in this piece.
 
     ``w^2 + 2 b g`` is the squared closing speed at contact for closing speed w, closing acceleration b and gap g, and
-    ``2 g / (w + w')`` the time until then, w' being the speed at contact. A front that stops first gives its way on top.
+    ``2 g / (w + w')`` the time until then, w' being the speed at contact. A front that stops first adds its way to g.
     """
     N, width = cell.speed.shape[0], cell.speed.shape[1]
     slack, vague = noise(cell, path, p, False), motion.vague[p] + motion.vague[p + 1]

@@ -275,7 +275,7 @@ def stay(
 
 @compiled_apart
 def settle_down(motion: Motion, p: int, most_apart: float, length: float, touch: Floats) -> None:
-    """Largest difference of speeds and gap of a pair in contact; its first impact opens it by ``most_apart`` at most."""
+    """Largest difference of speeds and gap of a pair in contact; its impact opens it by ``most_apart`` at most."""
     least, most = pressing_together(motion, p)
     touch[SOFTEST], touch[HARDEST], touch[SINCE] = math.inf, 0.0, 0.0
     touch[OPENING], touch[CLOSING] = most_apart - min(least, 0.0) * length, max(most, 0.0) * length

@@ -57,9 +57,9 @@ class Path(NamedTuple):
     """Worlds of a cell that have gone one way so far."""
 
     forms: Floats  # [N + P + 1, W] speeds, gaps, harm so far
-    # [P, TOUCH_WIDTH] of pairs in contact: by how much they open and close at most (m/s), largest gap (m), least and largest pressing
-    # acceleration (m/s2) and time since contact began (s). Their two speeds are that of their common centre of mass,
-    # from which their neighbours' gaps are counted
+    # [P, TOUCH_WIDTH] of pairs in contact: by how much they open and close at most (m/s), largest gap (m), least and
+    # largest pressing acceleration (m/s2) and time since that is so (s). Their two speeds are that of their common
+    # centre of mass, from which their neighbours' gaps are counted
     touch: Floats
     marks: Ints  # [2 P + 1] 1 where the pair had an impact; FREE, TOUCHES or PARTS; number of the piece of time
 

@@ -46,9 +46,9 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled_apart
 def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """A pair in contact through one piece of time. Its speeds are those of its centre of mass, from which it may differ
+    """A pair in contact through one piece of time; ``motion`` holds both as if alone, and then as one.
 
-    by ``path.touch``; ``motion`` holds both as if alone.
+    Its speeds are those of its centre of mass, from which they may differ by what ``path.touch`` says.
     """
     touch, front, rear = path.touch[p], p, p + 1
     least, most = pressing_together(motion, p)
@@ -122,8 +122,8 @@ def bounce(touch: Floats, least: float, most: float, length: float, restitution:
     """What becomes of the difference of speeds and of the gap of a pair in contact within one piece.
 
     While it is pressed together by b between b- and b+, a flight that begins with separating speed s ends after at most
-    2 s / b-, with a closing speed of at most s sqrt(b+ / b-); an impact leaves the share e of it, none below the plastic
-    speed. So after 2 s / (b- (1 - e sqrt(b+ / b-))) the two move as one.
+    2 s / b-, with a closing speed of at most s sqrt(b+ / b-); an impact leaves the share e of it, none below the
+    plastic speed. So after 2 s / (b- (1 - e sqrt(b+ / b-))) the two move as one.
     """
     if touch[OPENING] == 0.0 and touch[CLOSING] <= 0.0 and touch[WIDE] == 0.0 and least >= 0.0:
         touch[CLOSING] = 0.0

@@ -14,8 +14,8 @@ import numpy as np
 
 from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.episode import HARM_IS_TOTAL
 from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
@@ -23,7 +23,7 @@ from ethbrake_marl.shield.certify_kernel import NO_CERTIFICATE
 from ethbrake_marl.shield.interior_kernel import Known, bound_box
 
 MOST_VEHICLES = 3
-CELLS_AT_ALERT, CELLS = 200, 60  # looked at for the bound at the alert, and for one later certificate
+CELLS_AT_ALERT, CELLS = 200, 40  # looked at for the bound at the alert, and for one later certificate
 NEAR = 1.02  # times the largest harm in a corner: a bound this good is not refined any further
 NEARLY_NOTHING = 0.1  # m2/s2, likewise
 CORNERS, INTERIOR = "corners", "interior"  # which worlds of a box robust mode certifies
@@ -59,17 +59,18 @@ class Boxes(NamedTuple):
 
 
 def boxes_of(
-    possible: Worlds, n: int, scenario: Scenario, vehicle: int, others: Mapping[int, Script], command: Floats,
-    harm_count: HarmCount,
-) -> Boxes:  # fmt: skip
-    """The boxes of n worlds whose members are ``possible`` [n * M], with the others' ``command`` [n * M, N] in each.
+    possible: Worlds, running: Running, scenario: Scenario, others: Mapping[int, Script], command: Floats
+) -> Boxes:
+    """The boxes of the n worlds of ``running`` at the alert, their members being ``possible`` [n * M].
 
-    Raises ``InvalidInput`` for what interior mode cannot certify: more than three vehicles, an obstacle ahead, total
-    harm, or others that do anything else than brake fully, coast, or hold one deceleration.
+    ``command`` [n * M, N] is what the ``others`` do in each. Raises ``InvalidInput`` for what interior mode cannot
+    certify: more than three vehicles, an obstacle ahead, total harm, or others that do anything else than brake fully,
+    coast, or hold one deceleration.
     """
+    n, vehicle, total = running.n, int(running.problem.vehicles[0]), running.problem.clock[0, HARM_IS_TOTAL] == 1.0
     v, N = possible.vehicles, possible.N
-    if N > MOST_VEHICLES or obstacle_ahead(possible).any() or harm_count != "first":
-        what = "total harm" if harm_count != "first" else f"{N} vehicles" if N > MOST_VEHICLES else "an obstacle ahead"
+    if N > MOST_VEHICLES or obstacle_ahead(possible).any() or total:
+        what = "total harm" if total else f"{N} vehicles" if N > MOST_VEHICLES else "an obstacle ahead"
         raise InvalidInput(
             f"shield: robust interior: {what}: it certifies first-impact harm of at most {MOST_VEHICLES} vehicles"
             " without an obstacle; robust corners takes every scenario"
@@ -109,10 +110,16 @@ def _constants(others: Mapping[int, Script], vehicle: int, command: Floats) -> F
     return constant
 
 
-def bound_plans(boxes: Boxes, plans: Floats, enough: Floats, cells: int) -> Floats:
+def bounds_at_alert(boxes: Boxes, plans: Floats, harm: Floats) -> Floats:
+    """Upper bound on the harm of each plan [n, L] over its box, whose largest harm in a corner is ``harm``, [n] m2/s2."""
+    return bound_plans(boxes, plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
+
+
+def bound_plans(boxes: Boxes, plans: Floats, enough: Floats, cells: int, *, only_enough: bool = False) -> Floats:
     """Upper bound on the harm of each plan [n, L], from the alert on, over all worlds of its box, [n] m2/s2.
 
     A bound at most ``enough`` [n] is not refined any further, and no more than ``cells`` parts of a box are looked at.
+    With ``only_enough`` what is above ``enough`` is no bound: it says that none at most that was found.
     """
     bounds = np.empty(len(plans))
     for k in range(len(plans)):
@@ -122,7 +129,9 @@ def bound_plans(boxes: Boxes, plans: Floats, enough: Floats, cells: int) -> Floa
             boxes.time_step_s, boxes.horizon_s,
         )  # fmt: skip
         plan = np.ascontiguousarray(plans[k], np.float64)
-        bounds[k] = bound_box(low, high, np.flatnonzero(high > low), known, plan, float(enough[k]), cells)[0]
+        bounds[k] = bound_box(low, high, np.flatnonzero(high > low), known, plan, float(enough[k]), cells, only_enough)[
+            0
+        ]
     return bounds
 
 
@@ -143,7 +152,7 @@ def certify_inside(
     """
     plan, bound = decision.backup.plan.copy(), decision.bound.copy()
     changed = np.flatnonzero(asked & (plan != held.plan).any(axis=1))
-    found = bound_plans(boxes.take(changed), plan[changed], budget[changed], CELLS)
+    found = bound_plans(boxes.take(changed), plan[changed], budget[changed], CELLS, only_enough=True)
     least = np.where(decision.intervened, held.harm, budget)[changed]
     good = found <= least
     bound[changed[good]] = found[good]

@@ -93,22 +93,12 @@ def wait(cell: Cell, known: Known, late: Floats) -> bool:
         return False
     N, slowest = cell.speed.shape[0], np.empty(cell.speed.shape[0])
     for i in range(N):
-        pull = np.zeros_like(late)
-        if i != cell.vehicle:
-            acts = cell.onset[i].copy()  # after the alert
-            add(acts, 1.0, late)
-            acts[0] -= cell.times[0]
-            if high(acts) <= 1e-12:
-                pull[0] = cell.constant[i]
-                if math.isnan(cell.constant[i]):
-                    pull = negative(cell.brake[i])
-            elif low(acts) < high(late):
-                return False
+        pull, certain = early_pull(cell, i, late)
         way = product(cell.speed[i], late)
         add(way, 0.5, product(pull, square(late)))
         add(cell.speed[i], 1.0, product(pull, late))
         slowest[i] = low(cell.speed[i])
-        if slowest[i] < 0.0:
+        if slowest[i] < 0.0 or not certain:
             return False
         if i > 0:
             closing = max(high(cell.speed[i]) - slowest[i - 1], 0.0)
@@ -118,6 +108,23 @@ def wait(cell: Cell, known: Known, late: Floats) -> bool:
         if i < N - 1:
             add(cell.gap[i], 1.0, way)
     return True
+
+
+@compiled_apart
+def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
+    """Acceleration of a vehicle until ``late`` after the alert; False where it may begin within that time."""
+    pull = np.zeros_like(late)
+    if i == cell.vehicle:
+        return pull, True
+    acts = cell.onset[i].copy()  # after the alert
+    add(acts, 1.0, late)
+    acts[0] -= cell.times[0]
+    if high(acts) > 1e-12:
+        return pull, low(acts) >= high(late)
+    if math.isnan(cell.constant[i]):
+        return negative(cell.brake[i]), True
+    pull[0] = cell.constant[i]
+    return pull, True
 
 
 @compiled_apart
@@ -152,30 +159,32 @@ def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[
 
 @compiled_apart
 def bound_of(
-    low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, stack: Stack, motion: Motion, out: Floats
-) -> float:
-    """Upper bound on the harm of a plan over one box."""
+    low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, stack: Stack, motion: Motion, out: Floats,
+    most: float,
+) -> float:  # fmt: skip
+    """Upper bound on the harm of a plan over one box, unless it is above ``most``."""
     cell, good = cell_of(low_, high_, free, known, plan)
     if not good:
         return math.inf
-    return most_harm(cell, stack, motion, out)
+    return most_harm(cell, stack, motion, out, most)
 
 
 @compiled_apart
 def bound_box(
-    low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int
+    low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
     """Upper bound on the harm of a plan [L] over a box [Q], and the cells looked at.
 
-    The box is halved where the bound is largest, until that is at most ``enough`` or ``cells`` were looked at.
+    The box is halved where the bound is largest, until that is at most ``enough`` or ``cells`` were looked at. With
+    ``only_enough`` a part is given up once its harm is above ``enough``: a larger result is then no bound.
     """
     N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
     stack, motion = new_stack(N, K + 2), new_motion(N, K + 2)
     lows, highs = np.empty((cells + 1, Q)), np.empty((cells + 1, Q))
     bounds, slopes = np.full(cells + 1, -math.inf), np.zeros((cells + 1, K + 2))
     lows[0], highs[0] = low_, high_
-    bounds[0] = bound_of(low_, high_, free, known, plan, stack, motion, slopes[0])
-    size, looked = 1, 1
+    most, size, looked = enough if only_enough else math.inf, 1, 1
+    bounds[0] = bound_of(low_, high_, free, known, plan, stack, motion, slopes[0], most)
     while looked + 2 <= cells and K > 0:
         at = int(np.argmax(bounds[:size]))
         if bounds[at] <= enough:
@@ -186,8 +195,8 @@ def bound_box(
         middle = 0.5 * (lows[at, which] + highs[at, which])
         lows[size], highs[size] = lows[at], highs[at]
         highs[at, which], lows[size, which] = middle, middle
-        bounds[at] = bound_of(lows[at], highs[at], free, known, plan, stack, motion, slopes[at])
-        bounds[size] = bound_of(lows[size], highs[size], free, known, plan, stack, motion, slopes[size])
+        bounds[at] = bound_of(lows[at], highs[at], free, known, plan, stack, motion, slopes[at], most)
+        bounds[size] = bound_of(lows[size], highs[size], free, known, plan, stack, motion, slopes[size], most)
         size += 1
         looked += 2
     return bounds[:size].max(), looked

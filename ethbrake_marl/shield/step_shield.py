@@ -22,6 +22,7 @@ from ethbrake_marl.physics.episode import number_of_decisions
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import PER_WORLD as OF_PROBLEM
 from ethbrake_marl.search.problem import profile_problem
+from ethbrake_marl.shield import interior
 from ethbrake_marl.shield.certify import (
     Backup,
     Decision,
@@ -34,18 +35,6 @@ from ethbrake_marl.shield.certify import (
 )
 from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE
 from ethbrake_marl.shield.comparison import as_predicted
-from ethbrake_marl.shield.interior import (
-    CELLS_AT_ALERT,
-    CORNERS,
-    INTERIOR,
-    NEAR,
-    NEARLY_NOTHING,
-    Boxes,
-    bound_plans,
-    boxes_of,
-    certify_inside,
-    checked_robust,
-)
 from ethbrake_marl.shield.interventions import Intervention, interventions, write_down
 from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, merged, put, rolled_out
 from ethbrake_marl.shield.settings import check_amount, check_scenario
@@ -104,7 +93,7 @@ class StepShield:
         allowance: float = 0.0,
         others: Mapping[int, Script] | None = None,
         uncertainty: Uncertainty | None = None,
-        robust: str = CORNERS,
+        robust: str = interior.CORNERS,
         logging: bool = False,
     ) -> None:
         check_harm_count(harm_count)
@@ -113,8 +102,8 @@ class StepShield:
         if vehicle not in range(scenario.vehicles):
             raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
         self.scenario, self.vehicle, self.harm_count, self.allowance = scenario, vehicle, harm_count, allowance
-        self.uncertainty, self.robust = uncertainty, checked_robust(robust, "shield")
-        self.boxes: Boxes | None = None  # of the running episodes, where every world of them is certified
+        self.uncertainty, self.robust = uncertainty, interior.checked_robust(robust, "shield")
+        self.boxes: interior.Boxes | None = None  # where every world of them is certified
         self.log: list[Intervention] | None = [] if logging else None
         self.found: list[Intervention] = []  # in the last decision
         self.running: Running | None = None
@@ -176,9 +165,9 @@ class StepShield:
             plan[alone <= harm] = actions[alone <= harm]
             harm = np.minimum(alone, harm)
         new = copy.copy(self)
-        if members > 1 and self.robust == INTERIOR:
-            boxes = boxes_of(possible, worlds.n, scenario, vehicle, self._others, others, self.harm_count)
-            harm = bound_plans(boxes, plan, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
+        if members > 1 and self.robust == interior.INTERIOR:
+            boxes = interior.boxes_of(possible, running, scenario, self._others, others)
+            harm = interior.bounds_at_alert(boxes, plan, harm)
             new.boxes = boxes if self.boxes is None or len(rows) >= running_rows else self.boxes.put(rows, boxes)
         new._place(rows, running, Backup(plan, harm), alone, plan_rests(running, plan))
         self.__dict__.update(new.__dict__)
@@ -239,7 +228,7 @@ class StepShield:
         if proposer is not None and (rows := np.flatnonzero(decision.reason == NO_CERTIFICATE)).size:
             decision = merged(decision, rows, certify_rollouts(now, given, rows, budget, held.plan, proposer))
         if self.boxes is not None:
-            decision = certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
+            decision = interior.certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
         decision.reason[asked & self.distrusted] = BROKEN
         self.interventions = self.interventions + (decision.intervened & asked)
         self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
