@@ -157,7 +157,7 @@ _WRAPPERS: dict[str, Entry] = {
     "step": Entry("+step", "every action certified, or replaced", (Source.MODEL,), "shield.agents:shield_steps"),
     "robust": Entry(
         "+robust[:interior]",
-        "the same where not everything is known: against the corners of an uncertainty; interior: all it leaves possible",
+        "the same where not everything is known: in the corners of an uncertainty; interior: in all of it",
         (Source.MODEL,),
         "shield.agents:shield_steps_robustly",
     ),

@@ -132,10 +132,9 @@ class StepShieldAgent(AgentAround):
     ``InvalidInput`` for what is not an agent, and what ``StepShield`` raises.
 
     Args:
-        harm_count, allowance, logging: as ``ShieldOptions``.
+        harm_count, allowance, logging, robust: as ``ShieldOptions``.
         later_rollouts: whether the policy itself may certify an action.
         uncertainty: robust mode: what is certified must hold in every member.
-        robust: as ``ShieldOptions``.
         believed: worlds at the alert as the shield takes them to be; None: as they are, which is what the policy sees.
 
     """
@@ -296,7 +295,6 @@ def shield_steps(policy: Agent, argument: None, settings: AgentSettings) -> Agen
 
 def shield_steps_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
     """``+robust`` or ``+robust:interior`` around an agent, against the uncertainty of the settings."""
-    scenario, where = settings.needed_scenario(), f"agent {settings.spec!r}"
+    scenario, where, robust = settings.needed_scenario(), f"agent {settings.spec!r}", argument or "corners"
     uncertainty = mode_uncertainty("robust", settings.uncertainty, where)
-    robust = "corners" if argument is None else argument
     return StepShieldAgent(policy, scenario, harm_count=settings.harm_count, uncertainty=uncertainty, robust=robust)

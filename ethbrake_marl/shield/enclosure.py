@@ -23,6 +23,7 @@ from ethbrake_marl.shield.enclosure_motion import (
     ROUNDING,
     STANDS,
     TOUCHES,
+    WIDE,
     Cell,
     Motion,
     Path,
@@ -39,7 +40,10 @@ MOST_PATHS = 4000  # of one cell
 
 @compiled_apart
 def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
-    """Upper bound on the harm of every world of the cell (m2/s2), unless it is above ``most``; ``out`` [W] is the form that reaches it."""
+    """Upper bound on the harm of every world of the cell (m2/s2), unless it is above ``most``.
+
+    ``out`` [W] becomes the form that reaches it.
+    """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     worst, paths = -math.inf, 0
     first = Path(stack.forms[0], stack.touch[0], stack.marks[0])
@@ -57,43 +61,60 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
             return worst
         if paths > MOST_PATHS:
             return math.inf
-    return worst
+    return worst if worst >= 0.0 else math.inf  # each world goes some way
 
 
 @compiled_apart
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Follow a path to its end; the larger one of ``worst`` and its harm and that of the paths that end with it."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
-    pieces, quiet = cell.action.shape[0], 0
-    for j in range(pieces):
+    quiet = 0  # from this piece of time on nobody drives
+    for j in range(cell.action.shape[0]):
         if cell.action[j] > 0.0:
             quiet = j + 1
-    while path.marks[2 * P] < pieces:
+    while path.marks[2 * P] < cell.action.shape[0]:
         piece = path.marks[2 * P]
-        length = cell.times[piece + 1] - cell.times[piece]
         move_alone(cell, path.forms, piece, motion)
-        for p in range(P):
-            if path.marks[P + p] == FREE and path.marks[p] == 1 and may_meet(cell, path, motion, p, length):
-                if is_blurred(path, motion, N, p, length):
-                    embrace(cell, path, p)
-            if path.marks[P + p] == TOUCHES:
-                move_together(cell, path, motion, p, length)
-        for p in range(P):
-            if path.marks[P + p] == FREE and may_meet(cell, path, motion, p, length):
-                for i in range(p, p + 2):
-                    if motion.rest[i] == MOVES:
-                        motion.speed[i, -1] += TOUCH_SPEED_MPS  # by a touch, which is no impact
-                for stands in range(2):
-                    if (motion.rest[p] == STANDS) == (stands == 1) or motion.rest[p] == MAY_STOP:
-                        how, there = approach(cell, path, motion, p, length, stands == 1)
-                        if there:
-                            worst = branch(cell, path, stack, motion, p, how, worst, out)
+        worst = meet(cell, path, stack, motion, worst, out)
         if not go_on(cell, path, motion):
             return worst
-        if path.marks[2 * P] >= quiet and (motion.rest == STANDS).all() and path.touch[:, :2].max() <= 0.0:
-            break
         path.marks[2 * P] += 1
+        if piece >= quiet and (motion.rest == STANDS).all() and path.touch[:, :WIDE].max() <= 0.0:
+            break
     return keep_worst(path.forms[N + P], worst, out)
+
+
+@compiled_apart
+def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
+    """Pairs in contact, and those that may come into contact, in one piece of time; ``worst`` as ``follow``."""
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
+    for p in range(P):
+        again = path.marks[P + p] == FREE and path.marks[p] == 1
+        if again and may_meet(cell, path, motion, p, length) and is_blurred(path, motion, N, p, length):
+            embrace(cell, path, p)
+        if path.marks[P + p] == TOUCHES:
+            move_together(cell, path, motion, p, length)
+    for p in range(P):
+        if path.marks[P + p] == FREE and may_meet(cell, path, motion, p, length):
+            worst = impacts(cell, path, stack, motion, p, worst, out)
+    return worst
+
+
+@compiled_apart
+def impacts(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, worst: float, out: Floats) -> float:
+    """The impacts that a pair may have in one piece of time, its front moving then or standing."""
+    P = cell.gap.shape[0]
+    length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
+    for i in range(p, p + 2):
+        if motion.rest[i] == MOVES:
+            motion.speed[i, -1] += TOUCH_SPEED_MPS  # by a touch, which is no impact
+    for stands in range(2):
+        if (motion.rest[p] == STANDS) == (stands == 1) or motion.rest[p] == MAY_STOP:
+            how, there = approach(cell, path, motion, p, length, stands == 1)
+            if there:
+                worst = branch(cell, path, stack, motion, p, how, worst, out)
+    return worst
 
 
 @compiled_apart

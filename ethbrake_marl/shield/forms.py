@@ -1,8 +1,8 @@
 """Affine forms: numbers that depend on where in a box a world lies, with a bound on what is not linear in it.
 
 A form [W] of a box with K uncertain numbers, W = K + 2, stands for ``c + g_1 e_1 + ... + g_K e_K + r e``: the centre,
-one slope for each uncertain number, and a remainder. ``e_k`` in [-1, 1] says where in the box the world lies, the same in
-every form; ``e`` in [-1, 1] is any, another one in every form. What two forms share in ``e_k`` cancels when they are
+one slope for each uncertain number, and a remainder. ``e_k`` in [-1, 1] says where in the box the world lies, the same
+in every form; ``e`` in [-1, 1] is any, another one in every form. What two forms share in ``e_k`` cancels when they are
 subtracted, which plain intervals cannot do.
 
 Each operation encloses: for every world of the box there are values of ``e`` for which the result stands for what the

@@ -58,6 +58,11 @@ class Boxes(NamedTuple):
         return Boxes(*(column[rows] for column in self[:6]), *self[6:])
 
 
+def placed(old: Boxes | None, new: Boxes, rows: Ints) -> Boxes:
+    """The boxes of a batch in which episodes begin in these rows: all of them, or some of the ``old`` ones."""
+    return new.take(np.argsort(rows)) if old is None or len(rows) >= len(old.low) else old.put(rows, new)
+
+
 def boxes_of(
     possible: Worlds, running: Running, scenario: Scenario, others: Mapping[int, Script], command: Floats
 ) -> Boxes:
@@ -111,7 +116,7 @@ def _constants(others: Mapping[int, Script], vehicle: int, command: Floats) -> F
 
 
 def bounds_at_alert(boxes: Boxes, plans: Floats, harm: Floats) -> Floats:
-    """Upper bound on the harm of each plan [n, L] over its box, whose largest harm in a corner is ``harm``, [n] m2/s2."""
+    """Upper bound on the harm of each plan [n, L] over its box, ``harm`` being its largest in a corner, [n] m2/s2."""
     return bound_plans(boxes, plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
 
 
@@ -143,20 +148,23 @@ def checked_robust(robust: object, where: str) -> str:
 
 
 def certify_inside(
-    boxes: Boxes, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
+    boxes: Boxes | None, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
 ) -> Decision:
-    """A decision that the corners allow, refused where its plan is not certified for every world of the box.
+    """A decision that the corners allow, refused where its plan is not certified for every world of the box, if any.
 
     ``held`` is the backup before it. A plan without a certificate never replaces the held one. Episodes end at the
     horizon: that all corners rest does not mean that every world does.
     """
+    if boxes is None:
+        return decision
     plan, bound = decision.backup.plan.copy(), decision.bound.copy()
     changed = np.flatnonzero(asked & (plan != held.plan).any(axis=1))
     found = bound_plans(boxes.take(changed), plan[changed], budget[changed], CELLS, only_enough=True)
     least = np.where(decision.intervened, held.harm, budget)[changed]
     good = found <= least
     bound[changed[good]] = found[good]
-    decision.margin[changed] = budget[changed] - found
+    known = np.isfinite(found)
+    decision.margin[changed[known]] = (budget[changed] - found)[known]
     bad = changed[~good]
     plan[bad], bound[bad] = held.plan[bad], held.harm[bad]
     decision = decision._replace(bound=bound, backup=decision.backup._replace(plan=plan, harm=bound))

@@ -28,7 +28,7 @@ class ShieldOptions:
         harm_count: the harm that is guaranteed, ``first`` or ``total``.
         allowance: how far above the bound is allowed, m2/s2; not in mode ``episode``.
         uncertainty: what mode ``robust`` does not know, such as ``"gaps_m=0.5"``.
-        robust: the worlds that mode ``robust`` certifies: the ``corners`` of the uncertainty (fast), or its ``interior``.
+        robust: what mode ``robust`` certifies of an uncertainty: its ``corners`` (fast), or its whole ``interior``.
         intervention_penalty: taken off the reward of a step in which something else than the proposal was applied.
         logging: keep every intervention in ``shield.log``; not in mode ``episode``.
         where: who is given them, for messages.

@@ -151,8 +151,7 @@ class StepShield:
         with renumbered(np.repeat(np.arange(worlds.n), members)):
             problem = profile_problem(
                 possible, [vehicle], harm_count=self.harm_count, horizon_s=scenario.horizon_s,
-                time_step_s=scenario.time_step_s,
-                others_mps2=others,
+                time_step_s=scenario.time_step_s, others_mps2=others,
             )  # fmt: skip
         running = begin_running(problem, members)
         plan = np.repeat(command_to_action(-best, worlds.vehicles, vehicle)[:, np.newaxis], self._width, axis=1)
@@ -167,8 +166,7 @@ class StepShield:
         new = copy.copy(self)
         if members > 1 and self.robust == interior.INTERIOR:
             boxes = interior.boxes_of(possible, running, scenario, self._others, others)
-            harm = interior.bounds_at_alert(boxes, plan, harm)
-            new.boxes = boxes if self.boxes is None or len(rows) >= running_rows else self.boxes.put(rows, boxes)
+            harm, new.boxes = interior.bounds_at_alert(boxes, plan, harm), interior.placed(self.boxes, boxes, rows)
         new._place(rows, running, Backup(plan, harm), alone, plan_rests(running, plan))
         self.__dict__.update(new.__dict__)
 
@@ -222,13 +220,11 @@ class StepShield:
         asked = asked & ~before.finished
         each = np.repeat(asked, before.members)
         now = before._replace(ended=before.ended | ~each)
-        given = np.where(self.distrusted, np.nan, np.asarray(proposed, np.float64))
-        held, budget = self.backup, self.bound
+        given, held, budget = np.where(self.distrusted, np.nan, np.asarray(proposed, float)), self.backup, self.bound
         decision = certify(now, given, held, budget)
         if proposer is not None and (rows := np.flatnonzero(decision.reason == NO_CERTIFICATE)).size:
             decision = merged(decision, rows, certify_rollouts(now, given, rows, budget, held.plan, proposer))
-        if self.boxes is not None:
-            decision = interior.certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
+        decision = interior.certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
         decision.reason[asked & self.distrusted] = BROKEN
         self.interventions = self.interventions + (decision.intervened & asked)
         self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
@@ -243,8 +239,7 @@ class StepShield:
         assert self.running is not None
         backup = self.backup._replace(plan=self.backup.plan[:n], harm=self.backup.harm[:n])
         rows = {name: getattr(self, name)[:n] for name in PER_WORLD}
-        if self.boxes is not None:
-            self.boxes = self.boxes.take(np.arange(n))
+        self.boxes = self.boxes and self.boxes.take(np.arange(n))
         self.__dict__.update(rows | {"running": self.running.take(np.arange(n)), "backup": backup})
 
     def _compare(self, seen: Floats, asked: Bools) -> None:
@@ -260,9 +255,8 @@ class StepShield:
         states[at, :columns] = np.repeat(seen[rows], running.members, axis=0)
         ended[at] = np.repeat(running.steps[rows], running.members) >= running.problem.last_step[at]
         self.running = running._replace(states=states, ended=ended)
-        plan, harm = self.backup.plan.copy(), self.backup.harm.copy()
+        plan, harm, held = self.backup.plan.copy(), self.backup.harm.copy(), self.backup.plan
         harm[rows] = np.inf
-        held = self.backup.plan
         for constant in (None, *self.backup.constants):
             trial = held if constant is None else from_now(held, constant, running.steps)
             found = _harm_of(self.running, trial, rows)
