@@ -162,8 +162,9 @@ _WRAPPERS: dict[str, Entry] = {
         "shield.factories:shield_steps",
     ),
     "robust": Entry(
-        "+robust[:believed]",
-        "the same where not everything is known: against an uncertainty; believed: against all that was not received",
+        "+robust[:interior|:believed]",
+        "the same where not everything is known: in the corners of an uncertainty, interior: in all of it;"
+        " believed: against all that was not received",
         (Source.MODEL,),
         "shield.factories:shield_steps_robustly",
     ),

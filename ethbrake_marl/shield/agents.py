@@ -133,7 +133,7 @@ class StepShieldAgent(AgentAround):
     ``InvalidInput`` for what is not an agent, and what ``StepShield`` raises.
 
     Args:
-        harm_count, allowance, logging: as ``ShieldOptions``.
+        harm_count, allowance, logging, robust: as ``ShieldOptions``.
         later_rollouts: whether the policy itself may certify an action.
         uncertainty: robust mode: what is certified must hold in every member.
         believed: worlds at the alert as the shield takes them to be; None: as they are, which is what the policy sees.
@@ -152,13 +152,15 @@ class StepShieldAgent(AgentAround):
         logging: bool = False,
         later_rollouts: bool = True,
         uncertainty: Uncertainty | str | None = None,
+        robust: str = "corners",
         believed: Worlds | None = None,
     ) -> None:
         check_agent(policy, "step")
         if not (believed is None or isinstance(believed, Worlds)):
             raise InvalidInput(f"step: believed = {believed!r}: must be worlds at the alert, or None")
         uncertainty = checked_uncertainty(uncertainty)
-        super().__init__(policy, f"{policy.name}+{'step' if uncertainty is None else 'robust'}")
+        mode = "step" if uncertainty is None else "robust" if robust == "corners" else f"robust:{robust}"
+        super().__init__(policy, f"{policy.name}+{mode}")
         self.scenario = scenario
         self.shield: StepShield | None = None
         self.predicted_harm: Floats = np.zeros(0)
@@ -168,6 +170,7 @@ class StepShieldAgent(AgentAround):
             "allowance": allowance,
             "logging": logging,
             "uncertainty": uncertainty,
+            "robust": robust,
         }
         self._later_rollouts = later_rollouts
         self._wanted: Floats = np.zeros(0)

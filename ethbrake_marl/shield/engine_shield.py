@@ -190,7 +190,8 @@ class AttachedShield(Attached):
         vehicle = shielded_vehicles(engine, options.where, options.mode)
         shield = StepShield(
             engine.scenario, vehicle, harm_count=options.harm_count, allowance=options.allowance, others=engine.scripts,
-            uncertainty=checked_uncertainty(options.uncertainty), cap=options.cap, logging=options.logging,
+            uncertainty=checked_uncertainty(options.uncertainty), cap=options.cap, robust=options.robust,
+            logging=options.logging,
         )  # fmt: skip
         self.policies = None if policy is None else proposing_agents(policy, shield.vehicles, options.where)
         self._warned = False

@@ -10,6 +10,7 @@ from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.shield.agents import Bound
 from ethbrake_marl.shield.alert import CAPS, Cap
+from ethbrake_marl.shield.interior import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.shield.settings import check_amount
 from ethbrake_marl.shield.uncertainty import Uncertainty, mode_uncertainty
 
@@ -30,6 +31,7 @@ class ShieldOptions:
         uncertainty: what mode ``robust`` does not know, such as ``"gaps_m=0.5"``.
         cap: ``baseline``: no vehicle ever bears more harm than it would under the constants of least harm, whose sum is
             the bound at the alert. None: the sum alone is bounded. Mode ``step`` alone.
+        robust: what mode ``robust`` certifies of an uncertainty: its ``corners`` (fast), or its whole ``interior``.
         intervention_penalty: taken off the reward of a step in which something else than the proposal was applied.
         logging: keep every intervention in ``shield.log``; not in mode ``episode``.
         where: who is given them, for messages.
@@ -48,6 +50,7 @@ class ShieldOptions:
     allowance: float = 0.0
     uncertainty: Uncertainty | str | None = None
     cap: Cap | None = None
+    robust: str = CORNERS
     intervention_penalty: float = 0.0
     logging: bool = False
     where: str = field(default="shield", compare=False)
@@ -67,6 +70,8 @@ class ShieldOptions:
         if self.cap is not None and (mode != "step" or self.cap not in CAPS):
             allowed = "mode step alone takes one" if self.cap in CAPS else f"must be {', '.join(CAPS)} or None"
             raise InvalidInput(f"{self.where}: cap = {self.cap!r}: {allowed}")
+        if checked_robust(self.robust, self.where) == INTERIOR and mode != "robust":
+            raise InvalidInput(f"{self.where}: robust = {self.robust!r}: mode {mode} takes none; robust does")
         check_amount("intervention_penalty", self.intervention_penalty, self.where)
         object.__setattr__(self, "mode", mode)
         object.__setattr__(self, "uncertainty", uncertainty)

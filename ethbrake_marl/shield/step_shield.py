@@ -19,6 +19,7 @@ from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.episode import number_of_decisions
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import PER_WORLD as OF_PROBLEM
+from ethbrake_marl.shield import interior
 from ethbrake_marl.shield.alert import CAPS, Cap, Settings, Start, start_of
 from ethbrake_marl.shield.certify import (
     Backup,
@@ -90,6 +91,7 @@ class StepShield:
         others: Mapping[int, Script] | None = None,
         uncertainty: Uncertainty | None = None,
         cap: Cap | None = None,
+        robust: str = interior.CORNERS,
         logging: bool = False,
     ) -> None:
         check_harm_count(harm_count)
@@ -104,6 +106,8 @@ class StepShield:
             raise unknown_name("shield cap", cap, CAPS)
         self.scenario, self.harm_count, self.allowance = scenario, harm_count, allowance
         self.uncertainty, self.cap = uncertainty, cap
+        self.robust = interior.checked_robust(robust, "shield")
+        self.boxes: interior.Boxes | None = None  # where every world of them is certified
         self.log: list[Intervention] | None = [] if logging else None
         self.found: list[Intervention] = []  # in the last decision
         self.running: Running | None = None
@@ -149,7 +153,14 @@ class StepShield:
             self.scenario, self.vehicle, self.harm_count, self._others, self.uncertainty, self.cap, self._width
         )
         new = copy.copy(self)
-        new._place(rows, start_of(settings, worlds, policies_of(policy, self.vehicle)))
+        start = start_of(settings, worlds, policies_of(policy, self.vehicle))
+        if start.running.members > 1 and self.robust == interior.INTERIOR:
+            assert self.uncertainty is not None
+            boxes = interior.boxes_of(self.uncertainty.members(worlds), start.running, self.scenario, self._others)
+            harm = interior.bounds_at_alert(boxes, start.backup.plan, start.backup.harm)
+            start = start._replace(backup=start.backup._replace(harm=harm))
+            new.boxes = interior.placed(self.boxes, boxes, rows)
+        new._place(rows, start)
         self.__dict__.update(new.__dict__)
 
     def propose(
@@ -209,6 +220,7 @@ class StepShield:
         rejected = (decision.reason == NO_CERTIFICATE).reshape(len(asked), -1).any(axis=1)
         if proposer is not None and (rows := np.flatnonzero(rejected)).size:
             decision = merged(decision, rows, certify_rollouts(now, given, rows, budget, held.plan, proposer))
+        decision = interior.certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
         decision.reason[asked & self.distrusted] = BROKEN
         replaced = decision.intervened.reshape(len(asked), -1).sum(axis=1)
         self.interventions = self.interventions + replaced * asked
@@ -224,6 +236,7 @@ class StepShield:
         assert self.running is not None
         backup = self.backup._replace(plan=self.backup.plan[:n], harm=self.backup.harm[:n])
         rows = {name: getattr(self, name)[:n] for name in PER_WORLD}
+        self.boxes = self.boxes and self.boxes.take(np.arange(n))
         self.__dict__.update(rows | {"running": self.running.take(np.arange(n)), "backup": backup})
 
     def _compare(self, seen: Floats, asked: Bools) -> None:
@@ -239,9 +252,8 @@ class StepShield:
         states[at, :columns] = np.repeat(seen[rows], running.members, axis=0)
         ended[at] = np.repeat(running.steps[rows], running.members) >= running.problem.last_step[at]
         self.running = running._replace(states=states, ended=ended)
-        plan, harm = self.backup.plan.copy(), self.backup.harm.copy()
+        plan, harm, held = self.backup.plan.copy(), self.backup.harm.copy(), self.backup.plan
         harm[rows] = np.inf
-        held = self.backup.plan
         for constant in (None, *self.backup.constants):
             trial = held if constant is None else from_now(held, constant, running.steps)
             found = _harm_of(self.running, trial, rows)

@@ -306,7 +306,9 @@ def main() -> int:
     parser.add_argument("--decisions", type=int, default=5_000, help="timed one by one")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
-        "--only", default="speed,interference,search,believed,interfaces,joint,bound", help="gates, with commas between them"
+        "--only",
+        default="speed,interference,search,believed,interfaces,joint,bound",
+        help="gates, with commas between them",
     )
     parser.add_argument("--results", type=Path, default=ROOT / "runs" / "test-shield", help="folder of finished chunks")
     parser.add_argument("--part", default="1/1", help="this process's share of the chunks, for instance 1/2")

@@ -1,0 +1,191 @@
+"""Robust mode for every world of the box of intervals: which boxes, and an upper bound on the harm of plans over them.
+
+What is certified is a whole plan, from the alert on: nothing that is seen later narrows a box. So the proof is short.
+The plan that is held has a bound over all worlds of the box; it is replaced by another one, with the same past, only if
+that one's bound is at most the budget. What was applied at the end is the plan that is held then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.engine.stream import Script
+from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.episode import HARM_IS_TOTAL
+from ethbrake_marl.physics.obstacle import obstacle_ahead
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
+from ethbrake_marl.shield.certify_kernel import NO_CERTIFICATE
+from ethbrake_marl.shield.interior_kernel import Known, bound_box
+from ethbrake_marl.shield.rollouts import put
+
+MOST_VEHICLES = 3
+CELLS_AT_ALERT, CELLS = 200, 40  # looked at for the bound at the alert, and for one later certificate
+NEAR = 1.02  # times the largest harm in a corner: a bound this good is not refined any further
+NEARLY_NOTHING = 0.1  # m2/s2, likewise
+CORNERS, INTERIOR = "corners", "interior"  # which worlds of a box robust mode certifies
+CERTAINTIES = (CORNERS, INTERIOR)
+SCRIPTS = ("full_brake", "coast", "constant")
+
+
+class Boxes(NamedTuple):
+    """The boxes of n worlds: each uncertain number from ``low`` to ``high``."""
+
+    low: Floats  # [n, Q] braking, driving, latency, mass, speed of each vehicle, then the gaps
+    high: Floats  # [n, Q]
+    limit: Floats  # [n, N] m/s
+    restitution: Floats  # [n]
+    begin_s: Floats  # [n]
+    constant: Floats  # [n, N] m/s2; NaN: full braking
+    vehicle: int
+    time_step_s: float
+    horizon_s: float
+
+    def put(self, rows: Ints, new: Boxes) -> Boxes:
+        """A copy with the boxes of ``new`` in these rows."""
+        placed: dict[str, Any] = {name: put(getattr(self, name), rows, getattr(new, name)) for name in PER_BOX}
+        return self._replace(**placed)
+
+    def take(self, rows: Ints) -> Boxes:
+        """Those of some worlds."""
+        return self._replace(**{name: getattr(self, name)[rows] for name in PER_BOX})
+
+
+PER_BOX = ("low", "high", "limit", "restitution", "begin_s", "constant")
+
+
+def placed(old: Boxes | None, new: Boxes, rows: Ints) -> Boxes:
+    """The boxes of a batch in which episodes begin in these rows: all of them, or some of the ``old`` ones."""
+    return new.take(np.argsort(rows)) if old is None or len(rows) >= len(old.low) else old.put(rows, new)
+
+
+def boxes_of(possible: Worlds, running: Running, scenario: Scenario, others: Mapping[int, Script]) -> Boxes:
+    """The boxes of the n worlds of ``running`` at the alert, their members being ``possible`` [n * M].
+
+    Raises ``InvalidInput`` for what interior mode cannot
+    certify: more than three vehicles, an obstacle ahead, total harm, or others that do anything else than brake fully,
+    coast, or hold one deceleration.
+    """
+    n, vehicle, total = running.n, int(running.problem.vehicles[0]), running.problem.clock[0, HARM_IS_TOTAL] == 1.0
+    v, N = possible.vehicles, possible.N
+    command = running.problem.command[:, running.problem.command.shape[1] - N :]
+    if N > MOST_VEHICLES or obstacle_ahead(possible).any() or total:
+        what = "total harm" if total else f"{N} vehicles" if N > MOST_VEHICLES else "an obstacle ahead"
+        raise InvalidInput(
+            f"shield: robust interior: {what}: it certifies first-impact harm of at most {MOST_VEHICLES} vehicles"
+            " without an obstacle; robust corners takes every scenario"
+        )
+    numbers = np.concatenate(
+        [v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, possible.speeds_mps, possible.gaps_m],
+        axis=1,
+    ).reshape(n, -1, 6 * N - 1)
+    members = len(v.mass_t) // n
+    return Boxes(
+        numbers.min(axis=1), numbers.max(axis=1), v.speed_limit_mps[::members], v.restitution[::members],
+        possible.time_s[::members], _constants(others, vehicle, command.reshape(n, members, N)), vehicle,
+        scenario.time_step_s, scenario.horizon_s,
+    )  # fmt: skip
+
+
+def _constants(others: Mapping[int, Script], vehicle: int, command: Floats) -> Floats:
+    """Command of each other vehicle [n, N], NaN where it brakes fully; [n, M, N] in the members."""
+    constant = np.full((command.shape[0], command.shape[2]), np.nan)
+    for i, script in others.items():
+        name = getattr(script, "name", type(script).__name__)
+        kind = name.split(":")[0]
+        if i == vehicle or kind == "full_brake":
+            continue
+        same = bool((command[:, :, i] == command[:, :1, i]).all())
+        if kind not in SCRIPTS or not same:
+            why = (
+                "whose command is another one in each world of the box"
+                if kind in SCRIPTS
+                else "which it cannot enclose"
+            )
+            raise InvalidInput(
+                f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, {why}; full_brake, coast and"
+                " constant:A are possible, A being at most every capacity of the box"
+            )
+        constant[:, i] = command[:, 0, i]
+    return constant
+
+
+def bounds_at_alert(boxes: Boxes, plans: Floats, harm: Floats) -> Floats:
+    """Upper bound on the harm of each plan [n, L] over its box, ``harm`` being its largest in a corner, [n] m2/s2."""
+    return bound_plans(boxes, plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
+
+
+def bound_plans(boxes: Boxes, plans: Floats, enough: Floats, cells: int, *, only_enough: bool = False) -> Floats:
+    """Upper bound on the harm of each plan [n, L], from the alert on, over all worlds of its box, [n] m2/s2.
+
+    A bound at most ``enough`` [n] is not refined any further, and no more than ``cells`` parts of a box are looked at.
+    With ``only_enough`` what is above ``enough`` is no bound: it says that none at most that was found.
+    """
+    bounds = np.empty(len(plans))
+    for k in range(len(plans)):
+        low, high = boxes.low[k], boxes.high[k]
+        known = Known(
+            boxes.vehicle, boxes.constant[k], boxes.limit[k], float(boxes.restitution[k]), float(boxes.begin_s[k]),
+            boxes.time_step_s, boxes.horizon_s,
+        )  # fmt: skip
+        plan = np.ascontiguousarray(plans[k], np.float64)
+        bounds[k] = bound_box(low, high, np.flatnonzero(high > low), known, plan, float(enough[k]), cells, only_enough)[
+            0
+        ]
+    return bounds
+
+
+def checked_robust(robust: object, where: str) -> str:
+    """``corners`` or ``interior``; raises ``UnknownName`` for anything else."""
+    if robust not in CERTAINTIES:
+        raise unknown_name(f"{where}: robust", robust, CERTAINTIES)
+    return str(robust)
+
+
+def certify_inside(
+    boxes: Boxes | None, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
+) -> Decision:
+    """A decision that the corners allow, refused where its plan is not certified for every world of the box, if any.
+
+    ``held`` is the backup before it. A plan without a certificate never replaces the held one. Episodes end at the
+    horizon: that all corners rest does not mean that every world does.
+    """
+    if boxes is None:
+        return decision
+    plan, bound = decision.backup.plan.copy(), decision.bound.copy()
+    changed = np.flatnonzero(asked & (plan != held.plan).any(axis=1))
+    found = bound_plans(boxes.take(changed), plan[changed], budget[changed], CELLS, only_enough=True)
+    least = np.where(decision.intervened, held.harm, budget)[changed]
+    good = found <= least
+    bound[changed[good]] = found[good]
+    known = np.isfinite(found)
+    decision.margin[changed[known]] = (budget[changed] - found)[known]
+    bad = changed[~good]
+    plan[bad], bound[bad] = held.plan[bad], held.harm[bad]
+    decision = decision._replace(bound=bound, backup=decision.backup._replace(plan=plan, harm=bound))
+    refused = bad[~decision.intervened[bad]]
+    if refused.size:
+        decision = _refuse(running, held, decision, refused)
+    after = decision.after
+    over = np.repeat(after.steps, after.members) >= after.problem.last_step
+    each = np.repeat(asked, after.members)
+    return decision._replace(after=after._replace(ended=np.where(each, over, after.ended)))
+
+
+def _refuse(running: Running, held: Backup, decision: Decision, rows: Ints) -> Decision:
+    """The decision with the held plan's action in these rows."""
+    part = running.take(rows)
+    action = held.plan[rows, part.steps]
+    kept = Backup(held.plan[rows], held.harm[rows], held.constants)
+    with renumbered(rows):
+        instead = certify(part, action, kept, held.harm[rows])
+    at, after = running.rows_of(rows), decision.after
+    states, ended = after.states.copy(), after.ended.copy()
+    states[at], ended[at] = instead.after.states, instead.after.ended
+    decision.applied[rows], decision.intervened[rows] = instead.applied, True
+    decision.reason[rows] = NO_CERTIFICATE
+    return decision._replace(after=after._replace(states=states, ended=ended))

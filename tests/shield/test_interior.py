@@ -1,0 +1,180 @@
+"""Interior mode: the bound holds for every world of the box, by hand and against worlds drawn from it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.protocol import fixed_commands
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.physics.episode import number_of_decisions
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.search.problem import profile_problem
+from ethbrake_marl.shield import ShieldOptions, StepShield, forms, parse_uncertainty
+from ethbrake_marl.shield.certify import begin_running, plan_harm
+from ethbrake_marl.shield.interior import bound_plans, boxes_of
+from tests.shield.lines import line
+from tests.shield.test_certify import STEPS, two
+
+UNUSUAL = {
+    "gaps": ({}, "gaps_m=1"),
+    "capacities": ({"restitution": 0.0}, "braking_capacity_mps2=5%"),
+    "very unequal masses": ({"mass_t": [0.05, 100, 1], "restitution": 0.3}, "mass_t=20%,gaps_m.pair_2=0.5"),
+    "late leader": ({"latency_s": [0.6, 0.2, 0.9]}, "latency_s.vehicle_1=0.15,speeds_mps.vehicle_2=0.5"),
+    "own latency": ({}, "latency_s.vehicle_2=0.1,gaps_m.pair_1=0.5"),
+    "elastic": ({"restitution": 1.0}, "speeds_mps=0.4"),
+    "close": ({"gaps_m": [0.3, 0.2]}, "gaps_m=0.2,latency_s.vehicle_3=0.1"),
+    "driving": ({"driving_capacity_mps2": 8, "speed_limit_mps": 21}, "driving_capacity_mps2=20%"),
+}
+
+
+def boxed(scenario, worlds, text):
+    uncertainty = parse_uncertainty(text)
+    possible = uncertainty.members(worlds)
+    others = script_agents(scenario, except_for=1)
+    command = fixed_commands(others, possible, "test", vehicle=1)
+    problem = profile_problem(possible, [1], horizon_s=scenario.horizon_s, others_mps2=command)
+    running = begin_running(problem, possible.n // worlds.n)
+    return uncertainty, boxes_of(possible, running, scenario, others)
+
+
+def harm_inside(scenario, uncertainty, worlds, plan, draws, rng):
+    truth = uncertainty.draw(worlds.take(np.zeros(draws, np.int64)), rng)
+    command = fixed_commands(script_agents(scenario, except_for=1), truth, "test", vehicle=1)
+    running = begin_running(profile_problem(truth, [1], horizon_s=scenario.horizon_s, others_mps2=command))
+    return plan_harm(running, np.repeat(plan[np.newaxis], draws, axis=0))
+
+
+def width(scenario):
+    return int(number_of_decisions(np.zeros(1), scenario.time_step_s, scenario.horizon_s)[0]) + 1
+
+
+OPERATIONS = {
+    "product": (lambda x, y: forms.product(x, y), lambda a, b: a * b),
+    "square": (lambda x, y: forms.square(x), lambda a, b: a * a),
+    "square_root": (lambda x, y: forms.square_root(x), lambda a, b: np.sqrt(a)),
+    "reciprocal": (lambda x, y: forms.reciprocal(x), lambda a, b: 1.0 / a),
+    "positive_part": (lambda x, y: forms.positive_part(y), lambda a, b: np.maximum(b, 0.0)),
+    "difference": (lambda x, y: forms.difference(x, y), lambda a, b: a - b),
+}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_forms__enclose_what_they_stand_for(name):
+    enclose, exact = OPERATIONS[name]
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        x, y = rng.normal(0.0, 0.2, 5), rng.normal(0.0, 0.6, 5)
+        x[0], x[-1], y[-1] = 1.5 + rng.random(), abs(x[-1]), abs(y[-1])
+        x[1:] *= 1.3 / max(np.abs(x[1:]).sum(), 1.3)
+        at = rng.choice([-1.0, 1.0, 0.3], (64, 3))
+        a = x[0] + at @ x[1:4] + x[4] * rng.choice([-1.0, 1.0], 64)
+        b = y[0] + at @ y[1:4] + y[4] * rng.choice([-1.0, 1.0], 64)
+        out = enclose(x, y)
+        assert (np.abs(exact(a, b) - out[0] - at @ out[1:4]) <= out[4] + 1e-12).all()
+
+
+def test_by_hand__two_vehicles_the_bound_is_that_of_the_least_gap():
+    scenario, worlds = two(speed=14.0)  # full braking by 5 m/s2 from 15 m: the front stands
+    _, boxes = boxed(scenario, worlds, "gaps_m=2")
+    plan = np.full((1, STEPS), -1.0)
+    # 13 m in the worst world: 14^2 - 2 * 5 * 13
+    assert bound_plans(boxes, plan, np.zeros(1), 1)[0] == pytest.approx(66.0, abs=1e-3)
+    _, boxes = boxed(scenario, worlds, "gaps_m=2,speeds_mps.vehicle_2=1")
+    found = bound_plans(boxes, plan, np.zeros(1), 25)[0]
+    assert 15.0**2 - 130.0 <= found <= 15.0**2 - 130.0 + 1.0
+
+
+@pytest.mark.parametrize("name", UNUSUAL)
+def test_bound__is_at_least_the_harm_of_every_world_drawn_from_the_box(name):
+    changed, text = UNUSUAL[name]
+    scenario = load_scenario("paper-random").replace(early_impacts="keep", **changed)
+    rng, finite = np.random.default_rng(5), 0
+    for k in range(3):
+        worlds = scenario.sample(1, 3, first=k).worlds
+        uncertainty, boxes = boxed(scenario, worlds, text)
+        for plan in (np.full(width(scenario), -0.9), np.repeat(rng.uniform(-1.0, 0.6, 30), 4)[: width(scenario)]):
+            bound = bound_plans(boxes, plan[np.newaxis], np.zeros(1), 9)[0]
+            finite += bool(np.isfinite(bound))
+            assert harm_inside(scenario, uncertainty, worlds, plan, 40, rng).max() <= bound
+    assert finite >= 2 or name == "very unequal masses"
+
+
+def test_bound__more_parts_never_make_it_worse():
+    scenario = load_scenario("paper-random")
+    worlds = scenario.sample(1, 7, first=11).worlds
+    _, boxes = boxed(scenario, worlds, "gaps_m=0.5")
+    plan = np.full((1, width(scenario)), -0.9)
+    found = [bound_plans(boxes, plan, np.zeros(1), cells)[0] for cells in (1, 5, 21)]
+    assert found[0] >= found[1] >= found[2] > 0.0
+
+
+def test_shield__coasting_stays_within_the_bound_in_every_world_of_the_box():
+    scenario = load_scenario("paper-random")
+    worlds = scenario.sample(2, 7, first=11).worlds
+    uncertainty = parse_uncertainty("gaps_m=0.5")
+    shield = StepShield(scenario, 1, uncertainty=uncertainty, robust="interior")
+    shield.begin(worlds, np.arange(2))
+    told = [shield.bound.copy()]
+    while not shield.running.finished.all():
+        shield.decide(np.zeros(2))
+        told.append(shield.bound.copy())
+    assert (np.diff(told, axis=0) <= 0.0).all() and (shield.interventions > 0).all()
+    assert (shield.interventions < shield.running.steps).any()  # and some of it was let through
+    rng = np.random.default_rng(1)
+    for k in range(2):
+        harm = harm_inside(scenario, uncertainty, worlds.take([k]), shield.backup.plan[k], 300, rng)
+        assert harm.max() <= shield.bound[k] <= shield.first_bound[k]
+    assert (shield.bound < 200.0).all()
+
+
+def test_no_width__is_step_mode_to_the_bit():
+    scenario = line(3)
+    worlds, bounds = scenario.sample(5, 3).worlds, []
+    for settings in ({}, {"uncertainty": parse_uncertainty("mass_t=0%"), "robust": "interior"}):
+        shield = StepShield(scenario, 1, **settings)
+        shield.begin(worlds, np.arange(5))
+        for _ in range(5):
+            shield.decide(np.zeros(5))
+        bounds.append(shield.bound.tolist())
+    assert bounds[0] == bounds[1]
+
+
+def test_agents__are_written_with_the_interior():
+    scenario = load_scenario("paper-random")
+    agent = make_agent("full_brake+robust:interior", scenario=scenario, uncertainty="gaps_m=0.5")
+    assert agent.name == "full_brake+robust:interior"
+
+
+@pytest.mark.parametrize(
+    ("scenario", "count", "message"),
+    [
+        (line(5), "first", "5 vehicles"),
+        (load_scenario("paper-random-obstacle"), "first", "an obstacle ahead"),
+        (load_scenario("paper-random"), "total", "total harm"),
+        (
+            load_scenario("paper-random").replace(
+                early_impacts="keep",
+                roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "gentlest_front"},
+            ),
+            "first",
+            "gentlest_front",
+        ),
+    ],
+)
+def test_refused__what_it_cannot_certify(scenario, count, message):
+    vehicle = scenario.learners[0]
+    shield = StepShield(
+        scenario, vehicle, harm_count=count, uncertainty=parse_uncertainty("gaps_m.pair_1=0.1"), robust="interior"
+    )
+    with pytest.raises(InvalidInput, match=message):
+        shield.begin(scenario.sample(1, 0).worlds, np.arange(1))
+
+
+def test_refused__an_unknown_certainty_and_one_without_uncertainty():
+    with pytest.raises(UnknownName, match="corners"):
+        ShieldOptions(uncertainty="gaps_m=1", robust="edges")
+    with pytest.raises(InvalidInput, match="robust"):
+        ShieldOptions(mode="step", robust="interior")
