@@ -56,7 +56,7 @@ class Line(NamedTuple):
     start: Floats  # [TABLE_ROWS, N or N + 1] with everybody's command but that of the controlled vehicle
     shared: Floats  # the same where that vehicle's command takes effect
     table: Floats  # room
-    clock: Floats  # [CLOCK_WIDTH] length of a simulation, restitution, time from the start to ``shared``
+    clock: Floats  # [3] length of a simulation, restitution, time from the start to ``shared``
     controlled: int  # column of the vehicle
     vehicles: int  # column of Vehicle 1
     harm: int  # the row whose sum is minimised
@@ -185,9 +185,14 @@ def will_stay_apart(table: Floats) -> bool:
       harder while it closes the least gap is positive, too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the gap
       is concave until f stands, and falls from then on.) All with margins.
     """
-    vehicles = table.shape[1]
+    vehicles, hardest = table.shape[1], 0.0
     for i in range(vehicles):
         if table[ACTIVE, i] == 0.0 or table[COMMAND, i] > 0.0 or table[SPEED, i] < 0.0:
+            return False
+        hardest = max(hardest, -table[COMMAND, i])
+    for p in range(vehicles - 1):  # what surely meets is soon told
+        closing = table[SPEED, p + 1] - table[SPEED, p]
+        if closing > 0.0 and closing * closing >= 2.0 * hardest * table[GAP, p]:
             return False
     accelerate(table)
     for p in range(vehicles - 1):
