@@ -76,7 +76,7 @@ def test_by_hand__proposals_that_are_harmless_alone_and_collide_together_go_to_t
 
 
 def test_by_hand__what_one_of_two_makes_better_is_in_the_bound_at_once():
-    _, worlds = three(gaps_m=[2.6, 10], speeds_mps=[0, 5, 11.3])
+    _, worlds = three(gaps_m=[2.6, 10], speeds_mps=[0, 5, 11])
     plan = np.full((1, STEPS, 2), -1.0)
     plan[0, 0, 1] = -0.5  # Vehicle 3 runs into Vehicle 2, and brakes too little at first
     running, backup = start(worlds, plan)
