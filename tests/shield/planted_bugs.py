@@ -19,6 +19,7 @@ OF_TEAMS = tuple(
     for name in (
         "by_hand__of_two_proposals_the_harmless_one_is_accepted_the_other_replaced",
         "by_hand__proposals_that_are_harmless_alone_and_collide_together_go_to_the_front_one",
+        "by_hand__what_one_of_two_makes_better_is_in_the_bound_at_once",
         "by_hand__who_says_no_number_keeps_the_plan_and_the_other_is_clipped",
         "shares__are_those_of_the_ledger_and_the_light_one_bears_more",
         "caps__reject_what_only_moves_harm_to_another",

@@ -66,13 +66,24 @@ def test_by_hand__proposals_that_are_harmless_alone_and_collide_together_go_to_t
     plan[0, :4, 0] = 0.0  # coasts 2 m first, then stops after 2.5 m, 0.4 m before Vehicle 1
     running, backup = start(worlds, plan)
     assert backup.harm.tolist() == [0.0]  # Vehicle 3 stops 12 + 4.5 - 14.4 = 2.1 m behind
-    front, rear = np.array([[-1.0, -1.0]]), np.array([[0.0, 0.0]])
+    front, rear = np.array([[-1.0, -1.0]]), np.array([[0.0, 0.4]])
     for each in (front, rear):
         assert not certify(running, each, backup, backup.harm).intervened.any()
-    several = np.array([[-1.0, 0.8]])  # 0.9 m sooner, and about 1.5 m later
+    several = np.array([[-1.0, 0.4]])  # 0.65 m sooner, and 1.69 m later
     assert plan_harm(certify(running, several, backup, np.full(1, 1e9)).after, plan)[0] > 0.0
     decision = certify(running, several, backup, backup.harm)
     assert told(decision) == ["plan remains", "no certificate"] and decision.applied[0].tolist() == [-1.0, -1.0]
+
+
+def test_by_hand__what_one_of_two_makes_better_is_in_the_bound_at_once():
+    _, worlds = three(gaps_m=[2.6, 10], speeds_mps=[0, 5, 11])
+    plan = np.full((1, STEPS, 2), -1.0)
+    plan[0, 0, 1] = -0.5  # Vehicle 3 runs into Vehicle 2, and brakes too little at first
+    running, backup = start(worlds, plan)
+    decision = certify(running, np.array([[1.0, -1.0]]), backup, backup.harm)
+    assert decision.intervened.tolist() == [[True, False]]  # Vehicle 2 has 0.1 m to spare
+    assert decision.bound.tolist() == plan_harm(decision.after, decision.backup.plan).tolist()
+    assert decision.bound[0] < backup.harm[0] - 1.0
 
 
 def test_by_hand__who_says_no_number_keeps_the_plan_and_the_other_is_clipped():
