@@ -16,7 +16,7 @@ from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.scenario.roles import parse_agent_spec
 
 REFINED = ("refined", "refined:profile")
-SHIELDS = ("episode", "episode:pairwise", "step", "robust")
+SHIELDS = ("episode", "episode:pairwise", "step", "robust", "robust:interior")
 AROUND = (*REFINED, *SHIELDS)  # in the order in which they are put around an agent
 
 OLD_SPELLINGS = {  # of a policy; ``hybrid@PATH`` is ``ppo@PATH+episode`` now

@@ -1,4 +1,4 @@
-"""Nineteen bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
+"""Twenty-two bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
 applied to a temporary copy. There ``test_certify``, ``test_step_shield`` and one test of ``test_robust`` run with
@@ -14,13 +14,29 @@ import sys
 from tests.programme.planting import Patch, misfits, red_with
 
 BY_HAND = "test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner"
-QUICK = ("tests/shield/test_certify.py", "tests/shield/test_step_shield.py", f"tests/shield/test_robust.py::{BY_HAND}")
-WHOLE = tuple(
-    f"tests/shield/test_{name}.py" for name in ("engine_shield", "step", "rollouts", "interfaces", "interference")
+FORMS_TEST = "tests/shield/test_interior.py::test_forms__enclose_what_they_stand_for"
+QUICK = (
+    "tests/shield/test_certify.py",
+    "tests/shield/test_step_shield.py",
+    f"tests/shield/test_robust.py::{BY_HAND}",
+    FORMS_TEST,
 )
-KERNEL, CERTIFY, GUARD, ROLLOUTS, ATTACHED, COMPARISON = (
+WHOLE = tuple(
+    f"tests/shield/test_{name}.py"
+    for name in ("engine_shield", "step", "rollouts", "interfaces", "interference", "interior")
+)
+KERNEL, CERTIFY, GUARD, ROLLOUTS, ATTACHED, COMPARISON, FORMS, INSIDE = (
     f"ethbrake_marl/shield/{name}.py"
-    for name in ("certify_kernel", "certify", "step_shield", "rollouts", "engine_shield", "comparison")
+    for name in (
+        "certify_kernel",
+        "certify",
+        "step_shield",
+        "rollouts",
+        "engine_shield",
+        "comparison",
+        "forms",
+        "interior",
+    )
 )
 
 BUGS: dict[str, tuple[Patch, ...]] = {
@@ -126,6 +142,11 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     ),
     "a step that was not made is not noticed": (
         Patch(ATTACHED, "if self.engine.steps_made != self.sent.steps_made + 1:", "if self.engine.steps_made < 0:"),
+    ),
+    "what is of second order is left out of a product": (Patch(FORMS, " + radius(x) * radius(y)", ""),),
+    "a square root is taken for its chord": (Patch(FORMS, "error = 0.5 * (0.25 / slope - start)", "error = 0.0"),),
+    "a plan without a certificate inside the box is held": (
+        Patch(INSIDE, "good = found <= least", "good = found <= np.inf"),
     ),
     "a surprise is not flagged": (Patch(GUARD, "if not surprising.any():", "if surprising.any() or True:"),),
 }

@@ -1,11 +1,12 @@
 """Trying to break the step shield: ``make test-shield`` (``python -m tests.shield.programme``).
 
-Five gates, one line each, exit status 1 if one fails:
+Six gates, one line each, exit status 1 if one fails:
 
 bound   random worlds against every adversary of ``tests.shield.lines``, both counts, N = 3 and 5, e from 0 to 0.3
 interfaces   worlds through every wrapped interface (``tests.shield.interface_attack``)
 interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
 search  restarts of a search against the shield, and against twelve leaks of it (``tests.shield.search``)
+inside  worlds drawn from the inside of intervals, behind robust mode (``tests.shield.inside``)
 speed   decisions per second in a batch, and the latency of one decision
 
 No realised harm may be above the bound at the alert (tolerance 1e-9). Bound and interfaces run in chunks; each finished
@@ -35,6 +36,7 @@ from ethbrake_marl.shield import StepShieldAgent
 from ethbrake_marl.shield.certify import certify
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from tests.shield.inside import inside_gate
 from tests.shield.interface_attack import INTERFACES
 from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
 from tests.shield.lines import ADVERSARIES, attack, line
@@ -255,10 +257,13 @@ def main() -> int:
     parser.add_argument("--interface-worlds", type=int, default=10_000, help="through each interface")
     parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each interface")
     parser.add_argument("--restarts", type=int, default=1_000, help="of the search")
+    parser.add_argument("--intervals", default="gaps_m=0.5", help="of the gate 'inside'")
+    parser.add_argument("--boxes", type=int, default=20, help="of that gate")
+    parser.add_argument("--draws", type=int, default=50_000, help="worlds out of each box")
     parser.add_argument("--decisions", type=int, default=5_000, help="timed one by one")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
-        "--only", default="speed,interference,search,interfaces,bound", help="gates, with commas between them"
+        "--only", default="speed,inside,interference,search,interfaces,bound", help="gates, with commas between them"
     )
     parser.add_argument("--results", type=Path, default=ROOT / "runs" / "test-shield", help="folder of finished chunks")
     parser.add_argument("--part", default="1/1", help="this process's share of the chunks, for instance 1/2")
@@ -266,6 +271,7 @@ def main() -> int:
     code = code_digest()
     gates = {
         "speed": lambda: speed(given.decisions),
+        "inside": lambda: inside_gate(given.intervals, given.boxes, given.draws, given.seed),
         "search": lambda: search_gate(given.restarts, given.seed),
         "interference": lambda: interference_gate(given.interfered, given.seed),
         "interfaces": lambda: run_chunks(list(interface_chunks(given.interface_worlds)), interface_chunk, given, code),
