@@ -8,7 +8,7 @@ that one's bound is at most the budget. What was applied at the end is the plan 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
 from ethbrake_marl.shield.certify_kernel import NO_CERTIFICATE
 from ethbrake_marl.shield.interior_kernel import Known, bound_box
+from ethbrake_marl.shield.rollouts import put
 
 MOST_VEHICLES = 3
 CELLS_AT_ALERT, CELLS = 200, 40  # looked at for the bound at the alert, and for one later certificate
@@ -28,6 +29,7 @@ NEAR = 1.02  # times the largest harm in a corner: a bound this good is not refi
 NEARLY_NOTHING = 0.1  # m2/s2, likewise
 CORNERS, INTERIOR = "corners", "interior"  # which worlds of a box robust mode certifies
 CERTAINTIES = (CORNERS, INTERIOR)
+PER_BOX = ("low", "high", "limit", "restitution", "begin_s", "constant")  # arrays of Boxes
 SCRIPTS = ("full_brake", "coast", "constant")
 
 
@@ -46,16 +48,13 @@ class Boxes(NamedTuple):
 
     def put(self, rows: Ints, new: Boxes) -> Boxes:
         """A copy with the boxes of ``new`` in these rows."""
-        columns = []
-        for old, fresh in zip(self[:6], new[:6], strict=True):
-            placed = old.copy()
-            placed[rows] = fresh
-            columns.append(placed)
-        return Boxes(*columns, *self[6:])
+        columns: dict[str, Any] = {name: put(getattr(self, name), rows, getattr(new, name)) for name in PER_BOX}
+        return self._replace(**columns)
 
     def take(self, rows: Ints) -> Boxes:
         """Those of some worlds."""
-        return Boxes(*(column[rows] for column in self[:6]), *self[6:])
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in PER_BOX}
+        return self._replace(**columns)
 
 
 def placed(old: Boxes | None, new: Boxes, rows: Ints) -> Boxes:
