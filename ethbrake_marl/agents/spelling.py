@@ -16,7 +16,7 @@ from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.scenario.roles import parse_agent_spec
 
 REFINED = ("refined", "refined:profile")
-SHIELDS = ("episode", "episode:pairwise", "step", "robust")
+SHIELDS = ("episode", "episode:pairwise", "step", "robust", "robust:interior")
 BELIEVED = ("episode:believed", "episode:pairwise:believed", "step:believed", "robust:believed")  # on what was received
 AROUND = (*REFINED, *SHIELDS, *BELIEVED)  # in the order in which they are put around an agent
 

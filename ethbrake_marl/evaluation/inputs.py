@@ -132,7 +132,7 @@ def make_lineup(
     for k, each in enumerate(written):
         if each in written[:k]:
             raise InvalidInput(f"agent {str(each)!r} is given twice; each agent drives every world once")
-    if uncertainty is not None and not any(each.shield == "robust" for each in written):
+    if uncertainty is not None and not any(each.shield in ("robust", "robust:interior") for each in written):
         raise InvalidInput(f"uncertainty {uncertainty}: nobody uses it; an agent with +robust does: ppo@PATH+robust")
     return {
         str(each): make_agent(str(each), scenario=scenario, harm_count=harm_count, uncertainty=uncertainty)

@@ -85,7 +85,8 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
 @compiled_apart
 def apart(touch: Floats) -> float:
     """Largest difference of speeds of a pair in contact."""
-    return float(max(touch[OPENING], touch[CLOSING], 0.0))
+    most: float = max(touch[OPENING], touch[CLOSING], 0.0)
+    return most
 
 
 @compiled_apart

@@ -22,22 +22,24 @@ from ethbrake_marl.physics.compiled import compiled_apart
 @compiled_apart
 def radius(x: Floats) -> float:
     """Largest distance from the centre."""
-    whole = x[-1]
+    whole: float = x[-1]
     for k in range(1, x.shape[0] - 1):
         whole += abs(x[k])
-    return float(whole)
+    return whole
 
 
 @compiled_apart
 def low(x: Floats) -> float:
     """Least value."""
-    return float(x[0] - radius(x))
+    least: float = x[0] - radius(x)
+    return least
 
 
 @compiled_apart
 def high(x: Floats) -> float:
     """Largest value."""
-    return float(x[0] + radius(x))
+    most: float = x[0] + radius(x)
+    return most
 
 
 @compiled_apart

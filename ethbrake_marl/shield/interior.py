@@ -29,6 +29,7 @@ NEAR = 1.02  # times the largest harm in a corner: a bound this good is not refi
 NEARLY_NOTHING = 0.1  # m2/s2, likewise
 CORNERS, INTERIOR = "corners", "interior"  # which worlds of a box robust mode certifies
 CERTAINTIES = (CORNERS, INTERIOR)
+PER_BOX = ("low", "high", "limit", "restitution", "begin_s", "constant")  # arrays of Boxes
 SCRIPTS = ("full_brake", "coast", "constant")
 
 
@@ -47,15 +48,13 @@ class Boxes(NamedTuple):
 
     def put(self, rows: Ints, new: Boxes) -> Boxes:
         """A copy with the boxes of ``new`` in these rows."""
-        placed: dict[str, Any] = {name: put(getattr(self, name), rows, getattr(new, name)) for name in PER_BOX}
-        return self._replace(**placed)
+        columns: dict[str, Any] = {name: put(getattr(self, name), rows, getattr(new, name)) for name in PER_BOX}
+        return self._replace(**columns)
 
     def take(self, rows: Ints) -> Boxes:
         """Those of some worlds."""
-        return self._replace(**{name: getattr(self, name)[rows] for name in PER_BOX})
-
-
-PER_BOX = ("low", "high", "limit", "restitution", "begin_s", "constant")
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in PER_BOX}
+        return self._replace(**columns)
 
 
 def placed(old: Boxes | None, new: Boxes, rows: Ints) -> Boxes:

@@ -1,4 +1,4 @@
-"""Twenty-seven bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
+"""Thirty bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
 applied to a temporary copy. There ``test_certify``, ``test_step_shield`` and some other tests run with
@@ -14,6 +14,7 @@ import sys
 from tests.programme.planting import Patch, misfits, red_with
 
 BY_HAND = "test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner"
+FORMS_TEST = "tests/shield/test_interior.py::test_forms__enclose_what_they_stand_for"
 OF_TEAMS = tuple(
     f"tests/shield/test_joint.py::test_{name}"
     for name in (
@@ -27,17 +28,17 @@ OF_TEAMS = tuple(
 )
 QUICK = (
     "tests/shield/test_certify.py", "tests/shield/test_step_shield.py", f"tests/shield/test_robust.py::{BY_HAND}",
-    *OF_TEAMS,
+    *OF_TEAMS, FORMS_TEST,
 )  # fmt: skip
 WHOLE = tuple(
     f"tests/shield/test_{name}.py"
-    for name in ("joint", "engine_shield", "step", "rollouts", "interfaces", "interference")
+    for name in ("joint", "engine_shield", "step", "rollouts", "interfaces", "interference", "interior")
 )
-KERNEL, MEMBERS, CERTIFY, ALERT, GUARD, ROLLOUTS, ATTACHED, COMPARISON, TEAM = (
+KERNEL, MEMBERS, CERTIFY, ALERT, GUARD, ROLLOUTS, ATTACHED, COMPARISON, TEAM, FORMS, INSIDE = (
     f"ethbrake_marl/shield/{name}.py"
     for name in (
         "certify_kernel", "members", "certify", "alert", "step_shield", "rollouts", "engine_shield", "comparison",
-        "team_agent",
+        "team_agent", "forms", "interior",
     )
 )  # fmt: skip
 
@@ -203,6 +204,11 @@ BUGS: dict[str, tuple[Patch, ...]] = {
             "self.vehicles = tuple(team.drivers)",
             "self.vehicles = tuple(team.drivers)[:1] * len(team.drivers)",
         ),
+    ),
+    "what is of second order is left out of a product": (Patch(FORMS, " + radius(x) * radius(y)", ""),),
+    "a square root is taken for its chord": (Patch(FORMS, "error = 0.5 * (0.25 / slope - start)", "error = 0.0"),),
+    "a plan without a certificate inside the box is held": (
+        Patch(INSIDE, "good = found <= least", "good = found <= np.inf"),
     ),
     "a surprise is not flagged": (Patch(GUARD, "if not surprising.any():", "if surprising.any() or True:"),),
 }

@@ -8,6 +8,7 @@ interfaces   worlds through every wrapped interface (``tests.shield.interface_at
 interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
 search  restarts of a search against the shield, and against twelve leaks of it (``tests.shield.search``)
 believed  worlds that are corners of what was not received (``tests.shield.corners``)
+inside  worlds drawn from the inside of intervals, behind robust mode (``tests.shield.inside``)
 speed   decisions per second in a batch, and the latency of one decision
 
 No realised harm may be above the bound at the alert (tolerance 1e-9; of teams none, and harm must be the last bound, as
@@ -40,6 +41,7 @@ from ethbrake_marl.shield.certify import certify
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.shield.corners import corners_gate
+from tests.shield.inside import inside_gate
 from tests.shield.interface_attack import INTERFACES
 from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
 from tests.shield.joint_attack import ADVERSARIES as JOINT_ADVERSARIES
@@ -303,11 +305,14 @@ def main() -> int:
     parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each interface")
     parser.add_argument("--corner-worlds", type=int, default=60_000, help="of the gate 'believed'")
     parser.add_argument("--restarts", type=int, default=1_000, help="of the search")
+    parser.add_argument("--intervals", default="gaps_m=0.5", help="of the gate 'inside'")
+    parser.add_argument("--boxes", type=int, default=20, help="of that gate")
+    parser.add_argument("--draws", type=int, default=50_000, help="worlds out of each box")
     parser.add_argument("--decisions", type=int, default=5_000, help="timed one by one")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
         "--only",
-        default="speed,interference,search,believed,interfaces,joint,bound",
+        default="speed,inside,interference,search,believed,interfaces,joint,bound",
         help="gates, with commas between them",
     )
     parser.add_argument("--results", type=Path, default=ROOT / "runs" / "test-shield", help="folder of finished chunks")
@@ -316,6 +321,7 @@ def main() -> int:
     code = code_digest()
     gates = {
         "speed": lambda: speed(given.decisions),
+        "inside": lambda: inside_gate(given.intervals, given.boxes, given.draws, given.seed),
         "search": lambda: search_gate(given.restarts, given.seed),
         "interference": lambda: interference_gate(given.interfered, given.seed),
         "joint": lambda: run_chunks(list(joint_chunks(given.joint_worlds)), joint_chunk, given, code),

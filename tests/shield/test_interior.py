@@ -26,7 +26,7 @@ UNUSUAL = {
     "own latency": ({}, "latency_s.vehicle_2=0.1,gaps_m.pair_1=0.5"),
     "elastic": ({"restitution": 1.0}, "speeds_mps=0.4"),
     "close": ({"gaps_m": [0.3, 0.2]}, "gaps_m=0.2,latency_s.vehicle_3=0.1"),
-    "driving": ({"driving_capacity_mps2": 8, "speed_limit_mps": 21}, "driving_capacity_mps2=20%"),
+    "driving": ({"driving_capacity_mps2": 8, "speed_limit_mps": 22.5}, "driving_capacity_mps2=20%"),
 }
 
 
@@ -92,13 +92,13 @@ def test_bound__is_at_least_the_harm_of_every_world_drawn_from_the_box(name):
     changed, text = UNUSUAL[name]
     scenario = load_scenario("paper-random").replace(early_impacts="keep", **changed)
     rng, finite = np.random.default_rng(5), 0
-    for k in range(3):
+    for k in range(2):
         worlds = scenario.sample(1, 3, first=k).worlds
         uncertainty, boxes = boxed(scenario, worlds, text)
         for plan in (np.full(width(scenario), -0.9), np.repeat(rng.uniform(-1.0, 0.6, 30), 4)[: width(scenario)]):
-            bound = bound_plans(boxes, plan[np.newaxis], np.zeros(1), 9)[0]
+            bound = bound_plans(boxes, plan[np.newaxis], np.zeros(1), 5)[0]
             finite += bool(np.isfinite(bound))
-            assert harm_inside(scenario, uncertainty, worlds, plan, 40, rng).max() <= bound
+            assert harm_inside(scenario, uncertainty, worlds, plan, 25, rng).max() <= bound
     assert finite >= 2 or name == "very unequal masses"
 
 
