@@ -36,6 +36,7 @@ from ethbrake_marl.limits.meetings import (
     ONSET_R,
     REAR_SHARE,
     RESTITUTION,
+    TIME_STEP,
     U_F,
     V_F,
     V_L,
@@ -75,6 +76,7 @@ def lower_bound(
     harm_count: HarmCount = "first",
     horizon_s: float = 8.0,
     scripts: Mapping[int, str] | None = None,
+    time_step_s: float | None = None,
 ) -> LowerBound:
     """Proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicle``.
 
@@ -103,7 +105,7 @@ def lower_bound(
     has_rear = open_pair[:, vehicle] if vehicle < worlds.N - 1 else none
     unavoidable = has_front & has_rear & (verdict.reason >= 2)
     out = np.empty((worlds.n, BOUNDS))
-    bound_worlds(_states(at_onset, vehicle), horizon_s - start, has_front, has_rear, unavoidable, out)
+    bound_worlds(_states(at_onset, vehicle, time_step_s), horizon_s - start, has_front, has_rear, unavoidable, out)
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
     early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)
@@ -130,7 +132,7 @@ def rounding(worlds: Worlds, vehicle: int) -> Floats:
     return outward
 
 
-def _states(worlds: Worlds, i: int) -> Floats:
+def _states(worlds: Worlds, i: int, time_step_s: float | None = None) -> Floats:
     """The rows of the compiled bounds [n, WIDTH]; columns of a neighbour that is not there stay 0."""
     v = worlds.vehicles
     at = np.zeros((worlds.n, WIDTH))
@@ -140,6 +142,7 @@ def _states(worlds: Worlds, i: int) -> Floats:
         U_F: v.driving_capacity_mps2[:, i],
         LIMIT_F: v.speed_limit_mps[:, i],
         RESTITUTION: v.restitution,
+        TIME_STEP: 0.0 if time_step_s is None else time_step_s,
     }
     if i > 0:
         columns[GAP_L] = worlds.gaps_m[:, i - 1]

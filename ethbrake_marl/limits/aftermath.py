@@ -1,0 +1,295 @@
+"""Compiled: the harm at the other pair that must follow a first meeting, whatever the controlled vehicle does then.
+
+A first meeting at ``time`` with ``closing`` leaves a state that is known exactly. From it on, the centre of mass of the
+two moves on a path that no command improves but the extreme one, and the controlled vehicle is faster (slower) than the
+centre only while it comes back to its partner. ``lead`` bounds that. docs/avoidability.md has the proofs.
+
+A cell of meetings lies between ``early`` and ``late``; its state is taken at ``early``. From ``late`` to ``end`` the
+command of the decision before is still in force, which lacks at least ``lack`` of the extreme one (m/s2).
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.limits.meetings import (
+    A_F,
+    A_L,
+    A_R,
+    FRONT_FIRST,
+    FRONT_SHARE,
+    GAP_L,
+    GAP_R,
+    LIMIT_F,
+    ONSET_R,
+    REAR_SHARE,
+    RESTITUTION,
+    U_F,
+    V_L,
+    follower,
+    leader,
+)
+from ethbrake_marl.limits.walk import fill_braking, fill_drive_then_brake, fill_window, walk
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.worlds import Floats
+
+LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting at which the time is divided, to bound both parts
+
+
+@compiled
+def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
+    """How far ahead of the common speed a flight of this length can bring the controlled vehicle, less what it costs.
+
+    ``share (press L - o) - G``, where G is the least loss of command, at most ``reach`` a second, that keeps the two
+    apart for L: ``G L - G^2 / 2 reach >= press L^2 / 2 - o L``. -inf where nothing keeps them apart. [m/s]
+    """
+    relative = share * (press * flight - opening)
+    if press * flight <= 2.0 * opening:
+        return relative
+    if reach == math.inf:
+        return relative - (0.5 * press * flight - opening)
+    inside = reach * (reach - press) * flight * flight + 2.0 * reach * opening * flight
+    if inside < 0.0:
+        return -math.inf
+    return relative - reach * flight + math.sqrt(inside)
+
+
+@compiled
+def best_flight(share: float, press: float, reach: float, opening: float) -> float:
+    """The length of the flight of the largest ``flight_lead``; inf if it rises for ever."""
+    if press <= 0.0:
+        return math.inf
+    if share <= 0.5:
+        return 2.0 * opening / press
+    if reach == math.inf:
+        return math.inf
+    slope = reach - share * press
+    left = slope * slope - reach * (reach - press)
+    if slope <= 0.0:
+        return 2.0 * opening / (press - reach)
+    if left <= 0.0:
+        return math.inf
+    root = math.sqrt(left)
+    return max(reach * opening / (root * (slope + root)), 2.0 * opening / press)
+
+
+@compiled
+def lead(
+    share: float, press: float, reach: float, opening: float, shortest: float, longest: float, lost: float
+) -> float:
+    """Largest ``flight_lead`` of lengths between ``shortest`` and ``longest``, of which ``lost`` is lost in any case."""
+    flight = best_flight(share, press, reach, opening)
+    if lost > 0.0 and press > 0.0:
+        both = opening + lost
+        flight = max(flight, (both + math.sqrt(max(both * both - press * lost * lost / reach, 0.0))) / press)
+    flight = min(max(flight, shortest), longest)
+    most = share * (press * flight - opening) - lost if press > 0.0 else -lost
+    return min(flight_lead(share, press, reach, opening, flight), most) if press > 0.0 else most
+
+
+@compiled
+def decays(share: float, press: float, reach: float, bounce: float) -> bool:
+    """Whether no loss of command pays that makes a later bounce larger; ``reach`` then bounds what flights gain."""
+    if share <= 0.5:
+        return True
+    if reach == math.inf or press <= 0.0:
+        return False
+    if reach > press:
+        return bounce * (math.sqrt(reach / (reach - press)) - share) <= 1.0 - share
+    return bounce * flight_lead(share, press, reach, 1.0, best_flight(share, press, reach, 1.0)) <= 1.0 - share
+
+
+@compiled
+def largest_lead(
+    share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
+    since: float, until: float,
+) -> float:  # fmt: skip
+    """How much faster than the common speed, without loss, it can be between ``since`` and ``until``. [m/s]
+
+    The last flight before the rear meeting began with the first impact, after the window from ``late`` to ``end`` in
+    which ``lost`` is lost, or within it. ``reach`` is inf where ``press`` is not constant.
+    """
+    if since < end:
+        lost, end = 0.0, late
+    if not decays(share, press, reach, bounce):
+        return lead(share, press, math.inf, opening, 0.0, until, lost)
+    shortest = 0.0 if reach == math.inf else max(since - late, 0.0)
+    longest = math.inf if share > 0.5 and reach <= press else until
+    first = lead(share, press, reach, opening, shortest, longest, lost)
+    again = bounce * (opening + lost)
+    result = max(first, lead(share, press, reach, again, 0.0, longest, 0.0) - (1.0 - share) * lost)
+    if lost > 0.0:
+        gain = max((1.0 + bounce) * share - 1.0, 2.0 * share - 1.0)
+        within = lead(share, press, reach, bounce * opening, 0.0, longest, 0.0) + gain * lost
+        shortest = 0.0 if reach == math.inf else since - end
+        within = min(within, lead(share, press, reach, again, shortest, longest, 0.0))
+        result = max(result, min(within, share * press * until - (1.0 - share) * lost))
+    return result
+
+
+@compiled
+def least_of_line(
+    start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, since: float,
+    until: float,
+) -> float:  # fmt: skip
+    """Least value of ``start + slope t + bend (t - turn)+ + other_bend (t - other_turn)+`` from since to until."""
+    least = math.inf
+    for time in (since, until, min(max(turn, since), until), min(max(other_turn, since), until)):
+        value = start + slope * time + bend * max(time - turn, 0.0) + other_bend * max(time - other_turn, 0.0)
+        least = min(least, value)
+    return least
+
+
+@compiled
+def least_closing(
+    start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
+    press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
+) -> float:  # fmt: skip
+    """Least closing speed of a second meeting at most ``until``: that of the common speed, less the lead.
+
+    The time is divided at one of a few moments: what was lost in the window counts only after it.
+    """
+    best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
+    best -= largest_lead(share, press, reach, bounce, opening, lost, late, end, 0.0, until)
+    for k in range(len(LEADS)):
+        since = until - LEADS[k]
+        if since <= 0.0:
+            break
+        near = least_of_line(start, slope, turn, bend, other_turn, other_bend, since, until)
+        near -= largest_lead(share, press, reach, bounce, opening, lost, late, end, since, until)
+        far = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, since)
+        far -= largest_lead(share, press, reach, bounce, opening, 0.0, late, late, 0.0, since)
+        best = max(best, min(near, far))
+    return max(best, 0.0)
+
+
+@compiled
+def pushed_by_leader(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Least closing speed at the rear, from the centre of mass of leader and controlled vehicle; 0: not proven.
+
+    A leader that stands keeps its place, so a later meeting is the same one later: only what holds for all counts.
+    """
+    share, rest, press = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    bounce = at[RESTITUTION]
+    speed, push = v_l + rest * closing, rest * at[U_F] - share * at[A_L]
+    stand = (speed + rest * bounce * closing) / at[A_L]
+    late, end, lost = late - early, end - early, lack * (end - late)
+    if v_l <= 0.0:
+        late, end, lack, lost = 0.0, 0.0, 0.0, 0.0
+    fill_window(plan, push, late, end, -rest * lack, stand, share * at[A_L])
+    onset = max(at[ONSET_R] - early, 0.0)
+    fill_braking(other, onset, at[A_R])
+    behind = max(at[GAP_L] + at[GAP_R] + way_l - way_r, 0.0)
+    until = walk(behind, speed, plan, v_r, other, onset + v_r / at[A_R])[1]
+    if until == math.inf:
+        return 0.0
+    reach = at[U_F] + at[A_F] if until <= stand else math.inf
+    if v_l <= 0.0:
+        slowest = max(v_r - at[A_R] * max(until - onset, 0.0), 0.0)
+        least = least_of_line(slowest - speed, -push, 0.0, 0.0, stand, -share * at[A_L], 0.0, until)
+        return max(least - largest_lead(share, press, reach, bounce, bounce * closing, 0.0, 0.0, 0.0, 0.0, until), 0.0)
+    return least_closing(
+        v_r - speed, -push, onset, -at[A_R], stand, -share * at[A_L],
+        share, press, reach, bounce, bounce * closing, lost, late, end, until,
+    )  # fmt: skip
+
+
+@compiled
+def after_front(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Least squared closing speed at the rear after the leader was met from ``early`` on with at most ``closing``."""
+    share, rest = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    speed = v_l + rest * closing
+    if share * (1.0 + at[RESTITUTION]) <= 1.0:
+        speed -= share * at[RESTITUTION] * closing
+    onset = max(at[ONSET_R] - early, 0.0)
+    fill_drive_then_brake(plan, speed, at[U_F], at[LIMIT_F], math.inf, at[A_F])
+    fill_braking(other, onset, at[A_R])
+    behind = max(at[GAP_L] + at[GAP_R] + way_l - way_r, 0.0)
+    squared = walk(behind, speed, plan, v_r, other, onset + v_r / at[A_R])[2]
+    if rest < at[RESTITUTION] * share:
+        return squared
+    pushed = pushed_by_leader(at, early, late, closing, end, lack, plan, other)
+    return max(squared, pushed * pushed)
+
+
+@compiled
+def braking_after(
+    gap: float, least_gap: float, v_l: float, a_l: float, v_f: float, a_f: float, plan: Floats, other: Floats
+) -> float:
+    """Least squared closing speed with the leader of one that brakes at most with ``a_f``; 0 if none is certain.
+
+    Its gap is at most ``gap``, and at least ``least_gap`` where it matters: behind a leader that brakes harder.
+    """
+    fill_braking(plan, 0.0, a_l)
+    fill_braking(other, 0.0, a_f)
+    squared = walk(gap, v_l, plan, v_f, other, v_f / a_f)[2]
+    if a_f < a_l:
+        w = max(v_f - v_l, 0.0)
+        squared = min(squared, w * w + 2.0 * (a_l - a_f) * max(least_gap, 0.0))
+    return squared
+
+
+@compiled
+def pushed_by_rear(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """Least closing speed at the front, from the centre of mass of both other vehicles; for ``a_f >= a_r``."""
+    share, rest = at[REAR_SHARE], 1.0 - at[REAR_SHARE]
+    v_l = leader(at, early)[0]
+    bounce = at[RESTITUTION]
+    speed = max(follower(at, early)[0] - rest * closing, 0.0)
+    onset = max(at[ONSET_R] - early, 0.0)
+    late, end, lost = late - early, end - early, lack * (end - late)
+    fill_braking(plan, 0.0, at[A_L])
+    fill_window(other, -rest * at[A_F], late, end, rest * lack, onset, -share * at[A_R])
+    until = walk(gap, v_l, plan, speed, other, math.inf)[1]
+    if until == math.inf:
+        return 0.0
+    press, reach = at[A_F] - at[A_R], at[U_F] + at[A_F]
+    if onset > 0.0:
+        press, reach = at[A_F], math.inf
+    return least_closing(
+        speed - v_l, at[A_L] - rest * at[A_F], onset, -share * at[A_R], v_l / at[A_L], -at[A_L],
+        share, press, reach, bounce, bounce * closing, lost, late, end, until,
+    )  # fmt: skip
+
+
+@compiled
+def after_rear(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Least squared closing speed at the front after the rear vehicle was met from ``early`` on, at most ``closing``."""
+    share, rest = at[REAR_SHARE], 1.0 - at[REAR_SHARE]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    speed = v_r - rest * closing
+    if share * (1.0 + at[RESTITUTION]) <= 1.0:
+        speed += share * at[RESTITUTION] * closing
+    speed = max(speed - max(at[A_R] - at[A_F], 0.0) * (late - early), 0.0)
+    gap = max(at[GAP_L] + at[GAP_R] + way_l - way_r, 0.0)
+    least = gap - max(follower(at, late)[1] - way_r - (leader(at, late)[1] - way_l), 0.0)
+    squared = braking_after(gap, least, v_l, at[A_L], speed, at[A_F], plan, other)
+    if at[A_F] < at[A_R]:
+        return squared
+    pushed = pushed_by_rear(at, early, late, closing, end, lack, gap, plan, other)
+    return max(squared, pushed * pushed)
+
+
+@compiled
+def after(
+    kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """``after_front`` or ``after_rear``."""
+    if kind == FRONT_FIRST:
+        return after_front(at, early, late, closing, end, lack, plan, other)
+    return after_rear(at, early, late, closing, end, lack, plan, other)
