@@ -21,11 +21,11 @@ from ethbrake_marl.limits.meetings import (
     GAP_L,
     GAP_R,
     LIMIT_F,
+    OBSTACLE,
     ONSET_R,
     REAR_SHARE,
     RESTITUTION,
     U_F,
-    V_L,
     follower,
     leader,
 )
@@ -33,6 +33,7 @@ from ethbrake_marl.limits.walk import fill_braking, fill_drive_then_brake, fill_
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.worlds import Floats
 
+TOUCHING_M = 1e-6  # nearer than this a leader counts as touching the obstacle
 LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting at which the time is divided, to bound both parts
 
 
@@ -77,7 +78,7 @@ def best_flight(share: float, press: float, reach: float, opening: float) -> flo
 def lead(
     share: float, press: float, reach: float, opening: float, shortest: float, longest: float, lost: float
 ) -> float:
-    """Largest ``flight_lead`` of lengths between ``shortest`` and ``longest``, of which ``lost`` is lost in any case."""
+    """Largest ``flight_lead`` of lengths from ``shortest`` to ``longest``, of which ``lost`` is lost in any case."""
     flight = best_flight(share, press, reach, opening)
     if lost > 0.0 and press > 0.0:
         both = opening + lost
@@ -202,7 +203,10 @@ def pushed_by_leader(
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Least squared closing speed at the rear after the leader was met from ``early`` on with at most ``closing``."""
+    """Least squared closing speed at the rear after the leader was met from ``early`` on with at most ``closing``.
+
+    What is known of the centre of mass does not hold where an obstacle may throw both back.
+    """
     share, rest = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE]
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
@@ -214,10 +218,24 @@ def after_front(
     fill_braking(other, onset, at[A_R])
     behind = max(at[GAP_L] + at[GAP_R] + way_l - way_r, 0.0)
     squared = walk(behind, speed, plan, v_r, other, onset + v_r / at[A_R])[2]
-    if rest < at[RESTITUTION] * share:
+    if rest < at[RESTITUTION] * share or at[OBSTACLE] < math.inf:
         return squared
     pushed = pushed_by_leader(at, early, late, closing, end, lack, plan, other)
     return max(squared, pushed * pushed)
+
+
+@compiled
+def obstacle_harm(at: Floats, early: float, late: float, closing: float) -> float:
+    """Least squared speed at which the leader then meets the obstacle ahead: only its own brakes slow it down.
+
+    None is certain where it stands at the obstacle already: all three are one cluster then.
+    """
+    if not TOUCHING_M < at[OBSTACLE] - at[V_L] * at[V_L] / (2.0 * at[A_L]) < math.inf:
+        return 0.0
+    free = at[OBSTACLE] - leader(at, early)[1]
+    speed = leader(at, late)[0] + (1.0 - at[FRONT_SHARE]) * (1.0 + at[RESTITUTION]) * closing
+    harm: float = max(speed * speed - 2.0 * at[A_L] * free, 0.0)
+    return harm
 
 
 @compiled
@@ -267,7 +285,7 @@ def pushed_by_rear(
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Least squared closing speed at the front after the rear vehicle was met from ``early`` on, at most ``closing``."""
+    """Least squared closing speed at the front after the rear vehicle was met from ``early`` on with ``closing``."""
     share, rest = at[REAR_SHARE], 1.0 - at[REAR_SHARE]
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.limits.aftermath import after
+from ethbrake_marl.limits.aftermath import after, obstacle_harm
 from ethbrake_marl.limits.meetings import (
     A_F,
     A_L,
@@ -25,10 +25,9 @@ from ethbrake_marl.limits.meetings import (
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.worlds import Floats
 
-CELL = 5e-4  # a minimum over meetings is bounded this closely, relative to 1 m2/s2 and to itself
-STACK = 512
-MOST_CELLS = 20_000  # after which a minimum stays as loose as it is
-EARLY, LATE, SOFT, HARD, CELL_WIDTH = range(5)  # columns of the stack: times (s) and closing speeds (m/s) of a cell
+CELL = 1e-3  # a minimum over meetings is bounded this closely, relative to 1 m2/s2 and to itself
+CELLS = 500  # on the heap at once; a minimum that needs more stays as loose as it is then
+HARM, EARLY, LATE, SOFT, HARD, CELL_WIDTH = range(6)  # columns of the heap: bound, times (s), closing speeds (m/s)
 _SPLITS = 64  # parts at most into which decisions divide the times
 _TRIED = 8  # meetings tried before the search, to have something to compare with
 
@@ -48,7 +47,7 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
 
 @compiled
 def decision_around(at: Floats, early: float, late: float) -> tuple[float, float]:
-    """Start and end of the step that holds these times; without decisions, or over more than one step, both ``late``."""
+    """Start and end of the step that holds these times; both ``late`` without decisions or over more than one."""
     step = at[TIME_STEP]
     if step <= 0.0:
         return late, late
@@ -77,9 +76,11 @@ def lacking(kind: int, at: Floats, early: float, late: float, softest: float, ha
     softer = max(hard - softest, 0.0) / (early - begin)
     if turn >= begin:
         share = (turn - begin) / (early - begin)
-        return max(whole - 2.0 * softer - whole * share * share, 0.0)
+        lack: float = max(whole - 2.0 * softer - whole * share * share, 0.0)
+        return lack
     steep = (late - begin) / (begin - turn)
-    return max(whole - softer * (1.0 + steep) / (1.0 + 0.5 * steep), 0.0)
+    lack = max(whole - softer * (1.0 + steep) / (1.0 + 0.5 * steep), 0.0)
+    return lack
 
 
 @compiled
@@ -93,58 +94,100 @@ def harm_of(
     if end > late:
         lack = lacking(kind, at, early, late, gentlest_between(kind, at, early, late), hard, begin)
     follows = after(kind, at, early, late, hard, max(end, late), lack, plan, other)
-    return soft * soft + max(follows, floor)
+    harm = soft * soft + max(follows, floor)
+    return harm + obstacle_harm(at, early, late, soft) if kind == FRONT_FIRST else harm
 
 
 @compiled
-def push(stack: Floats, depth: int, early: float, late: float, soft: float, hard: float) -> int:
-    """Put a cell on the stack; its new depth."""
-    stack[depth, EARLY], stack[depth, LATE], stack[depth, SOFT], stack[depth, HARD] = early, late, soft, hard
-    return depth + 1
+def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
+    """Put a cell on the heap, whose first cell is the one of least harm; the new number of cells."""
+    at = count
+    while at > 0 and heap[(at - 1) // 2, HARM] > harm:
+        heap[at] = heap[(at - 1) // 2]
+        at = (at - 1) // 2
+    heap[at, HARM], heap[at, EARLY], heap[at, LATE], heap[at, SOFT], heap[at, HARD] = harm, early, late, soft, hard
+    return count + 1
+
+
+@compiled
+def drop_first(heap: Floats, count: int) -> int:
+    """Take the first cell off the heap; the new number of cells."""
+    count -= 1
+    at, below = 0, 1
+    while below < count:
+        if below + 1 < count and heap[below + 1, HARM] < heap[below, HARM]:
+            below += 1
+        if heap[below, HARM] >= heap[count, HARM]:
+            break
+        heap[at] = heap[below]
+        at, below = below, 2 * below + 1
+    heap[at] = heap[count]
+    return count
+
+
+@compiled
+def first_cells(
+    kind: int, at: Floats, first: float, last: float, hard: float, floor: float, plan: Floats, other: Floats,
+    heap: Floats,
+) -> int:  # fmt: skip
+    """Put the meetings between two times, at most ``hard``, on the heap: one cell for each step; their number."""
+    count, time = 0, first
+    while time < last:
+        until = next_split(kind, at, time, last) if count < _SPLITS else last
+        soft = gentlest_between(kind, at, time, until)
+        if soft < hard:
+            harm = harm_of(kind, at, time, until, soft, hard, floor, plan, other)
+            count = put(heap, count, harm, time, until, soft, hard)
+        time = until
+    return count
+
+
+@compiled
+def divide(
+    kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
+) -> tuple[int, float]:
+    """Replace the first cell of the heap by its halves; their number, and the harm of a meeting within."""
+    harm, early, late, soft, hard = heap[0, HARM], heap[0, EARLY], heap[0, LATE], heap[0, SOFT], heap[0, HARD]
+    count = drop_first(heap, count)
+    middle = 0.5 * (early + late)
+    if (late - early) * (at[U_F] + at[A_F] + at[A_L]) > hard - soft and early < middle < late:
+        closing = max(soft, gentlest(kind, at, middle)[0])
+        met = harm_of(kind, at, middle, middle, closing, closing, floor, plan, other)
+        least = harm_of(kind, at, middle, late, soft, hard, floor, plan, other)
+        count = put(heap, count, max(least, harm), middle, late, soft, hard)
+        soft, late = max(soft, gentlest_between(kind, at, early, middle)), middle
+    else:
+        middle = 0.5 * (soft + hard)
+        met = harm_of(kind, at, late, late, middle, middle, floor, plan, other)
+        least = harm_of(kind, at, early, late, middle, hard, floor, plan, other)
+        count = put(heap, count, max(least, harm), early, late, middle, hard)
+        hard = middle
+    if soft < hard:
+        least = harm_of(kind, at, early, late, soft, hard, floor, plan, other)
+        count = put(heap, count, max(least, harm), early, late, soft, hard)
+    return count, met
 
 
 @compiled
 def least_harm(
-    kind: int, at: Floats, first: float, last: float, floor: float, best: float, plan: Floats, other: Floats,
-    stack: Floats,
+    kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
+    other: Floats, heap: Floats,
 ) -> float:  # fmt: skip
-    """Lower bound of the harm of all meetings between two times; ``best`` if none does less than that."""
+    """Lower bound of the harm of all meetings between two times; ``best`` if none does less than that.
+
+    ``enough`` is proven without it: where some meeting does no more, 0 is returned at once.
+    """
     for k in range(_TRIED):
         time = first + (last - first) * k / (_TRIED - 1)
         closing = gentlest(kind, at, time)[0]
         best = min(best, harm_of(kind, at, time, time, closing, closing, floor, plan, other))
-    hard = math.sqrt(best)
-    depth, time = 0, first
-    while time < last:
-        until = next_split(kind, at, time, last)
-        if depth + 3 > _SPLITS:
-            until = last
-        depth = push(stack, depth, time, until, gentlest_between(kind, at, time, until), hard)
-        time = until
-    bound = best
-    cells = 0
-    while depth > 0:
-        depth -= 1
-        cells += 1
-        early, late, soft, hard = stack[depth, EARLY], stack[depth, LATE], stack[depth, SOFT], stack[depth, HARD]
-        if soft >= hard:
-            continue
-        harm = harm_of(kind, at, early, late, soft, hard, floor, plan, other)
-        if harm >= best - CELL * (1.0 + best) or depth + 2 > stack.shape[0] or cells > MOST_CELLS:
-            bound = min(bound, harm)
-            continue
-        middle = 0.5 * (early + late)
-        if (late - early) * (at[U_F] + at[A_F] + at[A_L]) > hard - soft and early < middle < late:
-            closing = max(soft, gentlest(kind, at, middle)[0])
-            best = min(best, harm_of(kind, at, middle, middle, closing, closing, floor, plan, other))
-            depth = push(stack, depth, middle, late, soft, hard)
-            depth = push(stack, depth, early, middle, max(soft, gentlest_between(kind, at, early, middle)), hard)
-            continue
-        middle = 0.5 * (soft + hard)
-        best = min(best, harm_of(kind, at, late, late, middle, middle, floor, plan, other))
-        depth = push(stack, depth, early, late, middle, hard)
-        depth = push(stack, depth, early, late, soft, middle)
-    return bound
+    count = first_cells(kind, at, first, last, math.sqrt(best), floor, plan, other, heap)
+    while best > enough and 0 < count < heap.shape[0] - 1 and heap[0, HARM] < best - CELL * (1.0 + best):
+        count, met = divide(kind, at, floor, count, plan, other, heap)
+        best = min(best, met)
+    if best <= enough:
+        return 0.0
+    return min(best, heap[0, HARM]) if count > 0 else best
 
 
 @compiled

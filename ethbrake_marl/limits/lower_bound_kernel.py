@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from ethbrake_marl.limits.avoidability_kernel import largest_behind, spare_gap
 from ethbrake_marl.limits.aftermath import after_front, after_rear
-from ethbrake_marl.limits.first_meeting import CELL_WIDTH, STACK, least_harm
+from ethbrake_marl.limits.avoidability_kernel import largest_behind, spare_gap
+from ethbrake_marl.limits.first_meeting import CELL_WIDTH, CELLS, least_harm
 from ethbrake_marl.limits.meetings import (
     A_F,
     A_L,
@@ -19,6 +19,7 @@ from ethbrake_marl.limits.meetings import (
     LIMIT_F,
     ONSET_R,
     REAR_FIRST,
+    TIME_STEP,
     U_F,
     V_F,
     V_L,
@@ -78,7 +79,9 @@ def last_ahead(at: Floats, first: float, last: float, plan: Floats, other: Float
 
 
 @compiled
-def front_first(at: Floats, floor: float, best: float, plan: Floats, other: Floats, stack: Floats) -> float:
+def front_first(
+    at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
     """Least harm, if below ``best``, where the leader is met first or all three meet at once.
 
     At once: the outer two close with W, of which the front pair has at least the least at that time.
@@ -91,7 +94,7 @@ def front_first(at: Floats, floor: float, best: float, plan: Floats, other: Floa
     if touches:
         last = largest_behind(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F], at[U_F], at[LIMIT_F])[1]
     end = last_ahead(at, first, last, plan, other)
-    best = least_harm(FRONT_FIRST, at, first, end, floor, best, plan, other, stack)
+    best = least_harm(FRONT_FIRST, at, first, end, floor, best, enough, plan, other, heap)
     if touches and end == last:
         best = leaning_harm(at, last, floor, best, plan, other)
         stand = at[V_L] / at[A_L]
@@ -121,7 +124,9 @@ def leaning_harm(at: Floats, time: float, floor: float, best: float, plan: Float
 
 
 @compiled
-def rear_first(at: Floats, floor: float, best: float, plan: Floats, other: Floats, stack: Floats) -> float:
+def rear_first(
+    at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
     """Least harm, if below ``best``, where the rear vehicle is met first."""
     high = max(at[V_F] / at[A_F], at[ONSET_R] + at[V_R] / at[A_R])
     first = meet_rear(at, high, plan, other)
@@ -129,7 +134,7 @@ def rear_first(at: Floats, floor: float, best: float, plan: Floats, other: Float
         return best
     last = meet_rear(at, 0.0, plan, other)
     if last < math.inf:
-        return least_harm(REAR_FIRST, at, first, last, floor, best, plan, other, stack)
+        return least_harm(REAR_FIRST, at, first, last, floor, best, enough, plan, other, heap)
     low, top = 0.0, high
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + top)
@@ -138,8 +143,9 @@ def rear_first(at: Floats, floor: float, best: float, plan: Floats, other: Float
         else:
             low = middle
     last = meet_rear(at, top, plan, other)
-    best = least_harm(REAR_FIRST, at, first, last, floor, best, plan, other, stack)
-    return leaned_on_harm(at, last, max(last, at[ONSET_R]) + _GRAZE_S, floor, best, plan, other)
+    best = least_harm(REAR_FIRST, at, first, last, floor, best, enough, plan, other, heap)
+    late = max(last, high, at[V_L] / at[A_L]) if at[A_F] >= at[A_R] else max(last, at[ONSET_R]) + _GRAZE_S
+    return leaned_on_harm(at, last, late, floor, best, plan, other)
 
 
 @compiled
@@ -148,7 +154,7 @@ def leaned_on_harm(
 ) -> float:
     """Least harm, if below ``best``, of the meetings with the rear vehicle from ``early`` on, however soft.
 
-    One that brakes harder than the controlled vehicle can lean on it only until it brakes: to ``late``.
+    Until ``late``: one that brakes harder than the controlled vehicle can lean on it only before it brakes.
     """
     soft = 0.0
     while soft * soft < best:
@@ -161,7 +167,7 @@ def leaned_on_harm(
 
 @compiled
 def combined_bound(
-    at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, stack: Floats
+    at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
     """Least harm of a world in which contact is unavoidable, whoever is met first; 0 if that may be after ``until``.
 
@@ -170,11 +176,18 @@ def combined_bound(
     stand = at[ONSET_R] + at[V_R] / at[A_R]
     way = solo_motion(at[V_R], -at[A_R], at[ONSET_R], math.inf, stand)[1]
     room = at[GAP_L] + at[V_L] * at[V_L] / (2.0 * at[A_L]) + at[GAP_R] - way
-    if not stand + math.sqrt(2.0 * max(room, 0.0) / at[A_F]) < until:
+    rest = at[ONSET_R] + at[V_R] / min(at[A_R], at[A_F])
+    if not max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[A_F])) < until:
         return 0.0
-    best = front_first(at, rear, LARGE, plan, other, stack)
-    best = rear_first(at, front, best, plan, other, stack)
-    return max(best - _TOUCH_HARM, 0.0) if best < LARGE else 0.0
+    step, least = at[TIME_STEP], 0.0
+    for time_step in (0.0, step):  # what holds for any command holds for one that changes at decisions only
+        at[TIME_STEP] = time_step
+        best = front_first(at, rear, LARGE, front + rear, plan, other, heap)
+        best = rear_first(at, front, best, front + rear, plan, other, heap)
+        least = max(least, best - _TOUCH_HARM if best < LARGE else 0.0)
+        if step <= 0.0:
+            break
+    return least
 
 
 @compiled
@@ -185,7 +198,7 @@ def bound_worlds(
 
     Each pair's where it exists, both together where contact is unavoidable.
     """
-    plan, other, stack = empty_plan(), empty_plan(), np.empty((STACK, CELL_WIDTH))
+    plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, CELL_WIDTH))
     for k in range(states.shape[0]):
         front, rear = 0.0, 0.0
         if has_front[k]:
@@ -196,4 +209,4 @@ def bound_worlds(
             rear = squared if time < until[k] and squared > _TOUCH_HARM else 0.0
         out[k, FRONT_BOUND], out[k, REAR_BOUND], out[k, COMBINED_BOUND] = front, rear, 0.0
         if unavoidable[k]:
-            out[k, COMBINED_BOUND] = combined_bound(states[k], until[k], front, rear, plan, other, stack)
+            out[k, COMBINED_BOUND] = combined_bound(states[k], until[k], front, rear, plan, other, heap)

@@ -28,7 +28,8 @@ FRONT_SHARE = 11  # m_l / (m_l + m_f)
 REAR_SHARE = 12  # m_r / (m_f + m_r)
 RESTITUTION = 13
 TIME_STEP = 14  # between two decisions (s), the first one now; 0 where commands may change at any time
-WIDTH = 15
+OBSTACLE = 15  # gap from the leader to an obstacle ahead of it (m), which it does not reach by itself; inf without
+WIDTH = 16
 FRONT_FIRST, REAR_FIRST = 0, 1
 _HALVINGS = 60
 _GUARD = 2.0**-46  # of the positions: a way that rounding shortens must not make a meeting look harder
@@ -88,7 +89,7 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
 
 @compiled
 def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
-    """Least closing speed of a meeting with the rear vehicle at ``time``, and how long it must be braked before driving.
+    """Least closing speed of a meeting with the rear vehicle at ``time``, and how long it must be braked before.
 
     The fastest way to be there then: brake, then drive. The braking is infinite where that is at its speed limit.
     """

@@ -41,9 +41,7 @@ def fill_braking(plan: Floats, onset: float, braking: float) -> None:
 
 
 @compiled
-def fill_window(
-    plan: Floats, u: float, late: float, end: float, change: float, turn: float, step: float
-) -> None:
+def fill_window(plan: Floats, u: float, late: float, end: float, change: float, turn: float, step: float) -> None:
     """Acceleration ``u``, from ``turn`` on ``step`` more, and from ``late`` to ``end`` also ``change`` more."""
     first, second, third = min(turn, late), min(max(turn, late), end), max(turn, end)
     u_1 = u + step if turn < late else u + change
