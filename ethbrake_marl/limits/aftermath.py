@@ -26,6 +26,7 @@ from ethbrake_marl.limits.meetings import (
     REAR_SHARE,
     RESTITUTION,
     U_F,
+    V_L,
     follower,
     leader,
 )
