@@ -132,8 +132,9 @@ def test_proofs__cover_an_obstacle_that_full_braking_never_meets_and_refuse_the_
     near = NEAR.sample(200, 7).worlds
     with pytest.raises(InvalidInput, match=r"obstacle_gap_m\[\d+\] = .*: must be beyond full braking of vehicle_1"):
         avoidability(near)
-    with pytest.raises(InvalidInput, match="lower_bound: worlds with an obstacle ahead"):
-        lower_bound(worlds)
+    with pytest.raises(InvalidInput, match=r"obstacle_gap_m\[\d+\] = .*: must be beyond full braking of vehicle_1"):
+        lower_bound(near)
+    assert np.all(lower_bound(worlds).front_pair == lower_bound(plain).front_pair)
     with pytest.raises(InvalidInput, match="avoidable_by_lp: obstacle_gap_m 42: the programme knows no obstacle"):
         avoidable_by_lp(worlds.take([0]), [1], 0.1)
 

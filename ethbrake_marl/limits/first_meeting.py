@@ -26,7 +26,7 @@ from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.worlds import Floats
 
 CELL = 1e-3  # a minimum over meetings is bounded this closely, relative to 1 m2/s2 and to itself
-CELLS = 500  # on the heap at once; a minimum that needs more stays as loose as it is then
+CELLS = 600  # room on the heap: after that many divisions a minimum stays as loose as it is
 HARM, EARLY, LATE, SOFT, HARD, CELL_WIDTH = range(6)  # columns of the heap: bound, times (s), closing speeds (m/s)
 _SPLITS = 64  # parts at most into which decisions divide the times
 _TRIED = 8  # meetings tried before the search, to have something to compare with
@@ -182,7 +182,9 @@ def least_harm(
         closing = gentlest(kind, at, time)[0]
         best = min(best, harm_of(kind, at, time, time, closing, closing, floor, plan, other))
     count = first_cells(kind, at, first, last, math.sqrt(best), floor, plan, other, heap)
-    while best > enough and 0 < count < heap.shape[0] - 1 and heap[0, HARM] < best - CELL * (1.0 + best):
+    for _ in range(heap.shape[0] - _SPLITS - 2):
+        if best <= enough or count == 0 or heap[0, HARM] >= best - CELL * (1.0 + best):
+            break
         count, met = divide(kind, at, floor, count, plan, other, heap)
         best = min(best, met)
     if best <= enough:
