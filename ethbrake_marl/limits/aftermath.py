@@ -31,7 +31,7 @@ from ethbrake_marl.limits.meetings import (
     leader,
 )
 from ethbrake_marl.limits.walk import fill_braking, fill_drive_then_brake, fill_window, walk
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
 from ethbrake_marl.physics.worlds import Floats
 
 TOUCHING_M = 1e-6  # nearer than this a leader counts as touching the obstacle
@@ -75,7 +75,7 @@ def best_flight(share: float, press: float, reach: float, opening: float) -> flo
     return max(reach * opening / (root * (slope + root)), 2.0 * opening / press)
 
 
-@compiled
+@compiled_apart
 def lead(
     share: float, press: float, reach: float, opening: float, shortest: float, longest: float, lost: float
 ) -> float:
@@ -101,7 +101,7 @@ def decays(share: float, press: float, reach: float, bounce: float) -> bool:
     return bounce * flight_lead(share, press, reach, 1.0, best_flight(share, press, reach, 1.0)) <= 1.0 - share
 
 
-@compiled
+@compiled_apart
 def largest_lead(
     share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
     since: float, until: float,
@@ -142,7 +142,7 @@ def least_of_line(
     return least
 
 
-@compiled
+@compiled_apart
 def least_closing(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
     press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
@@ -165,7 +165,7 @@ def least_closing(
     return max(best, 0.0)
 
 
-@compiled
+@compiled_apart
 def pushed_by_leader(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
@@ -200,7 +200,7 @@ def pushed_by_leader(
     )  # fmt: skip
 
 
-@compiled
+@compiled_apart
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
@@ -239,7 +239,7 @@ def obstacle_harm(at: Floats, early: float, late: float, closing: float) -> floa
     return harm
 
 
-@compiled
+@compiled_apart
 def braking_after(
     gap: float, least_gap: float, v_l: float, a_l: float, v_f: float, a_f: float, plan: Floats, other: Floats
 ) -> float:
@@ -256,7 +256,7 @@ def braking_after(
     return squared
 
 
-@compiled
+@compiled_apart
 def pushed_by_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
     other: Floats,
@@ -282,7 +282,7 @@ def pushed_by_rear(
     )  # fmt: skip
 
 
-@compiled
+@compiled_apart
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
@@ -303,7 +303,7 @@ def after_rear(
     return max(squared, pushed * pushed)
 
 
-@compiled
+@compiled_apart
 def after(
     kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
     other: Floats,

@@ -22,7 +22,7 @@ from ethbrake_marl.limits.meetings import (
     gentlest,
     leader,
 )
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
 from ethbrake_marl.physics.worlds import Floats
 
 CELL = 1e-3  # a minimum over meetings is bounded this closely, relative to 1 m2/s2 and to itself
@@ -32,7 +32,7 @@ _SPLITS = 64  # parts at most into which decisions divide the times
 _TRIED = 8  # meetings tried before the search, to have something to compare with
 
 
-@compiled
+@compiled_apart
 def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     """Least closing speed of the meetings between two times.
 
@@ -57,7 +57,7 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
     return begin, begin + step
 
 
-@compiled
+@compiled_apart
 def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
     """How much the command in force at the meetings of a cell lacks, at least, of the extreme one that follows best.
 
@@ -83,7 +83,7 @@ def lacking(kind: int, at: Floats, early: float, late: float, softest: float, ha
     return lack
 
 
-@compiled
+@compiled_apart
 def harm_of(
     kind: int, at: Floats, early: float, late: float, soft: float, hard: float, floor: float, plan: Floats,
     other: Floats,
@@ -98,7 +98,7 @@ def harm_of(
     return harm + obstacle_harm(at, early, late, soft) if kind == FRONT_FIRST else harm
 
 
-@compiled
+@compiled_apart
 def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
     """Put a cell on the heap, whose first cell is the one of least harm; the new number of cells."""
     at = count
@@ -109,7 +109,7 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
     return count + 1
 
 
-@compiled
+@compiled_apart
 def drop_first(heap: Floats, count: int) -> int:
     """Take the first cell off the heap; the new number of cells."""
     count -= 1
@@ -125,7 +125,7 @@ def drop_first(heap: Floats, count: int) -> int:
     return count
 
 
-@compiled
+@compiled_apart
 def first_cells(
     kind: int, at: Floats, first: float, last: float, hard: float, floor: float, plan: Floats, other: Floats,
     heap: Floats,
@@ -142,7 +142,7 @@ def first_cells(
     return count
 
 
-@compiled
+@compiled_apart
 def divide(
     kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
 ) -> tuple[int, float]:
@@ -168,7 +168,7 @@ def divide(
     return count, met
 
 
-@compiled
+@compiled_apart
 def least_harm(
     kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
     other: Floats, heap: Floats,

@@ -30,7 +30,7 @@ from ethbrake_marl.limits.meetings import (
     stays_ahead,
 )
 from ethbrake_marl.limits.walk import empty_plan, fill_braking, fill_drive_then_brake, walk
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
 from ethbrake_marl.physics.events import TOUCH_SPEED_MPS, solo_motion
 from ethbrake_marl.physics.worlds import Bools, Floats
 
@@ -61,7 +61,7 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
     return squared, time
 
 
-@compiled
+@compiled_apart
 def last_ahead(at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
     """The latest time, at most ``last``, of a meeting with the leader before which the rear vehicle has not come.
 
@@ -78,7 +78,7 @@ def last_ahead(at: Floats, first: float, last: float, plan: Floats, other: Float
     return last
 
 
-@compiled
+@compiled_apart
 def front_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
@@ -111,7 +111,7 @@ def front_first(
     return min(best, front * front + rear * rear)
 
 
-@compiled
+@compiled_apart
 def leaning_harm(at: Floats, time: float, floor: float, best: float, plan: Floats, other: Floats) -> float:
     """Least harm, if below ``best``, of the meetings with the leader from ``time`` on, however soft."""
     soft = 0.0
@@ -123,7 +123,7 @@ def leaning_harm(at: Floats, time: float, floor: float, best: float, plan: Float
     return best
 
 
-@compiled
+@compiled_apart
 def rear_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
@@ -148,7 +148,7 @@ def rear_first(
     return leaned_on_harm(at, last, late, floor, best, plan, other)
 
 
-@compiled
+@compiled_apart
 def leaned_on_harm(
     at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
 ) -> float:
@@ -165,7 +165,7 @@ def leaned_on_harm(
     return best
 
 
-@compiled
+@compiled_apart
 def combined_bound(
     at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:

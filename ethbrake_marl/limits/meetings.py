@@ -16,7 +16,7 @@ from ethbrake_marl.limits.walk import (
     time_to_limit,
     walk,
 )
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
 from ethbrake_marl.physics.events import solo_motion
 from ethbrake_marl.physics.worlds import Floats
 
@@ -50,7 +50,7 @@ def follower(at: Floats, time: float) -> tuple[float, float]:
     return speed, way
 
 
-@compiled
+@compiled_apart
 def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
     """Least closing speed of a meeting with the leader at ``time``, and how long it must be driven before braking.
 
@@ -87,7 +87,7 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
     return way, slow + drive * (left - beyond)
 
 
-@compiled
+@compiled_apart
 def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
     """Least closing speed of a meeting with the rear vehicle at ``time``, and how long it must be braked before.
 
@@ -106,13 +106,13 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
     return max(v_r - speed, 0.0), low if speed < at[LIMIT_F] else math.inf
 
 
-@compiled
+@compiled_apart
 def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
     """``gentlest_front`` or ``gentlest_rear``."""
     return gentlest_front(at, time) if kind == FRONT_FIRST else gentlest_rear(at, time)
 
 
-@compiled
+@compiled_apart
 def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
     """When one that drives for ``drive``, then brakes, meets the leader."""
     fill_drive_then_brake(plan, at[V_F], at[U_F], at[LIMIT_F], drive, at[A_F])
@@ -120,7 +120,7 @@ def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
     return walk(at[GAP_L], at[V_L], other, at[V_F], plan, math.inf)[1]
 
 
-@compiled
+@compiled_apart
 def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
     """When the rear vehicle meets one that brakes for ``brake``, then drives."""
     fill_brake_then_drive(plan, at[V_F], at[U_F], at[LIMIT_F], brake, at[A_F])
@@ -128,7 +128,7 @@ def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
     return walk(at[GAP_R], at[V_F], plan, at[V_R], other, at[ONSET_R] + at[V_R] / at[A_R])[1]
 
 
-@compiled
+@compiled_apart
 def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Floats) -> bool:
     """Whether one that drives for ``drive``, then brakes, is not met from behind until then."""
     fill_drive_then_brake(plan, at[V_F], at[U_F], at[LIMIT_F], drive, at[A_F])

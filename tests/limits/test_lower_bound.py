@@ -10,16 +10,16 @@ import pytest
 from ethbrake_marl import load_scenario
 from ethbrake_marl.agents import optimise_coupled
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.limits.avoidability import avoidability
 from ethbrake_marl.limits.aftermath import after
+from ethbrake_marl.limits.avoidability import avoidability
 from ethbrake_marl.limits.lower_bound import lower_bound, rounding
 from ethbrake_marl.limits.meetings import (
     A_F,
     A_L,
     A_R,
+    FRONT_FIRST,
     FRONT_SHARE,
     GAP_L,
-    FRONT_FIRST,
     GAP_R,
     LIMIT_F,
     OBSTACLE,
@@ -145,9 +145,7 @@ def test_best_known_harm__is_never_below_the_bound_and_near_it(name, n, harm_cou
     scenario = load_scenario(name)
     worlds = scenario.sample(n, seed=7).worlds
     known, verdict = best_known(worlds, Task(scenario, scenario.learners))[harm_count], avoidability(worlds)
-    bound = lower_bound(
-        worlds, harm_count=harm_count, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s
-    )
+    bound = lower_bound(worlds, harm_count=harm_count, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
     assert np.all(bound.harm <= known)
     assert bound.harm.mean() > 0.95 * known.mean()
     assert np.all(known[verdict.avoidable] == 0)

@@ -49,7 +49,9 @@ def test_command_in_force__the_way_to_meet_gently_is_the_wrong_one_after_it():
     at[meetings.GAP_L] = 10.0
     at[meetings.V_F] = 8.0
     closing, drive = gentlest_front(at, 1.5)
-    assert drive == pytest.approx(1.5 - math.sqrt(2 * (12 - 10) / 8)) and closing == pytest.approx(8 - 8 * math.sqrt(0.5))
+    assert drive == pytest.approx(1.5 - math.sqrt(2 * (12 - 10) / 8)) and closing == pytest.approx(
+        8 - 8 * math.sqrt(0.5)
+    )
     # 0.5 s at c instead of -8 and braking earlier instead: the speed at the end is higher by (8 + c) / 2 times 0.5 s or
     # more. So with 0.5 m/s more than the least, c is at most 2 * 0.5 / 0.5 above -8 and lacks 6 of 8.
     lack = lacking(FRONT_FIRST, at, 1.5, 1.5, closing, closing + 0.5, 1.0)
