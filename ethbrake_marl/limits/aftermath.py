@@ -79,13 +79,20 @@ def best_flight(share: float, press: float, reach: float, opening: float) -> flo
 def lead(
     share: float, press: float, reach: float, opening: float, shortest: float, longest: float, lost: float
 ) -> float:
-    """Largest ``flight_lead`` of lengths from ``shortest`` to ``longest``, of which ``lost`` is lost in any case."""
+    """Largest ``flight_lead`` of lengths from ``shortest`` to ``longest``, of which ``lost`` is lost in any case.
+
+    Of all openings up to ``opening``: where flights are cut short, a smaller one may lead further.
+    """
+    if press > 0.0:
+        opening = min(opening, 0.5 * press * longest)
     flight = best_flight(share, press, reach, opening)
     if lost > 0.0 and press > 0.0:
         both = opening + lost
         flight = max(flight, (both + math.sqrt(max(both * both - press * lost * lost / reach, 0.0))) / press)
     flight = min(max(flight, shortest), longest)
-    most = share * (press * flight - opening) - lost if press > 0.0 else -lost
+    most = share * press * flight - lost if press > 0.0 else -lost
+    if flight < longest and press > 0.0:
+        most -= share * opening
     return min(flight_lead(share, press, reach, opening, flight), most) if press > 0.0 else most
 
 
@@ -189,7 +196,7 @@ def pushed_by_leader(
     until = walk(behind, speed, plan, v_r, other, onset + v_r / at[A_R])[1]
     if until == math.inf:
         return 0.0
-    reach = at[U_F] + at[A_F] if until <= stand else math.inf
+    reach = at[U_F] + at[A_F] if until * at[A_L] <= v_l else math.inf  # the leader moves, however soft the impact
     if v_l <= 0.0:
         slowest = max(v_r - at[A_R] * max(until - onset, 0.0), 0.0)
         least = least_of_line(slowest - speed, -push, 0.0, 0.0, stand, -share * at[A_L], 0.0, until)
