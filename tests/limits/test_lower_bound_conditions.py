@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.limits import meetings
-from ethbrake_marl.limits.aftermath import after_front, after_rear, lead, obstacle_harm
+from ethbrake_marl.limits.aftermath import after_front, after_rear, obstacle_harm
 from ethbrake_marl.limits.first_meeting import lacking
+from ethbrake_marl.limits.flights import lead
 from ethbrake_marl.limits.meetings import FRONT_FIRST, OBSTACLE, REAR_FIRST, WIDTH, gentlest_front
 from ethbrake_marl.limits.walk import empty_plan
 

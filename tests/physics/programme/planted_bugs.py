@@ -35,7 +35,7 @@ EVENTS, IMPACT, SEGMENT, ADVANCE = (
     f"ethbrake_marl/physics/{name}.py" for name in ("events", "impact", "segment", "advance")
 )
 HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/obstacle.py"
-AFTERMATH, LOWER_BOUND = (f"ethbrake_marl/limits/{name}.py" for name in ("aftermath", "lower_bound"))
+FLIGHTS, LOWER_BOUND = (f"ethbrake_marl/limits/{name}.py" for name in ("flights", "lower_bound"))
 PROFILES = "ethbrake_marl/search/profiles.py"
 
 
@@ -145,7 +145,7 @@ BUGS: dict[str, tuple[Patch, ...]] = {
         Patch(IMPACT, "    if bounce == 0.0:\n", "    if bounce == -1.0:\n"),
     ),
     "lower bound: a flight that costs no command": (
-        Patch(AFTERMATH, "return relative - reach * flight + math.sqrt(inside)", "return relative"),
+        Patch(FLIGHTS, "return relative - reach * flight + math.sqrt(inside)", "return relative"),
     ),
     "lower bound not rounded outward": (
         Patch(LOWER_BOUND, "np.maximum(part - rounding(worlds, vehicle), 0.0)", "np.maximum(part, 0.0)"),
