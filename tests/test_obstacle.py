@@ -132,8 +132,9 @@ def test_proofs__cover_an_obstacle_that_full_braking_never_meets_and_refuse_the_
     near = NEAR.sample(200, 7).worlds
     with pytest.raises(InvalidInput, match=r"obstacle_gap_m\[\d+\] = .*: must be beyond full braking of vehicle_1"):
         avoidability(near)
-    with pytest.raises(InvalidInput, match="lower_bound: worlds with an obstacle ahead"):
-        lower_bound(worlds)
+    with pytest.raises(InvalidInput, match=r"obstacle_gap_m\[\d+\] = .*: must be beyond full braking of vehicle_1"):
+        lower_bound(near)
+    assert np.all(lower_bound(worlds).front_pair == lower_bound(plain).front_pair)
     with pytest.raises(InvalidInput, match="avoidable_by_lp: obstacle_gap_m 42: the programme knows no obstacle"):
         avoidable_by_lp(worlds.take([0]), [1], 0.1)
 
@@ -196,3 +197,13 @@ def test_manifest__a_policys_observation_is_known_again_by_its_features(name):
     schema = observation_schema(spec)
     assert schema.spec == spec and observation_schema(schema.spec) == schema
     assert set(schema.model_dump()) == {"front", "rear", "features", "scaling_sha256"}  # as in every shipped policy
+
+
+def test_lower_bound__knows_what_a_pushed_vehicle_does_at_the_obstacle():
+    scenario = ALL.with_learners([1])
+    worlds = scenario.sample(40, 7).worlds
+    bound = lower_bound(worlds, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
+    for harm_count in ("first", "total"):
+        found = best_harm(scenario, worlds, counts=(harm_count,), budget=500, threads=1).best[harm_count].harm
+        assert np.all(bound.harm <= found)
+    assert bound.harm.mean() > 1.0

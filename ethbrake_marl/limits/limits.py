@@ -78,7 +78,9 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
     if obstacle_ahead(worlds).any():
         contact, harm = avoidability(worlds, task.vehicle), None
     else:
-        bound = lower_bound(worlds, task.vehicle, harm_count="first", horizon_s=task.scenario.horizon_s)
+        bound = lower_bound(
+            worlds, task.vehicle, horizon_s=task.scenario.horizon_s, time_step_s=task.scenario.time_step_s
+        )
         contact, harm = bound.contact, bound.harm
     return Proof(contact.avoidable, contact.reason_name, harm)
 

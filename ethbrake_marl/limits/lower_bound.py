@@ -5,8 +5,8 @@ pushing as the physics has them:
 
 * front pair alone: the closing speed of full braking, since a push from behind only makes it worse;
 * rear pair alone: the closing speed of full drive;
-* both together, where contact is unavoidable: whichever neighbour is met first and however softly, what follows at the
-  other one is bounded by momentum and energy.
+* both together, where contact is unavoidable: whichever neighbour is met first, whenever and however softly, what
+  follows at the other one is bounded by the motion of the centre of mass.
 
 To these comes what has happened, for certain, before the vehicle may act.
 
@@ -33,9 +33,11 @@ from ethbrake_marl.limits.meetings import (
     GAP_L,
     GAP_R,
     LIMIT_F,
+    OBSTACLE,
     ONSET_R,
     REAR_SHARE,
     RESTITUTION,
+    TIME_STEP,
     U_F,
     V_F,
     V_L,
@@ -75,20 +77,23 @@ def lower_bound(
     harm_count: HarmCount = "first",
     horizon_s: float = 8.0,
     scripts: Mapping[int, str] | None = None,
+    time_step_s: float | None = None,
 ) -> LowerBound:
     """Proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicle``.
 
     ``harm = early + max(front_pair + rear_pair, combined)``, each part rounded outward (``rounding``). The combined
-    bound is proven for a controlled vehicle that brakes at least as hard as both neighbours; elsewhere it is 0. What
-    may come only after the horizon counts as 0, and so does the next impact of a pair that was hit before where
-    ``harm_count`` is "first".
+    bound is 0 where contact can be avoided. What may come only after the horizon counts as 0, and so does the next
+    impact of a pair that was hit before where ``harm_count`` is "first".
 
-    Covers the same lines as ``avoidability``, without an obstacle ahead, and raises ``InvalidInput`` for others, for an
-    unknown ``harm_count``, and for a horizon that is not finite or lies before the vehicle may act.
+    With ``time_step_s`` it is proven only for commands that change at decisions, the first one when the vehicle may
+    act, one every ``time_step_s`` after it: what every agent drives. That is sharper, and takes ten times as long.
+
+    Covers the same lines as ``avoidability``, and raises ``InvalidInput`` for others, for an unknown ``harm_count``, a
+    time step that is not positive, and a horizon that is not finite or lies before the vehicle may act.
     """
     check_harm_count(harm_count)
-    if np.isfinite(worlds.obstacle_gap_m).any():
-        raise InvalidInput("lower_bound: worlds with an obstacle ahead (obstacle_gap_m); the proofs know none")
+    if time_step_s is not None and not 0.0 < time_step_s < np.inf:
+        raise InvalidInput(f"lower_bound: time_step_s {time_step_s!r}: must be a positive number of seconds, or None")
     verdict = avoidability(worlds, vehicle, scripts=scripts)
     start = np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
@@ -103,7 +108,7 @@ def lower_bound(
     has_rear = open_pair[:, vehicle] if vehicle < worlds.N - 1 else none
     unavoidable = has_front & has_rear & (verdict.reason >= 2)
     out = np.empty((worlds.n, BOUNDS))
-    bound_worlds(_states(at_onset, vehicle), horizon_s - start, has_front, has_rear, unavoidable, out)
+    bound_worlds(_states(at_onset, vehicle, time_step_s), horizon_s - start, has_front, has_rear, unavoidable, out)
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
     early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)
@@ -130,7 +135,7 @@ def rounding(worlds: Worlds, vehicle: int) -> Floats:
     return outward
 
 
-def _states(worlds: Worlds, i: int) -> Floats:
+def _states(worlds: Worlds, i: int, time_step_s: float | None) -> Floats:
     """The rows of the compiled bounds [n, WIDTH]; columns of a neighbour that is not there stay 0."""
     v = worlds.vehicles
     at = np.zeros((worlds.n, WIDTH))
@@ -140,6 +145,8 @@ def _states(worlds: Worlds, i: int) -> Floats:
         U_F: v.driving_capacity_mps2[:, i],
         LIMIT_F: v.speed_limit_mps[:, i],
         RESTITUTION: v.restitution,
+        OBSTACLE: worlds.obstacle_gap_m if i == 1 else np.inf,
+        TIME_STEP: 0.0 if time_step_s is None else time_step_s,
     }
     if i > 0:
         columns[GAP_L] = worlds.gaps_m[:, i - 1]

@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 
+from ethbrake_marl.limits.aftermath import after_front, after_rear
 from ethbrake_marl.limits.avoidability_kernel import largest_behind, spare_gap
+from ethbrake_marl.limits.first_meeting import CELL_WIDTH, CELLS, least_harm
 from ethbrake_marl.limits.meetings import (
     A_F,
     A_L,
@@ -17,26 +19,26 @@ from ethbrake_marl.limits.meetings import (
     LIMIT_F,
     ONSET_R,
     REAR_FIRST,
-    REAR_SHARE,
+    TIME_STEP,
     U_F,
     V_F,
     V_L,
     V_R,
-    after,
-    meet,
+    gentlest_front,
     meet_front,
     meet_rear,
+    stays_ahead,
 )
 from ethbrake_marl.limits.walk import empty_plan, fill_braking, fill_drive_then_brake, walk
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
 from ethbrake_marl.physics.events import TOUCH_SPEED_MPS, solo_motion
 from ethbrake_marl.physics.worlds import Bools, Floats
 
 FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
-CELL = 1e-3  # a minimum over meetings is bounded this closely, relative to 1 m2/s2 and to itself
+LARGE = 1e6  # m2/s2: more harm than any impact of vehicles does
 _TOUCH_HARM = 2.0 * TOUCH_SPEED_MPS * TOUCH_SPEED_MPS  # what two touches may hide
 _HALVINGS = 60
-_STACK = 128
+_GRAZE_S = 1e-3  # more than rounding can move a graze
 
 
 @compiled
@@ -59,141 +61,133 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
     return squared, time
 
 
-@compiled
-def least_harm(
-    kind: int, at: Floats, low: float, least: float, high: float, floor: float, plan: Floats, other: Floats,
-    stack: Floats,
-) -> float:  # fmt: skip
-    """Lower bound of ``closing^2 + max(after, floor)`` over all meetings of this kind with a parameter >= ``low``.
+@compiled_apart
+def last_ahead(at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
+    """The latest time, at most ``last``, of a meeting with the leader before which the rear vehicle has not come.
 
-    With the parameter (how long to drive, or to brake) the closing speed rises from ``least`` and the meeting comes
-    earlier; ``after`` falls with the closing speed and rises with the time. So a cell is bounded by the closing speed
-    of its low end and what follows its high end. Cells are halved until they come close to the best. Meetings harder
-    than that of ``high``, the earliest one, are bounded in the same way in cells of the closing speed.
+    At ``first`` there is room. The later the meeting, the shorter the drive before it and the less room behind.
     """
-    time, closing = meet(kind, at, high, plan, other)
-    if time == math.inf:
-        return 0.0
-    best = closing * closing + max(after(kind, at, time, closing, plan, other), floor)
-    bound, slow, step = math.inf, closing, 0.02 * (1.0 + closing)
-    while slow * slow < min(best, bound):
-        bound = min(bound, slow * slow + max(after(kind, at, time, slow + step, plan, other), floor))
-        slow += step
-    push(stack, 0, low, least, high, time, closing)
-    depth = 1
-    while depth > 0:
-        depth -= 1
-        low, least, high, time, closing = stack[depth]
-        cell = least * least + max(after(kind, at, time, closing, plan, other), floor)
-        middle = 0.5 * (low + high)
-        if cell >= min(best, bound) - CELL * (1.0 + best) or depth + 2 > stack.shape[0] or not low < middle < high:
-            bound = min(bound, cell)
-            continue
-        then, pace = meet(kind, at, middle, plan, other)
-        best = min(best, pace * pace + max(after(kind, at, then, pace, plan, other), floor))
-        push(stack, depth, low, least, middle, then, pace)
-        push(stack, depth + 1, middle, pace, high, time, closing)
-        depth += 2
-    return bound
-
-
-@compiled
-def push(stack: Floats, row: int, low: float, least: float, high: float, time: float, closing: float) -> None:
-    """Put one cell into its row of the stack."""
-    stack[row, 0], stack[row, 1], stack[row, 2], stack[row, 3], stack[row, 4] = low, least, high, time, closing
-
-
-@compiled
-def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Floats) -> bool:
-    """Whether one that drives for ``drive``, then brakes, is not met from behind until then (1e-9 m are forgiven)."""
-    fill_drive_then_brake(plan, at[V_F], at[U_F], at[LIMIT_F], drive, at[A_F])
-    fill_braking(other, at[ONSET_R], at[A_R])
-    return walk(at[GAP_R], at[V_F], plan, at[V_R], other, until)[0] >= -1e-9
-
-
-@compiled
-def gentlest_front_meeting(at: Floats, high: float, plan: Floats, other: Floats) -> tuple[float, float]:
-    """The shortest drive (low side) after which braking meets the leader, but not before the rear vehicle comes.
-
-    And the closing speed there. The longer the drive, the earlier the meeting and the more room behind; at ``high``
-    there is room.
-    """
-    low, touch = 0.0, math.inf
-    if spare_gap(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F]) >= 0.0:
-        low, touch, _ = largest_behind(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F], at[U_F], at[LIMIT_F])
-    time, least = meet_front(at, low, plan, other)
-    if stays_ahead(at, low, min(time, touch), plan, other):
-        return low, least
+    if stays_ahead(at, gentlest_front(at, last)[1], last, plan, other):
+        return last
     for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        time, closing = meet_front(at, middle, plan, other)
-        if stays_ahead(at, middle, time, plan, other):
-            high = middle
+        middle = 0.5 * (first + last)
+        if stays_ahead(at, gentlest_front(at, middle)[1], middle, plan, other):
+            first = middle
         else:
-            low, least = middle, closing
-    return low, least
+            last = middle
+    return last
 
 
-@compiled
-def front_first(at: Floats, floor: float, plan: Floats, other: Floats, stack: Floats) -> float:
-    """Least harm if the leader is met first or all three meet at once; inf if the rear vehicle always comes before.
+@compiled_apart
+def front_first(
+    at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Least harm, if below ``best``, where the leader is met first or all three meet at once.
 
-    At once: the outer two close with W, of which the front pair has at least ``least``. Needs ``a_f >= a_l``.
+    At once: the outer two close with W, of which the front pair has at least the least at that time.
     """
-    high, _ = meet_front(at, math.inf, plan, other)
-    if high == math.inf or not stays_ahead(at, high, high, plan, other):
-        return math.inf
-    low, least = gentlest_front_meeting(at, high, plan, other)
-    bound = least_harm(FRONT_FIRST, at, low, least, high, floor, plan, other, stack)
+    first = meet_front(at, math.inf, plan, other)
+    if first == math.inf or not stays_ahead(at, first, first, plan, other):
+        return best
+    touches = spare_gap(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F]) >= 0.0
+    last = meet_front(at, 0.0, plan, other)
+    if touches:
+        last = largest_behind(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F], at[U_F], at[LIMIT_F])[1]
+    end = last_ahead(at, first, last, plan, other)
+    best = least_harm(FRONT_FIRST, at, first, end, floor, best, enough, plan, other, heap)
+    if touches and end == last:
+        best = leaning_harm(at, last, floor, best, plan, other)
+        stand = at[V_L] / at[A_L]
+        if last < stand:
+            best = leaning_harm(at, stand, floor, best, plan, other)
     fill_braking(plan, 0.0, at[A_L])
     fill_braking(other, at[ONSET_R], at[A_R])
     _, time, squared = walk(at[GAP_L] + at[GAP_R], at[V_L], plan, at[V_R], other, math.inf)
     if time == math.inf:
-        return bound
+        return best
+    least = gentlest_front(at, min(time, last))[0] if time > first else 0.0
     front = max(least, 0.5 * math.sqrt(squared))
     rear = max(math.sqrt(squared) - front, 0.0)
-    return min(bound, front * front + rear * rear)
+    return min(best, front * front + rear * rear)
 
 
-@compiled
-def rear_first(at: Floats, floor: float, plan: Floats, other: Floats, stack: Floats) -> float:
-    """Least harm if the rear vehicle is met first; inf if full braking is not met from behind. Needs ``a_f >= a_r``."""
-    high = max(at[V_F] / at[A_F], at[ONSET_R] + at[V_R] / at[A_R])
-    if meet_rear(at, high, plan, other)[0] == math.inf:
-        return math.inf
-    low, least, top = 0.0, 0.0, high
-    time, closing = meet_rear(at, 0.0, plan, other)
-    if time < math.inf:
-        least = closing
-    else:
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (low + top)
-            if meet_rear(at, middle, plan, other)[0] < math.inf:
-                top = middle
-            else:
-                low = middle
-    return least_harm(REAR_FIRST, at, low, least, high, floor, plan, other, stack)
+@compiled_apart
+def leaning_harm(at: Floats, time: float, floor: float, best: float, plan: Floats, other: Floats) -> float:
+    """Least harm, if below ``best``, of the meetings with the leader from ``time`` on, however soft."""
+    soft = 0.0
+    while soft * soft < best:
+        hard = soft + 0.02 * (1.0 + soft)
+        follows = after_front(at, time, time, hard, time, 0.0, plan, other)
+        best = min(best, soft * soft + max(follows, floor))
+        soft = hard
+    return best
 
 
-@compiled
-def combined_bound(
-    at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, stack: Floats
+@compiled_apart
+def rear_first(
+    at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Least harm of a world in which contact is unavoidable, whoever is met first; 0 where nothing is proven.
+    """Least harm, if below ``best``, where the rear vehicle is met first."""
+    high = max(at[V_F] / at[A_F], at[ONSET_R] + at[V_R] / at[A_R])
+    first = meet_rear(at, high, plan, other)
+    if first == math.inf:
+        return best
+    last = meet_rear(at, 0.0, plan, other)
+    if last < math.inf:
+        return least_harm(REAR_FIRST, at, first, last, floor, best, enough, plan, other, heap)
+    low, top = 0.0, high
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + top)
+        if meet_rear(at, middle, plan, other) < math.inf:
+            top = middle
+        else:
+            low = middle
+    last = meet_rear(at, top, plan, other)
+    best = least_harm(REAR_FIRST, at, first, last, floor, best, enough, plan, other, heap)
+    late = max(last, high, at[V_L] / at[A_L]) if at[A_F] >= at[A_R] else max(last, at[ONSET_R]) + _GRAZE_S
+    return leaned_on_harm(at, last, late, floor, best, plan, other)
 
-    ``front`` and ``rear`` are the pairs' own bounds. Proven for ``a_f >= a_l``, ``a_f >= a_r``,
-    ``(a_f + p) / 2 >= a_l``, and when everything ends before ``until``.
+
+@compiled_apart
+def leaned_on_harm(
+    at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
+) -> float:
+    """Least harm, if below ``best``, of the meetings with the rear vehicle from ``early`` on, however soft.
+
+    Until ``late``: one that brakes harder than the controlled vehicle can lean on it only before it brakes.
     """
-    pooled = (1.0 - at[REAR_SHARE]) * at[A_F] + at[REAR_SHARE] * at[A_R]
-    if not (at[A_F] >= at[A_L] and at[A_F] >= at[A_R] and 0.5 * (at[A_F] + pooled) >= at[A_L]):
-        return 0.0
+    soft = 0.0
+    while soft * soft < best:
+        hard = soft + 0.02 * (1.0 + soft)
+        follows = after_rear(at, early, late, hard, late, 0.0, plan, other)
+        best = min(best, soft * soft + max(follows, floor))
+        soft = hard
+    return best
+
+
+@compiled_apart
+def combined_bound(
+    at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Least harm of a world in which contact is unavoidable, whoever is met first; 0 if that may be after ``until``.
+
+    ``front`` and ``rear`` are the pairs' own bounds.
+    """
     stand = at[ONSET_R] + at[V_R] / at[A_R]
     way = solo_motion(at[V_R], -at[A_R], at[ONSET_R], math.inf, stand)[1]
     room = at[GAP_L] + at[V_L] * at[V_L] / (2.0 * at[A_L]) + at[GAP_R] - way
-    if not stand + math.sqrt(2.0 * max(room, 0.0) / at[A_F]) < until:
+    rest = at[ONSET_R] + at[V_R] / min(at[A_R], at[A_F])
+    if not max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[A_F])) < until:
         return 0.0
-    bound = min(front_first(at, rear, plan, other, stack), rear_first(at, front, plan, other, stack))
-    return max(bound - _TOUCH_HARM, 0.0)
+    step, least = at[TIME_STEP], 0.0
+    for time_step in (0.0, step):  # what holds for any command holds for one that changes at decisions only
+        at[TIME_STEP] = time_step
+        best = front_first(at, rear, LARGE, front + rear, plan, other, heap)
+        best = rear_first(at, front, best, front + rear, plan, other, heap)
+        least = max(least, best - _TOUCH_HARM if best < LARGE else 0.0)
+        if step <= 0.0:
+            break
+    return least
 
 
 @compiled
@@ -204,7 +198,7 @@ def bound_worlds(
 
     Each pair's where it exists, both together where contact is unavoidable.
     """
-    plan, other, stack = empty_plan(), empty_plan(), np.empty((_STACK, 5))
+    plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, CELL_WIDTH))
     for k in range(states.shape[0]):
         front, rear = 0.0, 0.0
         if has_front[k]:
@@ -215,4 +209,4 @@ def bound_worlds(
             rear = squared if time < until[k] and squared > _TOUCH_HARM else 0.0
         out[k, FRONT_BOUND], out[k, REAR_BOUND], out[k, COMBINED_BOUND] = front, rear, 0.0
         if unavoidable[k]:
-            out[k, COMBINED_BOUND] = combined_bound(states[k], until[k], front, rear, plan, other, stack)
+            out[k, COMBINED_BOUND] = combined_bound(states[k], until[k], front, rear, plan, other, heap)

@@ -1,6 +1,6 @@
 """Two vehicles on plans of piecewise constant acceleration: how close they come, and where they first meet.
 
-A plan is an array [2, 4]: row ENDS holds the end of each piece (seconds from now, the last one infinite), row
+A plan is an array [2, PIECES]: row ENDS holds the end of each piece (seconds from now, the last one infinite), row
 ACCELERATIONS its acceleration (m/s2). Braking ends at rest and then holds. No time step: each piece is closed form.
 """
 
@@ -38,6 +38,15 @@ def fill_plan(
 def fill_braking(plan: Floats, onset: float, braking: float) -> None:
     """Coast until ``onset``, then brake to rest."""
     fill_plan(plan, onset, 0.0, onset, 0.0, onset, 0.0, -braking)
+
+
+@compiled
+def fill_window(plan: Floats, u: float, late: float, end: float, change: float, turn: float, step: float) -> None:
+    """Acceleration ``u``, from ``turn`` on ``step`` more, and from ``late`` to ``end`` also ``change`` more."""
+    first, second, third = min(turn, late), min(max(turn, late), end), max(turn, end)
+    u_1 = u + step if turn < late else u + change
+    u_2 = u + step + change if turn < end else u
+    fill_plan(plan, first, u, second, u_1, third, u_2, u + step)
 
 
 @compiled

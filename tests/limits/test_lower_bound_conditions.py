@@ -1,40 +1,86 @@
-"""Where the combined bound claims nothing, and why: by hand."""
+"""What a first meeting leaves, and what the command in force costs: by hand."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 
-from ethbrake_marl.limits import meetings as avoidability_meetings
-from ethbrake_marl.limits.avoidability import avoidability
-from ethbrake_marl.limits.lower_bound import lower_bound
-from ethbrake_marl.limits.meetings import WIDTH, after_rear
+from ethbrake_marl.limits import meetings
+from ethbrake_marl.limits.aftermath import after_front, after_rear, obstacle_harm
+from ethbrake_marl.limits.first_meeting import lacking
+from ethbrake_marl.limits.flights import lead
+from ethbrake_marl.limits.meetings import FRONT_FIRST, OBSTACLE, REAR_FIRST, WIDTH, gentlest_front
 from ethbrake_marl.limits.walk import empty_plan
-from ethbrake_marl.physics import concatenate
-from tests.limits.test_lower_bound import line
 
 
 def state(**given):
-    """A state at the onset, all else 0."""
+    """A state at the onset, all else 0; no obstacle."""
     at = np.zeros(WIDTH)
+    at[OBSTACLE] = math.inf
     for name, value in given.items():
-        at[getattr(avoidability_meetings, name)] = value
+        at[getattr(meetings, name)] = value
     return at
 
 
-@pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")  # 0 * inf, when it runs uncompiled
-def test_weak_rear__what_follows_a_later_meeting_is_less_and_nothing_is_claimed():
-    # Vehicle 3 coasts at 20 m/s and meets with 12 m/s: both at 14, the leader's speed, 0.8 m behind it. They brake with
-    # p = 0.5 * 6 + 0.5 * 1 = 3.5 at most, the leader with 6: at the leader after 0.8 s with 2 m/s, 1 m/s of it certain.
-    # Meeting 0.05 s later leaves 0.4925 m and 0.3 m/s: sqrt(0.09 + 5 * 0.4925) m/s after 0.519 s, 0.949 m/s certain.
-    at = state(GAP_L=0.4, GAP_R=0.4, V_L=14, A_L=6, V_F=15, A_F=6, V_R=20, A_R=1, ONSET_R=9, REAR_SHARE=0.5)
-    now, later = (after_rear(at, time, 12.0, empty_plan(), empty_plan()) for time in (0.0, 0.05))
-    assert now == pytest.approx(1.0)
-    assert later == pytest.approx((np.sqrt(2.5525) - 1.25 * (np.sqrt(2.5525) - 0.3) / 2.5) ** 2)
-    assert later < 0.91
-    # The minimum over meetings supposes that it rises. It does while (a_f + p) / 2 >= a_l; here 4.75 < 6.
-    weak, strong = (line([10, 1], [0, 20, 40], [6, 6, rear]) for rear in (1, 6))
-    assert np.all(avoidability(concatenate([weak, strong])).reason >= 2)
-    assert lower_bound(strong).combined[0] > 0
-    assert lower_bound(weak, horizon_s=100.0).combined[0] == 0
-    assert lower_bound(weak, horizon_s=100.0).harm[0] > 0  # of the pairs
+def test_obstacle__is_met_by_a_leader_that_was_pushed_on():
+    # 12 against 10 m/s, equal masses, no bounce: both at 11. Brakes of 5 take 2 * 5 * 11 of 121 on the way of 11 m.
+    at = state(V_L=10, A_L=5, FRONT_SHARE=0.5, OBSTACLE=11)
+    assert obstacle_harm(at, 0.0, 0.0, 2.0) == pytest.approx(11)
+    at[OBSTACLE] = 13
+    assert obstacle_harm(at, 0.0, 0.0, 2.0) == 0
+    at[OBSTACLE] = 10  # the leader stops at the obstacle itself: all three are one cluster
+    assert obstacle_harm(at, 0.0, 0.0, 2.0) == 0
+
+
+def test_obstacle__takes_the_centre_of_mass_from_the_proof():
+    at = state(GAP_R=4, V_L=10, A_L=5, V_F=12, A_F=7, U_F=7, LIMIT_F=40, V_R=20, A_R=6, FRONT_SHARE=0.5)
+    free = after_front(at, 0.0, 0.0, 2.0, 0.0, 0.0, empty_plan(), empty_plan())
+    at[OBSTACLE] = 11
+    assert after_front(at, 0.0, 0.0, 2.0, 0.0, 0.0, empty_plan(), empty_plan()) < free
+
+
+def test_command_in_force__the_way_to_meet_gently_is_the_wrong_one_after_it():
+    # In the step from 1 to 2 s; the gentlest meeting at 1.5 s drives for the first second, then brakes with 8.
+    at = state(GAP_L=1.5, V_L=0, A_L=1, V_F=2, A_F=8, U_F=0, LIMIT_F=40, V_R=9, A_R=1)
+    at[meetings.GAP_L] = 2 * 1.5 - 0.5 * 8 * 0.25
+    closing, drive = gentlest_front(at, 1.5)
+    assert (closing, drive) == (pytest.approx(0.0, abs=1e-9), pytest.approx(1.0))
+    at[meetings.GAP_L] = 10.0
+    at[meetings.V_F] = 8.0
+    closing, drive = gentlest_front(at, 1.5)
+    assert drive == pytest.approx(1.5 - math.sqrt(2 * (12 - 10) / 8)) and closing == pytest.approx(
+        8 - 8 * math.sqrt(0.5)
+    )
+    # 0.5 s at c instead of -8 and braking earlier instead: the speed at the end is higher by (8 + c) / 2 times 0.5 s or
+    # more. So with 0.5 m/s more than the least, c is at most 2 * 0.5 / 0.5 above -8 and lacks 6 of 8.
+    lack = lacking(FRONT_FIRST, at, 1.5, 1.5, closing, closing + 0.5, 1.0)
+    share = (drive - 1.0) / 0.5 if drive > 1.0 else 0.0
+    if share > 0.0:
+        assert lack == pytest.approx(max(8 - 2 - 8 * share**2, 0.0))
+    else:
+        steep = 0.5 / (1.0 - drive)
+        assert lack == pytest.approx(8 - (1 + steep) / (1 + 0.5 * steep))
+    assert lacking(FRONT_FIRST, at, 1.5, 1.5, closing, closing, 1.0) == pytest.approx(8)
+    assert lacking(REAR_FIRST, at, 1.0, 1.5, closing, closing, 1.0) == 0
+
+
+@pytest.mark.parametrize("share", [0.2, 0.45, 0.55])
+def test_lead__is_what_a_flight_gains_less_the_command_it_costs(share):
+    # Every flight, tried: brake for s, then drive until the partner is met again (press 13, reach 14).
+    press, reach, opening = 13.0, 14.0, 0.3
+    best = -math.inf
+    for s in np.linspace(0.0, 0.5, 501):
+        gap, relative = opening * s + 0.5 * (reach - press) * s * s, -(opening + (reach - press) * s)
+        met = (-relative + math.sqrt(relative**2 + 2 * press * gap)) / press
+        best = max(best, share * (relative + press * met) - reach * s * (1.0 - share))
+    found = lead(share, press, reach, opening, 0.0, 50.0, 0.0)
+    assert found >= best - 1e-9
+    assert found == pytest.approx(best, abs=2e-3)
+
+
+def test_after_rear__of_one_that_brakes_less_than_the_rear_vehicle_is_its_own_braking():
+    # Both at 19 after 20 against 18 m/s; the rear one, braking harder, is no help: 19^2 - 2 * 4 * 7.
+    at = state(GAP_L=7, V_L=0, A_L=5, V_F=18, A_F=4, V_R=20, A_R=8, REAR_SHARE=0.5)
+    assert after_rear(at, 0.0, 0.0, 2.0, 0.0, 0.0, empty_plan(), empty_plan()) == pytest.approx(361 - 56)

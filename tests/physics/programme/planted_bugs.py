@@ -35,7 +35,7 @@ EVENTS, IMPACT, SEGMENT, ADVANCE = (
     f"ethbrake_marl/physics/{name}.py" for name in ("events", "impact", "segment", "advance")
 )
 HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/obstacle.py"
-BOUNDS, LOWER_BOUND = (f"ethbrake_marl/limits/{name}.py" for name in ("lower_bound_kernel", "lower_bound"))
+FLIGHTS, LOWER_BOUND = (f"ethbrake_marl/limits/{name}.py" for name in ("flights", "lower_bound"))
 PROFILES = "ethbrake_marl/search/profiles.py"
 
 
@@ -144,8 +144,8 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "plastic cluster left out of order by a last digit": (
         Patch(IMPACT, "    if bounce == 0.0:\n", "    if bounce == -1.0:\n"),
     ),
-    "lower bound: combined bound claimed for a weak rear": (
-        Patch(BOUNDS, " and 0.5 * (at[A_F] + pooled) >= at[A_L]):", "):"),
+    "lower bound: a flight that costs no command": (
+        Patch(FLIGHTS, "return relative - reach * flight + math.sqrt(inside)", "return relative"),
     ),
     "lower bound not rounded outward": (
         Patch(LOWER_BOUND, "np.maximum(part - rounding(worlds, vehicle), 0.0)", "np.maximum(part, 0.0)"),

@@ -1,0 +1,224 @@
+"""Compiled: the harm at the other pair that must follow a first meeting, whatever the controlled vehicle does then.
+
+A first meeting at ``time`` with ``closing`` leaves a state that is known exactly. From it on, the centre of mass of the
+two moves on a path that no command improves but the extreme one, and the controlled vehicle is faster (slower) than the
+centre only while it comes back to its partner. ``lead`` bounds that. docs/avoidability.md has the proofs.
+
+A cell of meetings lies between ``early`` and ``late``; its state is taken at ``early``. From ``late`` to ``end`` the
+command of the decision before is still in force, which lacks at least ``lack`` of the extreme one (m/s2).
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.limits.flights import largest_lead
+from ethbrake_marl.limits.meetings import (
+    A_F,
+    A_L,
+    A_R,
+    FRONT_FIRST,
+    FRONT_SHARE,
+    GAP_L,
+    GAP_R,
+    LIMIT_F,
+    OBSTACLE,
+    ONSET_R,
+    REAR_SHARE,
+    RESTITUTION,
+    U_F,
+    V_L,
+    follower,
+    leader,
+)
+from ethbrake_marl.limits.walk import fill_braking, fill_drive_then_brake, fill_window, walk
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
+from ethbrake_marl.physics.worlds import Floats
+
+TOUCHING_M = 1e-6  # nearer than this a leader counts as touching the obstacle
+LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting at which the time is divided, to bound both parts
+
+
+@compiled
+def least_of_line(
+    start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, since: float,
+    until: float,
+) -> float:  # fmt: skip
+    """Least value of ``start + slope t + bend (t - turn)+ + other_bend (t - other_turn)+`` from since to until."""
+    least = math.inf
+    for time in (since, until, min(max(turn, since), until), min(max(other_turn, since), until)):
+        value = start + slope * time + bend * max(time - turn, 0.0) + other_bend * max(time - other_turn, 0.0)
+        least = min(least, value)
+    return least
+
+
+@compiled_apart
+def least_closing(
+    start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
+    press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
+) -> float:  # fmt: skip
+    """Least closing speed of a second meeting at most ``until``: that of the common speed, less the lead.
+
+    The time is divided at one of a few moments: what was lost in the window counts only after it.
+    """
+    best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
+    best -= largest_lead(share, press, reach, bounce, opening, lost, late, end, 0.0, until)
+    for k in range(len(LEADS)):
+        since = until - LEADS[k]
+        if since <= 0.0:
+            break
+        near = least_of_line(start, slope, turn, bend, other_turn, other_bend, since, until)
+        near -= largest_lead(share, press, reach, bounce, opening, lost, late, end, since, until)
+        far = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, since)
+        far -= largest_lead(share, press, reach, bounce, opening, 0.0, late, late, 0.0, since)
+        best = max(best, min(near, far))
+    return max(best, 0.0)
+
+
+@compiled_apart
+def pushed_by_leader(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Least closing speed at the rear, from the centre of mass of leader and controlled vehicle; 0: not proven.
+
+    A leader that stands keeps its place, so a later meeting is the same one later: only what holds for all counts.
+    """
+    share, rest, press = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    bounce = at[RESTITUTION]
+    speed, push = v_l + rest * closing, rest * at[U_F] - share * at[A_L]
+    stand = (speed + rest * bounce * closing) / at[A_L]
+    late, end, lost = late - early, end - early, lack * (end - late)
+    if v_l <= 0.0:
+        late, end, lack, lost = 0.0, 0.0, 0.0, 0.0
+    fill_window(plan, push, late, end, -rest * lack, stand, share * at[A_L])
+    onset = max(at[ONSET_R] - early, 0.0)
+    fill_braking(other, onset, at[A_R])
+    behind = max(at[GAP_L] + at[GAP_R] + way_l - way_r, 0.0)
+    until = walk(behind, speed, plan, v_r, other, onset + v_r / at[A_R])[1]
+    if until == math.inf:
+        return 0.0
+    reach = at[U_F] + at[A_F] if until * at[A_L] <= v_l else math.inf  # the leader moves, however soft the impact
+    if v_l <= 0.0:
+        slowest = max(v_r - at[A_R] * max(until - onset, 0.0), 0.0)
+        least = least_of_line(slowest - speed, -push, 0.0, 0.0, stand, -share * at[A_L], 0.0, until)
+        return max(least - largest_lead(share, press, reach, bounce, bounce * closing, 0.0, 0.0, 0.0, 0.0, until), 0.0)
+    return least_closing(
+        v_r - speed, -push, onset, -at[A_R], stand, -share * at[A_L],
+        share, press, reach, bounce, bounce * closing, lost, late, end, until,
+    )  # fmt: skip
+
+
+@compiled_apart
+def after_front(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Least squared closing speed at the rear after the leader was met from ``early`` on with at most ``closing``.
+
+    What is known of the centre of mass does not hold where an obstacle may throw both back.
+    """
+    share, rest = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    speed = v_l + rest * closing
+    if share * (1.0 + at[RESTITUTION]) <= 1.0:
+        speed -= share * at[RESTITUTION] * closing
+    onset = max(at[ONSET_R] - early, 0.0)
+    fill_drive_then_brake(plan, speed, at[U_F], at[LIMIT_F], math.inf, at[A_F])
+    fill_braking(other, onset, at[A_R])
+    behind = max(at[GAP_L] + at[GAP_R] + way_l - way_r, 0.0)
+    squared = walk(behind, speed, plan, v_r, other, onset + v_r / at[A_R])[2]
+    if rest < at[RESTITUTION] * share or at[OBSTACLE] < math.inf:
+        return squared
+    pushed = pushed_by_leader(at, early, late, closing, end, lack, plan, other)
+    return max(squared, pushed * pushed)
+
+
+@compiled
+def obstacle_harm(at: Floats, early: float, late: float, closing: float) -> float:
+    """Least squared speed at which the leader then meets the obstacle ahead: only its own brakes slow it down.
+
+    None is certain where it stands at the obstacle already: all three are one cluster then.
+    """
+    if not TOUCHING_M < at[OBSTACLE] - at[V_L] * at[V_L] / (2.0 * at[A_L]) < math.inf:
+        return 0.0
+    free = at[OBSTACLE] - leader(at, early)[1]
+    speed = leader(at, late)[0] + (1.0 - at[FRONT_SHARE]) * (1.0 + at[RESTITUTION]) * closing
+    harm: float = max(speed * speed - 2.0 * at[A_L] * free, 0.0)
+    return harm
+
+
+@compiled_apart
+def braking_after(
+    gap: float, least_gap: float, v_l: float, a_l: float, v_f: float, a_f: float, plan: Floats, other: Floats
+) -> float:
+    """Least squared closing speed with the leader of one that brakes at most with ``a_f``; 0 if none is certain.
+
+    Its gap is at most ``gap``, and at least ``least_gap`` where it matters: behind a leader that brakes harder.
+    """
+    fill_braking(plan, 0.0, a_l)
+    fill_braking(other, 0.0, a_f)
+    squared = walk(gap, v_l, plan, v_f, other, v_f / a_f)[2]
+    if a_f < a_l:
+        w = max(v_f - v_l, 0.0)
+        squared = min(squared, w * w + 2.0 * (a_l - a_f) * max(least_gap, 0.0))
+    return squared
+
+
+@compiled_apart
+def pushed_by_rear(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """Least closing speed at the front, from the centre of mass of both other vehicles; for ``a_f >= a_r``."""
+    share, rest = at[REAR_SHARE], 1.0 - at[REAR_SHARE]
+    v_l = leader(at, early)[0]
+    bounce = at[RESTITUTION]
+    speed = max(follower(at, early)[0] - rest * closing, 0.0)
+    onset = max(at[ONSET_R] - early, 0.0)
+    late, end, lost = late - early, end - early, lack * (end - late)
+    fill_braking(plan, 0.0, at[A_L])
+    fill_window(other, -rest * at[A_F], late, end, rest * lack, onset, -share * at[A_R])
+    until = walk(gap, v_l, plan, speed, other, math.inf)[1]
+    if until == math.inf:
+        return 0.0
+    press, reach = at[A_F] - at[A_R], at[U_F] + at[A_F]
+    if onset > 0.0:
+        press, reach = at[A_F], math.inf
+    return least_closing(
+        speed - v_l, at[A_L] - rest * at[A_F], onset, -share * at[A_R], v_l / at[A_L], -at[A_L],
+        share, press, reach, bounce, bounce * closing, lost, late, end, until,
+    )  # fmt: skip
+
+
+@compiled_apart
+def after_rear(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Least squared closing speed at the front after the rear vehicle was met from ``early`` on with ``closing``."""
+    share, rest = at[REAR_SHARE], 1.0 - at[REAR_SHARE]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    speed = v_r - rest * closing
+    if share * (1.0 + at[RESTITUTION]) <= 1.0:
+        speed += share * at[RESTITUTION] * closing
+    speed = max(speed - max(at[A_R] - at[A_F], 0.0) * (late - early), 0.0)
+    gap = max(at[GAP_L] + at[GAP_R] + way_l - way_r, 0.0)
+    least = gap - max(follower(at, late)[1] - way_r - (leader(at, late)[1] - way_l), 0.0)
+    squared = braking_after(gap, least, v_l, at[A_L], speed, at[A_F], plan, other)
+    if at[A_F] < at[A_R]:
+        return squared
+    pushed = pushed_by_rear(at, early, late, closing, end, lack, gap, plan, other)
+    return max(squared, pushed * pushed)
+
+
+@compiled_apart
+def after(
+    kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """``after_front`` or ``after_rear``."""
+    if kind == FRONT_FIRST:
+        return after_front(at, early, late, closing, end, lack, plan, other)
+    return after_rear(at, early, late, closing, end, lack, plan, other)
