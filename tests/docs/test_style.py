@@ -16,13 +16,6 @@ MOST_CHARACTERS = 100
 MOST_LINES = 8  # of a paragraph
 
 # Pages from before these rules. A page leaves the list when it is rewritten, and none comes back.
-NOT_YET = {
-    f"docs/{name}.md"
-    for name in (
-        "avoidability",
-        "shield",
-    )
-}  # fmt: skip
 PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")])
 
 FENCE = re.compile(r"\s*(```+|~~~+|:::+)")
@@ -75,10 +68,7 @@ def long_paragraphs(text: str) -> list[int]:
 def test_page__has_short_lines_and_short_paragraphs(path: Path) -> None:
     text = path.read_text("utf-8")
     wrong = {"lines": long_lines(text), "paragraphs": long_paragraphs(text)}
-    if path.relative_to(ROOT).as_posix() in NOT_YET:
-        assert any(wrong.values()), f"{path.name} is rewritten: take it out of NOT_YET"
-    else:
-        assert not any(wrong.values()), wrong
+    assert not any(wrong.values()), wrong
 
 
 def test_readme__is_short_and_begins_with_a_moving_picture_of_less_than_300_kb() -> None:

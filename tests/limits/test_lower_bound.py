@@ -153,7 +153,7 @@ def test_best_known_harm__is_never_below_the_bound_and_near_it(name, n, harm_cou
     leaning = ~verdict.avoidable & ~bound.impact_proven
     assert 0.005 < leaning.mean() < 0.035
     assert known[leaning].max() < 1.0
-    assert known[leaning].mean() < 0.03
+    assert known[leaning].mean() < 0.05
 
 
 @pytest.mark.parametrize("name", ["paper-random", "paper-random-early", "paper-delay-high"])
