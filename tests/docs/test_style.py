@@ -15,7 +15,6 @@ ROOT = DOCS.parent
 MOST_CHARACTERS = 100
 MOST_LINES = 8  # of a paragraph
 
-# Pages from before these rules. A page leaves the list when it is rewritten, and none comes back.
 PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")])
 
 FENCE = re.compile(r"\s*(```+|~~~+|:::+)")
