@@ -89,7 +89,7 @@ def test_wrapper__passes_the_api_test():
 def test_bad_input__is_refused():
     with pytest.raises(UnknownName, match="did you mean 'episode'"):
         HybridShield(parallel_env(), make_agent("full_brake"), mode="episod")
-    with pytest.raises(InvalidInput, match="exactly one learner"):
+    with pytest.raises(InvalidInput, match="shields every learner"):
         HybridShield(parallel_env(), make_agent("full_brake"), agents=["vehicle_1"])
     shielded = HybridShield(parallel_env(), make_agent("full_brake"))
     shielded.reset(seed=0)
