@@ -74,7 +74,7 @@ PAPER_PARAMETERS = {
 }
 
 PAPER_NOTE = (
-    "The paper's rows cannot come from the parameters that it states: in 62.6 % of the worlds of its random test no"
+    "The paper's rows cannot come from the parameters that it states: in 62.3 % of the worlds of its random test no"
     " command of Vehicle 2 whatsoever avoids an impact (in 65.1 % none avoids contact), yet its hybrids collide in"
     " 59 %; and in its 5,000-world test the hybrid avoids 2,005 collisions, although its two parts together avoid at"
     " most 2,000. If Vehicle 2 could act at about 0.2 s instead of the stated 0.5 s, full braking would come close to"

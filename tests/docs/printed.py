@@ -104,7 +104,10 @@ TABLES: dict[str, How] = {
         "ethbrake shield --scenario paper-random-obstacle --harm-count total --agents ppo@shipped --json",
     ),
     "| what | first-impact harm | of the best known": TRAINED,
+    "| training seed | default, tuning": TRAINED,
     "| what the vehicles do | first-impact harm": TRAINED,
+    "| channel | `full_brake` | `ppo@shipped/ppo`": _by(SEARCH),
+    "| level | who proposes | alone": _by(SEARCH),
     # lists of worlds
     "| Agent | Knows | Collisions": _by(
         NIGHTLY,
@@ -207,6 +210,7 @@ PICTURES: dict[str, How] = {
     "shield-robustness.png": _by(
         SEARCH, "ethbrake picture robustness --agent ppo@shipped --episodes 300 --output shield-robustness.png"
     ),
+    "price-of-not-knowing.png": _by(SEARCH),
     "shield-operating.png": _by(TRAINING),
     "shield-modes.png": _by(TRAINING),
     "regimes.png": _by(NIGHTLY, "the program on its page"),

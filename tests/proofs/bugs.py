@@ -89,9 +89,9 @@ BUGS = {
         certify_kernel, "decide_world", "tell_action(out, plan[step], value, budget - value)",
         "tell_action(out, plan[step], certified, budget - value)", statements.decision,
     ),
-    "of two proposals the second is certified beside the plan as it was": Bug(
-        certify_kernel, "decide_world", "copy_action(plan[step], tried[1])",
-        "copy_action(tried[1] if accepted else plan[step], tried[1])", statements.decision_of_two,
+    "of two, what was tried last is looked at, not what is applied": Bug(
+        certify_kernel, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
+        "take_steps(world, states, ended, step, tried[1], after, over)", statements.decision_of_two,
     ),
     "the first of two that is accepted keeps the bound from before": Bug(
         certify_kernel, "decide_world", "bound, accepted = value, accepted + 1", "accepted = accepted + 1",

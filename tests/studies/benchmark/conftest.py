@@ -37,8 +37,8 @@ def tiny(suites: Path) -> Suite:
 
 @pytest.fixture(scope="session")
 def entries(suites: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with an entry of full_brake, coast (all lists) and full_brake+step (two lists); not to be changed."""
+    """A folder with an entry of full_brake, coast (all lists) and full_brake+episode (two lists); not to be changed."""
     suite, folder = load_suite("tiny", suites), tmp_path_factory.mktemp("entries")
-    for spec in ("full_brake", "coast", "full_brake+step"):
+    for spec in ("full_brake", "coast", "full_brake+episode"):
         write_entry(folder / f"{spec}.json", make_entry(suite, spec))
     return folder

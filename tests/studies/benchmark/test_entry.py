@@ -83,7 +83,7 @@ def test_full_braking__realises_nothing_and_every_list_tells_its_worlds(tiny, en
 
 
 def test_lists_that_an_agent_cannot_drive__have_no_score_and_so_has_the_whole(entries):
-    entry = read_entry(entries / "full_brake+step.json")
+    entry = read_entry(entries / "full_brake+episode.json")
     assert isinstance(entry.lists["cooperation-3-pair"], NotDriven)
     assert entry.lists["cooperation-3-pair"].not_driven
     assert entry.lists_driven == 2 and entry.overall is None

@@ -18,7 +18,7 @@ from ethbrake_marl.studies.benchmark.page import leaderboard_page
 from ethbrake_marl.studies.benchmark.suite import plain_sha256
 from ethbrake_marl.studies.benchmark.table import leaderboard_markdown
 
-NAMES = ("full_brake", "coast", "full_brake+step")
+NAMES = ("full_brake", "coast", "full_brake+episode")
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def change(file: Path, edit: Callable[[dict[str, Any]], None], *, bind: bool = T
 def test_entries__are_ranked_by_their_score_and_those_of_some_lists_stand_below(tiny, entries):
     found = read_leaderboard(paths(entries), tiny)
     ranked = [row for row in found.rows if row.ranked]
-    assert found.rows[-1].entry.agent == "full_brake+step" and not found.rows[-1].ranked
+    assert found.rows[-1].entry.agent == "full_brake+episode" and not found.rows[-1].ranked
     assert [row.score.value for row in ranked] == sorted((row.score.value for row in ranked), reverse=True)
     assert read_leaderboard(paths(entries)[::-1], tiny) == found
 
@@ -54,7 +54,9 @@ def test_table__is_told_as_markdown_and_as_a_page(tiny, entries):
     found = read_leaderboard(paths(entries), tiny)
     lines = leaderboard_markdown(found).splitlines()
     assert lines[0] == "|  | Agent | Overall | paper-random | paper-random-obstacle | cooperation-3-pair |"
-    assert "| – | `full_brake+step` | (" in lines[-1] and "2 of 3 lists) | " in lines[-1] and lines[-1].endswith("– |")
+    assert (
+        "| – | `full_brake+episode` | (" in lines[-1] and "2 of 3 lists) | " in lines[-1] and lines[-1].endswith("– |")
+    )
     page = leaderboard_page(found)
     assert page.startswith("<!DOCTYPE html>") and tiny.sha256 in page and "not driven" in page
     assert all(row.entry.entry_sha256 in page for row in found.rows)
@@ -154,7 +156,7 @@ def test_files_that_are_no_entries__are_refused(tiny, kept):
 
 
 def test_verification__drives_again_and_finds_edits_that_fit_each_other(tiny, kept):
-    found = read_leaderboard([kept / "coast.json", kept / "full_brake+step.json"], tiny)
+    found = read_leaderboard([kept / "coast.json", kept / "full_brake+episode.json"], tiny)
     assert [verify(row, tiny) for row in found.rows] == ["the same, bit for bit"] * 2
     coast = next(row.entry for row in found.rows if row.entry.agent == "coast")
 
