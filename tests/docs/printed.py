@@ -108,6 +108,7 @@ TABLES: dict[str, How] = {
     "| what the vehicles do | first-impact harm": TRAINED,
     "| channel | `full_brake` | `ppo@shipped/ppo`": _by(SEARCH),
     "| level | who proposes | alone": _by(SEARCH),
+    "| robust mode | worlds | above": _by(SEARCH, "make test-shield"),
     # lists of worlds
     "| Agent | Knows | Collisions": _by(
         NIGHTLY,
