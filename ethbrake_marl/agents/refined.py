@@ -107,7 +107,7 @@ class Refined(AgentAround):
 
     def _harm(self, worlds: Worlds, vehicle: int, deviation: Floats) -> Floats:
         """Harm under one deviation per world, [n]."""
-        return drive(worlds, _Deviating(self._stage, deviation), self.scenario, vehicle).ledger.world_harm(
+        return drive(worlds, _Deviating(self._stage, deviation, self.name), self.scenario, vehicle).ledger.world_harm(
             self.harm_count
         )
 
@@ -124,8 +124,8 @@ def refine(policy: Agent, argument: str | None, settings: AgentSettings) -> Agen
 class _Deviating(AgentAround):
     """A policy plus one given deviation per world."""
 
-    def __init__(self, policy: Agent, deviation: Floats) -> None:
-        super().__init__(policy, "deviating")
+    def __init__(self, policy: Agent, deviation: Floats, name: str) -> None:
+        super().__init__(policy, name)
         self.deviation = deviation  # [n, segments]
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:

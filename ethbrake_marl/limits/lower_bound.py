@@ -51,6 +51,8 @@ EPS = 2.0**-52  # the spacing of doubles at 1
 # squared closing speed by at most 8 eps of these, and an episode has up to 500 of them.
 BOUND_EPS = 2.0**12
 
+LEAST_TIME_STEP_S = 1e-3  # between decisions: work grows as they come closer
+
 
 @dataclass(frozen=True, slots=True)
 class LowerBound:
@@ -89,11 +91,15 @@ def lower_bound(
     act, one every ``time_step_s`` after it: what every agent drives. That is sharper, and takes ten times as long.
 
     Covers the same lines as ``avoidability``, and raises ``InvalidInput`` for others, for an unknown ``harm_count``, a
-    time step that is not positive, and a horizon that is not finite or lies before the vehicle may act.
+    time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
     """
     check_harm_count(harm_count)
-    if time_step_s is not None and not 0.0 < time_step_s < np.inf:
-        raise InvalidInput(f"lower_bound: time_step_s {time_step_s!r}: must be a positive number of seconds, or None")
+    number = isinstance(time_step_s, (int, float)) and not isinstance(time_step_s, bool)
+    if time_step_s is not None and not (number and LEAST_TIME_STEP_S <= time_step_s < np.inf):
+        raise InvalidInput(
+            f"lower_bound: time_step_s {time_step_s!r}: must be a number of seconds from {LEAST_TIME_STEP_S:g} on, or"
+            " None"
+        )
     verdict = avoidability(worlds, vehicle, scripts=scripts)
     start = np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):

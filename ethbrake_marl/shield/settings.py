@@ -86,6 +86,11 @@ def shielded_vehicles(engine: Engine, where: str, mode: str | None) -> int | tup
     """
     if mode == "step" and len(engine.learners) > 1:
         return tuple(sorted(engine.learners))
+    if not engine.learners:
+        raise InvalidInput(
+            f"{where}: no vehicle of scenario {engine.scenario.name!r} learns, so there is nobody to shield; pass"
+            " learners=['vehicle_2'] to the environment"
+        )
     check_one_learner(
         engine.scenario.name,
         [engine.scenario.vehicle_names[i] for i in engine.learners],

@@ -155,3 +155,8 @@ def test_wrapper__says_what_is_not_what_it_must_be(wrong, message):
     given = {"env": parallel_env(), "policy": make_agent("full_brake")}
     with pytest.raises(InvalidInput, match=message):
         HybridShield(**{**given, **wrong})
+
+
+def test_wrapper__says_that_nobody_learns():
+    with pytest.raises(InvalidInput, match=r"no vehicle of scenario 'paper-random' learns"):
+        HybridShield(parallel_env(learners=[]), make_agent("full_brake"), mode="step")
