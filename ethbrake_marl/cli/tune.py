@@ -66,6 +66,7 @@ def tune_command(
         check_folder(output)
         check_tuning(plan, output)
         if export is not None:
+            force = force or _is_an_export(plan, export)
             _check_export(plan, export, force)
         if dry_run:
             _show_plan(plan, output, trials, jobs, as_json)
@@ -95,6 +96,17 @@ def _check_export(plan: TuningPlan, export: Path, force: bool) -> None:
         raise InvalidInput(f"export {export}: must end in .yaml, as recipes do")
     best_recipe(plan, {}, export, "")
     check_target(export, force=force)
+
+
+def _is_an_export(plan: TuningPlan, export: Path) -> bool:
+    """Whether this tuning wrote the file before: then the same command goes on, and replaces it."""
+    from ethbrake_marl.studies.tuning.table import export_head
+
+    head = export_head(plan, export).encode()
+    if not export.is_file():
+        return False
+    with export.open("rb") as file:
+        return file.read(len(head)) == head
 
 
 def _show_state(bars: Bars, state: TuningState) -> None:

@@ -49,10 +49,18 @@ def best_recipe(plan: TuningPlan, values: Values, file: Path, source: str) -> st
     Raises ``InvalidInput`` for a file whose name cannot be a recipe's.
     """
     check_file_name("recipe", file.stem)
-    recipe = plan.training(values).recipe.replace(name=file.stem, title=plan.file.title, source=source)
+    described = f"Settings of {plan.file.recipe} that `ethbrake tune` found."
+    recipe = plan.training(values).recipe.replace(
+        name=file.stem, title=plan.file.title, description=described, source=source
+    )
+    return recipe_text(recipe, export_head(plan, file))
+
+
+def export_head(plan: TuningPlan, file: Path) -> str:
+    """The first line of an exported recipe."""
     settings = "".join(f" --set {text}" for text in scenario_texts(plan))
     command = f"ethbrake train --scenario {plan.file.scenario}{settings} --recipe {file.name}"
-    return recipe_text(recipe, f"# The best trial of a tuning, trained again: {command}\n")
+    return f"# The best trial of a tuning, trained again: {command}\n"
 
 
 def scenario_texts(plan: TuningPlan) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+import yaml
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.learning.recipe import load_recipe
@@ -238,3 +239,18 @@ def test_second_command__in_a_folder_is_refused(finished_tuning, write_tuning, t
     with FileLock(folder / "tuning.lock"):
         assert tune(write_tuning(), folder) == 2
     assert "another process tunes here" in capsys.readouterr().err
+
+
+def test_same_command__exports_again_over_its_own_recipe(finished_tuning, small, tmp_path, capsys):
+    for each in ("out", "best.yaml"):
+        target = shutil.copytree if (finished_tuning.parent / each).is_dir() else shutil.copy
+        target(finished_tuning.parent / each, tmp_path / each)
+    file, export = tmp_path / "tuning.yaml", tmp_path / "best.yaml"
+    file.write_text(yaml.safe_dump(small))
+    text = export.read_text()
+    assert "Settings of" in text and "half a minute" not in text
+    assert tune(file, tmp_path / "out", "--trials", str(TRIALS), "--export", str(export)) == 0
+    assert export.read_text() == text
+    export.write_text(text[1:])
+    assert tune(file, tmp_path / "out", "--trials", str(TRIALS), "--export", str(export)) == 2
+    assert "best.yaml: is there already" in capsys.readouterr().err
