@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.cli.options import ForceOption, ScenarioOption, SetOption, VehicleOption
+from ethbrake_marl.cli.options import ForceOption, ScenarioOption, SetOption, UncertaintyOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, say
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.dataset.write import (
@@ -19,7 +19,7 @@ from ethbrake_marl.evaluation.dataset.write import (
 from ethbrake_marl.evaluation.inputs import LIST_SEED, check_agents, load_evaluated, make_lineup
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.settings import read_settings
-from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 
 def dataset_command(
@@ -37,10 +37,7 @@ def dataset_command(
     harm_count: Annotated[
         HarmCount, typer.Option(help="Harm that agents minimise, and the reward counts: first impacts only, or all.")
     ] = "first",
-    uncertainty: Annotated[
-        str | None,
-        typer.Option(metavar="QUANTITY=WIDTH,...", help=f"What the robust shield does not know, such as {EXAMPLE}."),
-    ] = None,
+    uncertainty: UncertaintyOption = None,
     settings: SetOption = None,
     force: ForceOption = False,
 ) -> None:

@@ -9,7 +9,14 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption, VehicleOption
+from ethbrake_marl.cli.options import (
+    ForceOption,
+    JsonOption,
+    ScenarioOption,
+    SetOption,
+    UncertaintyOption,
+    VehicleOption,
+)
 from ethbrake_marl.cli.picture import PictureOption, counted_without, picture_app, picture_target, tell_left_out
 from ethbrake_marl.cli.report import ReportOption, check_page, write_evaluation_report
 from ethbrake_marl.cli.shards import (
@@ -57,7 +64,7 @@ from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.settings import read_settings
 from ethbrake_marl.scenario import Sample, Task
 from ethbrake_marl.scenario.sample import kind_columns
-from ethbrake_marl.shield.uncertainty import EXAMPLE, parse_uncertainty
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 Groups = Mapping[str, Sequence[SummaryRow]]
 
@@ -76,10 +83,7 @@ def evaluate_command(
         str,
         typer.Option(metavar="|".join(OLD_SHIELDS), help="Old: now +SHIELD behind an agent, such as ppo@shipped+step."),
     ] = "none",
-    uncertainty: Annotated[
-        str | None,
-        typer.Option(metavar="QUANTITY=WIDTH,...", help=f"What the robust shield does not know, such as {EXAMPLE}."),
-    ] = None,
+    uncertainty: UncertaintyOption = None,
     initial_states: Annotated[
         Path | None, typer.Option(metavar="CSV|YAML", help="Your own worlds: one per row, or named ones of falsify.")
     ] = None,

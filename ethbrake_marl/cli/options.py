@@ -12,6 +12,7 @@ import typer
 from ethbrake_marl import __version__
 from ethbrake_marl.cli.terminal import show
 from ethbrake_marl.errors import OldSpelling
+from ethbrake_marl.shield.uncertainty import EXAMPLE
 
 ScenarioOption = Annotated[
     str,
@@ -40,6 +41,10 @@ NameOption = Annotated[
 ]
 OutputOption = Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the run, instead of --name.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what is already there.")]
+UncertaintyOption = Annotated[
+    str | None,
+    typer.Option(metavar="QUANTITY=WIDTH,...", help=f"What the robust shield does not know, such as {EXAMPLE}."),
+]
 VehicleOption = Annotated[
     str | None, typer.Option(help="Who is driven; other learners brake fully.", show_default="the learner")
 ]

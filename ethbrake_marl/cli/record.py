@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.cli.options import ForceOption, ScenarioOption, VehicleOption
+from ethbrake_marl.cli.options import ForceOption, ScenarioOption, UncertaintyOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, say
 from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.film import check_ending, check_number_of_films, film_bytes, film_scenes
 from ethbrake_marl.evaluation.inputs import LIST_SEED, load_evaluated, make_lineup
 from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 
 def record_command(
@@ -24,6 +25,7 @@ def record_command(
     world: Annotated[int, typer.Option(help="Number of the world in the list.", min=0)] = 0,
     seed: Annotated[int, typer.Option(help="Seed of the list.", min=0)] = LIST_SEED,
     vehicle: VehicleOption = None,
+    uncertainty: UncertaintyOption = None,
     force: ForceOption = False,
 ) -> None:
     """Agents in one world of the list, in real time: the road to scale, commands, impacts, harm."""
@@ -32,7 +34,8 @@ def record_command(
     target = check_target(output, force=force)
     check_number_of_films(len(agents.split(",")))
     chosen = load_evaluated(scenario, vehicle)
-    lineup = make_lineup(agents.split(","), chosen)
+    intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
+    lineup = make_lineup(agents.split(","), chosen, uncertainty=intervals)
     worlds = chosen.sample(1, seed, first=world).worlds
     films = {}
     with interruptible("nothing was written"):
