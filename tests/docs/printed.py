@@ -110,6 +110,7 @@ TABLES: dict[str, How] = {
     "| level | who proposes | alone": _by(SEARCH),
     "| robust mode | worlds | above": _by(SEARCH, "make test-shield"),
     "| intervals | mode | above": _by(SEARCH, "make test-shield"),
+    "| agents | worlds | processor time": _by(SPEED),
     # lists of worlds
     "| Agent | Knows | Collisions": _by(
         NIGHTLY,
