@@ -1,7 +1,8 @@
 """The one way in which this package compiles a kernel: strict floating point, cached safely.
 
 numba keys its cache on a function's own file, so editing a *callee* in another file would silently keep the
-stale machine code. Here the cache folder carries a hash of every kernel source and of the numba version.
+stale machine code. Here the kernels of a file lie in a folder that carries a hash of this file, of the kernel sources
+that it imports, and of the numba version: an edit compiles anew what can call it, and nothing else.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import atexit
 import hashlib
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -27,19 +29,16 @@ from ethbrake_marl.errors import check_whole_number
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGE = Path(__file__).resolve().parents[1]
 _MARK = b"@compiled"
+_IMPORT = re.compile(r"^from (ethbrake_marl[.\w]*) import (\([^)]*\)|.*)$", re.MULTILINE)
+_CONSTANT = re.compile(r"\b[A-Z][A-Z0-9_]*\b")
 _TEMPORARY = "ethbrake_marl-"
 
 
 @cache
 def cache_folder() -> Path:
     """Folder of the compiled kernels: the user's cache, or where that cannot be written one for this process alone."""
-    digest = hashlib.sha256(numba.__version__.encode())
-    for source in sorted(_PACKAGE.rglob("*.py")):
-        text = source.read_bytes()
-        if _MARK in text:
-            digest.update(text)
     home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home) / "ethbrake_marl" / digest.hexdigest()[:16]
+    folder = Path(home) / "ethbrake_marl"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -50,6 +49,41 @@ def cache_folder() -> Path:
         return temporary
 
 
+@cache
+def kernel_folder(source: Path) -> Path:
+    """Folder of the kernels of one file, below ``cache_folder``: another one after every edit that can change them."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for needed in kernel_sources(source):
+        digest.update(needed.read_bytes())
+    return cache_folder() / digest.hexdigest()[:16]
+
+
+def kernel_sources(source: Path) -> list[Path]:
+    """The file, and all of this package that its kernels may be made of, sorted by name.
+
+    These are the files with kernels that it imports, theirs, and so on; and files from which any of them imports a
+    constant (a name in capitals).
+    """
+    found, follow = {source}, [source]
+    while follow:
+        for module, names in _IMPORT.findall(follow.pop().read_text("utf-8")):
+            for imported in _files(module, names):
+                has_kernels = _MARK in imported.read_bytes()
+                if imported not in found and (has_kernels or _CONSTANT.search(names)):
+                    found.add(imported)
+                    follow += [imported] * has_kernels
+    return sorted(found)
+
+
+def _files(module: str, names: str) -> list[Path]:
+    """The files of a module of this package; of a package its own, and those of the names that are modules."""
+    place = _PACKAGE.joinpath(*module.split(".")[1:])
+    if place.with_suffix(".py").is_file():
+        return [place.with_suffix(".py")]
+    within = [place / f"{name}.py" for name in re.findall(r"\w+", names)]
+    return [place / "__init__.py", *(file for file in within if file.is_file())]
+
+
 def is_temporary(folder: Path) -> bool:
     """Whether a ``cache_folder`` goes when this process ends."""
     return folder.name.startswith(_TEMPORARY)
@@ -58,14 +92,15 @@ def is_temporary(folder: Path) -> bool:
 def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
     """Call ``tell`` once, when this process begins to compile: the folder of the kernels, and whether it was empty.
 
-    Kernels that are loaded from the folder are not compiled.
+    Kernels that are loaded from the folder are not compiled. Empty means: not even the physics of today is there.
     """
     events: Any = event  # numba's own types end here
 
     class Once(event.Listener):
         def on_start(self, event_: event.Event) -> None:
             events.unregister("numba:compile", self)
-            tell(cache_folder(), not any(cache_folder().rglob("*.nbi")))
+            physics = kernel_folder(Path(__file__).with_name("advance.py"))
+            tell(cache_folder(), not any(physics.rglob("*.nbi")))
 
         def on_end(self, event_: event.Event) -> None:
             """Nothing: it does not listen any more."""
@@ -114,7 +149,7 @@ def compiled_bare_apart(function: Function) -> Function:
 def _compile(function: Function, *, inline: bool, within: bool = False, bare: bool = False) -> Function:
     config: Any = numba_config  # its settings are made at run time
     before = config.CACHE_DIR
-    config.CACHE_DIR = str(cache_folder())
+    config.CACHE_DIR = str(kernel_folder(Path(function.__code__.co_filename)))
     try:
         how: dict[str, Any] = {"inline": "always"} if within else {"forceinline": inline}
         if bare:

@@ -80,7 +80,8 @@ def test_completion__a_variable_that_no_shell_set_changes_nothing(ethbrake, monk
     ("kernels", "temporary", "told"),
     [
         ([], False, f"compiling the physics, once, about {terminal.COMPILE_S} s\n"),
-        (["one.nbi"], False, "compiling a part of the physics that was not used before, once, some seconds\n"),
+        (["older/one.nbi"], False, f"compiling the physics, once, about {terminal.COMPILE_S} s\n"),
+        (["today/one.nbi"], False, "compiling a part of the physics that was not used before, once, some seconds\n"),
         ([], True, "no folder can be written"),
     ],
 )
@@ -88,8 +89,10 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, kernels,
     folder = tmp_path / ("ethbrake_marl-x" if temporary else "kept")
     folder.mkdir()
     for name in kernels:
+        (folder / name).parent.mkdir()
         (folder / name).touch()
     monkeypatch.setattr("ethbrake_marl.physics.compiled.cache_folder", lambda: folder)
+    monkeypatch.setattr("ethbrake_marl.physics.compiled.kernel_folder", lambda source: folder / "today")
     terminal.tell_compilation()
 
     @numba.njit
