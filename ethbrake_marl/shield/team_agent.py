@@ -18,7 +18,7 @@ from ethbrake_marl.shield.step_shield import StepShield
 class ShieldedTeam(Team):
     """Every driver of a ``team`` proposes, and one ``StepShield`` certifies or replaces what they do together.
 
-    The settings are those of ``StepShieldAgent``, and ``cap``. After ``begin``, ``predicted_harm`` [n] is the bound.
+    The settings are those of ``StepShieldAgent``. After ``begin``, ``predicted_harm`` [n] is the bound.
     Raises ``InvalidInput`` for a learner of the scenario that the team does not drive, and what ``StepShield`` raises.
 
     >>> import ethbrake_marl as eb
@@ -37,6 +37,11 @@ class ShieldedTeam(Team):
             )
         self.together = _Together(copy.deepcopy(team), scenario, settings)
         super().__init__({i: _Member(self.together, i) for i in team.drivers}, f"{team.name}+step")
+
+    @property
+    def policy(self) -> Team:
+        """Who proposes: the team as it is without a shield."""
+        return Team(self.together.policies, self.name.removesuffix("+step"))
 
     @property
     def shield(self) -> StepShield | None:
