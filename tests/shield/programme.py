@@ -217,7 +217,7 @@ def interference_gate(episodes: int, seed: int) -> bool:
             flush=True,
         )
     for wrapper in WRAPPERS:
-        tallies = [wrapped(name, wrapper, episodes, seed) for name in PLAYS if name != "evaluation"]
+        tallies = [wrapped(name, wrapper, episodes, seed) for name in PLAYS if "evaluation" not in name]
         total = [sum(column) for column in zip(*tallies, strict=True)]
         good = good and total[1] == total[4] == 0 and all(tally.refused > 0 for tally in tallies)
         print(
