@@ -47,9 +47,8 @@ class ModeRow:
     horizon_ends: int  # worlds that the horizon cut off before the line stood: no bound says what comes after
     against_episode: Estimate | None  # minus that of episode mode, paired by world; None: of that itself, and of teams
     against_none: Estimate | None = None  # likewise, minus that without a shield
-    replaced: float | None = (
-        None  # share of the decisions of all shielded vehicles; of step mode alone, as what follows
-    )
+    # all that follows is of step mode alone
+    replaced: float | None = None  # share of the decisions of all shielded vehicles
     bound: Estimate | None = None  # at the alert, mean over worlds (m2/s2)
     vehicles: tuple[VehicleRow, ...] = ()
     verdicts: tuple[float, ...] | None = None  # shares of the replaced decisions, in the order of VERDICTS

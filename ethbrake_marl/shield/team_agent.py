@@ -103,6 +103,13 @@ class _Member(AgentAround):
         self.together.after_step(packed)
 
 
+def shield_around(agent: Agent) -> StepShield | None:
+    """The step shield of an agent, or of the shielded team that it is a member of; None where there is none yet."""
+    if isinstance(agent, _Member):
+        return agent.together.shield
+    return agent.shield if isinstance(agent, StepShieldAgent) else None
+
+
 def drives_alone(driver: Driver) -> Agent | ShieldedTeam | None:
     """Who may say something about a whole world: an agent, the only driver of a team, or a shielded team."""
     if isinstance(driver, ShieldedTeam) or not isinstance(driver, Team):
