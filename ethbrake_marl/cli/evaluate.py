@@ -50,7 +50,6 @@ from ethbrake_marl.evaluation.inputs import (
     PROGRESS_EVERY,
     check_agents,
     choose_worlds,
-    load_driven,
     load_evaluated,
     make_lineup,
     make_proposers,
@@ -58,7 +57,7 @@ from ethbrake_marl.evaluation.inputs import (
 from ethbrake_marl.evaluation.paper import TESTS
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.results_file import results_to_json
-from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_table, modes_to_json
+from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_tables, modes_to_json
 from ethbrake_marl.evaluation.text import metrics_table
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.settings import read_settings
@@ -247,16 +246,18 @@ def shield_command(
 ) -> None:
     """Compare no shield, episode mode and step mode on the same worlds.
 
-    Each decision that step mode replaced is simulated again without it: needed (harm would have been higher), harmless
-    (the same), costly (lower).
+    Where several vehicles learn: no shield, step mode, and step mode with caps, for the whole team. Each decision that
+    step mode replaced is simulated again without it: needed (harm would have been higher), harmless (the same), costly
+    (lower).
     """
-    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
+    chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
     sample, task = chosen.sample(episodes, LIST_SEED), Task(chosen, chosen.learners, harm_count)
     rows = measure_modes(agents, sample, task)
     if as_json:
         write_json(modes_to_json(rows, sample, task))
     else:
-        result_console().print(modes_table(rows))
+        for table in modes_tables(rows):
+            result_console().print(table)
     tell_left_out(rows[0].left_out, episodes)
     moving = {f"{row.agent} ({row.mode})": row.horizon_ends for row in rows if row.mode != NONE}
     if note := horizon_note(moving, episodes - len(rows[0].left_out), chosen.horizon_s):
@@ -280,7 +281,7 @@ def picture_shield_modes(
     from ethbrake_marl.figures.shield import shield_modes_figure
     from ethbrake_marl.figures.style import write_picture
 
-    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
+    chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
     rows = measure_modes(agents, chosen.sample(episodes, LIST_SEED), Task(chosen, chosen.learners, harm_count))
     caption = (
         f"{chosen.name}, {count_of(episodes, 'world')} of the list of seed {LIST_SEED}, {harm_count} harm; mean and 95"

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
 from ethbrake_marl.errors import count_of
@@ -14,7 +15,7 @@ from ethbrake_marl.evaluation import check_target
 from ethbrake_marl.evaluation.criticality import CELLS, criticality_map
 from ethbrake_marl.evaluation.deceleration import deceleration_curve
 from ethbrake_marl.evaluation.identity import result_identity
-from ethbrake_marl.evaluation.inputs import LIST_SEED, load_driven, make_agents, make_proposers
+from ethbrake_marl.evaluation.inputs import LIST_SEED, load_driven, load_evaluated, make_agents, make_proposers
 from ethbrake_marl.evaluation.text import left_out_line
 from ethbrake_marl.figures import picture_ending
 from ethbrake_marl.harm import HarmCount
@@ -119,7 +120,7 @@ def picture_shield(
     from ethbrake_marl.figures.style import write_picture
     from ethbrake_marl.shield.review import ALLOWANCES, operating_curves
 
-    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
+    chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
     worlds = chosen.sample(episodes, LIST_SEED).worlds
     lineup = make_proposers(agents.split(","), chosen, harm_count=harm_count)
     with interruptible("nothing was written"), progress_bars() as bars:
@@ -169,6 +170,7 @@ def picture_robustness(
     chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
     sample = chosen.sample(episodes, LIST_SEED)
     (policy,) = make_proposers([agent], chosen, harm_count=harm_count).values()
+    assert not isinstance(policy, Team)  # one vehicle learns
     with interruptible("nothing was written"), progress_bars() as bars:
         points = robustness(
             sample.worlds, policy, Task(chosen, chosen.learners, harm_count), intervals,

@@ -89,7 +89,7 @@ class AttachedHybrid(Attached):
             "bound_harm": float(self.hybrid.bound_harm[k]),
         }
 
-    def start_info(self, k: int) -> dict[str, Any]:
+    def start_info(self, k: int, c: int = 0) -> dict[str, Any]:
         """Who will drive the episode of world ``k``, before the first decision."""
         return {
             "mode": "episode",

@@ -34,6 +34,8 @@ class ShieldOptions:
         robust: what mode ``robust`` certifies of an uncertainty: its ``corners`` (fast), or its whole ``interior``.
         intervention_penalty: taken off the reward of a step in which something else than the proposal was applied.
         logging: keep every intervention in ``shield.log``; not in mode ``episode``.
+        shares: tell in ``infos`` what each vehicle itself bears under the plan held now, and under the baseline plan;
+            with a ``cap`` it is told always. Costs a few percent of a step; not in mode ``episode``.
         where: who is given them, for messages.
 
     Raises ``InvalidInput`` naming the setting that does not fit, ``UnknownName`` for a mode.
@@ -53,6 +55,7 @@ class ShieldOptions:
     robust: str = CORNERS
     intervention_penalty: float = 0.0
     logging: bool = False
+    shares: bool = False
     where: str = field(default="shield", compare=False)
 
     def __post_init__(self) -> None:
@@ -60,8 +63,9 @@ class ShieldOptions:
         if mode not in MODES:
             raise unknown_name("shield mode", mode, MODES)
         uncertainty = mode_uncertainty(mode, self.uncertainty, self.where)
-        if mode == "episode" and (self.allowance != 0.0 or self.logging):
-            name = "allowance" if self.allowance != 0.0 else "logging"
+        given = [name for name in ("allowance", "logging", "shares") if getattr(self, name)]
+        if mode == "episode" and given:
+            name = given[0]
             raise InvalidInput(
                 f"{self.where}: {name} = {getattr(self, name)!r}: mode episode takes none; step and robust do"
             )
