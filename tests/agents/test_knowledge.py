@@ -48,6 +48,7 @@ STATED = {  # every agent there is: all of the registry, and what ``make_lineup`
     "planner:20:believed": (BELIEFS,),
     "coast+step:believed": (SENSORS, BELIEFS),
     "coast+robust:believed": (SENSORS, BELIEFS),
+    "coast+robust:interior:believed": (SENSORS, BELIEFS),
     "ppo@shipped/ppo+step:believed": (MESSAGES, BELIEFS),
     "ppo@shipped/ppo+episode:believed": (MESSAGES, BELIEFS),
     "ppo@shipped/ppo+episode:pairwise:believed": (MESSAGES, BELIEFS),
