@@ -13,7 +13,7 @@ import copy
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import product
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 
@@ -22,14 +22,16 @@ from ethbrake_marl.agents.believed import Foretold, Ranges, Told, believed_world
 from ethbrake_marl.agents.believing import SUFFIX, Odometer
 from ethbrake_marl.agents.protocol import Agent, place
 from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import state_columns, worlds_at
-from ethbrake_marl.shield.certify import Decision, plan_harm
+from ethbrake_marl.shield.certify import Decision
+from ethbrake_marl.shield.held import Held, held_in, hold_better
 from ethbrake_marl.shield.interior import CORNERS, INTERIOR, checked_robust
-from ethbrake_marl.shield.rollouts import Proposer, put
+from ethbrake_marl.shield.rollouts import Proposer
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty
 
@@ -57,10 +59,18 @@ class BelievedShield:
     decision ``predicted_harm`` [n] is the first bound, on the harm from that decision on. ``robust`` says in which
     worlds it certifies: None in the middle of what is not known, ``corners`` also in all corners of its range, and
     ``interior`` in all worlds of the box around them, once, at the first decision. Raises ``InvalidInput`` for a
-    mixture, and a scenario with more than ``MOST_CORNERS`` corners.
+    mixture, and a scenario with more than ``MOST_CORNERS`` corners. ``others`` are scripts of the other vehicles, by
+    index; None: those of the scenario.
     """
 
-    def __init__(self, scenario: Scenario, *, harm_count: HarmCount = "first", robust: str | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        harm_count: HarmCount = "first",
+        robust: str | None = None,
+        others: Mapping[int, Script] | None = None,
+    ) -> None:
         self.scenario = scenario
         self.robust = None if robust is None else checked_robust(robust, SUFFIX)
         self.shield: StepShield | None = None
@@ -68,6 +78,7 @@ class BelievedShield:
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
         self.decision: Decision | None = None  # the last one
         self._harm_count: HarmCount = harm_count
+        self._others = others  # None: the scenario's scripts
         self._odometer = Odometer()
         self._heard: Floats = np.zeros((0, 0))  # what the shield began on; NaN where it has not begun
         self._asked_s: Floats = np.zeros(0)  # [n] time of the last decision
@@ -76,6 +87,13 @@ class BelievedShield:
         self._impact_s: Floats = np.zeros((0, 0))  # [n, N] last time at which an impact of this vehicle was foretold
         self._ranges: tuple[int, Ranges] | None = None
         self._ranges_of(scenario.learners[0] if scenario.learners else 0)
+
+    @property
+    def members(self) -> int:
+        """Worlds that are certified for each one: the middle, and all corners."""
+        assert self._ranges is not None
+        vehicle, ranges = self._ranges
+        return 1 if self.robust is None else 1 + 2 ** len(ranges.uncertain(vehicle))
 
     def branch(self) -> BelievedShield:
         """A copy that goes on apart: what it decides leaves this one as it is."""
@@ -87,9 +105,12 @@ class BelievedShield:
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Remember where these episodes start; nothing has been received yet."""
+        self._ranges_of(vehicle)
         if len(rows) >= len(self._wanted) or self.shield is None or self.shield.vehicle != vehicle:
             certain = self.robust or CORNERS
-            self.shield = StepShield(self.scenario, vehicle, harm_count=self._harm_count, robust=certain)
+            self.shield = StepShield(
+                self.scenario, vehicle, harm_count=self._harm_count, others=self._others, robust=certain
+            )
             self._odometer, self.interventions = Odometer(), np.zeros(0, np.int64)
             self.predicted_harm = self._asked_s = self._wanted = np.zeros(0)
             self._heard, self._impact_s, self._totals = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0, 0))
@@ -162,17 +183,17 @@ class BelievedShield:
         rows = rows if begun else np.arange(worlds.n)
         if not rows.size:
             return
-        old = _held(shield, rows) if begun and self.robust != INTERIOR else None
+        old = held_in(shield, rows) if begun and self.robust != INTERIOR else None
         keeps = keeps & ~fresh[:, np.newaxis]
         self._begin_shield(worlds.take(rows), believed.take(rows), vehicle, way_m[rows], rows, keeps[rows], old)
         if old is not None:
-            _hold_better(shield, rows, old, ~fresh[rows])
+            hold_better(shield, rows, old, ~fresh[rows])
         rows = rows[due[rows]]  # the others begin anew at their own first decision
         first, self._heard[rows] = rows[fresh[rows]], heard[rows]
         self.predicted_harm[first] = shield.backup.harm[first]
 
     def _begin_shield(
-        self, worlds: Worlds, believed: Worlds, vehicle: int, way_m: Floats, rows: Ints, keeps: Bools, old: _Held | None
+        self, worlds: Worlds, believed: Worlds, vehicle: int, way_m: Floats, rows: Ints, keeps: Bools, old: Held | None
     ) -> None:
         """Begin in ``rows``: in the middle of what is open, and for a robust shield in its corners."""
         shield, shares = self.shield, [None, *self._corners(vehicle)]
@@ -247,7 +268,8 @@ class BelievedShield:
         share: dict[tuple[str, int], float] | None,
         foretold: Foretold | None = None,
     ) -> Worlds:
-        others, ranges = script_agents(self.scenario, except_for=vehicle), self._ranges_of(vehicle)
+        others, ranges = self._others, self._ranges_of(vehicle)
+        others = script_agents(self.scenario, except_for=vehicle) if others is None else others
         return believed_worlds(worlds, vehicle, ranges, others, way_m, share=share, foretold=foretold)
 
     def _ranges_of(self, vehicle: int) -> Ranges:
@@ -261,39 +283,3 @@ class BelievedShield:
                 )
             self._ranges = vehicle, ranges
         return self._ranges[1]
-
-
-class _Held(NamedTuple):
-    """What a shield holds in some rows."""
-
-    rest: Floats  # [m, L] its plans from the present decision on; full braking after them
-    states: Floats  # [m, M, S] of its members now, their harm so far included
-
-
-def _held(shield: StepShield, rows: Ints) -> _Held:
-    running = shield.running
-    assert running is not None
-    plan, done = shield.backup.plan[rows], running.steps[rows]
-    column, last = np.arange(plan.shape[1]) + done[:, np.newaxis], plan.shape[1] - 1
-    rest = np.take_along_axis(plan, np.minimum(column, last), axis=1)
-    states = running.states.reshape(running.n, running.members, -1)[rows]
-    return _Held(np.where(column <= last, rest, -1.0), states)
-
-
-def _hold_better(shield: StepShield, rows: Ints, old: _Held, held_before: Bools) -> None:
-    """Count the members' harm so far, and hold what is left of the old plans where it harms no more than the new."""
-    running = shield.running
-    assert running is not None
-    if not held_before.any():
-        return
-    rows, states, at = rows[held_before], running.states.copy(), running.rows_of(rows[held_before])
-    pairs = (states.shape[1] - 1) // 5
-    states[at, -2 * pairs :] = old.states[held_before].reshape(len(at), -1)[:, -2 * pairs :]
-    shield.running = running._replace(states=states)
-    part, plan = shield.running.take(rows), shield.backup.plan[rows].copy()
-    harm, before = plan_harm(part, plan), plan_harm(part, old.rest[held_before])
-    kept = before <= harm
-    plan[kept] = old.rest[held_before][kept]
-    shield.backup = shield.backup._replace(
-        plan=put(shield.backup.plan, rows, plan), harm=put(shield.backup.harm, rows, np.where(kept, before, harm))
-    )

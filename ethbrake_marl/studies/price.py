@@ -99,6 +99,7 @@ def limit_of(agent: str) -> str | None:
 
     A robust shield has none that knows: beside it stands the step shield.
 
+    >>> from ethbrake_marl.studies.price import limit_of
     >>> limit_of("planner:128:believed"), limit_of("coast+robust:believed"), limit_of("coast")
     ('planner:128', 'coast+step', None)
 
