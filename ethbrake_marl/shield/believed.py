@@ -56,11 +56,11 @@ class BelievedShield:
 
     It begins at the first decision, and anew whenever another vehicle is heard for the first time, is heard to react,
     or moves otherwise than was foretold; what is left of its plan is a candidate for the next one. After the first
-    decision ``predicted_harm`` [n] is the first bound, on the harm from that decision on. ``robust`` says in which
-    worlds it certifies: None in the middle of what is not known, ``corners`` also in all corners of its range, and
-    ``interior`` in all worlds of the box around them, once, at the first decision. Raises ``InvalidInput`` for a
-    mixture, and a scenario with more than ``MOST_CORNERS`` corners. ``others`` are scripts of the other vehicles, by
-    index; None: those of the scenario.
+    decision ``predicted_harm`` [n] is the first bound; infinite where the vehicle had an impact before, whose harm
+    nobody told it. ``robust`` says in which worlds it certifies: None in the middle of what is not known, ``corners``
+    also in all corners of its range, and ``interior`` in all worlds of the box around them, once, at the first
+    decision. Raises ``InvalidInput`` for a mixture, and a scenario with more than ``MOST_CORNERS`` corners. ``others``
+    are scripts of the other vehicles, by index; None: those of the scenario.
     """
 
     def __init__(
@@ -190,7 +190,9 @@ class BelievedShield:
             hold_better(shield, rows, old, ~fresh[rows])
         rows = rows[due[rows]]  # the others begin anew at their own first decision
         first, self._heard[rows] = rows[fresh[rows]], heard[rows]
-        self.predicted_harm[first] = shield.backup.harm[first]
+        felt = worlds.pair_hit[first, max(vehicle - 1, 0) : vehicle + 1].any(axis=1)
+        felt |= worlds.obstacle_hit[first] & (vehicle == 0)
+        self.predicted_harm[first] = np.where(felt, np.inf, shield.backup.harm[first])
 
     def _begin_shield(
         self, worlds: Worlds, believed: Worlds, vehicle: int, way_m: Floats, rows: Ints, keeps: Bools, old: Held | None

@@ -86,6 +86,7 @@ class AttachedBelieved(Attached):
             "intervened": bool(decision.intervened[k]),
             "reason": REASONS[int(decision.reason[k])],
             "margin": float(decision.margin[k]),
+            "bound_harm": float(shield.bound[k]) if np.isfinite(after.predicted_harm[k]) else np.inf,
             **self._marks(),
         }
 

@@ -8,6 +8,7 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield.believed_agent import BelievedShieldAgent
@@ -105,3 +106,13 @@ def test_robust__too_many_open_numbers_are_refused() -> None:
 def test_believed__what_cannot_be_is_refused(spec: str, words: str) -> None:
     with pytest.raises(InvalidInput, match=words):
         make_agent(spec, scenario=BASE)
+
+
+def test_believed__bounds_nothing_where_its_vehicle_had_an_impact_before_the_first_decision() -> None:
+    late = BASE.replace(latency_s=[0.0, 1.2, 0.5])
+    for spec in ("coast+step:believed", "coast+robust:believed"):
+        harm, bound = driven(make_agent(spec, scenario=late), late, 60)
+        assert 0 < np.isinf(bound).sum() < 10 and (harm <= bound + ABOVE).all()
+    agents = {spec: make_agent(spec, scenario=late) for spec in ("coast+step", "coast+robust:believed")}
+    known, received = summarise(evaluate(late.sample(60, 7), agents, scenario=late))
+    assert known.predicted_harm is not None and received.predicted_harm is None  # no mean of what is not finite
