@@ -61,7 +61,8 @@ class Sent(NamedTuple):
     steps_made: int  # by the engine until then
     applied: Floats  # [n] actions
     asked: Bools  # [n] worlds whose episode runs
-    certified: Certified | None  # None: episode mode
+    certified: Certified | None  # None: episode mode, and a believed world
+    after: object = None  # the memory to come, of a shield over a believed world
 
 
 class Attached(ABC):
