@@ -87,6 +87,11 @@ class Document:
                 return self.lines[path[:length]]
         return None
 
+    def where(self, path: YamlPath) -> str:
+        """The file, and the line of ``line_of`` where there is one: how a message about ``path`` begins."""
+        line = self.line_of(path)
+        return self.file if line is None else f"{self.file}, line {line}"
+
 
 @dataclass(slots=True)
 class _Open:
