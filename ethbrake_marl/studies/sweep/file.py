@@ -15,6 +15,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    PrivateAttr,
     Tag,
     ValidationError,
     field_validator,
@@ -26,6 +27,7 @@ from ethbrake_marl.files.messages import Wording, explain
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 
 MOST_JOBS = 200_000
+_GRID: YamlPath = ("grid",)
 LEVEL = "cooperation-"  # how the scenario of a level of cooperation begins
 
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
@@ -50,7 +52,7 @@ _Lists = Annotated[dict[str, _Values], AfterValidator(_check_keys)]
 class Request:
     """One job as the file asks for it."""
 
-    place: str  # in the file
+    path: YamlPath  # in the file: of the grid, or of a listed job
     scenario: str  # a name or a path
     level: str  # of cooperation; empty where a scenario was named
     recipe: str  # a name or a path
@@ -58,9 +60,18 @@ class Request:
     settings: tuple[str, ...]  # KEY=VALUE each, as for ``train --set``
 
     @property
+    def place(self) -> str:
+        """The path, as messages name it."""
+        return _place(self.path)
+
+    @property
     def kind(self) -> tuple[str, str, tuple[str, ...]]:
         """The job without its seed."""
         return self.scenario, self.recipe, self.settings
+
+
+def _place(path: YamlPath) -> str:
+    return "grid" if path == _GRID else f"jobs[{path[1]}]"
 
 
 class _Part(BaseModel):
@@ -138,6 +149,7 @@ class SweepFile(_Part):
     settings: _Settings = Field(default={}, alias="set")
     grid: Grid | None = None
     jobs: Annotated[tuple[ListedJob, ...], Field(strict=False)] = ()
+    _document: Document = PrivateAttr(Document("the sweep", {}, {}))  # where it stands, for messages
 
     def requests(self) -> Iterator[Request]:
         """The jobs: of the grid, seed by seed, so that first results of all are there early; then those listed."""
@@ -145,23 +157,37 @@ class SweepFile(_Part):
             yield from self._of_grid(self.grid)
         for k, job in enumerate(self.jobs):
             scenario, level = (job.scenario, "") if job.level is None else (LEVEL + job.level, job.level)
-            texts = self._texts(job.settings, f"jobs[{k}]")
-            yield Request(f"jobs[{k}]", str(scenario), level, job.recipe, job.seed, texts)
+            texts = self._texts(job.settings, ("jobs", k))
+            yield Request(("jobs", k), str(scenario), level, job.recipe, job.seed, texts)
 
     def _of_grid(self, grid: Grid) -> Iterator[Request]:
         lines = [(name, "") for name in grid.scenario or ()] + [(LEVEL + name, name) for name in grid.level or ()]
         changes = [
-            self._texts(dict(zip(grid.settings, values, strict=True)), "grid")
+            self._texts(dict(zip(grid.settings, values, strict=True)), _GRID)
             for values in itertools.product(*grid.settings.values())
         ]
         for seed in grid.seeds():
             for (scenario, level), recipe, texts in itertools.product(lines, grid.recipe, changes):
-                yield Request("grid", scenario, level, recipe, seed, texts)
+                yield Request(_GRID, scenario, level, recipe, seed, texts)
 
-    def _texts(self, own: dict[str, Any], place: str) -> tuple[str, ...]:
+    def where(self, asked: Request, part: str = "") -> str:
+        """File and line of a job; of a ``part`` of it: ``recipe``, ``scenario``, or the key of a setting."""
+        path = (*asked.path, "set", part) if part else asked.path
+        if part in self.settings:
+            path = ("set", part)
+        elif part in ("recipe", "scenario"):
+            key = "level" if part == "scenario" and asked.level else part
+            listed = getattr(self.grid, key) if asked.path == _GRID else ()
+            named = {"recipe": asked.recipe, "scenario": asked.scenario, "level": asked.level}[key]
+            path = (*asked.path, key, *(k for k, each in enumerate(listed) if each == named))
+        return self._document.where(path)
+
+    def _texts(self, own: dict[str, Any], path: YamlPath) -> tuple[str, ...]:
         twice = [key for key in own if key in self.settings]
         if twice:
-            raise InvalidInput(f"{place}.set.{twice[0]}: stands in the file's own set too; leave one of them out")
+            where = self._document.where((*path, "set", twice[0]))
+            key = f"{_place(path)}.set.{twice[0]}"
+            raise InvalidInput(f"{where}: {key}: stands in the file's own set too; leave one of them out")
         return tuple(f"{key}={flow_text(value)}" for key, value in {**self.settings, **own}.items())
 
 
@@ -174,6 +200,7 @@ def read_sweep(path: str | Path) -> SweepFile:
         found = SweepFile.model_validate(document.content)
     except ValidationError as error:
         raise explain(error, document, _SweepWording()) from None
+    found._document = document
     _check_size(found, document)
     return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +14,7 @@ from pydantic import (
     Discriminator,
     Field,
     PlainValidator,
+    PrivateAttr,
     Tag,
     ValidationError,
     model_validator,
@@ -20,7 +22,7 @@ from pydantic import (
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.messages import Wording, explain
-from ethbrake_marl.files.yaml import YamlPath, flow_text, read_yaml
+from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
@@ -139,6 +141,11 @@ class TuningFile(_Part):
     measure: Measuring = Measuring()
     prune: Pruning | None = Pruning()  # null: every trial is trained to its end
     sampler: Sampling = Sampling()
+    _document: Document = PrivateAttr(Document("the tuning", {}, {}))  # where it stands, for messages
+
+    def refusing_at(self, *path: str | int) -> AbstractContextManager[None]:
+        """Begin the message of an ``InvalidInput`` from inside with file and line of what stands at ``path``."""
+        return self._document.refusing_at(path)
 
 
 def read_tuning(path: str | Path) -> TuningFile:
@@ -147,9 +154,11 @@ def read_tuning(path: str | Path) -> TuningFile:
     if not isinstance(document.content, dict):
         raise InvalidInput(f"{document.file}: must be a mapping with scenario, recipe and search")
     try:
-        return TuningFile.model_validate(document.content)
+        found = TuningFile.model_validate(document.content)
     except ValidationError as error:
         raise explain(error, document, _TuningWording()) from None
+    found._document = document
+    return found
 
 
 class _TuningWording(Wording):
