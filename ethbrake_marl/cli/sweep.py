@@ -23,6 +23,14 @@ KEPT = "the same command goes on with what is in the folder"
 _MOST = 4096
 
 
+def _show_schema(asked: bool) -> None:
+    if asked:
+        from ethbrake_marl.studies.sweep.file import sweep_json_schema
+
+        write_json(sweep_json_schema())
+        raise typer.Exit
+
+
 def sweep_command(
     file: Annotated[Path, typer.Argument(metavar="SWEEP.yaml", help="A grid or a list of jobs.")],
     output: Annotated[Path, typer.Option("--output", metavar="FOLDER", help="Folder of everything.")],
@@ -37,6 +45,12 @@ def sweep_command(
     form: Annotated[Literal["csv", "parquet"], typer.Option("--format", help="Of the table.")] = "csv",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the jobs and what they take; do nothing.")] = False,
     as_json: JsonOption = False,
+    schema: Annotated[
+        bool,
+        typer.Option(
+            "--schema", is_eager=True, callback=_show_schema, help="Print the JSON Schema of the file, and exit."
+        ),
+    ] = False,
 ) -> None:
     """Train every job of a file, and write one table of what they reached.
 

@@ -20,6 +20,14 @@ if TYPE_CHECKING:
 _MOST, _MOST_TRIALS = 4096, 100_000
 
 
+def _show_schema(asked: bool) -> None:
+    if asked:
+        from ethbrake_marl.studies.tuning.file import tuning_json_schema
+
+        write_json(tuning_json_schema())
+        raise typer.Exit
+
+
 def tune_command(
     file: Annotated[Path, typer.Argument(metavar="TUNING.yaml", help="A training and the ranges of its settings.")],
     output: Annotated[Path, typer.Option("--output", metavar="FOLDER", help="Folder of everything.")],
@@ -41,6 +49,12 @@ def tune_command(
         bool, typer.Option("--dry-run", help="Print the space and what the trials take; do nothing.")
     ] = False,
     as_json: JsonOption = False,
+    schema: Annotated[
+        bool,
+        typer.Option(
+            "--schema", is_eager=True, callback=_show_schema, help="Print the JSON Schema of the file, and exit."
+        ),
+    ] = False,
 ) -> None:
     """Search the settings of a recipe that do least harm on a list of worlds of its own.
 

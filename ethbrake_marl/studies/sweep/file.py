@@ -23,6 +23,7 @@ from pydantic import (
 )
 
 from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.files.json_schema import FileSchema, OneOrMore, publish
 from ethbrake_marl.files.messages import Wording, explain
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 
@@ -31,7 +32,7 @@ _GRID: YamlPath = ("grid",)
 LEVEL = "cooperation-"  # how the scenario of a level of cooperation begins
 
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
-_Names = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
+_Names = Annotated[tuple[str, ...], Field(strict=False, min_length=1), OneOrMore]
 _Values = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
 
 
@@ -81,8 +82,8 @@ class _Part(BaseModel):
 class SeedRange(_Part):
     """``count`` seeds from ``first`` on."""
 
-    first: _Seed = 0
-    count: Annotated[int, Field(ge=1, le=MOST_JOBS)]
+    first: _Seed = Field(default=0, description="the smallest seed")
+    count: int = Field(ge=1, le=MOST_JOBS, description="how many seeds")
 
 
 def _form_of_seeds(value: Any) -> str:
@@ -90,7 +91,8 @@ def _form_of_seeds(value: Any) -> str:
 
 
 _Seeds = Annotated[
-    Annotated[tuple[_Seed, ...], Field(strict=False, min_length=1), Tag("#list")] | Annotated[SeedRange, Tag("#range")],
+    Annotated[tuple[_Seed, ...], Field(strict=False, min_length=1), OneOrMore, Tag("#list")]
+    | Annotated[SeedRange, Tag("#range")],
     Discriminator(_form_of_seeds),
 ]
 
@@ -98,7 +100,9 @@ _Seeds = Annotated[
 class _Lines(_Part):
     """What a grid and a job have in common: a scenario, or the level of cooperation in its place."""
 
-    settings: _Settings = Field(default={}, alias="set")
+    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["scenario"]}, {"required": ["level"]}]})
+
+    settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as train --set")
 
     @model_validator(mode="after")
     def _one_of_two(self) -> _Lines:
@@ -110,11 +114,11 @@ class _Lines(_Part):
 class Grid(_Lines):
     """All combinations of what is listed."""
 
-    scenario: _Names | None = None
-    level: _Names | None = None
-    recipe: _Names
-    seed: _Seeds = (0,)
-    settings: _Lists = Field(default={}, alias="set")
+    scenario: _Names | None = Field(default=None, description="names or paths, as train --scenario")
+    level: _Names | None = Field(default=None, description="in its place: 3-pair is the scenario cooperation-3-pair")
+    recipe: _Names = Field(description="names or paths, as train --recipe")
+    seed: _Seeds = Field(default=(0,), description="of the trainings")
+    settings: _Lists = Field(default={}, alias="set", description="a list of values for each dotted key")
 
     @field_validator("scenario", "level", "recipe", "seed", mode="before")
     @classmethod
@@ -136,19 +140,19 @@ class Grid(_Lines):
 class ListedJob(_Lines):
     """One job."""
 
-    scenario: str | None = None
-    level: str | None = None
-    recipe: str
-    seed: _Seed = 0
+    scenario: str | None = Field(default=None, description="a name or a path, as train --scenario")
+    level: str | None = Field(default=None, description="in its place: 3-pair is the scenario cooperation-3-pair")
+    recipe: str = Field(description="a name or a path, as train --recipe")
+    seed: _Seed = Field(default=0, description="of the training")
 
 
 class SweepFile(_Part):
     """The whole file; ``settings`` hold for every job."""
 
-    title: str = ""
-    settings: _Settings = Field(default={}, alias="set")
-    grid: Grid | None = None
-    jobs: Annotated[tuple[ListedJob, ...], Field(strict=False)] = ()
+    title: str = Field(default="", description="one line, for you")
+    settings: _Settings = Field(default={}, alias="set", description="settings of every job, as train --set")
+    grid: Grid | None = Field(default=None, description="every combination of what it lists")
+    jobs: tuple[ListedJob, ...] = Field(default=(), strict=False, description="single jobs, after those of the grid")
     _document: Document = PrivateAttr(Document("the sweep", {}, {}))  # where it stands, for messages
 
     def requests(self) -> Iterator[Request]:
@@ -203,6 +207,12 @@ def read_sweep(path: str | Path) -> SweepFile:
     found._document = document
     _check_size(found, document)
     return found
+
+
+def sweep_json_schema() -> dict[str, Any]:
+    """JSON Schema of the file of a sweep, for editors that complete and check YAML."""
+    schema = SweepFile.model_json_schema(schema_generator=FileSchema)
+    return publish({**schema, "title": "Sweep", "anyOf": [{"required": ["grid"]}, {"required": ["jobs"]}]})
 
 
 def _check_size(found: SweepFile, document: Document) -> None:
