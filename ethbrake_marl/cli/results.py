@@ -1,4 +1,4 @@
-"""What ``evaluate`` and ``run`` print of a comparison, and the files that stand beside it."""
+"""The results of ``evaluate`` and ``run``: printed, and written beside the rows of every world."""
 
 from __future__ import annotations
 
