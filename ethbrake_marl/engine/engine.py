@@ -97,8 +97,7 @@ class Engine(Running):
     ) -> None:
         if not n >= 1:
             raise InvalidInput(f"engine: n = {n} worlds; at least 1 is needed")
-        self.scenario = scenario
-        self.n = n
+        self.scenario, self.n = scenario, n
         self.learners = tuple(learners)
         self.scripts = dict(scripts)
         unassigned = set(range(scenario.vehicles)) - set(self.learners) - set(self.scripts)
@@ -223,7 +222,7 @@ class Engine(Running):
             worlds = self.worlds
             for vehicle, script in self._remembering.items():
                 self._wanted[:, vehicle] = within_capacity(ask_script(script, worlds, vehicle), worlds, vehicle, script)
-        before = self._terms.harm_so_far(self)
+        before = self._terms.objective_harm(self) if self._terms.by_objective else None
         was = self._state.copy() if has_messages(self._state, self._params) else None
         reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
         status = self._step_worlds(columns, reward, outcome)
@@ -235,7 +234,8 @@ class Engine(Running):
         if status != DONE:
             times = self._state[:, 0]
             self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
-        self._terms.add(step, self, before)
+        if self._terms.add_something:
+            self._terms.add(step, self, before)
         return step
 
     def _columns(self, actions: Actions) -> Floats:

@@ -41,31 +41,26 @@ class Terms:
         self._learners, self._learner_index = tuple(learners), np.array(learners, np.int64)
         self._moving, self._own = moving_terms_of(self.params), registered_terms_of(self.params)
         self._moves_reward = bool(self._moving or self._own)
-        self._any = self._moves_reward or self.params.shaping > 0.0 or bool(self._objectives)
+        self.by_objective = bool(self._objectives)  # each vehicle's harm by an objective
+        self.are_foreign = bool(self._own)  # one is code that somebody registered, and so may fail
+        self.add_something = self._moves_reward or self.params.shaping > 0.0 or self.by_objective
 
     @property
     def shared_harm(self) -> float:
         """Weight of the harm of the whole line, which the compiled step counts: 0 where each has its objective."""
         return 0.0 if self._objectives else self.params.harm
 
-    @property
-    def are_foreign(self) -> bool:
-        """Whether one is code that somebody registered, and so may fail."""
-        return bool(self._own)
-
-    def harm_so_far(self, running: Running) -> Floats | None:
-        """What the objective of each vehicle makes of the harm so far, [n, N]; None without objectives."""
-        return self._objective_harm(running) if self._objectives else None
+    def objective_harm(self, running: Running) -> Floats:
+        """What the objective of each vehicle makes of the harm so far, [n, N]; only where there are objectives."""
+        return objective_harm(running.ledger, self.params.harm_count, self._objectives)
 
     def add(self, step: Step, running: Running, before: Floats | None) -> None:
         """Add what a step has brought to its reward; nothing for rows that stood still.
 
-        ``before``: ``harm_so_far`` before the step.
+        ``before``: ``objective_harm`` before the step, None without objectives.
         """
         if before is not None and self.params.harm > 0.0:
-            step.further["harm"] = before - self._objective_harm(running)
-        if not self._any:
-            return
+            step.further["harm"] = before - self.objective_harm(running)
         standing = running.ended & ~step.ended
         if self._moves_reward:
             outcome = self._outcome(step, running)
@@ -78,9 +73,6 @@ class Terms:
         extra = weighted_sum(self.params, step.further, step.reward.shape)
         extra[standing] = 0.0
         step.reward[:] += extra
-
-    def _objective_harm(self, running: Running) -> Floats:
-        return objective_harm(running.ledger, self.params.harm_count, self._objectives)
 
     def _outcome(self, step: Step, running: Running) -> StepOutcome:
         """What terms are computed from: views of the running rows."""
