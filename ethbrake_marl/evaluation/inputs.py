@@ -197,7 +197,7 @@ def _place_of_role(name_or_path: str, role: str) -> str:
     """File and line of a role, or the name of a shipped scenario."""
     if not Path(name_or_path).is_file():
         return f"scenario {name_or_path!r}"
-    return f"{name_or_path}, line {read_yaml(name_or_path).line_of(('roles', role))}"
+    return read_yaml(name_or_path).where(("roles", role))
 
 
 def _behind(shield: str, written: Sequence[AgentSpec]) -> list[AgentSpec]:
