@@ -90,7 +90,7 @@ class AttachedBelieved(Attached):
             **self._marks(),
         }
 
-    def start_info(self, k: int) -> dict[str, Any]:
+    def start_info(self, k: int, c: int = 0) -> dict[str, Any]:
         """The same keys before the first decision of world ``k``: nothing was certified, and the bound is infinite."""
         told = {"mode": self.options.mode, "proposed_action": 0.0, "chosen_action": 0.0, "intervened": False}
         told |= {"reason": "", "bound_harm": np.inf, "margin": 0.0, "settles": False, **self._marks()}
