@@ -134,9 +134,11 @@ def room():
 
 
 def test_rear_first__is_impossible_where_the_leader_must_be_met_before():
-    # One stands 5 m ahead, the other comes from 100 m behind.
-    at = state(GAP_L=5, V_L=0, A_L=5, V_F=20, A_F=6, U_F=4, LIMIT_F=40, GAP_R=100, V_R=20, A_R=4, FRONT_SHARE=0.9)
+    # One stands 5 m ahead, the other comes from 100 m behind; 60 m ahead it may come in time.
+    at = state(GAP_L=5, V_L=0, A_L=5, V_F=20, A_F=6, U_F=4, LIMIT_F=40, GAP_R=100, V_R=40, A_R=4, FRONT_SHARE=0.9)
     assert rear_first(at, 0.0, LARGE, -1.0, *room()) == LARGE
+    at[meetings.GAP_L] = 60
+    assert rear_first(at, 0.0, LARGE, -1.0, *room()) < LARGE
 
 
 def test_all_at_once__is_impossible_where_the_leader_must_be_met_before():
