@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 
-from ethbrake_marl.limits.flights import largest_lead
+from ethbrake_marl.limits.flights import largest_lead, widest_flight
 from ethbrake_marl.limits.meetings import (
     A_F,
     A_L,
@@ -31,11 +31,12 @@ from ethbrake_marl.limits.meetings import (
     follower,
     leader,
 )
-from ethbrake_marl.limits.walk import fill_braking, fill_drive_then_brake, fill_window, walk
+from ethbrake_marl.limits.walk import fill_braking, fill_drive_then_brake, fill_plan, fill_window, walk
 from ethbrake_marl.physics.compiled import compiled, compiled_apart
 from ethbrake_marl.physics.worlds import Floats
 
 TOUCHING_M = 1e-6  # nearer than this a leader counts as touching the obstacle
+HELD_M = 1e-6  # more room than rounding can make of the gap to the leader
 LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting at which the time is divided, to bound both parts
 
 
@@ -111,6 +112,43 @@ def pushed_by_leader(
 
 
 @compiled_apart
+def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
+    """Least closing speed at the rear of one that cannot fall far behind a leader of harder brakes; 0: not proven."""
+    share, rest, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[RESTITUTION]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    back = max((share * bounce - rest) * closing - leader(at, late)[0], 0.0)
+    thrown = share * (1.0 + bounce) > 1.0
+    drive = max(at[U_F], at[A_F]) if thrown else at[U_F]
+    press, push, speed = drive + at[A_L], rest * drive - share * at[A_L], v_l + rest * closing
+    behind = max(at[GAP_L] + at[GAP_R] + way_l - way_r, 0.0)
+    onset = max(at[ONSET_R] - early, 0.0)
+    until, most, start = onset + v_r / at[A_R], 0.0, speed
+    fill_braking(other, onset, at[A_R])
+    for _ in range(2):
+        most = widest_flight(share, at[A_L] - at[A_F], press, drive, bounce, closing, back, until)
+        if most == math.inf:
+            return 0.0
+        start = max(speed, rest * most)
+        turn = (start - rest * most) / -push if push < 0.0 else math.inf
+        fill_plan(plan, turn, push, turn, 0.0, turn, 0.0, 0.0)
+        until = walk(behind, start, plan, v_r, other, math.inf)[1]
+        if until == math.inf:
+            return 0.0
+    final = max(start + push * until, rest * most)
+    slowest = max(v_r - at[A_R] * max(until - onset, 0.0), 0.0)
+    if v_l <= 0.0:
+        return float(max(slowest - max(start, final) - share * most, 0.0))
+    room = 0.5 * most * most / (drive if thrown else press) + HELD_M if press > 0.0 else math.inf
+    since = 0.0
+    if behind > room:
+        fill_braking(plan, 0.0, at[A_L])
+        since = min(walk(behind - room, v_l, plan, v_r, other, math.inf)[1], until)
+    fast = max(v_r - at[A_R] * max(since - onset, 0.0), 0.0) - max(start + push * since, rest * most)
+    return float(max(min(fast, slowest - final) - share * most, 0.0))
+
+
+@compiled_apart
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
@@ -129,7 +167,11 @@ def after_front(
     fill_braking(other, onset, at[A_R])
     behind = max(at[GAP_L] + at[GAP_R] + way_l - way_r, 0.0)
     squared = walk(behind, speed, plan, v_r, other, onset + v_r / at[A_R])[2]
-    if rest < at[RESTITUTION] * share or at[OBSTACLE] < math.inf:
+    if at[OBSTACLE] < math.inf:
+        return squared
+    held = held_by_leader(at, early, late, closing, plan, other)
+    squared = max(squared, held * held)
+    if rest < at[RESTITUTION] * share:
         return squared
     pushed = pushed_by_leader(at, early, late, closing, end, lack, plan, other)
     return max(squared, pushed * pushed)
@@ -193,6 +235,21 @@ def pushed_by_rear(
 
 
 @compiled_apart
+def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
+    """Least closing speed at the front of one that stays ahead of both; for ``a_f >= a_r``. 0 where it may rise."""
+    share, v_l = at[REAR_SHARE], leader(at, early)[0]
+    pooled = (1.0 - share) * at[A_F] + share * at[A_R]
+    mean = 0.5 * (at[A_F] + pooled)
+    speed = follower(at, early)[0] - (1.0 - share) * closing
+    if not (mean >= at[A_L] and speed > 0.0):
+        return 0.0
+    fill_braking(plan, 0.0, at[A_L])
+    fill_braking(other, 0.0, pooled)
+    until = walk(gap, v_l, plan, speed, other, speed / pooled)[1]
+    return max(speed - mean * until - max(v_l - at[A_L] * until, 0.0), 0.0) if until < math.inf else 0.0
+
+
+@compiled_apart
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
@@ -210,6 +267,7 @@ def after_rear(
     if at[A_F] < at[A_R]:
         return squared
     pushed = pushed_by_rear(at, early, late, closing, end, lack, gap, plan, other)
+    pushed = max(pushed, slowed_by_rear(at, early, closing, gap, plan, other))
     return max(squared, pushed * pushed)
 
 

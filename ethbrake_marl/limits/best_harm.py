@@ -21,7 +21,10 @@ from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, BestKnown, join_tables, load_table, save_table
-from ethbrake_marl.physics import Floats, Ints, UInt64s, Worlds, leaving_out_failed
+from ethbrake_marl.limits.extreme_profiles import extreme_profiles
+from ethbrake_marl.limits.lower_bound import onset_states
+from ethbrake_marl.physics import Floats, Ints, UInt64s, Worlds, advance, leaving_out_failed
+from ethbrake_marl.physics.episode import START
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.search.kernel import MOST_PHASES
 from ethbrake_marl.search.problem import ProfileProblem, profile_problem
@@ -250,6 +253,7 @@ class _Search:
                 others_mps2=self.others,
             )
             starts.insert(0, constant_profiles(problem, -coupled.deceleration_mps2[:, np.newaxis, np.newaxis]))
+            starts.append(self.extremes(problem, vehicles[0]))
         else:
             for c, vehicle in enumerate(vehicles):
                 alone = self.best([vehicle], harm_count, (), vehicles if deciders is None else deciders).profiles
@@ -260,6 +264,13 @@ class _Search:
         return search_profiles(
             problem, _joined(starts, problem.n), budget=self.budget, seed=self.seed, threads=self.threads
         )
+
+    def extremes(self, problem: ProfileProblem, vehicle: int) -> Profiles:
+        """Profiles of full drive and full braking of one vehicle, to start from."""
+        at, _ = advance(self.worlds, self.others, until_s=problem.clock[:, START])
+        forward = np.all(at.speeds_mps >= 0.0, axis=1)
+        neighbours = (forward & there for there in (vehicle > 0, vehicle < at.N - 1))
+        return extreme_profiles(problem, onset_states(at, vehicle, None), *neighbours)
 
 
 def _startable(profiles: Profiles) -> Profiles:

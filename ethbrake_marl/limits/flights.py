@@ -40,8 +40,6 @@ def best_flight(share: float, press: float, reach: float, opening: float) -> flo
         return math.inf
     slope = reach - share * press
     left = slope * slope - reach * (reach - press)
-    if slope <= 0.0:
-        return 2.0 * opening / (press - reach)
     if left <= 0.0:
         return math.inf
     root = math.sqrt(left)
@@ -107,3 +105,21 @@ def largest_lead(
         within = min(within, lead(share, press, reach, again, shortest, longest, 0.0))
         result = max(result, min(within, share * press * until - (1.0 - share) * lost))
     return result
+
+
+@compiled
+def widest_flight(
+    share: float, slack: float, press: float, drive: float, bounce: float, closing: float, back: float, time: float
+) -> float:
+    """Most of ``sqrt(p^2 + 2 press s)`` in every flight from a partner that brakes harder by ``slack``; inf if unknown.
+
+    p is the speed with which the two part, s their gap. The first impact had ``closing`` and left the vehicle with
+    speed ``-back``. All within ``time``; ``drive`` is the most that a command accelerates. [m/s]
+    """
+    if not slack > 0.0 or not bounce * bounce * press < slack:
+        return math.inf
+    grow = bounce * bounce * press / slack
+    roll = max(share * (1.0 + bounce) - 1.0, 0.0)
+    return max(
+        math.sqrt(grow * closing * closing + 2.0 * drive * back * time), 2.0 * drive * roll * time / (1.0 - grow)
+    )

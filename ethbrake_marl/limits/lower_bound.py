@@ -114,7 +114,7 @@ def lower_bound(
     has_rear = open_pair[:, vehicle] if vehicle < worlds.N - 1 else none
     unavoidable = has_front & has_rear & (verdict.reason >= 2)
     out = np.empty((worlds.n, BOUNDS))
-    bound_worlds(_states(at_onset, vehicle, time_step_s), horizon_s - start, has_front, has_rear, unavoidable, out)
+    bound_worlds(onset_states(at_onset, vehicle, time_step_s), horizon_s - start, has_front, has_rear, unavoidable, out)
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
     early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)
@@ -141,8 +141,11 @@ def rounding(worlds: Worlds, vehicle: int) -> Floats:
     return outward
 
 
-def _states(worlds: Worlds, i: int, time_step_s: float | None) -> Floats:
-    """The rows of the compiled bounds [n, WIDTH]; columns of a neighbour that is not there stay 0."""
+def onset_states(worlds: Worlds, i: int, time_step_s: float | None) -> Floats:
+    """The worlds, in which vehicle ``i`` may act, as the compiled bounds take them [n, WIDTH] (``limits.meetings``).
+
+    Columns of a neighbour that is not there stay 0, as does the time step where there is none.
+    """
     v = worlds.vehicles
     at = np.zeros((worlds.n, WIDTH))
     columns = {

@@ -24,10 +24,12 @@ from ethbrake_marl.limits.meetings import (
     V_F,
     V_L,
     V_R,
+    braking_to_rear,
     gentlest_front,
     meet_front,
     meet_rear,
     stays_ahead,
+    stays_behind,
 )
 from ethbrake_marl.limits.walk import empty_plan, fill_braking, fill_drive_then_brake, walk
 from ethbrake_marl.physics.compiled import compiled, compiled_apart
@@ -39,6 +41,7 @@ LARGE = 1e6  # m2/s2: more harm than any impact of vehicles does
 _TOUCH_HARM = 2.0 * TOUCH_SPEED_MPS * TOUCH_SPEED_MPS  # what two touches may hide
 _HALVINGS = 60
 _GRAZE_S = 1e-3  # more than rounding can move a graze
+_PARTS = 8  # into which the times of soft meetings are divided
 
 
 @compiled
@@ -79,12 +82,30 @@ def last_ahead(at: Floats, first: float, last: float, plan: Floats, other: Float
 
 
 @compiled_apart
+def last_behind(at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
+    """The latest time, at most ``last``, of a meeting with the rear vehicle before which the leader is not met.
+
+    At ``first`` there is room. The later the meeting, the shorter the braking before it and the less room ahead.
+    """
+    if stays_behind(at, braking_to_rear(at, last), last, plan, other):
+        return last
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (first + last)
+        if stays_behind(at, braking_to_rear(at, middle), middle, plan, other):
+            first = middle
+        else:
+            last = middle
+    return last
+
+
+@compiled_apart
 def front_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
     """Least harm, if below ``best``, where the leader is met first or all three meet at once.
 
-    At once: the outer two close with W, of which the front pair has at least the least at that time.
+    At once: the outer two close with W, of which the front pair has at least the least at that time. Only if the leader
+    can be met as late as that.
     """
     first = meet_front(at, math.inf, plan, other)
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
@@ -95,7 +116,8 @@ def front_first(
         last = largest_behind(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F], at[U_F], at[LIMIT_F])[1]
     end = last_ahead(at, first, last, plan, other)
     best = least_harm(FRONT_FIRST, at, first, end, floor, best, enough, plan, other, heap)
-    if touches and end == last:
+    leans = touches and end == last
+    if leans:
         best = leaning_harm(at, last, floor, best, plan, other)
         stand = at[V_L] / at[A_L]
         if last < stand:
@@ -103,7 +125,7 @@ def front_first(
     fill_braking(plan, 0.0, at[A_L])
     fill_braking(other, at[ONSET_R], at[A_R])
     _, time, squared = walk(at[GAP_L] + at[GAP_R], at[V_L], plan, at[V_R], other, math.inf)
-    if time == math.inf:
+    if time == math.inf or (time > end + _GRAZE_S and not leans):
         return best
     least = gentlest_front(at, min(time, last))[0] if time > first else 0.0
     front = max(least, 0.5 * math.sqrt(squared))
@@ -130,11 +152,12 @@ def rear_first(
     """Least harm, if below ``best``, where the rear vehicle is met first."""
     high = max(at[V_F] / at[A_F], at[ONSET_R] + at[V_R] / at[A_R])
     first = meet_rear(at, high, plan, other)
-    if first == math.inf:
+    if first == math.inf or not stays_behind(at, first, first, plan, other):
         return best
     last = meet_rear(at, 0.0, plan, other)
     if last < math.inf:
-        return least_harm(REAR_FIRST, at, first, last, floor, best, enough, plan, other, heap)
+        end = last_behind(at, first, last, plan, other)
+        return least_harm(REAR_FIRST, at, first, end, floor, best, enough, plan, other, heap)
     low, top = 0.0, high
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + top)
@@ -143,19 +166,40 @@ def rear_first(
         else:
             low = middle
     last = meet_rear(at, top, plan, other)
-    best = least_harm(REAR_FIRST, at, first, last, floor, best, enough, plan, other, heap)
-    late = max(last, high, at[V_L] / at[A_L]) if at[A_F] >= at[A_R] else max(last, at[ONSET_R]) + _GRAZE_S
-    return leaned_on_harm(at, last, late, floor, best, plan, other)
+    end = last_behind(at, first, last, plan, other)
+    best = least_harm(REAR_FIRST, at, first, end, floor, best, enough, plan, other, heap)
+    if end < last:
+        return best
+    late = max(last_soft(at, high, plan, other), last) + _GRAZE_S
+    part = (late - last) / _PARTS
+    for k in range(_PARTS):
+        best = leaned_on_harm(at, last + k * part, last + (k + 1) * part, floor, best, plan, other)
+    return best
+
+
+@compiled_apart
+def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
+    """A time after which no first meeting with the rear vehicle comes, however soft; all stand at ``rest``.
+
+    It has then passed neither the leader nor the controlled vehicle; where it brakes harder than this one, by b, it was
+    faster by ``b t`` a time t before the meeting, from its onset on.
+    """
+    fill_braking(plan, 0.0, at[A_L])
+    fill_braking(other, at[ONSET_R], at[A_R])
+    last = min(max(rest, at[V_L] / at[A_L]), walk(at[GAP_L] + at[GAP_R], at[V_L], plan, at[V_R], other, math.inf)[1])
+    if at[A_F] >= at[A_R]:
+        return float(last)
+    harder, onset, closing = at[A_R] - at[A_F], at[ONSET_R], at[V_R] - at[V_F]
+    gap = max(at[GAP_R] + (0.5 * at[U_F] * onset - closing) * onset, 0.0)
+    ahead = max(closing + at[A_F] * onset, 0.0)
+    return float(min(last, onset + min(ahead / harder, math.sqrt(2.0 * gap / harder))))
 
 
 @compiled_apart
 def leaned_on_harm(
     at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
 ) -> float:
-    """Least harm, if below ``best``, of the meetings with the rear vehicle from ``early`` on, however soft.
-
-    Until ``late``: one that brakes harder than the controlled vehicle can lean on it only before it brakes.
-    """
+    """Least harm, if below ``best``, of the meetings with the rear vehicle from ``early`` to ``late``, however soft."""
     soft = 0.0
     while soft * soft < best:
         hard = soft + 0.02 * (1.0 + soft)

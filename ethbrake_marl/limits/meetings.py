@@ -33,7 +33,7 @@ WIDTH = 16
 FRONT_FIRST, REAR_FIRST = 0, 1
 _HALVINGS = 60
 _GUARD = 2.0**-46  # of the positions: a way that rounding shortens must not make a meeting look harder
-AHEAD_M = 1e-9  # an overlap up to this is no meeting with the rear vehicle
+AHEAD_M = 1e-9  # an overlap up to this is no meeting with the other vehicle
 
 
 @compiled
@@ -88,13 +88,9 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
 
 
 @compiled_apart
-def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
-    """Least closing speed of a meeting with the rear vehicle at ``time``, and how long it must be braked before.
-
-    The fastest way to be there then: brake, then drive. The braking is infinite where that is at its speed limit.
-    """
-    v_r, way = follower(at, time)
-    place = way - at[GAP_R]
+def braking_to_rear(at: Floats, time: float) -> float:
+    """How long it must be braked to be met by the rear vehicle at ``time``, if it is driven from then on."""
+    place = follower(at, time)[1] - at[GAP_R]
     low, high = 0.0, time
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -102,8 +98,18 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
             low = middle
         else:
             high = middle
-    speed = braked_then_driven(at, low, time)[1]
-    return max(v_r - speed, 0.0), low if speed < at[LIMIT_F] else math.inf
+    return low
+
+
+@compiled_apart
+def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
+    """Least closing speed of a meeting with the rear vehicle at ``time``, and how long it must be braked before.
+
+    The fastest way to be there then: brake, then drive. The braking is infinite where that is at its speed limit.
+    """
+    brake = braking_to_rear(at, time)
+    speed = braked_then_driven(at, brake, time)[1]
+    return max(follower(at, time)[0] - speed, 0.0), brake if speed < at[LIMIT_F] else math.inf
 
 
 @compiled_apart
@@ -134,3 +140,11 @@ def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Flo
     fill_drive_then_brake(plan, at[V_F], at[U_F], at[LIMIT_F], drive, at[A_F])
     fill_braking(other, at[ONSET_R], at[A_R])
     return walk(at[GAP_R], at[V_F], plan, at[V_R], other, until)[0] >= -AHEAD_M
+
+
+@compiled_apart
+def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Floats) -> bool:
+    """Whether one that brakes for ``brake``, then drives, does not meet the leader until then."""
+    fill_brake_then_drive(plan, at[V_F], at[U_F], at[LIMIT_F], brake, at[A_F])
+    fill_braking(other, 0.0, at[A_L])
+    return walk(at[GAP_L], at[V_L], other, at[V_F], plan, until)[0] >= -AHEAD_M

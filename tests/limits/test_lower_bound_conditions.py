@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.limits import meetings
-from ethbrake_marl.limits.aftermath import after_front, after_rear, obstacle_harm
-from ethbrake_marl.limits.first_meeting import lacking
-from ethbrake_marl.limits.flights import lead
+from ethbrake_marl.limits.aftermath import after_front, after_rear, held_by_leader, obstacle_harm, slowed_by_rear
+from ethbrake_marl.limits.first_meeting import CELL_WIDTH, CELLS, lacking
+from ethbrake_marl.limits.flights import lead, widest_flight
+from ethbrake_marl.limits.lower_bound_kernel import LARGE, front_first, last_soft, rear_first
 from ethbrake_marl.limits.meetings import FRONT_FIRST, OBSTACLE, REAR_FIRST, WIDTH, gentlest_front
 from ethbrake_marl.limits.walk import empty_plan
 
@@ -66,12 +67,14 @@ def test_command_in_force__the_way_to_meet_gently_is_the_wrong_one_after_it():
     assert lacking(REAR_FIRST, at, 1.0, 1.5, closing, closing, 1.0) == 0
 
 
-@pytest.mark.parametrize("share", [0.2, 0.45, 0.55])
-def test_lead__is_what_a_flight_gains_less_the_command_it_costs(share):
-    # Every flight, tried: brake for s, then drive until the partner is met again (press 13, reach 14).
-    press, reach, opening = 13.0, 14.0, 0.3
+@pytest.mark.parametrize(("share", "press", "reach"), [(0.2, 13, 14), (0.45, 13, 14), (0.55, 13, 14), (0.78, 13, 9)])
+def test_lead__is_what_a_flight_gains_less_the_command_it_costs(share, press, reach):
+    # Every flight, tried: brake for s, then drive until the partner is met again. The last one brakes less than it.
+    opening = 0.3
     best = -math.inf
     for s in np.linspace(0.0, 0.5, 501):
+        if opening * s + 0.5 * (reach - press) * s * s < 0.0:
+            break
         gap, relative = opening * s + 0.5 * (reach - press) * s * s, -(opening + (reach - press) * s)
         met = (-relative + math.sqrt(relative**2 + 2 * press * gap)) / press
         best = max(best, share * (relative + press * met) - reach * s * (1.0 - share))
@@ -84,3 +87,63 @@ def test_after_rear__of_one_that_brakes_less_than_the_rear_vehicle_is_its_own_br
     # Both at 19 after 20 against 18 m/s; the rear one, braking harder, is no help: 19^2 - 2 * 4 * 7.
     at = state(GAP_L=7, V_L=0, A_L=5, V_F=18, A_F=4, V_R=20, A_R=8, REAR_SHARE=0.5)
     assert after_rear(at, 0.0, 0.0, 2.0, 0.0, 0.0, empty_plan(), empty_plan()) == pytest.approx(361 - 56)
+
+
+def test_widest_flight__is_attained_by_braking_to_the_top_of_the_gap_and_driving():
+    # Parted with 1 m/s from one that brakes harder by 4: 0.125 m. Driving closes with 13: 2 * 13 * 0.125 = 13 / 4.
+    found = widest_flight(0.8, 4.0, 13.0, 7.0, 0.1, 10.0, 0.0, 3.0)
+    assert found**2 == pytest.approx(13 / 4)
+    assert widest_flight(0.8, 0.0, 13.0, 7.0, 0.1, 10.0, 0.0, 3.0) == math.inf  # it may stay behind for ever
+    assert widest_flight(0.8, 4.0, 13.0, 7.0, 0.9, 10.0, 0.0, 3.0) == math.inf  # every touch throws it further
+    # Thrown back with 0.5 m/s, it rolls for 3 s at most: 2 * 7 * 1.5 more.
+    assert widest_flight(0.8, 4.0, 13.0, 7.0, 0.1, 10.0, 0.5, 3.0) ** 2 == pytest.approx(13 / 4 + 21)
+
+
+def test_held__without_a_bounce_it_keeps_the_common_speed():
+    # 20 against 10 m/s, nine tenths of the mass in front, no bounce: both at 11, slowing by 0.9 * 8 - 0.1 * 2 = 7, and
+    # rest after 11^2 / 14 m. The rear one, at 30 m/s with 4, comes there after 100 m in all: 900 - 800.
+    at = state(V_L=10, A_L=8, V_F=20, A_F=4, U_F=2, LIMIT_F=40, V_R=30, A_R=4, FRONT_SHARE=0.9)
+    at[meetings.GAP_R] = 100 - 121 / 14
+    assert held_by_leader(at, 0.0, 0.0, 10.0, empty_plan(), empty_plan()) == pytest.approx(10.0, abs=1e-3)
+    at[meetings.A_F] = 9.0
+    assert held_by_leader(at, 0.0, 0.0, 10.0, empty_plan(), empty_plan()) == 0
+
+
+def test_slowed__is_the_common_speed_less_the_way_it_must_stay_ahead():
+    # 20 against 18 m/s: both at 19, slowing by 6, and by 7 on average for f alone. 7 m before one that stands.
+    at = state(V_L=0, A_L=5, V_F=18, A_F=8, V_R=20, A_R=4, REAR_SHARE=0.5)
+    until = (19 - math.sqrt(19**2 - 2 * 6 * 7)) / 6
+    found = slowed_by_rear(at, 0.0, 2.0, 7.0, empty_plan(), empty_plan())
+    assert found == pytest.approx(19 - 7 * until)
+    at[meetings.A_L] = 7.5  # harder than 7: the closing speed may rise
+    assert slowed_by_rear(at, 0.0, 2.0, 7.0, empty_plan(), empty_plan()) == 0
+
+
+def test_soft_meetings__with_one_that_brakes_harder_end_where_it_would_have_been_too_fast():
+    # It was faster by 2 t a time t before, over 1 m: t is at most 1 s, and 1.5 s for 3 m/s.
+    at = state(V_L=30, A_L=1, V_F=18, A_F=5, U_F=4, V_R=21, A_R=7, GAP_L=50, GAP_R=1)
+    assert last_soft(at, 9.0, empty_plan(), empty_plan()) == pytest.approx(1.0)
+    at[meetings.GAP_R] = 90
+    assert last_soft(at, 9.0, empty_plan(), empty_plan()) == pytest.approx(1.5)
+    at[meetings.ONSET_R] = 0.2  # till then it can be left behind by up to 4, or be come towards by up to 5
+    assert last_soft(at, 9.0, empty_plan(), empty_plan()) == pytest.approx(0.2 + 4 / 2)
+
+
+def room():
+    return empty_plan(), empty_plan(), np.empty((CELLS, CELL_WIDTH))
+
+
+def test_rear_first__is_impossible_where_the_leader_must_be_met_before():
+    # One stands 5 m ahead, the other comes from 100 m behind; 60 m ahead it may come in time.
+    at = state(GAP_L=5, V_L=0, A_L=5, V_F=20, A_F=6, U_F=4, LIMIT_F=40, GAP_R=100, V_R=40, A_R=4, FRONT_SHARE=0.9)
+    assert rear_first(at, 0.0, LARGE, -1.0, *room()) == LARGE
+    at[meetings.GAP_L] = 60
+    assert rear_first(at, 0.0, LARGE, -1.0, *room()) < LARGE
+
+
+def test_all_at_once__is_impossible_where_the_leader_must_be_met_before():
+    # As above: 400 - 2 * 6 * 5 = 340 in front; the rear one has 400 - 2 * 4 * 105 < 0 left, or 60 with weaker brakes.
+    at = state(GAP_L=5, V_L=0, A_L=5, V_F=20, A_F=4.5, U_F=0, LIMIT_F=40, GAP_R=100, V_R=30, A_R=4, FRONT_SHARE=0.98)
+    at[meetings.REAR_SHARE] = 0.5
+    front = 400 - 2 * 4.5 * 5
+    assert front_first(at, 0.0, LARGE, -1.0, *room()) > front + 30  # 900 - 840 less what is pushed on
