@@ -177,7 +177,7 @@ def _combined(
     """The bound of the front two pairs together, [n]: Vehicle 1 brakes by now, Vehicle 2 is taken to act from now."""
     v = now.vehicles
     stops = stopping_distances(now.speeds_mps[:, 0], onset[:, 0], v.braking_capacity_mps2[:, 0]) < now.obstacle_gap_m
-    rows = np.flatnonzero((onset[:, 0] <= 0.0) & counts[:, 0] & counts[:, 1] & stops)
+    rows = np.flatnonzero((onset[:, 0] <= 0.0) & counts[:, 0] & counts[:, 1] & stops & ~now.obstacle_hit)
     three = _front_three(now, rows)
     if not len(rows):
         return np.zeros(now.n)

@@ -23,6 +23,7 @@ from ethbrake_marl.limits.meetings import (
     GAP_L,
     GAP_R,
     LIMIT_F,
+    OBSTACLE,
     ONSET_R,
     RESTITUTION,
     TIME_STEP,
@@ -107,7 +108,7 @@ def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: F
     if last_first_meeting(at, first, plan, other) <= stand:
         return 0
     leader_moves = at[A_F] < at[A_L] and at[V_L] > at[A_L] * stand
-    thrown_back = 1.0 - at[FRONT_SHARE] < at[RESTITUTION] * at[FRONT_SHARE]
+    thrown_back = 1.0 - at[FRONT_SHARE] < at[RESTITUTION] * at[FRONT_SHARE] or at[OBSTACLE] < math.inf
     return 2 if leader_moves or thrown_back else 1
 
 
