@@ -83,8 +83,8 @@ def first_late(n, N, rng, line):
 
 
 def as_the_rear(n, N, rng, line):
-    """The last vehicle reacts first."""
-    return line["latency"][:, ::-1].copy()
+    """Of those behind Vehicle 1 the last one reacts first."""
+    return np.concatenate([line["latency"][:, :1], line["latency"][:, :0:-1]], axis=1)
 
 
 REGIONS = {

@@ -94,6 +94,35 @@ def test_bound__never_rises_with_more_vehicles_that_are_free():
         assert np.all(more.early + more.pairs.sum(axis=1) <= fewer.early + fewer.pairs.sum(axis=1) + 1e-6)
 
 
+def test_bound__grants_vehicle_3_what_it_may_gain_by_coming_earlier():
+    worlds = worlds_of("weak brakes behind", 200, 3, seed=3)
+    scripted, free = (team_bound(worlds, chosen, horizon_s=HORIZON_S).combined for chosen in ((1,), (1, 2)))
+    assert np.all(free <= 1.01 * scripted + 0.01) and (free < scripted - 1e-3).mean() > 0.02
+
+
+def test_bound__grants_vehicle_3_the_pushes_of_those_behind():
+    worlds = worlds_of("weak brakes behind", 200, 4, seed=3)
+    v = worlds.vehicles
+    three = make_worlds(
+        worlds.gaps_m[:, :2], worlds.speeds_mps[:, :3], braking_capacity_mps2=v.braking_capacity_mps2[:, :3],
+        driving_capacity_mps2=v.driving_capacity_mps2[:, :3], latency_s=v.latency_s[:, :3], mass_t=v.mass_t[:, :3],
+        restitution=v.restitution, speed_limit_mps=60.0,
+    )  # fmt: skip
+    found = [team_bound(some, (1,), horizon_s=HORIZON_S) for some in (three, worlds)]
+    same = found[1].early == 0  # nobody is pushed before Vehicle 2 may act
+    alone, pushed = (bound.combined[same] for bound in found)
+    assert np.all(pushed <= 1.01 * alone + 0.01) and (pushed < alone - 1e-3).mean() > 0.02
+
+
+def test_bound__knows_the_decisions_of_vehicle_2_only_where_it_is_the_first_to_act():
+    worlds = worlds_of("rear reacts first", 200, 3, seed=3)
+    bounds = [team_bound(worlds, (1, 2), horizon_s=HORIZON_S, time_step_s=step).combined for step in (None, 0.3)]
+    assert np.array_equal(*bounds) and (bounds[0] > 0).any()
+    worlds = worlds_of("plain", 200, 3, seed=3)
+    bounds = [team_bound(worlds, (1, 2), horizon_s=HORIZON_S, time_step_s=step).combined for step in (None, 0.3)]
+    assert np.all(bounds[0] <= bounds[1]) and (bounds[0] < bounds[1]).any()
+
+
 def test_bound__counts_nothing_after_the_horizon_nor_a_pair_that_was_hit_before():
     worlds = load_scenario("cooperation-3-pair").sample(200, seed=7).worlds
     near, usual = (team_bound(worlds, (1, 2), horizon_s=end).harm for end in (1.2, 8.0))
