@@ -4,7 +4,8 @@ docs/avoidability.md, "Teams", has the proofs, under both counting rules:
 
 * each pair alone: its front vehicle as far ahead as it can be (full drive where it is controlled, else full braking),
   its rear vehicle as far behind (full braking); pushes from outside the pair only make it worse;
-* the front three together, where Vehicle 1 brakes fully, Vehicle 2 is controlled, and contact is unavoidable.
+* the front three together, where Vehicle 1 brakes fully, Vehicle 2 is controlled, and contact is unavoidable; where
+  Vehicle 1 is controlled, the obstacle ahead is the first of the three.
 
 Bounds of different pairs add up, as each holds for every joint command. All parts are rounded outward.
 """
@@ -12,33 +13,14 @@ Bounds of different pairs add up, as each holds for every joint command. All par
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HarmCount, check_harm_count, empty_ledger
-from ethbrake_marl.limits.avoidability import avoidability
+from ethbrake_marl.limits.front_three import Line, behind_wall, combined_bound
 from ethbrake_marl.limits.lower_bound import BOUND_EPS, EPS, LEAST_TIME_STEP_S
-from ethbrake_marl.limits.meetings import (
-    A_F,
-    A_L,
-    A_R,
-    FRONT_SHARE,
-    GAP_L,
-    GAP_R,
-    LIMIT_F,
-    OBSTACLE,
-    ONSET_R,
-    REAR_SHARE,
-    RESTITUTION,
-    TIME_STEP,
-    U_F,
-    V_F,
-    V_L,
-    V_R,
-    WIDTH,
-)
 from ethbrake_marl.limits.pair_kernel import (
     FOLLOWER_A,
     FOLLOWER_ONSET,
@@ -53,12 +35,7 @@ from ethbrake_marl.limits.pair_kernel import (
     PAIR_WIDTH,
     bound_pairs,
 )
-from ethbrake_marl.limits.team_kernel import bound_threes
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance
-from ethbrake_marl.physics.events import stopping_distances
-from ethbrake_marl.physics.worlds import vehicles_at_once
-
-_FRONT, _MIDDLE, _REAR = range(3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +46,7 @@ class TeamBound:
     early: Floats  # done before any controlled vehicle may act
     obstacle: Floats  # Vehicle 1 and the obstacle ahead
     pairs: Floats  # [n, P] of each pair alone, from then on
-    combined: Floats  # of the front two pairs together; 0 where nothing is proven
+    combined: Floats  # of the front two pairs together (see ``team_bound``); 0 where nothing is proven
 
     @property
     def impact_proven(self) -> Bools:
@@ -89,7 +66,9 @@ def team_bound(
 ) -> TeamBound:
     """Proven lower bound on the harm from now to ``horizon_s`` (absolute), over all joint commands of ``vehicles``.
 
-    ``harm = early + obstacle + max(pairs[:, 0] + pairs[:, 1], combined) + pairs[:, 2:]``, each part rounded outward.
+    ``harm = early + obstacle + max(pairs[:, 0] + pairs[:, 1], combined) + pairs[:, 2:]``, each part rounded outward;
+    where Vehicle 1 is controlled, ``combined`` is that of the obstacle and Vehicles 1 and 2: ``early + max(obstacle +
+    pairs[:, 0], combined) + pairs[:, 1:]``.
     All other vehicles brake with their whole capacity from their latencies on; ``scripts`` (index -> name) is only
     checked to say the same. What may come only after the horizon counts as 0, and so does the next impact of a pair
     that was hit before where ``harm_count`` is "first". One controlled vehicle is allowed; ``lower_bound`` is sharper
@@ -115,14 +94,20 @@ def team_bound(
     pairs = np.stack([_pair(now, p, onset, chosen, until, counts[:, p]) for p in range(worlds.N - 1)], axis=1)
     ahead = forward[:, 0] & np.isfinite(now.obstacle_gap_m) & ~(now.obstacle_hit & (harm_count == "first"))
     obstacle = _obstacle(now, onset, until, ahead)
-    combined = np.zeros(worlds.n)
-    if worlds.N >= 3 and 0 not in chosen and _MIDDLE in chosen:
-        combined = _combined(now, onset, chosen, until, pairs, counts, time_step_s)
+    combined, walled = np.zeros(worlds.n), bool(chosen[0] == 0)
+    if walled and ahead.any():
+        wall = behind_wall(Line(now, onset, counts), ahead)
+        both = np.stack([obstacle, pairs[:, 0]], axis=1)
+        combined = combined_bound(wall, chosen + 1, until, both, time_step_s)
+    elif worlds.N >= 3 and chosen[0] == 1:
+        combined = combined_bound(Line(now, onset, counts), chosen, until, pairs[:, :2], time_step_s)
     outward = _rounding(worlds, chosen)
     early, obstacle, combined = (np.maximum(part - outward, 0.0) for part in (early, obstacle, combined))
     pairs = np.maximum(pairs - outward[:, np.newaxis], 0.0)
-    front = np.maximum(pairs[:, :2].sum(axis=1), combined)
-    return TeamBound(early + obstacle + front + pairs[:, 2:].sum(axis=1), early, obstacle, pairs, combined)
+    alone = np.column_stack([obstacle, pairs])
+    together = alone[:, :2] if walled else alone[:, 1:3]
+    harm = early + alone.sum(axis=1) + np.maximum(combined - together.sum(axis=1), 0.0)
+    return TeamBound(harm, early, obstacle, pairs, combined)
 
 
 def _pair(now: Worlds, p: int, onset: Floats, chosen: Ints, until: Floats, counts: Bools) -> Floats:
@@ -163,63 +148,6 @@ def _bound(at: Floats, columns: Mapping[int, Floats | float], until: Floats, cou
     bound_pairs(at[counts], until[counts], out)
     found[counts] = out
     return found
-
-
-def _combined(
-    now: Worlds,
-    onset: Floats,
-    chosen: Ints,
-    until: Floats,
-    pairs: Floats,
-    counts: Bools,
-    time_step_s: float | None,
-) -> Floats:
-    """The bound of the front two pairs together, [n]: Vehicle 1 brakes by now, Vehicle 2 is taken to act from now."""
-    v = now.vehicles
-    stops = stopping_distances(now.speeds_mps[:, 0], onset[:, 0], v.braking_capacity_mps2[:, 0]) < now.obstacle_gap_m
-    rows = np.flatnonzero((onset[:, 0] <= 0.0) & counts[:, 0] & counts[:, 1] & stops & ~now.obstacle_hit)
-    three = _front_three(now, rows)
-    if not len(rows):
-        return np.zeros(now.n)
-    unavoidable = avoidability(three, _MIDDLE).reason >= 2
-    rows, three = rows[unavoidable], three.take(np.flatnonzero(unavoidable))
-    steps = np.where(onset[rows, _MIDDLE] <= 0.0, 0.0 if time_step_s is None else time_step_s, 0.0)
-    last, free = now.N == 3, _REAR in chosen
-    since = onset[rows, _REAR] if last else np.zeros(len(rows))
-    power = np.full(len(rows), np.inf)
-    if last:
-        full = v.braking_capacity_mps2[rows, _REAR] + v.driving_capacity_mps2[rows, _REAR]
-        power = full if free else np.zeros(len(rows))
-    found, out = np.zeros(now.n), np.empty(len(rows))
-    bound_threes(_states(three, steps), until[rows], pairs[rows, :2], since, power, out)
-    found[rows] = out
-    return found
-
-
-def _front_three(now: Worlds, rows: Ints) -> Worlds:
-    """The first three vehicles of these worlds, Vehicle 2 free to act at once."""
-    some = now.take(rows)
-    v = some.vehicles
-    braking, driving, latency, mass, limit = (
-        np.ascontiguousarray(each[:, :3])
-        for each in (
-            v.braking_capacity_mps2,
-            v.driving_capacity_mps2,
-            v.latency_s,
-            v.mass_t,
-            v.speed_limit_mps,
-        )
-    )
-    latency[:, _MIDDLE] = np.minimum(latency[:, _MIDDLE], some.time_s)
-    return replace(
-        some,
-        vehicles=vehicles_at_once(braking, driving, latency, mass, limit, v.restitution),
-        gaps_m=some.gaps_m[:, :2].copy(),
-        speeds_mps=some.speeds_mps[:, :3].copy(),
-        pair_hit=some.pair_hit[:, :2].copy(),
-        command_mps2=some.command_mps2[:, :3].copy(),
-        messages=np.zeros((some.n, 0)),
-    )
 
 
 def _checked(
@@ -264,30 +192,3 @@ def _rounding(worlds: Worlds, chosen: Ints) -> Floats:
     scale = fastest * fastest * (1.0 + closing / weakest) + 2.0 * closing * way
     outward: Floats = BOUND_EPS * EPS * scale
     return outward
-
-
-def _states(three: Worlds, steps: Floats) -> Floats:
-    """The rows of the compiled bound [n, WIDTH]."""
-    v, at = three.vehicles, np.zeros((three.n, WIDTH))
-    mass = v.mass_t
-    columns = {
-        GAP_L: three.gaps_m[:, 0],
-        V_L: three.speeds_mps[:, _FRONT],
-        A_L: v.braking_capacity_mps2[:, _FRONT],
-        V_F: three.speeds_mps[:, _MIDDLE],
-        A_F: v.braking_capacity_mps2[:, _MIDDLE],
-        U_F: v.driving_capacity_mps2[:, _MIDDLE],
-        LIMIT_F: v.speed_limit_mps[:, _MIDDLE],
-        GAP_R: three.gaps_m[:, 1],
-        V_R: three.speeds_mps[:, _REAR],
-        A_R: v.braking_capacity_mps2[:, _REAR],
-        ONSET_R: np.maximum(v.latency_s[:, _REAR] - three.time_s, 0.0),
-        FRONT_SHARE: mass[:, _FRONT] / (mass[:, _FRONT] + mass[:, _MIDDLE]),
-        REAR_SHARE: mass[:, _REAR] / (mass[:, _REAR] + mass[:, _MIDDLE]),
-        RESTITUTION: v.restitution,
-        TIME_STEP: steps,
-        OBSTACLE: three.obstacle_gap_m,
-    }
-    for column, values in columns.items():
-        at[:, column] = values
-    return at

@@ -57,7 +57,17 @@ def test_pairs__of_a_line_add_up_and_the_obstacle_too():
     found = team_bound(worlds, (0, 1, 2, 3))  # without drive the leaders coast
     assert found.pairs[0] == pytest.approx([100 - 2 * 5 * 2, 0, 100 - 2 * 5 * 3])
     assert found.obstacle[0] == pytest.approx(30**2 - 2 * 5 * 10)
-    assert found.harm[0] == pytest.approx(found.pairs[0].sum() + found.obstacle[0])
+    assert found.harm[0] == pytest.approx(found.pairs[0, 1:].sum() + max(found.obstacle[0] + 80, found.combined[0]))
+
+
+def test_bound__of_a_line_that_learns_whole_is_above_0_where_vehicle_2_cannot_stop_before_the_obstacle():
+    worlds = line([5], [20, 20], [5, 3], driving=[5, 5], obstacle=41)  # it needs 66.7 m, and has 46
+    found = team_bound(worlds, (0, 1), horizon_s=HORIZON_S)
+    assert found.obstacle[0] == found.pairs[0, 0] == 0 and 50 < found.combined[0] == found.harm[0]
+    assert found.harm[0] <= searched(profile_problem(worlds, (0, 1), horizon_s=HORIZON_S), "first", 2000)[0] < 80
+    assert team_bound(worlds, (0, 1), horizon_s=2.0).harm[0] == 0
+    wider = replace(worlds, obstacle_gap_m=np.array([62.0]))
+    assert team_bound(wider, (0, 1), horizon_s=HORIZON_S).harm[0] == 0
 
 
 @pytest.mark.parametrize("vehicle", [0, 1])
@@ -193,8 +203,10 @@ LINES = {
     "two, the rear one": (2, (1,), None),
     "two, both": (2, (0, 1), None),
     "three, the middle one, pushed by nobody": (3, (1,), None),
+    "two, both, with an obstacle": (2, (0, 1), (-3.0, 4.0)),
+    "two, the front one, with an obstacle": (2, (0,), (-3.0, 4.0)),
     "three, with a far obstacle": (3, (1, 2), (0.0, 10.0)),
-    "three, all, with an obstacle": (3, (0, 1, 2), (0.0, 10.0)),
+    "three, all, with an obstacle": (3, (0, 1, 2), (-3.0, 3.0)),
     "three, with an obstacle that is reached": (3, (1, 2), (-10.0, 2.0)),
     "five, all that follow": (5, (1, 2, 3, 4), None),
     "five, every other": (5, (0, 2, 4), None),
