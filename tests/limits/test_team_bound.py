@@ -227,5 +227,5 @@ def test_bound__is_never_above_a_joint_profile_of_any_line(kind):
 @pytest.mark.parametrize("region", REGIONS)
 def test_bound__is_never_above_a_longer_joint_search(region):
     for k, (N, vehicles, obstacle) in enumerate(LINES.values()):
-        check(worlds_of(region, 100, N, 80 + k, obstacle), vehicles, budget=3000, draws=20, seed=k)
-    check(worlds_of(region, 400, 3, seed=90), (1, 2), budget=5000, draws=40, seed=91)
+        check(worlds_of(region, 25, N, 80 + k, obstacle), vehicles, budget=800, draws=5, seed=k)
+    check(worlds_of(region, 100, 3, seed=90), (1, 2), budget=2000, draws=20, seed=91)
