@@ -180,13 +180,16 @@ def _command_text(
 
 
 def _prove(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[str, object]:
-    """What is proven beside what was found, where one of three vehicles is controlled; see ``evaluation.bounds``."""
+    """What is proven beside what was found; see ``evaluation.bounds``."""
     found = proven_of_table(worlds, task, table)
     if found is None:
         return {}
-    told = {"proven_harm": found.proven_harm, "contact_proven_rate": found.contact_proven_rate}
+    told: dict[str, object] = {"proven_harm": found.proven_harm}
+    if found.contact_proven_rate is not None:
+        told["contact_proven_rate"] = found.contact_proven_rate
     told["impact_proven_rate"] = found.impact_proven_rate
-    return told | {f"between_{name}": value for name, value in asdict(found.between).items() if value is not None}
+    inside = {} if found.between is None else asdict(found.between)
+    return told | {f"between_{name}": value for name, value in inside.items() if value is not None}
 
 
 def _show_shipped(*, as_json: bool) -> None:

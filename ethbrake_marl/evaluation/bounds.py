@@ -30,9 +30,9 @@ class Proven:
     """What is proven about a list of worlds."""
 
     proven_harm: float  # mean harm (m2/s2) that no command undercuts, under either count
-    contact_proven_rate: float
+    contact_proven_rate: float | None  # None where contact is not decided
     impact_proven_rate: float
-    between: Between
+    between: Between | None  # None where contact is not decided
 
 
 def proven_of(worlds: Worlds, task: Task, first: Floats, total: Floats) -> Proven | None:
@@ -40,9 +40,11 @@ def proven_of(worlds: Worlds, task: Task, first: Floats, total: Floats) -> Prove
     proof = prove(worlds, task)
     if isinstance(proof, Unproven) or proof.harm is None:
         return None
-    contact, impact = ~proof.avoidable, proof.harm > 0.0
-    rates = float(contact.mean()), float(impact.mean())
-    return Proven(float(proof.harm.mean()), *rates, between(contact, impact, first, total))
+    contact, impact = proof.contact, proof.harm > 0.0
+    harm, impact_rate = float(proof.harm.mean()), float(impact.mean())
+    if contact is None:
+        return Proven(harm, None, impact_rate, None)
+    return Proven(harm, float(contact.mean()), impact_rate, between(contact, impact, first, total))
 
 
 def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> Proven | None:
@@ -145,7 +147,8 @@ def _shipped_line(one: ShippedBounds) -> str:
 def _rates(proven: Proven | None) -> tuple[float | None, ...]:
     if proven is None:
         return (None, None, None)
-    return proven.contact_proven_rate, proven.impact_proven_rate, proven.between.rate
+    inside = proven.between
+    return proven.contact_proven_rate, proven.impact_proven_rate, None if inside is None else inside.rate
 
 
 def _number(value: float | None) -> str:

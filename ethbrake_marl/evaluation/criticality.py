@@ -13,7 +13,7 @@ from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
 from ethbrake_marl.evaluation.rollout import controlled_vehicle, evaluate
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.avoidability import avoidability
-from ethbrake_marl.limits.limits import Unproven, unproven_because
+from ethbrake_marl.limits.limits import Unproven, undecided_because
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.scenario import Scenario, Task, worlds_from_table
 from ethbrake_marl.scenario.quantities import QUANTITIES
@@ -84,7 +84,8 @@ def criticality_map(
         worlds, agents, scenario=scenario, chunk=CHUNK, on_progress=lambda agent, done: tell(agent, done, worlds.n)
     ).complete()
     limits = evaluation.limits
-    avoidable = None if isinstance(limits, Unproven) else limits.proof.avoidable.reshape(cells, cells)
+    verdict = None if isinstance(limits, Unproven) else limits.proof.avoidable
+    avoidable = None if verdict is None else verdict.reshape(cells, cells)
     boundary = avoidability_boundary(scenario, *ranges)
     return CriticalityMap(first, second, evaluation, avoidable, *(boundary or (None, None)))
 
@@ -97,7 +98,7 @@ def avoidability_boundary(scenario: Scenario, range_1_m: Range, range_2_m: Range
     """
     vehicle = controlled_vehicle(scenario, None)
     corners = _worlds_at(scenario, *np.array([range_1_m, range_2_m]))
-    if unproven_because(corners, Task(scenario, (vehicle,))) is not None:
+    if undecided_because(corners, Task(scenario, (vehicle,))) is not None:
         return None
 
     def avoidable(gap_1_m: Floats, gap_2_m: Floats) -> Bools:

@@ -132,8 +132,8 @@ def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
         return {name: [None] * len(outcome.collided) for name in REGRET_COLUMNS}
     n, proof = len(outcome.collided), regrets.limits.proof
     columns = (
-        proof.avoidable.astype(int),
-        proof.reason,
+        np.full(n, None) if proof.avoidable is None else proof.avoidable.astype(int),
+        np.full(n, None) if proof.reason is None else proof.reason,
         regrets.first_impact_harm,
         regrets.total_harm,
         regrets.source,

@@ -116,7 +116,9 @@ def assess(evaluation: Evaluation) -> Regrets | None:
     total = np.fmin.reduce([limits.total_harm, *(outcome.total_harm for outcome in outcomes)])
     regrets = Regrets(limits, first, total, np.zeros(0, np.str_))
     below = np.logical_or.reduce([regrets.below(outcome) for outcome in outcomes])
-    source = np.select([limits.proof.avoidable, ~limits.known, below], ["witness", "agents", "below_table"], "table")
+    avoidable = limits.proof.avoidable
+    witness = np.zeros(below.shape, np.bool_) if avoidable is None else avoidable
+    source = np.select([witness, ~limits.known, below], ["witness", "agents", "below_table"], "table")
     return Regrets(limits, first, total, source)
 
 
@@ -130,15 +132,16 @@ def distance(regrets: Regrets | None, outcome: Outcome, full_brake: Outcome | No
         return Distance()
     limits = regrets.limits
     avoidable, known, proven, certain = limits.proof.avoidable, limits.known, limits.proof.harm, limits.proof.impact
+    worlds = len(known)
     first, total = regrets.regret(outcome, "first"), regrets.regret(outcome, "total")
     reference = full_brake if bool(known.all()) else None
     return Distance(
-        unavoidable_rate=rate(int((~avoidable).sum()), len(avoidable)),
-        impact_proven_rate=None if certain is None else rate(int(certain.sum()), len(avoidable)),
+        unavoidable_rate=None if avoidable is None else rate(int((~avoidable).sum()), worlds),
+        impact_proven_rate=None if certain is None else rate(int(certain.sum()), worlds),
         between=None
-        if certain is None
+        if certain is None or avoidable is None
         else between(~avoidable, certain, regrets.first_impact_harm, regrets.total_harm),
-        avoidable_collision_rate=rate(int((outcome.collided & avoidable).sum()), len(avoidable)),
+        avoidable_collision_rate=None if avoidable is None else rate(int((outcome.collided & avoidable).sum()), worlds),
         best_known_first=mean(regrets.first_impact_harm),
         best_known_total=mean(regrets.total_harm),
         proven_harm=None if proven is None else mean(proven),

@@ -25,7 +25,7 @@ from ethbrake_marl.evaluation.cells import (
 from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.evaluation.harm_metrics import metric_headings
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
-from ethbrake_marl.evaluation.regret import Between
+from ethbrake_marl.evaluation.regret import Between, Distance
 from ethbrake_marl.evaluation.table import SummaryRow
 
 _TERMINAL_HEADINGS = (
@@ -155,19 +155,20 @@ def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
         return []
     contact = _bracket(percent_cell(found.unavoidable_rate, 1))
     first, total = found.best_known_first.value, found.best_known_total.value
-    text = f"In {contact} of these worlds no command of Vehicle 2 avoids contact"
-    if found.proven_harm is None:
+    text = f"In {contact} of these worlds no {_command_of(rows[0])} avoids contact"
+    if found.unavoidable_rate is None:
+        impact = _bracket(percent_cell(found.impact_proven_rate, 1))
+        text = f"In {impact} of these worlds no {_command_of(rows[0])} avoids an impact (proven)."
+        text += _tell_proven(found, first, total)
+    elif found.proven_harm is None:
         text += (
             f" (proven). Best known harm: {first:.2f} first-impact, {total:.2f} total; with an obstacle ahead no least"
             " harm is proven."
         )
     else:
-        impact, proven = _bracket(percent_cell(found.impact_proven_rate, 1)), found.proven_harm.value
-        text += (
-            f", in {impact} none avoids an impact (both proven).{_tell_gap(found.between)} Best known harm: {first:.2f}"
-            f" first-impact, {total:.2f} total; proven: no less than {proven:.2f}; gap: {first - proven:.2f}"
-            f" ({_share(first - proven, first)}) and {total - proven:.2f} ({_share(total - proven, total)})."
-        )
+        impact = _bracket(percent_cell(found.impact_proven_rate, 1))
+        text += f", in {impact} none avoids an impact (both proven).{_tell_gap(found.between)}"
+        text += _tell_proven(found, first, total)
     if found.known_best_share is not None and found.known_best_share < 1.0:
         text += (
             f" Found beforehand in {100 * found.known_best_share:.1f} % of the worlds; in the others it is the best of"
@@ -178,6 +179,22 @@ def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
         counts = ", ".join(f"{agent} in {count_of(count, 'world')}" for agent, count in below.items())
         text += f" Below what was known: {counts}."
     return [text]
+
+
+def _command_of(row: SummaryRow) -> str:
+    """Whose command it is: ``command of Vehicle 2``, or ``joint command`` where several are driven."""
+    driven = row.parameters.get("controlled_vehicle")
+    return "joint command" if driven is None else f"command of {str(driven).replace('vehicle_', 'Vehicle ')}"
+
+
+def _tell_proven(found: Distance, first: float, total: float) -> str:
+    """The best known and the proven harm, and what lies between, as a sentence."""
+    proven = 0.0 if found.proven_harm is None else found.proven_harm.value
+    return (
+        f" Best known harm: {first:.2f} first-impact, {total:.2f} total; proven: no less than {proven:.2f}; gap:"
+        f" {first - proven:.2f} ({_share(first - proven, first)}) and {total - proven:.2f}"
+        f" ({_share(total - proven, total)})."
+    )
 
 
 def _tell_gap(found: Between | None) -> str:

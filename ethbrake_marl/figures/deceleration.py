@@ -110,7 +110,7 @@ def _mark_best_known(axes: Axes, limits: Limits | Unproven) -> None:
         axes.axhline(harm, color=colour, linewidth=0.9, linestyle=dashes, alpha=0.7)
     proof = limits.proof
     least = "" if proof.harm is None else f"; proven: no less than {proof.harm[0]:.2f}"
-    told = " (avoidable)" if proof.avoidable[0] else least
+    told = " (avoidable)" if proof.avoidable is not None and proof.avoidable[0] else least
     axes.annotate(
         f"best known profile: {first:.2f} first-impact, {total:.2f} total{told}", (0.0, max(first, total)),
         xytext=(6, 3), textcoords="offset points", fontsize=8.5, color=GREY,

@@ -100,6 +100,8 @@ def harm_in_parts(evaluation: Evaluation) -> Figure:
     if regrets is None:
         raise InvalidInput("harm_in_parts: nothing is proven of these worlds, so no part can be told from another")
     avoidable = regrets.limits.proof.avoidable
+    if avoidable is None:
+        raise InvalidInput("harm_in_parts: where contact can be avoided is not decided for these vehicles")
     figure = new_figure(10.0, 1.4 + 0.36 * len(evaluation.outcomes))
     panels = figure.subplots(1, 2, sharey=True)
     for axes, count in zip(panels, HARM_COUNTS, strict=True):

@@ -4,6 +4,9 @@ Three vehicles, Vehicle 2 driven, the others braking fully: for these it is prov
 avoids all contact (``limits.avoidability``) and which harm no command undercuts (``limits.lower_bound``). The least
 harm known is the first proof's witness (harm 0), or the result of a search (``limits.best_harm``). An obstacle that
 Vehicle 1 does not reach by itself leaves the first proof as it is (only a push brings it there); the second knows none.
+
+Several driven vehicles, and lines of more than three: which harm no joint command undercuts (``limits.team_bound``).
+Whether contact can be avoided is decided for Vehicles 2 and 3 of three, and not for other teams.
 """
 
 from __future__ import annotations
@@ -17,12 +20,14 @@ from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.limits.avoidability import avoidability
 from ethbrake_marl.limits.lower_bound import lower_bound
 from ethbrake_marl.limits.shipped import best_known
+from ethbrake_marl.limits.team_bound import team_bound
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.physics.events import stopping_distances
 from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.scenario import Task
 
 _VEHICLES, _DRIVEN = 3, 1
+_DECIDED = ({1}, {1, 2})  # of three vehicles: who is driven where avoidability is proven
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,14 +41,19 @@ class Unproven:
 class Proof:
     """What is proven about each world, [n] each."""
 
-    avoidable: Bools  # some admissible command of Vehicle 2 avoids all contact
-    reason: NDArray[np.str_]  # why not: "early", "front" or "rear"; "" where avoidable
-    harm: Floats | None  # no command does less (m2/s2), under either count; None with an obstacle ahead
+    avoidable: Bools | None  # some admissible command avoids all contact; None where that is not decided
+    reason: NDArray[np.str_] | None  # why not: "early", "front" or "rear"; "" where avoidable
+    harm: Floats | None  # no command does less (m2/s2), under either count; None: not proven
 
     @property
     def impact(self) -> Bools | None:
-        """Worlds in which every command leads to an impact, not only to contact; None with an obstacle ahead."""
+        """Worlds in which every command leads to an impact, not only to contact; None where no harm is proven."""
         return None if self.harm is None else self.harm > 0.0
+
+    @property
+    def contact(self) -> Bools | None:
+        """Worlds in which every command leads to contact; None where that is not decided."""
+        return None if self.avoidable is None else ~self.avoidable
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +76,8 @@ def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
     if isinstance(proof, Unproven):
         return proof
     found = best_known(worlds, task)
-    first, total = (np.where(proof.avoidable, 0.0, found[harm_count]) for harm_count in HARM_COUNTS)
+    avoidable = np.zeros(worlds.n, np.bool_) if proof.avoidable is None else proof.avoidable
+    first, total = (np.where(avoidable, 0.0, found[harm_count]) for harm_count in HARM_COUNTS)
     return Limits(proof, first, total)
 
 
@@ -75,33 +86,58 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
     because = unproven_because(worlds, task)
     if because is not None:
         return Unproven(because)
+    horizon_s, time_step_s = task.scenario.horizon_s, task.scenario.time_step_s
+    if _is_team(task):
+        harm = team_bound(worlds, task.vehicles, horizon_s=horizon_s, time_step_s=time_step_s).harm
+        if undecided_because(worlds, task) is not None:
+            return Proof(None, None, harm)
+        contact = avoidability(worlds, _DRIVEN)
+        return Proof(contact.avoidable, contact.reason_name, harm)
     if obstacle_ahead(worlds).any():
-        contact, harm = avoidability(worlds, task.vehicle), None
-    else:
-        bound = lower_bound(
-            worlds, task.vehicle, horizon_s=task.scenario.horizon_s, time_step_s=task.scenario.time_step_s
-        )
-        contact, harm = bound.contact, bound.harm
-    return Proof(contact.avoidable, contact.reason_name, harm)
+        contact = avoidability(worlds, task.vehicle)
+        return Proof(contact.avoidable, contact.reason_name, None)
+    bound = lower_bound(worlds, task.vehicle, horizon_s=horizon_s, time_step_s=time_step_s)
+    return Proof(bound.contact.avoidable, bound.contact.reason_name, bound.harm)
 
 
 def unproven_because(worlds: Worlds, task: Task) -> str | None:
     """Why nothing is proven for the task in these worlds, as a clause; None when it is."""
+    if not _is_team(task):
+        return undecided_because(worlds, task)
+    return _script_because(task, "harm is bounded")
+
+
+def undecided_because(worlds: Worlds, task: Task) -> str | None:
+    """Why it is not decided in these worlds whether contact can be avoided, as a clause; None when it is."""
     scenario, names = task.scenario, task.scenario.vehicle_names
-    if len(task.vehicles) != 1:
+    if not task.vehicles or (len(task.vehicles) > 1 and set(task.vehicles) not in _DECIDED):
         return f"driven are: {task.names}; avoidability is proven for one vehicle"
     if scenario.vehicles != _VEHICLES:
         return f"{scenario.vehicles} vehicles; avoidability is proven for {_VEHICLES}"
-    if task.vehicle != _DRIVEN:
+    if set(task.vehicles) not in _DECIDED:
         return f"{task.names} is driven; avoidability is proven for {names[_DRIVEN]}"
-    for i in (0, 2):
-        script = scenario.scripts.get(i, "full_brake")
-        if script != "full_brake":
-            return f"{names[i]} follows {script}; avoidability is proven where it follows full_brake"
+    because = _script_because(task, "avoidability is proven")
+    if because is not None:
+        return because
     latency_s = worlds.vehicles.latency_s
     way_m = stopping_distances(worlds.speeds_mps[:, 0], latency_s[:, 0], worlds.vehicles.braking_capacity_mps2[:, 0])
     if not (way_m < worlds.obstacle_gap_m).all():
         return "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"
     if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():
         return f"{names[0]} may brake later than {names[_DRIVEN]}; nothing is proven then"
+    return None
+
+
+def _is_team(task: Task) -> bool:
+    """Whether the bound of teams is asked: several are driven, or one of more vehicles than ``lower_bound`` covers."""
+    return len(task.vehicles) > 1 or (len(task.vehicles) == 1 and task.scenario.vehicles > _VEHICLES)
+
+
+def _script_because(task: Task, proven: str) -> str | None:
+    """That somebody who is not driven follows another script than full_brake, as a clause; else None."""
+    scenario = task.scenario
+    for i in range(scenario.vehicles):
+        script = scenario.scripts.get(i, "full_brake")
+        if i not in task.vehicles and script != "full_brake":
+            return f"{scenario.vehicle_names[i]} follows {script}; {proven} where it follows full_brake"
     return None

@@ -46,10 +46,11 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
 
     add(f"Where {focus} did worst", worst_rows(evaluation, focus), WORST)
     regrets = assess(evaluation)
-    if regrets is not None:
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    if avoidable is not None:
         add(
             f"Avoidable, and {focus} collided",
-            _largest(total, outcome.collided & regrets.limits.proof.avoidable),
+            _largest(total, outcome.collided & avoidable),
             _EACH,
         )
     if BASELINE in evaluation.outcomes and focus != BASELINE:

@@ -33,7 +33,9 @@ _NONE = "–"
 def worst_section(evaluation: Evaluation, focus: str, watched: Collection[int]) -> Section:
     """The ten worlds in which an agent did worst; those that the page plays have a button."""
     regrets, outcome = assess(evaluation), evaluation.outcome(focus)
-    known = [] if regrets is None else ["Best known, first", "Best known, total", "Contact"]
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    known = [] if regrets is None else ["Best known, first", "Best known, total"]
+    known += [] if avoidable is None else ["Contact"]
     head = ["World", "First-impact harm", "Total harm", *known, "Impacts"]
     rows: list[Row] = []
     for k in worst_rows(evaluation, focus).tolist():
@@ -41,7 +43,8 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Collection[int]) 
         best: list[str] = []
         if regrets is not None:
             best += [f"{regrets.best(count)[k]:.2f}" for count in HARM_COUNTS]
-            best.append("avoidable" if regrets.limits.proof.avoidable[k] else "unavoidable")
+        if avoidable is not None:
+            best.append("avoidable" if avoidable[k] else "unavoidable")
         button = Markup('{} <button type="button" data-watch="{}">Watch</button>').format(number, number)
         harms = (f"{outcome.first_impact_harm[k]:.2f}", f"{outcome.total_harm[k]:.2f}")
         world = button if number in watched else number
@@ -62,12 +65,13 @@ def avoidable_section(evaluation: Evaluation) -> Section:
     """Collisions and harm where contact could be avoided, and where nobody could; and the regret of each agent."""
     regrets = assess(evaluation)
     body: list[str | Part] = []
-    if regrets is None:
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    if regrets is None or avoidable is None:
         told = "Nothing is proven of these worlds, so what was avoidable is not told apart."
+        if regrets is not None:
+            told = "Where contact can be avoided is not decided for these vehicles, so that is not told apart."
         body.append(f"{told} Reason: {evaluation.limits.because}." if isinstance(evaluation.limits, Unproven) else told)
-        title, words = "Harm world by world", "For each harm x, the share of the worlds in which an agent did more."
     else:
-        avoidable = regrets.limits.proof.avoidable
         share = rate(int(avoidable.sum()), len(avoidable)).in_words(digits=1, scale=100.0, unit=" %")
         body.append(
             f"Contact can be avoided in {share} of these worlds (proven, world by world); in the others no command can."
@@ -82,6 +86,8 @@ def avoidable_section(evaluation: Evaluation) -> Section:
                 "Mean harm per world as the least that is known, and what each agent did above it.",
             )
         )
+    title, words = "Harm world by world", "For each harm x, the share of the worlds in which an agent did more."
+    if regrets is not None:
         title = "Regret world by world"
         words = "For each regret x, the share of the worlds in which an agent did more than x above the best known."
     body.append(drawing(regret_distribution(evaluation), title, words))

@@ -135,6 +135,7 @@ TABLES: dict[str, How] = {
         "ethbrake evaluate --scenario paper-random --agents full_brake,e_v2x_bm:pairwise --json",
     )._replace(quoted=("85.26", "9.8514")),  # the paper's
     "| list | worlds | proven | best known, first": EXACT,
+    "| level | driven | proven | best known": _by(SEARCH),
     "| list | unavoidable | front | rear": _by(SEARCH, "make test-physics"),
     "| d1, d2; v1, v2, v3; tau2, tau3": EXACT,
     "| agent | predicted | collisions": _by(SEARCH),

@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -14,8 +15,12 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, outcome, parameters, rollout, summarise, write_per_world_csv
 from ethbrake_marl.evaluation.regret import assess
+from ethbrake_marl.evaluation.text import limit_lines
+from ethbrake_marl.figures.report import harm_in_parts
 from ethbrake_marl.limits import limits, lower_bound
-from ethbrake_marl.limits.limits import Limits, Unproven, known_limits, prove
+from ethbrake_marl.limits.limits import Limits, Proof, Unproven, known_limits, prove
+from ethbrake_marl.limits.team_bound import team_bound
+from ethbrake_marl.pages.evidence import avoidable_section, worst_section
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from tests.cli.conftest import TINY_RECIPE
@@ -92,12 +97,56 @@ def test_known_limits__are_the_proof_and_the_best_known(worlds: Worlds) -> None:
 
 def test_known_limits__say_why_nothing_is_proven(worlds: Worlds) -> None:
     scenario = load_scenario("paper-random")
-    assert known_limits(worlds, Task(scenario, (0, 1))) == Unproven(
-        "driven are: vehicle_1, vehicle_2; avoidability is proven for one vehicle"
-    )
     assert known_limits(worlds, Task(scenario, ())) == Unproven(
         "driven are: none; avoidability is proven for one vehicle"
     )
+    coasts = load_scenario("cooperation-3-pair").replace(roles={"vehicle_1": "coast", "vehicle_2": "learner"})
+    assert known_limits(worlds, Task(coasts, (1, 2))) == Unproven(
+        "vehicle_1 follows coast; harm is bounded where it follows full_brake"
+    )
+
+
+def test_prove__decides_contact_of_vehicles_2_and_3_as_of_vehicle_2_alone(worlds: Worlds) -> None:
+    scenario = load_scenario("cooperation-3-pair")
+    alone, both = prove(worlds, Task(scenario, (1,))), prove(worlds, Task(scenario, (2, 1)))
+    assert isinstance(alone, Proof) and isinstance(both, Proof)
+    assert np.array_equal(alone.avoidable, both.avoidable) and np.array_equal(alone.reason, both.reason)
+    assert 0.99 * alone.harm.mean() < both.harm.mean() <= alone.harm.mean()
+
+
+@pytest.mark.parametrize(
+    ("name", "vehicles"),
+    [("cooperation-4-all", (0, 1, 2)), ("cooperation-3-five", (1, 2, 3, 4)), ("cooperation-2-five", (1,))],
+)
+def test_prove__bounds_the_harm_of_other_teams_without_a_verdict_on_contact(name: str, vehicles: tuple[int]) -> None:
+    scenario = load_scenario(name)
+    sample = scenario.sample(30, 7)
+    found = known_limits(sample.worlds, Task(scenario, vehicles))
+    assert isinstance(found, Limits) and found.proof.avoidable is None and found.proof.contact is None
+    bound = team_bound(sample.worlds, vehicles, horizon_s=8.0, time_step_s=0.1)
+    assert np.array_equal(found.proof.harm, bound.harm)
+    assert not found.known.any()
+    assert (found.proof.harm > 0).any() == (name != "cooperation-4-all")
+
+
+def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decided(tmp_path: Path) -> None:
+    scenario = load_scenario("cooperation-3-five")
+    agents = {name: make_agent(name) for name in ("full_brake", "coast")}
+    found = evaluate(scenario.sample(20, 7), agents, scenario=scenario)
+    rows = summarise(found)
+    told = rows[0].distance
+    assert told.unavoidable_rate is None and told.between is None and told.avoidable_collision_rate is None
+    assert told.proven_harm is not None and 0 < told.proven_harm.value < told.best_known_first.value
+    assert told.impact_proven_rate is not None and told.known_best_share == 0.0
+    [text] = limit_lines(rows)
+    assert "no joint command avoids an impact (proven)" in text and "avoids contact" not in text
+    write_per_world_csv(tmp_path / "out.csv", found)
+    header, first = (tmp_path / "out.csv").read_text().splitlines()[:2]
+    cells = dict(zip(header.split(","), first.split(","), strict=False))
+    assert cells["avoidable"] == cells["unavoidable_reason"] == "" and float(cells["proven_harm"]) >= 0
+    assert avoidable_section(found).title and worst_section(found, "coast", ()).title
+    with pytest.raises(InvalidInput, match="where contact can be avoided is not decided"):
+        harm_in_parts(found)
 
 
 @pytest.mark.parametrize("vehicles", [(2,), (-1,), (0, 0)])

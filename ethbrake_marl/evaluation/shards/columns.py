@@ -78,10 +78,11 @@ def _limit_counts(outcome: Outcome, regrets: Regrets) -> dict[str, int]:
     proof, known = regrets.limits.proof, regrets.limits.known
     found = {
         "known": int(known.sum()),
-        "unavoidable": int((~proof.avoidable).sum()),
-        "avoidable_collisions": int((outcome.collided & proof.avoidable).sum()),
         "below_best_known": int(regrets.below(outcome).sum()),
     }
+    if proof.avoidable is not None:
+        found["unavoidable"] = int((~proof.avoidable).sum())
+        found["avoidable_collisions"] = int((outcome.collided & proof.avoidable).sum())
     if proof.impact is not None:
         found["impact_proven"] = int(proof.impact.sum())
     return found

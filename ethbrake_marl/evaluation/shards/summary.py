@@ -37,6 +37,10 @@ class _Agent:
         """Their share, with the exact interval."""
         return exact_rate(self.count(name), self._worlds)
 
+    def share_if_counted(self, name: str) -> Estimate | None:
+        """Their share; None where nobody counted, not even to 0."""
+        return self.share(name) if name in self._tally.counts else None
+
     def _whole(self, tally: AgentTally | None, name: str) -> Moments | None:
         found = None if tally is None else tally.moments.get(name)
         return found if found is not None and found.count == self._worlds else None
@@ -67,9 +71,9 @@ class _Agent:
         if self.count("known") != self._worlds:
             return Distance()
         return Distance(
-            unavoidable_rate=self.share("unavoidable"),
+            unavoidable_rate=self.share_if_counted("unavoidable"),
             impact_proven_rate=None if self.mean("proven_harm") is None else self.share("impact_proven"),
-            avoidable_collision_rate=self.share("avoidable_collisions"),
+            avoidable_collision_rate=self.share_if_counted("avoidable_collisions"),
             best_known_first=self.mean("best_known_first"),
             best_known_total=self.mean("best_known_total"),
             proven_harm=self.mean("proven_harm"),

@@ -93,8 +93,10 @@ class Explored:
         proof = prove(world, self.task)
         if isinstance(proof, Unproven):
             return {"avoidable": None, "why": shown(proof.because), "proven_harm": None}
-        avoidable, reason = bool(proof.avoidable[0]), str(proof.reason[0])
         harm = None if proof.harm is None else float(proof.harm[0])
+        if proof.avoidable is None or proof.reason is None:
+            return {"avoidable": None, "why": "not decided for these vehicles", "proven_harm": harm}
+        avoidable, reason = bool(proof.avoidable[0]), str(proof.reason[0])
         return {"avoidable": avoidable, "why": _REASONS.get(reason, ""), "proven_harm": harm}
 
     def best_constant(self, world: Worlds) -> dict[str, Any]:
