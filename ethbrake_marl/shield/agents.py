@@ -176,7 +176,7 @@ class StepShieldAgent(AgentAround):
         self._wanted: Floats = np.zeros(0)
         self._first_s: Floats = np.zeros(0)  # [n] time of the first decision
         self._asked: _Asked | None = None
-        self._make(0)  # refuses bad settings at once
+        self._make(scenario.learners[0] if len(scenario.learners) == 1 else 0)  # refuses bad settings at once
 
     @property
     def chosen_policy(self) -> Bools:

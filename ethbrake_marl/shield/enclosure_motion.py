@@ -33,8 +33,8 @@ MOVES, MAY_STOP, STANDS = 0, 1, 2  # in this piece of time
 FREE, TOUCHES, PARTS = 0, 1, 2  # what a pair does; the last: it was in contact when this piece of time began
 ROUNDING = 1e-12  # of a number and of 1: added to the remainders in each piece of time, far above the engine's own
 # columns of Path.touch, of a pair in contact: by how much it opens and closes at most (m/s), its largest gap (m), least
-# and largest pressing acceleration (m/s2) since it is pressed together, and the time since then (s); the largest speed of
-# the rear one in the worlds that creep (m/s, 0: none do); in the present piece the largest difference of speeds and gap
+# and largest pressing acceleration (m/s2) since it is pressed together, and the time since then (s); the largest speed
+# of the rear one in the worlds that creep (m/s, 0: none do); in this piece the largest difference of speeds, and gap
 OPENING, CLOSING, WIDE, SOFTEST, HARDEST, SINCE, CREEP, SPREAD, REACH = range(9)
 TOUCH_WIDTH = 9
 

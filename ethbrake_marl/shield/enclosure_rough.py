@@ -72,16 +72,19 @@ def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Pa
     P, e = cell.gap.shape[0], cell.restitution
     first = path.marks[0] == 1 or hit == 0
     if P == 1:
-        return 0.0 if first else own[1] * own[1]
+        alone: float = 0.0 if first else own[1] * own[1]
+        return alone
     second = path.marks[1] == 1 or hit == 1
     fastest = max(own[1], own[2])
     ahead = driven(cell, 1, (1.0 + e) * fastest, since)  # closing speed of the front pair, its rear one pushed
-    back = own[2] + max(e * driven(cell, 1, fastest, since), backwards)  # of the rear pair, its front one thrown back
+    back: float = own[2] + max(
+        e * driven(cell, 1, fastest, since), backwards
+    )  # of the rear pair, its front one thrown back
     if first and second:
         return 0.0
     if first:
         return back * back
     if second:
         return ahead * ahead
-    alone_first, alone_second = fastest * fastest, own[2] * own[2]
-    return max(alone_first + back * back, alone_second + ahead * ahead)
+    most: float = max(fastest * fastest + back * back, own[2] * own[2] + ahead * ahead)
+    return most

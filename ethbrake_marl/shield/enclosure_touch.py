@@ -146,9 +146,7 @@ def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
 
 
 @compiled_apart
-def creep(
-    cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, hardest: float, length: float
-) -> None:
+def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, hardest: float, length: float) -> None:
     """Note that worlds may creep by now, the pair's centre of mass being as slow as ``slowest`` in this piece."""
     if weakest < 0.0 and touch[SPREAD] > 0.0 and slowest <= largest_share(cell, p) * touch[SPREAD]:
         touch[CREEP] = max(touch[CREEP], touch[SPREAD])

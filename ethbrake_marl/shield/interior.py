@@ -14,8 +14,8 @@ import numpy as np
 
 from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.episode import HARM_IS_TOTAL
 from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
@@ -62,22 +62,45 @@ def placed(old: Boxes | None, new: Boxes, rows: Ints) -> Boxes:
     return new.take(np.argsort(rows)) if old is None or len(rows) >= len(old.low) else old.put(rows, new)
 
 
+def check_possible(scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
+    """Raise ``InvalidInput`` for a setting that interior mode cannot certify, whatever its worlds.
+
+    That is: total harm, more than three vehicles, an obstacle ahead, or others that do anything else than brake fully,
+    coast, or hold one deceleration.
+    """
+    if harm_count == "total":
+        raise _refusal("total harm")
+    if scenario.vehicles > MOST_VEHICLES:
+        raise _refusal(f"{scenario.vehicles} vehicles")
+    if scenario.has_obstacle:
+        raise _refusal("an obstacle ahead")
+    for i, script in sorted(others.items()):
+        name = getattr(script, "name", type(script).__name__)
+        if name.split(":")[0] not in SCRIPTS:
+            raise InvalidInput(
+                f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, which it cannot enclose; full_brake,"
+                " coast and constant:A are possible; robust corners takes every script"
+            )
+
+
+def _refusal(what: str) -> InvalidInput:
+    return InvalidInput(
+        f"shield: robust interior: {what}: it certifies first-impact harm of at most {MOST_VEHICLES} vehicles without"
+        " an obstacle; robust corners takes every scenario"
+    )
+
+
 def boxes_of(possible: Worlds, running: Running, scenario: Scenario, others: Mapping[int, Script]) -> Boxes:
     """The boxes of the n worlds of ``running`` at the alert, their members being ``possible`` [n * M].
 
-    Raises ``InvalidInput`` for what interior mode cannot
-    certify: more than three vehicles, an obstacle ahead, total harm, or others that do anything else than brake fully,
-    coast, or hold one deceleration.
+    Raises ``InvalidInput`` for worlds that interior mode cannot certify: with an obstacle ahead, or in which another
+    vehicle's command is not the same in the whole box. ``check_possible`` says what no world of a scenario changes.
     """
-    n, vehicle, total = running.n, int(running.problem.vehicles[0]), running.problem.clock[0, HARM_IS_TOTAL] == 1.0
+    n, vehicle = running.n, int(running.problem.vehicles[0])
     v, N = possible.vehicles, possible.N
     command = running.problem.command[:, running.problem.command.shape[1] - N :]
-    if N > MOST_VEHICLES or obstacle_ahead(possible).any() or total:
-        what = "total harm" if total else f"{N} vehicles" if N > MOST_VEHICLES else "an obstacle ahead"
-        raise InvalidInput(
-            f"shield: robust interior: {what}: it certifies first-impact harm of at most {MOST_VEHICLES} vehicles"
-            " without an obstacle; robust corners takes every scenario"
-        )
+    if obstacle_ahead(possible).any():
+        raise _refusal("an obstacle ahead")
     numbers = np.concatenate(
         [v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, possible.speeds_mps, possible.gaps_m],
         axis=1,
@@ -98,16 +121,11 @@ def _constants(others: Mapping[int, Script], vehicle: int, command: Floats) -> F
         kind = name.split(":")[0]
         if i == vehicle or kind == "full_brake":
             continue
-        same = bool((command[:, :, i] == command[:, :1, i]).all())
-        if kind not in SCRIPTS or not same:
-            why = (
-                "whose command is another one in each world of the box"
-                if kind in SCRIPTS
-                else "which it cannot enclose"
-            )
+        if not (command[:, :, i] == command[:, :1, i]).all():
             raise InvalidInput(
-                f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, {why}; full_brake, coast and"
-                " constant:A are possible, A being at most every capacity of the box"
+                f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, whose command is another one in each"
+                " world of the box; full_brake, coast and constant:A are possible, A being at most every capacity of"
+                " the box"
             )
         constant[:, i] = command[:, 0, i]
     return constant

@@ -76,7 +76,7 @@ class StepShield:
     fallback ``best constant`` drives: the better one of the plan's rest and the constants, chosen again after every
     surprise. With an ``uncertainty`` (robust mode) all of this holds for the worst member of each world, and what is
     seen must lie within the range of their predictions. Raises ``InvalidInput`` for an unknown count or vehicle, a
-    negative allowance, or others whose commands are not fixed.
+    negative allowance, others whose commands are not fixed, or what ``robust`` interior cannot certify.
     """
 
     fallback = "best constant"
@@ -121,6 +121,8 @@ class StepShield:
         self.baseline_shares: Floats = np.zeros((0, 0))  # [n, N] what each vehicle bears under the best constants
         scripts = script_agents(scenario, except_for=self.vehicles) if others is None else others
         self._others = {i: script for i, script in scripts.items() if i not in self.vehicles}
+        if uncertainty is not None and self.robust == interior.INTERIOR:
+            interior.check_possible(scenario, harm_count, self._others)
         self._width = int(number_of_decisions(np.zeros(1), scenario.time_step_s, scenario.horizon_s)[0]) + 1
 
     @property

@@ -8,11 +8,12 @@ import pytest
 from ethbrake_marl.agents.protocol import fixed_commands
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics.episode import number_of_decisions
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search.problem import profile_problem
-from ethbrake_marl.shield import ShieldOptions, StepShield, forms, parse_uncertainty
+from ethbrake_marl.shield import HybridShield, ShieldOptions, StepShield, forms, parse_uncertainty
 from ethbrake_marl.shield.certify import begin_running, plan_harm
 from ethbrake_marl.shield.interior import bound_plans, boxes_of
 from tests.shield.lines import line
@@ -164,12 +165,21 @@ def test_agents__are_written_with_the_interior():
         ),
     ],
 )
-def test_refused__what_it_cannot_certify(scenario, count, message):
-    vehicle = scenario.learners[0]
-    shield = StepShield(
-        scenario, vehicle, harm_count=count, uncertainty=parse_uncertainty("gaps_m.pair_1=0.1"), robust="interior"
-    )
-    with pytest.raises(InvalidInput, match=message):
+def test_refused__what_it_cannot_certify_when_it_is_made(scenario, count, message):
+    vehicle, text = scenario.learners[0], "gaps_m.pair_1=0.1"
+    with pytest.raises(InvalidInput, match=f"robust interior: .*{message}"):
+        StepShield(scenario, vehicle, harm_count=count, uncertainty=parse_uncertainty(text), robust="interior")
+    with pytest.raises(InvalidInput, match=f"robust interior: .*{message}"):
+        make_agent("full_brake+robust:interior", scenario=scenario, uncertainty=text, harm_count=count)
+    with pytest.raises(InvalidInput, match=f"robust interior: .*{message}"):
+        HybridShield(parallel_env(scenario), mode="robust", uncertainty=text, robust="interior", harm_count=count)
+    StepShield(scenario, vehicle, harm_count=count, uncertainty=parse_uncertainty(text))  # corners take it
+
+
+def test_refused__what_only_the_worlds_tell_when_they_begin():
+    scenario = line(3).replace(braking_capacity_mps2=[6.0, 6.0, 5.2])  # vehicle_3 holds 5 m/s2, which 4.68 cannot
+    shield = StepShield(scenario, 1, uncertainty=parse_uncertainty("braking_capacity_mps2=10%"), robust="interior")
+    with pytest.raises(InvalidInput, match=r"constant:5.*(capacity|another one in each world)"):
         shield.begin(scenario.sample(1, 0).worlds, np.arange(1))
 
 
