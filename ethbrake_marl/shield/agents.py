@@ -29,7 +29,8 @@ from ethbrake_marl.physics.episode import decision_s, first_decision_s
 from ethbrake_marl.physics.rows import TIME, Packed
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import state_columns
-from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
+from ethbrake_marl.shield.comparison import difference, seen_columns
+from ethbrake_marl.shield.interior import expects
 from ethbrake_marl.shield.rollouts import Proposer, proposed_actions
 from ethbrake_marl.shield.settings import check_scenario
 from ethbrake_marl.shield.step_shield import Certified, StepShield
@@ -258,7 +259,7 @@ class StepShieldAgent(AgentAround):
         assert shield.running is not None
         seen = seen_columns(packed)
         compared = asked.certified.asked & (time_s > asked.time_s) & ~shield.distrusted
-        wrong = compared & ~as_predicted(shield.running, seen)
+        wrong = compared & ~expects(shield.boxes, shield.running, seen)
         if self._believed is None and wrong.any():
             k = int(np.argmax(wrong))
             told = difference(shield.running.nominal().states[k], seen[k])

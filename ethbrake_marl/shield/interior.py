@@ -20,6 +20,7 @@ from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
 from ethbrake_marl.shield.certify_kernel import NO_CERTIFICATE
+from ethbrake_marl.shield.comparison import as_predicted
 from ethbrake_marl.shield.interior_kernel import Known, bound_box
 from ethbrake_marl.shield.rollouts import put
 
@@ -62,12 +63,14 @@ def placed(old: Boxes | None, new: Boxes, rows: Ints) -> Boxes:
     return new.take(np.argsort(rows)) if old is None or len(rows) >= len(old.low) else old.put(rows, new)
 
 
-def check_possible(scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
+def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
     """Raise ``InvalidInput`` for a setting that interior mode cannot certify, whatever its worlds.
 
     That is: total harm, more than three vehicles, an obstacle ahead, or others that do anything else than brake fully,
     coast, or hold one deceleration.
     """
+    if robust != INTERIOR:
+        return
     if harm_count == "total":
         raise _refusal("total harm")
     if scenario.vehicles > MOST_VEHICLES:
@@ -129,6 +132,19 @@ def _constants(others: Mapping[int, Script], vehicle: int, command: Floats) -> F
             )
         constant[:, i] = command[:, 0, i]
     return constant
+
+
+def expects(boxes: Boxes | None, running: Running, seen: Floats) -> Bools:
+    """Where what is seen now [n, columns] may be, as far as is known, [n].
+
+    Where the own latency of a box is uncertain a decision falls at another time in each of its worlds. No range of the
+    corners holds them then: any finite numbers may be.
+    """
+    expected = as_predicted(running, seen)
+    if boxes is not None:
+        own = 2 * boxes.limit.shape[1] + boxes.vehicle
+        expected |= (boxes.high[:, own] > boxes.low[:, own]) & np.isfinite(seen).all(axis=1)
+    return expected
 
 
 def bounds_at_alert(boxes: Boxes, plans: Floats, harm: Floats) -> Floats:

@@ -30,7 +30,6 @@ from ethbrake_marl.shield.certify import (
     plan_harm,
 )
 from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE
-from ethbrake_marl.shield.comparison import as_predicted
 from ethbrake_marl.shield.interventions import Intervention, interventions, write_down
 from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, merged, put
 from ethbrake_marl.shield.settings import check_amount, check_scenario, checked_vehicles, policies_of
@@ -121,8 +120,7 @@ class StepShield:
         self.baseline_shares: Floats = np.zeros((0, 0))  # [n, N] what each vehicle bears under the best constants
         scripts = script_agents(scenario, except_for=self.vehicles) if others is None else others
         self._others = {i: script for i, script in scripts.items() if i not in self.vehicles}
-        if uncertainty is not None and self.robust == interior.INTERIOR:
-            interior.check_possible(scenario, harm_count, self._others)
+        interior.check_possible(self.robust, scenario, harm_count, self._others)
         self._width = int(number_of_decisions(np.zeros(1), scenario.time_step_s, scenario.horizon_s)[0]) + 1
 
     @property
@@ -245,7 +243,7 @@ class StepShield:
         """Find the worlds that did not do what was predicted, and choose anew there from what is seen."""
         assert self.running is not None
         running, columns = self.running, seen.shape[1]
-        surprising = asked & ~as_predicted(running, seen)
+        surprising = asked & ~interior.expects(self.boxes, running, seen)
         if not surprising.any():
             return
         self.distrusted = self.distrusted | surprising
