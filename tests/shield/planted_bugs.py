@@ -1,4 +1,4 @@
-"""Thirty-six bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
+"""Thirty-five bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
 applied to a temporary copy. There ``test_certify``, ``test_step_shield`` and some other tests run with
@@ -232,9 +232,6 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "in a box no speed limit ends a drive": (Patch(MOTION, "if fastest > cell.limit[i]:", "if fastest > math.inf:"),),
     "a gap in contact stays as wide as it was": (
         Patch(TOUCH, "touch[WIDE] = max(wide, min(height, wide + fastest * length))", "touch[WIDE] = wide"),
-    ),
-    "a pair that brakes to a stop in contact is known as one that moves": (
-        Patch(TOUCH, "weakest < 0.0 and touch[SPREAD] > 0.0", "weakest > 0.0 and touch[SPREAD] > 0.0"),
     ),
     "what no path follows does no harm": (
         Patch(ROUGH, "return high(path.forms[-1]) + rough_rest(", "return high(path.forms[-1]) + 0.0 * rough_rest("),
