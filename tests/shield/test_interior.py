@@ -174,8 +174,9 @@ def test_bound__is_never_above_what_speeds_allow():
 
 
 def test_engine__with_an_uncertain_own_latency_no_world_of_the_box_is_distrusted_or_above_the_bound():
-    # vehicle_3, faster at the alert, brakes through vehicle_2's speed then: gap 2 at its decisions is largest in between
-    scenario = load_scenario("paper-random").replace(gaps_m=[60, 25], speeds_mps=[20, 20, 21], latency_s=[0, 0.3, 0.8])
+    # vehicle_3 is faster at the alert and brakes through the speed of vehicle_2 then: gap 2 has its extreme in between
+    changed = {"gaps_m": [60, 25], "speeds_mps": [20, 20, 21], "latency_s": [0, 0.3, 0.8]}
+    scenario = load_scenario("paper-random").replace(**changed)
     told = scenario.sample(1, 3).worlds.take(np.zeros(4, np.int64))
     uncertainty = parse_uncertainty("latency_s.vehicle_2=0.15")
     truth = uncertainty.draw(told, np.random.default_rng(1))
