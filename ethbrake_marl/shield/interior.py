@@ -189,8 +189,9 @@ def certify_inside(
     """
     if boxes is None:
         return decision
-    plan, bound = decision.backup.plan.copy(), decision.bound.copy()
-    changed = np.flatnonzero(asked & (plan != held.plan).any(axis=1))
+    plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)
+    bound = np.where(asked & ~other, held.harm, decision.bound)  # of the corners alone, where the plan is the same
+    changed = np.flatnonzero(asked & other)
     found = bound_plans(boxes.take(changed), plan[changed], budget[changed], CELLS, only_enough=True)
     least = np.where(decision.intervened, held.harm, budget)[changed]
     good = found <= least

@@ -1,4 +1,4 @@
-"""Thirty-five bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
+"""Thirty-six bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
 applied to a temporary copy. There ``test_certify``, ``test_step_shield`` and some other tests run with
@@ -225,6 +225,9 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "a square root is taken for its chord": (Patch(FORMS, "error = 0.5 * (0.25 / slope - start)", "error = 0.0"),),
     "a plan without a certificate inside the box is held": (
         Patch(INSIDE, "good = found <= least", "good = found <= np.inf"),
+    ),
+    "a plan that is kept is told the harm of its corners": (
+        Patch(INSIDE, "np.where(asked & ~other, held.harm, decision.bound)", "decision.bound.copy()"),
     ),
     "an impact before the first decision is passed over in a box": (
         Patch(WAIT, "max(fastest - slowest[i - 1], 0.0) * high(late) + 1e-9", "-1.0"),

@@ -216,6 +216,20 @@ def test_shield__coasting_stays_within_the_bound_in_every_world_of_the_box():
     assert (shield.bound < 200.0).all()
 
 
+def test_shield__the_bound_falls_only_with_another_plan():
+    scenario = load_scenario("paper-random")
+    shield = StepShield(scenario, 1, uncertainty=parse_uncertainty("gaps_m=0.5"), robust="interior")
+    shield.begin(scenario.sample(6, 3).worlds, np.arange(6))
+    rng, same = np.random.default_rng(0), 0
+    while not shield.running.finished.all():
+        held, going = shield.backup, ~shield.running.finished
+        shield.decide(rng.uniform(-1.0, 1.0, 6))
+        kept = going & (shield.backup.plan == held.plan).all(axis=1)
+        assert (shield.backup.harm[kept] == held.harm[kept]).all()  # not the lower harm of its corners
+        same += kept.sum()
+    assert same > 10
+
+
 def test_no_width__is_step_mode_to_the_bit():
     scenario = line(3)
     worlds, bounds = scenario.sample(5, 3).worlds, []
