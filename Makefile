@@ -41,7 +41,7 @@ help:
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
-	@echo "make test-hostile     6,800 files and command lines of strangers: each refused in one line, or in order"
+	@echo "make test-hostile     7,000 files and command lines of strangers: each refused in one line, or in order"
 	@echo "make audit            every pinned package with its licence; reported weaknesses where pip-audit is installed"
 	@echo "make test-light       install the wheel alone: at most 650 MB, no torch, and its examples run; then the sdist"
 	@echo "make test-libraries   train with other people's libraries, each in its own environment below .venvs/, and print the matrix"

@@ -36,7 +36,12 @@ napoleon_numpy_docstring = False
 html_theme = "furo"
 html_title = f"ethbrake_marl {__version__}"
 html_favicon = "figures/favicon.svg"
-html_extra_path = ["../scenarios/scenario.schema.json", "../train/recipe.schema.json"]
+html_extra_path = [
+    "../scenarios/scenario.schema.json",
+    "../train/recipe.schema.json",
+    "sweep.schema.json",
+    "tuning.schema.json",
+]
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_copy_source = False

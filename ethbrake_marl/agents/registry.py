@@ -162,7 +162,7 @@ _WRAPPERS: dict[str, Entry] = {
         "shield.factories:shield_steps",
     ),
     "robust": Entry(
-        "+robust[:interior|:believed]",
+        "+robust[:interior][:believed]",
         "the same where not everything is known: in the corners of an uncertainty, interior: in all of it;"
         " believed: against all that was not received",
         (Source.MODEL,),

@@ -17,7 +17,9 @@ from ethbrake_marl.scenario.roles import parse_agent_spec
 
 REFINED = ("refined", "refined:profile")
 SHIELDS = ("episode", "episode:pairwise", "step", "robust", "robust:interior")
-BELIEVED = ("episode:believed", "episode:pairwise:believed", "step:believed", "robust:believed")  # on what was received
+BELIEVED = (  # on what was received
+    "episode:believed", "episode:pairwise:believed", "step:believed", "robust:believed", "robust:interior:believed",
+)  # fmt: skip
 AROUND = (*REFINED, *SHIELDS, *BELIEVED)  # in the order in which they are put around an agent
 
 OLD_SPELLINGS = {  # of a policy; ``hybrid@PATH`` is ``ppo@PATH+episode`` now

@@ -47,6 +47,10 @@ def ablate_command(
     budget: Annotated[
         int | None, typer.Option(help="Candidates per world and count of that search.", show_default="20000")
     ] = None,
+    shield: Annotated[
+        str | None,
+        typer.Option(metavar="step", help="Also drive behind this shield, one for all learners.", show_default="none"),
+    ] = None,
     settings: SetOption = None,
     quick: Annotated[bool, typer.Option("--quick", help="A first look: few seeds, worlds and decisions.")] = False,
     jobs: Annotated[int, typer.Option(help="Trainings at once; changes no result.")] = 1,
@@ -70,7 +74,7 @@ def ablate_command(
         names = [*(LADDER if quick else STANDARD)] if levels is None else [each.strip() for each in levels.split(",")]
         if not 1 <= jobs <= 64:
             raise InvalidInput(f"jobs {jobs}: must be from 1 to 64")
-        plan = _plan(names, recipes, scheme, settings, list_seed, output, chosen)
+        plan = _plan(names, recipes, scheme, settings, list_seed, output, shield, chosen)
         if not cost:
             check_settings(plan)
         check_finished(plan.trainings())
@@ -140,6 +144,7 @@ def _plan(
     settings: list[str] | None,
     list_seed: int,
     output: Path,
+    shield: str | None,
     numbers: dict[str, int],
 ) -> Plan:
     from ethbrake_marl.learning.recipe import load_recipe
@@ -162,6 +167,7 @@ def _plan(
         noted=given.texts,
         list_seed=list_seed,
         folder=output,
+        shield=shield,
         **numbers,
     )
     check_plan(plan)

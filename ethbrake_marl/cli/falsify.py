@@ -43,35 +43,43 @@ WORSE = 1  # exit status when a kept world is worse than it was
 ROUNDING = 1e-6  # m2/s2
 
 
+AgentOption = Annotated[
+    str | None, typer.Option(help="Who drives; any agent of `ethbrake evaluate`.", show_default="policy@shipped")
+]
+MeasureOption = Annotated[
+    MeasureName,
+    typer.Option(metavar="|".join(MEASURES), help="What is searched for: harm, regret, a difference, a bound."),
+]
+AgainstOption = Annotated[
+    str | None,
+    typer.Option(metavar="AGENT", help="Whom regret or difference compares with.", show_default=HINDSIGHT),
+]
+AtRandomOption = Annotated[
+    bool, typer.Option("--at-random", help="Try worlds as a list draws them, to compare the search with.")
+]
+WorldsOption = Annotated[
+    Path | None, typer.Option(metavar="FILE.yaml", help="Write the worlds, by name, for evaluate and --again.")
+]
+AgainOption = Annotated[
+    Path | None, typer.Option(metavar="FILE.yaml", help="Drive the worlds of a file again instead of searching.")
+]
+
+
 def falsify_command(
     context: typer.Context,
-    agent: Annotated[
-        str | None, typer.Option(help="Who drives; any agent of `ethbrake evaluate`.", show_default="policy@shipped")
-    ] = None,
-    measure: Annotated[
-        MeasureName,
-        typer.Option(metavar="|".join(MEASURES), help="What is searched for: harm, regret, a difference, a bound."),
-    ] = "regret",
-    against: Annotated[
-        str | None,
-        typer.Option(metavar="AGENT", help="Whom regret or difference compares with.", show_default=HINDSIGHT),
-    ] = None,
+    agent: AgentOption = None,
+    measure: MeasureOption = "regret",
+    against: AgainstOption = None,
     scenario: ScenarioOption = "paper-random",
     budget: Annotated[int, typer.Option(help="Worlds that are tried.", min=1)] = 4000,
     seed: Annotated[int, typer.Option(help="Seed of the search.", min=0)] = 0,
     most: Annotated[int, typer.Option("--keep", help="Worlds that are kept, at most.", min=1, max=MOST)] = 20,
-    at_random: Annotated[
-        bool, typer.Option("--at-random", help="Try worlds as a list draws them, to compare the search with.")
-    ] = False,
+    at_random: AtRandomOption = False,
     harm_count: Annotated[HarmCount, typer.Option(help="Harm that is measured, and that agents minimise.")] = "first",
     vehicle: VehicleOption = None,
     settings: SetOption = None,
-    output: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="Write the worlds, by name, for evaluate and --again.")
-    ] = None,
-    again: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="Drive the worlds of a file again instead of searching.")
-    ] = None,
+    output: WorldsOption = None,
+    again: AgainOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -89,23 +97,16 @@ def falsify_command(
             raise typer.Exit(WORSE)
         return
     agent = agent or "policy@shipped"
-    if output is not None:
-        if output.suffix.lower() not in (".yaml", ".yml"):
-            raise InvalidInput(f"{output}: must end in .yaml")
-        check_target(output, force=force)
+    _check_output(output, force=force)
     given = read_settings(settings)
     chosen = load_evaluated(scenario, vehicle, given.scenario)
     measured_by = make_measure(measure, agent, against, chosen, harm_count)
     check_agents(measured_by.agents, chosen.replace(early_impacts="keep").sample(1, seed).worlds, chosen)
     with interruptible("nothing was written"), progress_bars() as bars:
         found = falsify(
-            measured_by,
-            budget,
-            seed,
-            most=most,
-            adaptive=not at_random,
+            measured_by, budget, seed, most=most, adaptive=not at_random,
             on_round=lambda done, total: bars.show(agent, done, total),
-        )
+        )  # fmt: skip
     worlds = _named(found, measured_by)
     told = _told(found, budget) | {"worlds": [world.model_dump(exclude_none=True) for world in worlds]}
     if worlds:
@@ -121,6 +122,14 @@ def falsify_command(
         return
     _show(worlds, measured_by)
     show(_summary(found, measured_by, budget))
+
+
+def _check_output(output: Path | None, *, force: bool) -> None:
+    """Refuse a file of worlds that cannot be written, before any work."""
+    if output is not None:
+        if output.suffix.lower() not in (".yaml", ".yml"):
+            raise InvalidInput(f"{output}: must end in .yaml")
+        check_target(output, force=force)
 
 
 def _refuse_others(context: typer.Context) -> None:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli.terminal import show
+from ethbrake_marl.cli.terminal import show, write_json
 from ethbrake_marl.errors import OldSpelling
+from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, OLD_SHIELDS
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.shield.uncertainty import EXAMPLE
 
 ScenarioOption = Annotated[
@@ -45,6 +47,32 @@ UncertaintyOption = Annotated[
     str | None,
     typer.Option(metavar="QUANTITY=WIDTH,...", help=f"What the robust shield does not know, such as {EXAMPLE}."),
 ]
+AgentsOption = Annotated[str, typer.Option(metavar="A,B,...", help="Who drives, with commas between them.")]
+ListEpisodesOption = Annotated[int | None, typer.Option(help="Worlds of the list.", show_default=str(EPISODES))]
+ListSeedOption = Annotated[int | None, typer.Option(help="Seed of the list.", show_default=str(LIST_SEED))]
+HarmCountOption = Annotated[HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")]
+OldShieldOption = Annotated[
+    str,
+    typer.Option(metavar="|".join(OLD_SHIELDS), help="Old: now +SHIELD behind an agent, such as ppo@shipped+step."),
+]
+StatesOption = Annotated[
+    Path | None, typer.Option(metavar="CSV|YAML", help="Your own worlds: one per row, or named ones of falsify.")
+]
+PerWorldOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Also write one row per world and agent (.csv, .parquet), and FILE.json."),
+]
+ObjectiveOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME",
+        help="Also tell the results under this objective; standard: under all usual ones. Repeatable.",
+    ),
+]
+GroupOption = Annotated[
+    str | None,
+    typer.Option(metavar="COLUMN", help="Also tell the results by group: scenario (a mixture), vehicle_2_type."),
+]
 VehicleOption = Annotated[
     str | None, typer.Option(help="Who is driven; other learners brake fully.", show_default="the learner")
 ]
@@ -58,6 +86,18 @@ JobsOption = Annotated[
     int, typer.Option("--jobs", min=1, max=64, help="So many at once, a process each; changes no result.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout.")]
+
+
+def schema_option(schema: Callable[[], dict[str, Any]]) -> Any:
+    """The option ``--schema`` of a command that reads files of one kind: print their JSON Schema and exit."""
+
+    def show_schema(asked: bool) -> None:
+        if asked:
+            write_json(schema())
+            raise typer.Exit
+
+    told = "Print the JSON Schema of the file, and exit."
+    return typer.Option("--schema", is_eager=True, callback=show_schema, help=told)
 
 
 def _show_version(asked: bool) -> None:

@@ -19,21 +19,26 @@ KEPT = "the same command goes on with what is in the folder"
 EPISODES = 10_000
 
 
+ItemsArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="[ITEM ...]", help="What to make.", show_default="everything")
+]
+FolderOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FOLDER", help="Folder of everything.", show_default="runs/reproduction"),
+]
+DocsOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.md", help="Write the results as Markdown, too, figures beside it."),
+]
+
+
 def reproduce_command(
-    names: Annotated[
-        list[str] | None, typer.Argument(metavar="[ITEM ...]", help="What to make.", show_default="everything")
-    ] = None,
+    names: ItemsArgument = None,
     quick: Annotated[bool, typer.Option("--quick", help="Train nothing: shipped policies (the default).")] = False,
     full: Annotated[bool, typer.Option("--full", help="Train learning curves and a policy stopped early.")] = False,
-    output: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Folder of everything.", show_default="runs/reproduction"),
-    ] = None,
+    output: FolderOption = None,
     episodes: Annotated[int, typer.Option(help="The most worlds of any list; the paper has 10,000.")] = EPISODES,
-    docs: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.md", help="Write the results as Markdown, too, figures beside it."),
-    ] = None,
+    docs: DocsOption = None,
     cost: Annotated[bool, typer.Option("--cost", help="Say what is left to do and what it takes; stop.")] = False,
     listed: Annotated[bool, typer.Option("--list", help="List the items; stop.")] = False,
     force: ForceOption = False,
@@ -56,10 +61,7 @@ def reproduce_command(
         if listed:
             _list([(item.name, ", ".join(item.labels), item.title) for item in chosen], as_json)
             return
-        if quick and full:
-            raise InvalidInput("--quick and --full: give one of the two")
-        if not 2 <= episodes <= EPISODES:
-            raise InvalidInput(f"episodes {episodes}: must be from 2 to {EPISODES:,}")
+        _check(quick=quick, full=full, episodes=episodes)
         mode: Mode = FULL if full else QUICK
         folder = output or Path("runs") / "reproduction"
         if full:
@@ -82,6 +84,13 @@ def reproduce_command(
     if not finished:
         say(f"interrupted: items are made of the trainings that were finished; {KEPT}")
         raise typer.Exit(INTERRUPTED)
+
+
+def _check(*, quick: bool, full: bool, episodes: int) -> None:
+    if quick and full:
+        raise InvalidInput("--quick and --full: give one of the two")
+    if not 2 <= episodes <= EPISODES:
+        raise InvalidInput(f"episodes {episodes}: must be from 2 to {EPISODES:,}")
 
 
 def _list(items: list[tuple[str, str, str]], as_json: bool) -> None:

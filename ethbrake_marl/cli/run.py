@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.cli.evaluate import show_beside, show_rows
 from ethbrake_marl.cli.options import (
     ForceOption,
     JsonOption,
@@ -20,6 +19,7 @@ from ethbrake_marl.cli.options import (
     TrainingSeedOption,
     VehicleOption,
 )
+from ethbrake_marl.cli.results import show_beside, show_rows
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, say, write_json
 from ethbrake_marl.cli.train import KEPT, end_of_training
 from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, load_driven

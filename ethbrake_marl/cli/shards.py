@@ -11,13 +11,14 @@ from typing import Annotated
 
 import typer
 
+from ethbrake_marl.cli.results import show_rows
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
 from ethbrake_marl.errors import InvalidInput, check_whole_number, need
-from ethbrake_marl.evaluation import SummaryRow, horizon_note, rescored_table, rich_table
+from ethbrake_marl.evaluation import horizon_note, rescored_table
 from ethbrake_marl.evaluation.inputs import check_agents, make_lineup
-from ethbrake_marl.evaluation.shards.question import Question, ask
+from ethbrake_marl.evaluation.shards.question import Asked, Question, ask
 from ethbrake_marl.evaluation.shards.summary import rescore_shards, shards_to_json, summarise_shards
-from ethbrake_marl.evaluation.text import metrics_table
+from ethbrake_marl.evaluation.shards.tally import Tally
 from ethbrake_marl.files.durable import write_file
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.scenario import Scenario
@@ -43,6 +44,10 @@ RowsOption = Annotated[
     bool, typer.Option("--rows", help="With --output: also one row per world and agent, as Parquet files in it.")
 ]
 RESULTS = "results.json"
+_INTERVALS = (
+    "Intervals: rates exact (Clopper-Pearson), means by Student's t; all from exact sums, the same bits in any"
+    " number of shards."
+)
 
 
 def check_shards(
@@ -125,7 +130,12 @@ def evaluate_in_shards(
         tally = evaluate_shards(
             asked, shards=shards, jobs=jobs, workers=workers, folder=folder, tell=bars.show_progress
         )
-    summary = summarise_shards(asked, tally)
+    _tell(asked, tally, output, as_json=as_json)
+
+
+def _tell(asked: Asked, tally: Tally, output: Path | None, *, as_json: bool) -> None:
+    """Write the results beside the finished shards, and print the table."""
+    question, summary = asked.question, summarise_shards(asked, tally)
     results = shards_to_json(asked, tally, summary)
     if output is not None:
         write_file(output / RESULTS, (json.dumps(results, indent=2, allow_nan=False) + "\n").encode())
@@ -133,12 +143,13 @@ def evaluate_in_shards(
     if as_json:
         write_json(results)
     else:
-        _show(summary)
+        show_rows(summary)
+        show(_INTERVALS)
     moving = {row.agent: row.horizon_ends for row in summary if row.policy_share is not None}
-    if note := horizon_note(moving, tally.worlds, scenario.horizon_s):
+    if note := horizon_note(moving, tally.worlds, question.scenario.horizon_s):
         say(note)
-    if objectives and not as_json:
-        result_console().print(rescored_table(rescore_shards(asked, tally), harm_count))
+    if question.objectives and not as_json:
+        result_console().print(rescored_table(rescore_shards(asked, tally), question.harm_count))
 
 
 def _on_ray(address: str, jobs: int) -> Workers:
@@ -147,14 +158,3 @@ def _on_ray(address: str, jobs: int) -> Workers:
 
     most = None if jobs == 1 else jobs
     return RayWorkers(address, len(os.sched_getaffinity(0)) if address == LOCAL and most is None else most)
-
-
-def _show(rows: Sequence[SummaryRow]) -> None:
-    """The table, and how its intervals were made."""
-    result_console().print(rich_table(rows))
-    if rows[0].metrics:
-        result_console().print(metrics_table(rows))
-    show(
-        "Intervals: rates exact (Clopper-Pearson), means by Student's t; all from exact sums, the same bits in any"
-        " number of shards."
-    )

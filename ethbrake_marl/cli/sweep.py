@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ethbrake_marl.cli.options import JsonOption
+from ethbrake_marl.cli.options import JsonOption, schema_option
 from ethbrake_marl.cli.terminal import INTERRUPTED, Bars, interruptible, progress_bars, say, show, write_json
 from ethbrake_marl.errors import InvalidInput, need
 
@@ -21,6 +21,15 @@ if TYPE_CHECKING:
 FAILED = 1  # exit status where some jobs failed
 KEPT = "the same command goes on with what is in the folder"
 _MOST = 4096
+
+
+def _schema() -> dict[str, Any]:
+    from ethbrake_marl.studies.sweep.file import sweep_json_schema
+
+    return sweep_json_schema()
+
+
+SchemaOption = Annotated[bool, schema_option(_schema)]
 
 
 def sweep_command(
@@ -37,6 +46,7 @@ def sweep_command(
     form: Annotated[Literal["csv", "parquet"], typer.Option("--format", help="Of the table.")] = "csv",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the jobs and what they take; do nothing.")] = False,
     as_json: JsonOption = False,
+    schema: SchemaOption = False,
 ) -> None:
     """Train every job of a file, and write one table of what they reached.
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ethbrake_marl.cli.options import ForceOption, JsonOption
+from ethbrake_marl.cli.options import ForceOption, JsonOption, schema_option
 from ethbrake_marl.cli.sweep import FAILED, KEPT, workers_for
 from ethbrake_marl.cli.terminal import INTERRUPTED, Bars, interruptible, progress_bars, say, show, write_json
 from ethbrake_marl.errors import InvalidInput, count_of, need
@@ -20,6 +20,19 @@ if TYPE_CHECKING:
 _MOST, _MOST_TRIALS = 4096, 100_000
 
 
+def _schema() -> dict[str, Any]:
+    from ethbrake_marl.studies.tuning.file import tuning_json_schema
+
+    return tuning_json_schema()
+
+
+StorageOption = Annotated[
+    str | None,
+    typer.Option(metavar="URL", help="Of the study, to be shared.", show_default="a journal file in FOLDER"),
+]
+SchemaOption = Annotated[bool, schema_option(_schema)]
+
+
 def tune_command(
     file: Annotated[Path, typer.Argument(metavar="TUNING.yaml", help="A training and the ranges of its settings.")],
     output: Annotated[Path, typer.Option("--output", metavar="FOLDER", help="Folder of everything.")],
@@ -28,10 +41,7 @@ def tune_command(
     ray: Annotated[
         str | None, typer.Option(metavar="local|ADDRESS", help="Run the trials on Ray, not in processes of our own.")
     ] = None,
-    storage: Annotated[
-        str | None,
-        typer.Option(metavar="URL", help="Of the study, to be shared.", show_default="a journal file in FOLDER"),
-    ] = None,
+    storage: StorageOption = None,
     retries: Annotated[int, typer.Option(help="Further attempts at a trial whose process was lost.")] = 2,
     export: Annotated[
         Path | None, typer.Option(metavar="NAME.yaml", help="Write the best trial as a recipe of this name.")
@@ -41,6 +51,7 @@ def tune_command(
         bool, typer.Option("--dry-run", help="Print the space and what the trials take; do nothing.")
     ] = False,
     as_json: JsonOption = False,
+    schema: SchemaOption = False,
 ) -> None:
     """Search the settings of a recipe that do least harm on a list of worlds of its own.
 
@@ -55,13 +66,9 @@ def tune_command(
         from ethbrake_marl.studies.tuning.plan import plan_tuning
         from ethbrake_marl.studies.tuning.run import check_tuning, run_tuning
 
-        _check_numbers(trials, jobs, retries)
+        _check_options(trials, jobs, retries, storage)
         if ray is not None:
             need("ray")
-        if storage is not None and "://" not in storage:
-            raise InvalidInput(
-                "storage: must be an address such as sqlite:///study.db; leave it out for a journal file"
-            )
         plan = plan_tuning(read_tuning(file))
         check_folder(output)
         check_tuning(plan, output)
@@ -80,11 +87,13 @@ def tune_command(
     _show_result(plan, result, export, force, as_json)
 
 
-def _check_numbers(trials: int, jobs: int, retries: int) -> None:
+def _check_options(trials: int, jobs: int, retries: int, storage: str | None) -> None:
     limits = {"trials": (trials, 1, _MOST_TRIALS), "jobs": (jobs, 1, _MOST), "retries": (retries, 0, 100)}
     for name, (value, least, most) in limits.items():
         if not least <= value <= most:
             raise InvalidInput(f"{name} {value}: must be from {least} to {most:,}")
+    if storage is not None and "://" not in storage:
+        raise InvalidInput("storage: must be an address such as sqlite:///study.db; leave it out for a journal file")
 
 
 def _check_export(plan: TuningPlan, export: Path, force: bool) -> None:

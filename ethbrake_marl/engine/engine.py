@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import checked_action
-from ethbrake_marl.engine.step import BAD_ACTION, ENDED, OUTCOME_ROWS, START, STEP, Step, step_worlds
+from ethbrake_marl.engine.running import RUNNING, Running
+from ethbrake_marl.engine.step import BAD_ACTION, OUTCOME_ROWS, START, Step, step_worlds
 from ethbrake_marl.engine.stream import (
     Roster,
     Script,
@@ -28,51 +29,17 @@ from ethbrake_marl.engine.stream import (
     moved,
     within_capacity,
 )
+from ethbrake_marl.engine.terms import Terms
 from ethbrake_marl.errors import InvalidInput, renumbered
-from ethbrake_marl.harm import Ledger
-from ethbrake_marl.objectives import objective_harm
-from ethbrake_marl.observations import Observations, ObservationSpec, observation_for, observe_packed, plan_of
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.observations import ObservationSpec, observation_for, plan_of
+from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.messages import hear_rows
-from ethbrake_marl.physics.rows import (
-    NO_ROWS,
-    TIME,
-    Packed,
-    command_at,
-    gap_at,
-    has_messages,
-    has_news,
-    has_obstacle,
-    ledger_columns,
-    obstacle_ledger_columns,
-    own_latency_and_news,
-    pack,
-    params_at,
-    previous_at,
-    speed_at,
-    unpack,
-    with_news_columns,
-    with_obstacle_columns,
-)
+from ethbrake_marl.physics.rows import NO_ROWS, TIME, Packed, has_messages, has_news, has_obstacle, pack, unpack
 from ethbrake_marl.physics.segment import DONE
-from ethbrake_marl.rewards import (
-    Reward,
-    StepOutcome,
-    counted_terms,
-    further_terms,
-    moving_terms_of,
-    own_terms,
-    potential,
-    registered_terms_of,
-    resolved_objective,
-    reward_params,
-    weighted_sum,
-)
+from ethbrake_marl.rewards import Reward, counted_terms
 from ethbrake_marl.scenario import Scenario
 
 Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
-
-_RUNNING = ("_state", "_params", "_clock", "_wanted", "_potential")
 
 
 class Watcher(Protocol):
@@ -89,7 +56,7 @@ class Watcher(Protocol):
         """The memory once the engine, as it was ``before`` this step, is as ``after``."""
 
 
-class Engine:
+class Engine(Running):
     """A batch of ``n`` running episodes of one scenario.
 
     Steps start when the first of the ``deciders`` may act; with none, at t = 0. Whoever must see each episode's start
@@ -115,15 +82,6 @@ class Engine:
 
     """
 
-    roster: Roster  # who runs in which row, and which worlds failed
-    _state: Floats  # of the running episodes, as rows of ``physics.rows``
-    _params: Floats
-    _clock: Floats  # [n, CLOCK_WIDTH]
-    _wanted: Floats  # [n, N] m/s2
-    _potential: Floats  # [n, N]
-    _obstacle: bool  # the rows have columns of an obstacle
-    _by_link: bool  # ... of news by link
-
     def __init__(
         self,
         scenario: Scenario,
@@ -139,8 +97,7 @@ class Engine:
     ) -> None:
         if not n >= 1:
             raise InvalidInput(f"engine: n = {n} worlds; at least 1 is needed")
-        self.scenario = scenario
-        self.n = n
+        self.scenario, self.n = scenario, n
         self.learners = tuple(learners)
         self.scripts = dict(scripts)
         unassigned = set(range(scenario.vehicles)) - set(self.learners) - set(self.scripts)
@@ -152,7 +109,8 @@ class Engine:
         self.deciders = self.learners if deciders is None else tuple(deciders)
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
-        self.reward, self._objectives = resolved_objective(reward_params(reward), scenario.objective, scenario.vehicles)
+        self._terms = Terms(reward, scenario, self.learners)
+        self.reward = self._terms.params
         self.observation = (observation or observation_for(scenario)).at_steps_of(scenario.time_step_s)
         self._plan = plan_of(self.observation)
         self._memories: dict[Watcher, Any] = {}
@@ -162,12 +120,8 @@ class Engine:
         self._learner_index = np.array(self.learners, np.int64)
         total = float(self.reward.harm_count == "total")
         times = scenario.time_step_s, scenario.horizon_s
-        shared_harm = 0.0 if self._objectives else self.reward.harm
-        self._settings = np.array([*times, shared_harm, total, self.reward.terminal])
-        self._moving_terms, self._own_terms = moving_terms_of(self.reward), registered_terms_of(self.reward)
-        self._moves_reward = bool(self._moving_terms or self._own_terms)
+        self._settings = np.array([*times, self._terms.shared_harm, total, self.reward.terminal])
         self.reward_terms = counted_terms(self.reward)  # names of those whose values each step tells
-        self._more_terms = self._moves_reward or self.reward.shaping > 0.0 or bool(self._objectives)
         self._stream = Stream(scenario, self.deciders, self.scripts, seed)
         self.reset(worlds=worlds)
 
@@ -175,45 +129,6 @@ class Engine:
     def seed(self) -> int:
         """Seed of the training stream."""
         return self._stream.seed
-
-    @property
-    def packed(self) -> Packed:
-        """The running worlds themselves, as rows of ``physics.rows``: for kernels to read, not to be changed."""
-        return Packed(self._state, self._params)
-
-    @property
-    def wanted_mps2(self) -> Floats:
-        """What each vehicle wanted in the last step, [n, N]: for kernels to read, not to be changed."""
-        return self._wanted
-
-    @property
-    def worlds(self) -> Worlds:
-        """The worlds as they are now, in their own memory."""
-        return unpack(self.packed)
-
-    @property
-    def ledger(self) -> Ledger:
-        """Harm of the running episodes so far, in its own memory."""
-        vehicles = self.scenario.vehicles
-        first, total, count = ledger_columns(self._state, vehicles)
-        mass = self._params[:, params_at(3, vehicles) : params_at(4, vehicles)].copy()
-        return Ledger(first, total, count, *obstacle_ledger_columns(self._state, vehicles), mass)
-
-    @property
-    def known_from_s(self) -> Floats:
-        """From when on vehicle i acts on news of vehicle j, [n, N, N]: ``known_from_s`` of the worlds' vehicles."""
-        return own_latency_and_news(self._params, self.scenario.vehicles)[1]
-
-    @property
-    def ended(self) -> Bools:
-        """Episodes that have ended, [n]."""
-        ended: Bools = self._clock[:, ENDED] == 1.0
-        return ended
-
-    @property
-    def steps(self) -> Ints:
-        """Steps that the running episodes have taken, [n]."""
-        return self._clock[:, STEP].astype(np.int64)
 
     @property
     def watchers(self) -> tuple[Watcher, ...]:
@@ -269,7 +184,7 @@ class Engine:
     def _apart(self) -> Engine:
         """An engine that goes on from here without changing this one (scripts that remember are shared)."""
         new = copy.copy(self)
-        new.__dict__.update({name: getattr(self, name).copy() for name in _RUNNING})
+        new.__dict__.update({name: getattr(self, name).copy() for name in RUNNING})
         new.roster = copy.deepcopy(self.roster)
         return new
 
@@ -281,30 +196,6 @@ class Engine:
         self._clock[rows], self._wanted[rows] = start.clock, start.wanted
         self._begin(rows, start)
 
-    def _kept(self, packed: Packed) -> Packed:
-        """Rows as wide as they are kept: with columns of an obstacle, and of news by link, if the first had such."""
-        (state, params), N = packed, self.scenario.vehicles
-        return Packed(
-            with_obstacle_columns(state, N) if self._obstacle else state,
-            with_news_columns(params, N) if self._by_link else params,
-        )
-
-    def observe(self, vehicle: int) -> Observations:
-        """Current observation of one vehicle, [n, F]."""
-        if not 0 <= vehicle < self.scenario.vehicles:
-            raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{self.scenario.vehicles - 1}")
-        return self.observe_all(np.array([vehicle]))[:, 0]
-
-    def observe_all(self, vehicles: Ints, rows: Ints | None = None) -> Observations:
-        """Current observations of several vehicles, [n, len(vehicles), F]; only of the worlds ``rows`` if given."""
-        state, params = self._state, self._params
-        if rows is not None:
-            state, params = state.take(rows, axis=0), params.take(rows, axis=0)
-        if not self._plan.extras:
-            return observe_packed(state, params, vehicles, self._plan)
-        steps = self._clock[:, STEP] if rows is None else self._clock[rows, STEP]
-        return observe_packed(state, params, vehicles, self._plan, steps)
-
     def step(self, actions: Actions) -> Step:
         """Advance every running episode by one time step.
 
@@ -313,7 +204,7 @@ class Engine:
         refuses does not happen: the worlds stay as they are.
         """
         columns = self._columns(actions)
-        if not (self._memories or self._own_terms):  # nobody can refuse what happens
+        if not (self._memories or self._terms.are_foreign):  # nobody can refuse what happens
             step = self._advance(columns)
         else:
             new = self._apart()
@@ -331,7 +222,7 @@ class Engine:
             worlds = self.worlds
             for vehicle, script in self._remembering.items():
                 self._wanted[:, vehicle] = within_capacity(ask_script(script, worlds, vehicle), worlds, vehicle, script)
-        before = self._objective_harm() if self._objectives else None
+        before = self._terms.objective_harm(self) if self._terms.by_objective else None
         was = self._state.copy() if has_messages(self._state, self._params) else None
         reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
         status = self._step_worlds(columns, reward, outcome)
@@ -343,10 +234,8 @@ class Engine:
         if status != DONE:
             times = self._state[:, 0]
             self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
-        if before is not None and self.reward.harm > 0.0:
-            step.further["harm"] = before - self._objective_harm()
-        if self._more_terms:
-            self._add_further_terms(step)
+        if self._terms.add_something:
+            self._terms.add(step, self, before)
         return step
 
     def _columns(self, actions: Actions) -> Floats:
@@ -376,64 +265,6 @@ class Engine:
         each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
         return np.stack(each, axis=1)
 
-    def _objective_harm(self) -> Floats:
-        """What the objective of each vehicle makes of the harm so far, [n, N]."""
-        return objective_harm(self.ledger, self.reward.harm_count, self._objectives)
-
-    def _add_further_terms(self, step: Step) -> None:
-        """Add the terms that need the motion, or the future, to a step's reward; nothing for rows that stood still."""
-        standing = self.ended & ~step.ended
-        if self._moves_reward:
-            outcome = self._outcome(step)
-            step.further.update(further_terms(self._moving_terms, self.reward, outcome))
-            if self._own_terms:
-                counts = ~standing & (step.failed == 0)
-                step.further.update(own_terms(self._own_terms, outcome, counts, self.steps))
-        if self.reward.shaping > 0.0:
-            step.further["shaping"] = self._shaping(step.terminated)
-        extra = weighted_sum(self.reward, step.further, step.reward.shape)
-        extra[standing] = 0.0
-        step.reward[:] += extra
-
-    def _outcome(self, step: Step) -> StepOutcome:
-        """What terms are computed from: views of this engine's rows."""
-        vehicles, state, params = self.scenario.vehicles, self._state, self._params
-        gaps = gap_at(vehicles)
-        braking, driving, latency, mass = (
-            params[:, params_at(k, vehicles) : params_at(k + 1, vehicles)] for k in range(4)
-        )
-        return StepOutcome(
-            step.first_impact_harm,
-            step.total_harm,
-            step.safe_end,
-            state[:, gaps : gaps + vehicles - 1],
-            state[:, speed_at(vehicles) : command_at(vehicles)],
-            state[:, command_at(vehicles) : previous_at(vehicles)],
-            state[:, previous_at(vehicles) : gaps],
-            self.scenario.time_step_s,
-            state[:, TIME],
-            braking,
-            driving,
-            latency,
-            mass,
-            self._learner_index.view(),
-        )
-
-    def _shaping(self, terminated: Bools) -> Floats:
-        """The shaping term [n, N] of this step; keeps the new potentials, which are 0 where an episode terminated."""
-        before = self._potential
-        self._potential = self._potentials(self.worlds)
-        self._potential[terminated] = 0.0
-        shaping: Floats = self.reward.shaping_discount * self._potential - before
-        return shaping
-
-    def _potentials(self, worlds: Worlds) -> Floats:
-        """Potential of every learner, 0 for other vehicles, [n, N]."""
-        potentials = np.zeros(worlds.speeds_mps.shape)
-        shared = potential(self.reward, worlds, self.learners, self.scenario.horizon_s)
-        potentials[:, self._learner_index] = shared[:, np.newaxis]
-        return potentials
-
     def _begin(self, rows: Ints, start: Start) -> None:
         """Tell those who must know that episodes start in ``rows``, and move what depends on them."""
         if self._memories or self._remembering:
@@ -449,7 +280,8 @@ class Engine:
             hear_rows(moving, params, self._wanted[rows], self._state[rows, TIME], self.scenario.time_step_s)
             self._params[rows] = params
         if self.reward.shaping > 0.0:
-            self._potential[rows] = self._potentials(unpack(Packed(self._state[rows], self._params[rows])))
+            worlds = unpack(Packed(self._state[rows], self._params[rows]))
+            self._potential[rows] = self._terms.potentials(worlds, self.scenario)
 
     def _begin_with_memory(self, rows: Ints, alert: Worlds, start_s: Floats) -> None:
         """Scripts with a memory act at the alert on the whole batch; then the new worlds move to the first decision.

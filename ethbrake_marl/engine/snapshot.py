@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.running import RUNNING
 from ethbrake_marl.engine.stream import Roster
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.rows import params_at
 
 Arrays = dict[str, NDArray[Any]]
-
-_RUNNING = ("_state", "_params", "_clock", "_wanted", "_potential")
 
 
 def engine_snapshot(engine: Engine) -> Arrays:
@@ -23,7 +22,7 @@ def engine_snapshot(engine: Engine) -> Arrays:
 
     The stream is one number: worlds are pure functions of the seed and of where they stand in it.
     """
-    arrays: Arrays = {name.lstrip("_"): getattr(engine, name).copy() for name in _RUNNING}
+    arrays: Arrays = {name.lstrip("_"): getattr(engine, name).copy() for name in RUNNING}
     stream = engine._stream
     arrays["stream"] = np.array([stream.seed, stream.position], np.uint64)
     for vehicle, script in engine._remembering.items():
@@ -40,12 +39,12 @@ def restore_engine(engine: Engine, arrays: Mapping[str, NDArray[Any]]) -> None:
     arrays = with_own_latency(arrays, engine.scenario.vehicles)
     if engine.watchers:
         raise InvalidInput("engine snapshot: a shield follows this engine; restore first, then put the shield around")
-    for name in _RUNNING:
+    for name in RUNNING:
         have, wanted = arrays.get(name.lstrip("_")), getattr(engine, name)
         if have is None or have.shape != wanted.shape:
             shape = "nothing" if have is None else have.shape
             raise InvalidInput(f"engine snapshot: {name.lstrip('_')} is {shape}; {wanted.shape} is needed")
-    for name in _RUNNING:
+    for name in RUNNING:
         setattr(engine, name, np.array(arrays[name.lstrip("_")], np.float64))
     seed, taken = (int(number) for number in arrays["stream"])
     engine._stream.restart(seed)

@@ -33,6 +33,7 @@ Kind = Literal[
     "generalise",
     "learning-curves",
     "robustness",
+    "price",
 ]
 _PACKAGES = ("ethbrake-marl", "numba", "numpy")
 _WORDS = {"name", "title", "description", "source"}  # what a scenario is called changes nothing

@@ -142,7 +142,7 @@ def make_lineup(
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
     """``make_lineup`` where one vehicle is driven; raises ``InvalidInput`` for a team too."""
-    alone = {}
+    alone: dict[str, Agent] = {}
     for spec, agent in make_lineup(specs, scenario, harm_count=harm_count).items():
         if isinstance(agent, Team):
             raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
@@ -150,15 +150,19 @@ def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCou
     return alone
 
 
-def make_proposers(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
-    """``make_agents`` for what goes behind a shield; raises ``InvalidInput`` for a spec that has one already."""
-    agents = make_agents(specs, scenario, harm_count=harm_count)
+def make_proposers(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Driver]:
+    """What goes behind a shield: ``make_lineup`` where several vehicles learn, else ``make_agents``.
+
+    Raises ``InvalidInput`` for a spec that has a shield already.
+    """
+    make = make_lineup if len(scenario.learners) > 1 else make_agents
+    agents: Mapping[str, Driver] = make(specs, scenario, harm_count=harm_count)
     for spec in agents:
         if parse_spec(spec).shield is not None:
             raise InvalidInput(
                 f"agent {spec!r}: has a shield already; here the shields are put around what proposes: ppo@PATH"
             )
-    return agents
+    return dict(agents)
 
 
 def choose_worlds(
@@ -193,7 +197,7 @@ def _place_of_role(name_or_path: str, role: str) -> str:
     """File and line of a role, or the name of a shipped scenario."""
     if not Path(name_or_path).is_file():
         return f"scenario {name_or_path!r}"
-    return f"{name_or_path}, line {read_yaml(name_or_path).line_of(('roles', role))}"
+    return read_yaml(name_or_path).where(("roles", role))
 
 
 def _behind(shield: str, written: Sequence[AgentSpec]) -> list[AgentSpec]:

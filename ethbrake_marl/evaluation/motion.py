@@ -14,7 +14,8 @@ from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
 from ethbrake_marl.physics.episode import first_decision_s
 from ethbrake_marl.physics.pieces import segment_pieces
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.shield import HybridAgent, StepShieldAgent
+from ethbrake_marl.shield import HybridAgent
+from ethbrake_marl.shield.team_agent import shield_around
 
 _SAME = 1e-9  # m, m/s: a piece that goes on like the one before it is part of it
 _SHORT_S = 1e-4  # pieces of a cascade of tiny bounces may be shorter; they are not told apart
@@ -140,9 +141,9 @@ def _standing(worlds: Worlds, k: int) -> Floats:
 
 
 def _steps_taken_over(drivers: list[Agent], n: int) -> Floats:
-    """In how many decisions so far a step shield applied something else than the proposal, [n]."""
+    """A count, [n], that rises with every decision in which a step shield applied something else than a proposal."""
     count = np.zeros(n)
     for driver in drivers:
-        if isinstance(driver, StepShieldAgent) and driver.shield is not None:
-            count += driver.shield.interventions
+        if (shield := shield_around(driver)) is not None:
+            count += shield.interventions
     return count

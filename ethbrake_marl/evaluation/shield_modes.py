@@ -2,41 +2,55 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich import box
 from rich.table import Table
 
-from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.agents.team import Driver
+from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.evaluation.identity import policies_by_name, policy_sha256, result_identity
 from ethbrake_marl.evaluation.rollout import OnWorlds
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
-from ethbrake_marl.physics import Floats, LeftOutRows, Worlds, measured_without_failed
+from ethbrake_marl.physics import Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Sample, Task
-from ethbrake_marl.shield import HybridAgent, StepShieldAgent
-from ethbrake_marl.shield.review import VERDICTS, review
+from ethbrake_marl.shield import HybridAgent, ShieldedTeam, StepShieldAgent
+from ethbrake_marl.shield.behind import Shielded, drive_behind, join, put_shield
+from ethbrake_marl.shield.review import SAME_HARM, VERDICTS, review
 
-NONE, EPISODE, STEP, STEP_ALERT = "none", "episode", "step", "step-alert"  # the last: rollout at the alert only
+NONE, EPISODE, STEP = "none", "episode", "step"
+STEP_ALERT, STEP_CAP = "step-alert", "step-cap"  # step mode: rollout at the alert only; no vehicle above its cap
 CHUNK = 500  # worlds advanced together: bounds memory, changes no result
+
+
+class VehicleRow(NamedTuple):
+    """One vehicle of the line in step mode."""
+
+    vehicle: str
+    replaced: float | None  # share of its decisions; None: it is not shielded
+    harm: float  # mean over worlds of what it bears (m2/s2)
+    baseline: float  # ... of what it would bear under the baseline plan
+    above_baseline: float  # share of the worlds in which it bears more than that
 
 
 @dataclass(frozen=True, slots=True)
 class ModeRow:
-    """One agent behind one mode of the shield."""
+    """One agent, or one team, behind one mode of the shield."""
 
     agent: str
     mode: str
     harm: Estimate  # mean over worlds (m2/s2)
     horizon_ends: int  # worlds that the horizon cut off before the line stood: no bound says what comes after
-    against_episode: Estimate | None  # minus that of episode mode, paired by world; None: of episode mode itself
-    replaced: float | None = None  # share of the decisions; of step mode alone, as all that follows
+    against_episode: Estimate | None  # minus that of episode mode, paired by world; None: of that itself, and of teams
+    against_none: Estimate | None = None  # likewise, minus that without a shield
+    # all that follows is of step mode alone
+    replaced: float | None = None  # share of the decisions of all shielded vehicles
+    bound: Estimate | None = None  # at the alert, mean over worlds (m2/s2)
+    vehicles: tuple[VehicleRow, ...] = ()
     verdicts: tuple[float, ...] | None = None  # shares of the replaced decisions, in the order of VERDICTS
     above_bound: int | None = None  # worlds whose realised harm is above the bound told at the alert
     left_out: LeftOutRows = ()  # worlds that could not be advanced: in no row, whichever agent and mode met them
@@ -49,8 +63,10 @@ class ModeRow:
             "mode": self.mode,
             **estimates_to_json({"harm": self.harm}),
             "horizon_ends": self.horizon_ends,
-            **estimates_to_json({"against_episode": self.against_episode}),
+            **estimates_to_json({"against_episode": self.against_episode, "against_none": self.against_none}),
             "decisions_replaced": self.replaced,
+            **estimates_to_json({"bound": self.bound}),
+            "vehicles": [vehicle._asdict() for vehicle in self.vehicles],
         }
         shares = (None,) * len(VERDICTS) if self.verdicts is None else self.verdicts
         told |= {**dict(zip(VERDICTS, shares, strict=True)), "above_bound": self.above_bound}
@@ -59,26 +75,24 @@ class ModeRow:
 
 
 def compare_modes(
-    agents: Mapping[str, Agent],
+    agents: Mapping[str, Driver],
     worlds: Worlds,
     task: Task,
     *,
     on_progress: OnWorlds | None = None,
 ) -> list[ModeRow]:
-    """Let every agent drive the vehicle alone, in episode mode and in step mode, through every world; see ``ModeRow``.
+    """Let every agent drive alone, in episode mode and in step mode, through every world; see ``ModeRow``.
 
-    Each replaced decision of step mode is simulated again without the shield (``shield.review.review``). The given
-    agents are left as they are. A world that cannot be advanced with one of them is left out for all, and named in
-    ``left_out``. Raises ``InvalidInput`` where a shield refuses the scenario, ``PhysicsError`` where no world is left.
+    Where several vehicles learn, a team (an agent: a copy for each) drives alone, behind one step shield, and behind
+    one that caps what each vehicle bears; episode mode is for one vehicle. Each replaced decision of step mode is
+    simulated again without the shield (``shield.review.review``). The given agents are left as they are. A world that
+    cannot be advanced with one of them is left out for all, and named in ``left_out``. Raises ``InvalidInput`` where a
+    shield refuses the scenario, ``PhysicsError`` where no world is left.
     """
     rows, _, left_out = measured_without_failed(
         lambda at: _compare(agents, worlds.take(at), task, on_progress), worlds.n
     )
-    policies = {name: policy_sha256(agent) for name, agent in agents.items()}
-    named = {
-        name: {} if sha256 is None else policies_by_name({task.vehicle: sha256}, task.scenario)
-        for name, sha256 in policies.items()
-    }
+    named = {name: _policies(agent, task) for name, agent in agents.items()}
     return [replace(row, left_out=left_out, policy_sha256=named[row.agent]) for row in rows]
 
 
@@ -98,12 +112,19 @@ def compare_behind_shields(agents: Mapping[str, Driver], worlds: Worlds, task: T
     proposers = {
         agent.policy.name: agent.policy
         for name, agent in agents.items()
-        if isinstance(agent, HybridAgent | StepShieldAgent) and "+robust" not in name
+        if isinstance(agent, HybridAgent | StepShieldAgent | ShieldedTeam) and "+robust" not in name
     }
     return compare_modes(proposers, worlds, task) if proposers else []
 
 
-def _compare(agents: Mapping[str, Agent], worlds: Worlds, task: Task, on_progress: OnWorlds | None) -> list[ModeRow]:
+def _policies(agent: Driver, task: Task) -> Mapping[str, str]:
+    """Vehicle -> the SHA-256 of the policy that proposes for it, where one does."""
+    drivers = agent.drivers if isinstance(agent, Team) else dict.fromkeys(task.vehicles, agent)
+    found = {vehicle: policy_sha256(each) for vehicle, each in drivers.items()}
+    return policies_by_name({vehicle: sha for vehicle, sha in found.items() if sha is not None}, task.scenario)
+
+
+def _compare(agents: Mapping[str, Driver], worlds: Worlds, task: Task, on_progress: OnWorlds | None) -> list[ModeRow]:
     """The rows of worlds that can all be advanced; ``PhysicsError`` names those that cannot."""
     rows = []
     for name, agent in agents.items():
@@ -114,16 +135,27 @@ def _compare(agents: Mapping[str, Agent], worlds: Worlds, task: Task, on_progres
                 parts.append(_measured(worlds.take(chunk), agent, task))
             if on_progress is not None:
                 on_progress(name, min(first + CHUNK, worlds.n))
-        rows += _rows(name, parts)
+        rows += _rows(name, parts, task)
     return rows
 
 
-def modes_table(rows: list[ModeRow]) -> Table:
-    """The rows for a terminal, below the name of each agent."""
+def are_teams(rows: Sequence[ModeRow]) -> bool:
+    """Whether the rows are of several learners: there is no episode mode to compare with."""
+    return all(row.against_episode is None for row in rows)
+
+
+def modes_tables(rows: list[ModeRow]) -> list[Table]:
+    """The rows for a terminal, below the name of each agent; of teams also what each vehicle bears."""
+    return [_modes_table(rows), _shares_table(rows)] if are_teams(rows) else [_modes_table(rows)]
+
+
+def _modes_table(rows: list[ModeRow]) -> Table:
     title = "Mean harm per world (m²/s²), difference with 95 % interval"
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("agent, mode", overflow="fold")
-    for heading in ("harm", "minus episode mode", "replaced", *VERDICTS, "above"):
+    several = are_teams(rows)
+    against = "minus no shield" if several else "minus episode mode"
+    for heading in ("harm", against, *(["bound"] if several else []), "replaced", *VERDICTS, "above"):
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         if row.mode == NONE:
@@ -132,57 +164,98 @@ def modes_table(rows: list[ModeRow]) -> Table:
         table.add_row(
             f"  {row.mode}",
             f"{row.harm.value:.2f}",
-            _write_estimate(row.against_episode),
+            _write_estimate(row.against_none if several else row.against_episode),
+            *(["–" if row.bound is None else f"{row.bound.value:.2f}"] if several else []),
             *(_percent(share) for share in (row.replaced, *shares)),
             "–" if row.above_bound is None else str(row.above_bound),
         )
     return table
 
 
-def _measured(worlds: Worlds, agent: Agent, task: Task) -> dict[str, Any]:
-    """Of one chunk: harm per world under each mode, and what step mode replaced."""
-    scenario, vehicle, harm_count = task.scenario, task.vehicle, task.harm_count
-    found: dict[str, Any] = {}
-    drivers: dict[str, Agent] = {
-        NONE: copy.deepcopy(agent),
-        EPISODE: HybridAgent(agent, scenario, harm_count=harm_count),
-    }
-    for name, later in ((STEP, True), (STEP_ALERT, False)):
-        drivers[name] = StepShieldAgent(
-            copy.deepcopy(agent), scenario, harm_count=harm_count, logging=True, later_rollouts=later
-        )
-    for name, driver in drivers.items():
-        episodes = drive(worlds, driver, scenario, vehicle)
-        harm = episodes.ledger.world_harm(harm_count)
-        found[name], found[f"{name} moving"] = harm, int((~episodes.at_rest).sum())
-        if isinstance(driver, StepShieldAgent):
-            shield = driver.shield
-            assert shield is not None and shield.running is not None
-            verdict = review(driver, worlds, vehicle).verdict
-            above = int((harm > shield.first_bound).sum())
-            counted = [int((verdict == each).sum()) for each in VERDICTS]
-            found[f"{name} counts"] = np.array([int(shield.running.steps.sum()), above, *counted])
+def _shares_table(rows: list[ModeRow]) -> Table:
+    title = "What each vehicle bears, mean per world (m²/s²)"
+    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("agent, mode, vehicle", overflow="fold")
+    for heading in ("replaced", "bears", "under the baseline plan", "worlds with more"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        if row.vehicles:
+            table.add_row(f"{row.agent}, {row.mode}")
+        for each in row.vehicles:
+            harms = (f"{each.harm:.2f}", f"{each.baseline:.2f}")
+            table.add_row(f"  {each.vehicle}", _percent(each.replaced), *harms, _percent(each.above_baseline))
+    return table
+
+
+class _Part(NamedTuple):
+    """One chunk of worlds under one mode; what is not None is of step mode."""
+
+    harm: Floats  # [n]
+    moving: int  # worlds that the horizon cut off
+    shielded: Shielded | None = None
+    verdicts: Ints | None = None  # how many interventions got each of VERDICTS
+
+
+def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[str, _Part]:
+    """Each mode in one chunk."""
+    several = len(task.vehicles) > 1
+    found = {NONE: _alone(worlds, team_of(agent, task.vehicles), task)}
+    if not several:
+        assert not isinstance(agent, Team)
+        hybrid = HybridAgent(agent, task.scenario, harm_count=task.harm_count)
+        found[EPISODE] = _alone(worlds, Team({task.vehicle: hybrid}, hybrid.name), task)
+    modes: dict[str, dict[str, Any]] = {STEP: {}, STEP_ALERT: {"later_rollouts": False}}
+    for mode, settings in (modes | ({STEP_CAP: {"cap": "baseline"}} if several else {})).items():
+        behind = put_shield(agent, task, logging=True, **settings)
+        shielded = drive_behind(behind, worlds, task)
+        verdict = review(behind, worlds, None if several else task.vehicle).verdict
+        counted = np.array([int((verdict == each).sum()) for each in VERDICTS])
+        found[mode] = _Part(shielded.harm, int(shielded.moving.sum()), shielded, counted)
     return found
 
 
-def _rows(name: str, parts: list[dict[str, Any]]) -> list[ModeRow]:
-    harm: dict[str, Floats] = {
-        mode: np.concatenate([part[mode] for part in parts]) for mode in (NONE, EPISODE, STEP, STEP_ALERT)
-    }
-    moving = {mode: sum(part[f"{mode} moving"] for part in parts) for mode in harm}
-    rows = [
-        ModeRow(name, NONE, mean(harm[NONE]), moving[NONE], paired_difference(harm[NONE], harm[EPISODE])),
-        ModeRow(name, EPISODE, mean(harm[EPISODE]), moving[EPISODE], None),
-    ]
-    for mode in (STEP, STEP_ALERT):
-        decisions, above, *counted = np.sum([part[f"{mode} counts"] for part in parts], axis=0).tolist()
-        replaced = sum(counted)
-        shares = tuple(each / replaced for each in counted) if replaced else None
-        difference = paired_difference(harm[mode], harm[EPISODE])
+def _alone(worlds: Worlds, team: Team, task: Task) -> _Part:
+    episodes = drive(worlds, team, task.scenario)
+    return _Part(episodes.ledger.world_harm(task.harm_count), int((~episodes.at_rest).sum()))
+
+
+def _rows(name: str, parts: list[dict[str, _Part]], task: Task) -> list[ModeRow]:
+    harm = {mode: np.concatenate([part[mode].harm for part in parts]) for mode in parts[0]}
+
+    def minus(mode: str, other: str) -> Estimate | None:
+        return None if mode == other or other not in harm else paired_difference(harm[mode], harm[other])
+
+    rows = []
+    for mode in harm:
+        moving = sum(part[mode].moving for part in parts)
+        row = ModeRow(name, mode, mean(harm[mode]), moving, minus(mode, EPISODE), minus(mode, NONE))
         rows.append(
-            ModeRow(name, mode, mean(harm[mode]), moving[mode], difference, replaced / decisions, shares, above)
+            row if parts[0][mode].shielded is None else _in_step_mode(row, [part[mode] for part in parts], task)
         )
     return rows
+
+
+def _in_step_mode(row: ModeRow, parts: list[_Part], task: Task) -> ModeRow:
+    """The row with what the shield did."""
+    whole = join([part.shielded for part in parts if part.shielded is not None])
+    counted = np.sum([part.verdicts for part in parts if part.verdicts is not None], axis=0).tolist()
+    decisions, replaced = int(whole.decisions.sum()), sum(counted)
+    each = dict(zip(task.vehicles, (whole.replaced.sum(axis=0) / decisions).tolist(), strict=True))
+    above = (whole.vehicle_harm > whole.baseline + SAME_HARM).mean(axis=0)
+    return replace(
+        row,
+        replaced=replaced / (decisions * len(task.vehicles)),
+        bound=mean(whole.bound),
+        verdicts=tuple(count / replaced for count in counted) if replaced else None,
+        above_bound=int((whole.harm > whole.bound).sum()),
+        vehicles=tuple(
+            VehicleRow(
+                vehicle, each.get(i), float(whole.vehicle_harm[:, i].mean()), float(whole.baseline[:, i].mean()),
+                float(above[i]),
+            )
+            for i, vehicle in enumerate(task.scenario.vehicle_names)
+        ),
+    )  # fmt: skip
 
 
 def _write_estimate(estimate: Estimate | None) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.table import Table
 from rich.text import Text
@@ -116,7 +117,7 @@ class SummaryRow:
     total_difference: Estimate | None  # the same of total harm
     first_decrease: Estimate | None  # 1 - harm / the baseline's harm
     total_decrease: Estimate | None  # the same of total harm
-    predicted_harm: Estimate | None  # where the agent predicts
+    predicted_harm: Estimate | None  # where the agent predicts, and a finite harm in every world
     policy_share: float | None  # share of worlds in which a hybrid drove by its policy
     parameters: dict[str, Any]  # of the test, for JSON
     distance: Distance = field(default_factory=Distance)  # to the best known harm
@@ -269,6 +270,7 @@ def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: di
     first, total = outcome.first_impact_harm, outcome.total_harm
     collisions, episodes = int(outcome.collided.sum()), len(first)
     against = None if reference is None else (reference.first_impact_harm, reference.total_harm)
+    predicted = outcome.predicted_harm
     return SummaryRow(
         agent=agent,
         episodes=episodes,
@@ -281,7 +283,7 @@ def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: di
         total_difference=None if against is None else paired_difference(total, against[1]),
         first_decrease=None if against is None else relative_decrease(first, against[0]),
         total_decrease=None if against is None else relative_decrease(total, against[1]),
-        predicted_harm=None if outcome.predicted_harm is None else mean(outcome.predicted_harm),
+        predicted_harm=None if predicted is None or not np.isfinite(predicted).all() else mean(predicted),
         policy_share=None if outcome.chosen_policy is None else float(outcome.chosen_policy.mean()),
         parameters=conditions,
         shoved_m=None if outcome.shoved_m is None else mean(outcome.shoved_m),

@@ -146,6 +146,7 @@ def _reached(
     style = series_style(number + 1 if number == 0 else number + 3)
     x = [_place(level, ladder) + 0.06 * number for level in steps]
     _with_intervals(axes, x, steps, harm_count, label=algorithm, **style)
+    _behind_shield(axes, [(_place(level, ladder) + 0.06 * number, level) for level in own], harm_count, label=algorithm)
     worse = [level for level in own if level["clear"] is not None]
     beside = [_place(level, ladder) + 0.06 * number for level in worse]
     if worse:
@@ -159,6 +160,20 @@ def _reached(
         dots = level[harm_count]["searched"]["each_seed"]
         if len(dots) > 1:
             axes.scatter([place + 0.05] * len(dots), dots, s=6, color=str(style["color"]), alpha=0.5, linewidths=0)
+
+
+def _behind_shield(axes: Axes, placed: Sequence[tuple[float, Json]], harm_count: HarmCount, *, label: str) -> None:
+    """What the same teams do behind the step shield, as crosses to the left; nothing where none was put around them."""
+    behind = [(x - 0.12, level[harm_count]["shielded"]["searched"]["harm"]) for x, level in placed if _shielded(level)]
+    if behind:
+        x, values = [x for x, _ in behind], [harm["value"] for _, harm in behind]
+        ends = np.array([_interval(harm) for _, harm in behind]).T
+        name = f"{label}, shielded"
+        axes.errorbar(x, values, yerr=np.abs(ends - values), fmt="x", color=COLOURS[2], capsize=3, label=name)
+
+
+def _shielded(level: Json) -> bool:
+    return level["first"].get("shielded") is not None
 
 
 def _with_intervals(

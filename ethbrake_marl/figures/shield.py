@@ -10,7 +10,7 @@ from matplotlib.ticker import FuncFormatter, PercentFormatter
 from rich.table import Table
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.shield_modes import NONE, STEP, STEP_ALERT, ModeRow
+from ethbrake_marl.evaluation.shield_modes import NONE, STEP, STEP_ALERT, STEP_CAP, ModeRow, are_teams
 from ethbrake_marl.figures.style import GREY, add_caption, label_text, new_figure, series_style, style_axes
 from ethbrake_marl.shield.review import OperatingPoint
 from ethbrake_marl.shield.robustness import RobustnessPoint
@@ -98,14 +98,19 @@ def _curve(
     axes.plot([p.width for p in chosen], values, label=label, **series_style(number))  # type: ignore[arg-type]
 
 
-_OFFSETS = {NONE: -0.2, STEP: 0.0, STEP_ALERT: 0.2}
-_LABELS = {NONE: "no shield", STEP: "step mode", STEP_ALERT: "step mode, rollout at the alert only"}
+_OFFSETS = {NONE: -0.2, STEP: 0.0, STEP_ALERT: 0.2, STEP_CAP: 0.35}
+_LABELS = {
+    NONE: "no shield",
+    STEP: "step mode",
+    STEP_ALERT: "step mode, rollout at the alert only",
+    STEP_CAP: "step mode with caps",
+}
 
 
 def shield_modes_figure(rows: Sequence[ModeRow], *, caption: str = "") -> Figure:
     """Per agent the paired difference to episode mode with its 95 % interval, one mark per mode; left is less harm.
 
-    Raises ``InvalidInput`` without a row.
+    Of teams, for which there is no episode mode, the difference to no shield. Raises ``InvalidInput`` without a row.
     """
     if not rows:
         raise InvalidInput("shield_modes_figure: at least one agent is needed")
@@ -114,9 +119,11 @@ def shield_modes_figure(rows: Sequence[ModeRow], *, caption: str = "") -> Figure
     axes = figure.subplots()
     style_axes(axes)
     for number, mode in enumerate(_OFFSETS):
-        for row in (row for row in rows if row.mode == mode and row.against_episode is not None):
-            assert row.against_episode is not None
-            value, interval = row.against_episode.value, row.against_episode.interval
+        for row in (row for row in rows if row.mode == mode):
+            against = row.against_none if are_teams(rows) else row.against_episode
+            if against is None:
+                continue
+            value, interval = against.value, against.interval
             low, high = (value, value) if interval is None else interval
             style = {**series_style(number), "linestyle": "none"}
             place = agents.index(row.agent)
@@ -129,7 +136,8 @@ def shield_modes_figure(rows: Sequence[ModeRow], *, caption: str = "") -> Figure
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_yticks(range(len(agents)), agents, fontsize=9)
     axes.invert_yaxis()
-    axes.set_xlabel("Harm minus that of episode mode (m²/s² per world; linear within ±1)", fontsize=9)
+    other = "without a shield" if are_teams(rows) else "of episode mode"
+    axes.set_xlabel(f"Harm minus that {other} (m²/s² per world; linear within ±1)", fontsize=9)
     axes.legend(fontsize=8.5, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
     add_caption(figure, caption)
     return figure

@@ -1,4 +1,4 @@
-"""Files and folders that are either there completely or not at all, also after a crash."""
+"""Files and folders that are either there completely or not at all, also after a crash; locks end with the process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ethbrake_marl.errors import AlreadyExists
+from filelock import FileLock, Timeout
+
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
 
 _HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"  # short whatever the target is called: file names have a longest length
 
@@ -92,6 +94,25 @@ def remove_unfinished(folder: Path) -> None:
             shutil.rmtree(left)
         else:
             left.unlink()
+
+
+@contextmanager
+def hold_lock(lock: Path, other: str) -> Iterator[None]:
+    """Hold the file ``lock`` while the block runs.
+
+    Raises ``InvalidInput`` where another process holds it, which ``other`` names, and where it is no file for that.
+    """
+    held = FileLock(lock, blocking=False, mode=0o666)
+    try:
+        held.acquire()
+    except Timeout:
+        raise InvalidInput(f"{lock.parent}: {other}") from None
+    except OSError as error:
+        raise InvalidInput(f"{lock}: cannot be used as a lock ({error.strerror}); delete it") from None
+    try:
+        yield
+    finally:
+        held.release()
 
 
 def _refuse_existing(path: Path) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from pydantic import GetJsonSchemaHandler
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core import CoreSchema
 from pydantic_core.core_schema import NullableSchema, WithDefaultSchema
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -23,13 +25,22 @@ class FileSchema(GenerateJsonSchema):
         return {key: value for key, value in described.items() if key != "default" or value is not None}
 
 
+class OneOrMore:
+    """Of a list: in a file a single entry may stand in its place (a check of the model makes it a list)."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        several = handler(core)
+        return {"anyOf": [several["items"], several]}
+
+
 def publish(schema: dict[str, Any]) -> dict[str, Any]:
     """The schema as it is printed and shipped: with the dialect that it is written in, first."""
     return {"$schema": DIALECT, **schema}
 
 
 def schema_lines(kind: str) -> str:
-    """The comment by which a file names its schema, ``scenario`` or ``recipe``, and how that is got."""
+    """The comment by which a new file names its schema, ``scenario`` or ``recipe``, and how that is got."""
     return (
         f"# yaml-language-server: $schema={kind}.schema.json\n"
         "# Your editor completes and checks this file once that schema stands beside it:\n"

@@ -67,8 +67,7 @@ def explain(error: ValidationError, document: Document, wording: Wording) -> Inv
     more = len(unknown) + len(rest) - 1
     path = _path(shown)
     absent = shown["type"] == "missing" and len(path) == 1
-    line = None if absent else document.line_of(path)
-    where = document.file if line is None else f"{document.file}, line {line}"
+    where = document.file if absent else document.where(path)
     return InvalidInput(f"{where}: {_describe(shown, path, wording)}{f' (and {more} more)' if more else ''}")
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
@@ -86,6 +87,19 @@ class Document:
             if path[:length] in self.lines:
                 return self.lines[path[:length]]
         return None
+
+    def where(self, path: YamlPath) -> str:
+        """The file, and the line of ``line_of`` where there is one: how a message about ``path`` begins."""
+        line = self.line_of(path)
+        return self.file if line is None else f"{self.file}, line {line}"
+
+    @contextmanager
+    def refusing_at(self, path: YamlPath) -> Iterator[None]:
+        """Begin the message of an ``InvalidInput`` from inside with where ``path`` stands."""
+        try:
+            yield
+        except InvalidInput as error:
+            raise type(error)(f"{self.where(path)}: {error}") from None
 
 
 @dataclass(slots=True)

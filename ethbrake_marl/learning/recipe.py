@@ -242,9 +242,8 @@ def _checked(document: Document) -> TrainingRecipe:
         raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance algorithm: ppo")
     name = content.get("algorithm", "ppo")
     if not isinstance(name, str) or name not in algorithm_names():
-        line = document.line_of(("algorithm",))
-        where = document.file if line is None else f"{document.file}, line {line}"
-        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {' or '.join(algorithm_names())}")
+        where, right = document.where(("algorithm",)), " or ".join(algorithm_names())
+        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}")
     model: type[TrainingRecipe] = recipe_class(name)
     try:
         return model.model_validate(content)

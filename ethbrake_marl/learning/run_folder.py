@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any, Literal, get_args
 from filelock import FileLock, Timeout
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.durable import new_folder, write_file
+from ethbrake_marl.files.durable import hold_lock, new_folder, write_file
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 
 _LIMIT_BYTES = 16 << 20  # of a JSON file
@@ -195,20 +195,6 @@ def wait_for_others(path: Path, longest_s: float) -> None:
         pass
 
 
-@contextmanager
-def only_process(run: RunDirectory) -> Iterator[None]:
-    """Hold the run's lock, which ends with the process however it ends.
-
-    Raises ``InvalidInput`` when another process trains in this folder.
-    """
-    lock = FileLock(run.path / _LOCK, blocking=False, mode=0o666)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise InvalidInput(f"{run.path}: another process is training here") from None
-    except OSError as error:
-        raise InvalidInput(f"{lock.lock_file}: cannot be used as a lock ({error.strerror}); delete it") from None
-    try:
-        yield
-    finally:
-        lock.release()
+def only_process(run: RunDirectory) -> AbstractContextManager[None]:
+    """Hold the run's lock; raises ``InvalidInput`` when another process trains in this folder."""
+    return hold_lock(run.path / _LOCK, "another process is training here")

@@ -13,7 +13,7 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.conditions import parameter_line, parameters
 from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
 from ethbrake_marl.evaluation.regret import Regrets, assess
-from ethbrake_marl.evaluation.shield_modes import ModeRow, compare_behind_shields
+from ethbrake_marl.evaluation.shield_modes import ModeRow, are_teams, compare_behind_shields
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate
 from ethbrake_marl.figures.report import harm_in_parts, regret_distribution
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
@@ -118,10 +118,8 @@ def shield_evidence(
 ) -> ShieldEvidence | None:
     """What is behind a shield among these agents, alone and behind every mode, in the first worlds of an evaluation.
 
-    None where nobody has a shield, or more than one vehicle is driven.
+    None where nobody has a shield.
     """
-    if len(evaluation.vehicles) != 1:
-        return None
     worlds = evaluation.worlds.take(np.arange(min(evaluation.worlds.n, SHIELD_WORLDS)))
     rows = compare_behind_shields(agents, worlds, Task(evaluation.scenario, evaluation.vehicles, harm_count))
     if not rows:
@@ -133,15 +131,17 @@ def shield_evidence(
 
 def shield_section(evidence: ShieldEvidence) -> Section:
     """The modes of the shield on the same worlds, and what each intervention of step mode was good for."""
-    rows = evidence.rows
-    head = ["Agent, mode", "Harm", "Minus episode mode", "Decisions replaced", *VERDICTS, "Worlds above the bound"]
+    rows, teams = evidence.rows, are_teams(evidence.rows)
+    head = ["Agent, mode", "Harm", "Minus no shield" if teams else "Minus episode mode", "Decisions replaced"]
+    head += [*VERDICTS, "Worlds above the bound"]
     lines: list[Row] = []
     for row in rows:
         shares = (None,) * len(VERDICTS) if row.verdicts is None else row.verdicts
         replaced = [_NONE if share is None else f"{100.0 * share:.1f} %" for share in (row.replaced, *shares)]
         above = _NONE if row.above_bound is None else row.above_bound
-        against = _NONE if row.against_episode is None else _cell(row.against_episode)
-        lines.append([f"{row.agent}, {row.mode}", _cell(row.harm), against, *replaced, above])
+        against = row.against_none if teams else row.against_episode
+        told_against = _NONE if against is None else _cell(against)
+        lines.append([f"{row.agent}, {row.mode}", _cell(row.harm), told_against, *replaced, above])
     told = (
         "Each agent alone and behind every mode of the shield. Each decision that step mode replaced was simulated"
         " again without it: needed (harm would have been higher), harmless (the same), costly (lower)."
@@ -151,7 +151,25 @@ def shield_section(evidence: ShieldEvidence) -> Section:
     if left_out:
         told_of = count_of(len(left_out), "world")
         notes.append(paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
-    return Section("Shield", [told, table(head, lines, caption="Modes of the shield"), *notes])
+    borne = [_shares(rows)] if teams else []
+    return Section("Shield", [told, table(head, lines, caption="Modes of the shield"), *borne, *notes])
+
+
+def _shares(rows: Sequence[ModeRow]) -> Part:
+    """What each vehicle bears behind the shield of a team."""
+    head = ["Agent, mode, vehicle", "Decisions replaced", "Bears", "Under the baseline plan", "Worlds with more"]
+    lines: list[Row] = [
+        [
+            f"{row.agent}, {row.mode}, {each.vehicle}",
+            _NONE if each.replaced is None else f"{100.0 * each.replaced:.1f} %",
+            f"{each.harm:.2f}",
+            f"{each.baseline:.2f}",
+            f"{100.0 * each.above_baseline:.1f} %",
+        ]
+        for row in rows
+        for each in row.vehicles
+    ]
+    return table(head, lines, caption="What each vehicle bears")
 
 
 def _cell(estimate: Estimate, scale: float = 1.0, digits: int = 2, unit: str = "") -> Cell:

@@ -148,9 +148,8 @@ def _load(path: Path) -> Scenario:
     document = read_yaml(path)
     scenario = Scenario.from_document(_with_members(document, path.parent))
     if scenario.name != path.stem:
-        line = document.line_of(("name",))
         raise InvalidInput(
-            f"{path}, line {line}: name = {scenario.name}: must be the file's name, {path.stem}"
+            f"{document.where(('name',))}: name = {scenario.name}: must be the file's name, {path.stem}"
             f" (or rename the file to {scenario.name}{path.suffix})"
         )
     return scenario
@@ -181,8 +180,7 @@ def _with_members(document: Document, folder: Path) -> Document:
 
 
 def _place(document: Document, i: int) -> str:
-    line = document.line_of(("mixture", i, "scenario"))
-    return f"{document.file}{'' if line is None else f', line {line}'}: mixture[{i}].scenario"
+    return f"{document.where(('mixture', i, 'scenario'))}: mixture[{i}].scenario"
 
 
 def _member(name: str, where: str, folder: Path) -> dict[str, Any]:

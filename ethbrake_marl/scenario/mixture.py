@@ -79,8 +79,7 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
 
 def _check_members(document: Document, members: Sequence[ScenarioFields]) -> None:
     """Refuse mixtures in mixtures, a name given twice, and members that cannot be one batch."""
-    line = document.line_of(("mixture",))
-    where = f"{document.file}{'' if line is None else f', line {line}'}: mixture"
+    where = f"{document.where(('mixture',))}: mixture"
     first = members[0]
     if (given := document.content.get("vehicles", first.vehicles)) != first.vehicles:
         raise InvalidInput(

@@ -29,6 +29,7 @@ from ethbrake_marl.physics.episode import decision_s, first_decision_s
 from ethbrake_marl.physics.rows import TIME, Packed
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import state_columns
+from ethbrake_marl.shield.alert import Cap
 from ethbrake_marl.shield.comparison import difference, seen_columns
 from ethbrake_marl.shield.interior import expects
 from ethbrake_marl.shield.rollouts import Proposer, proposed_actions
@@ -134,7 +135,7 @@ class StepShieldAgent(AgentAround):
     ``InvalidInput`` for what is not an agent, and what ``StepShield`` raises.
 
     Args:
-        harm_count, allowance, logging, robust: as ``ShieldOptions``.
+        harm_count, allowance, logging, cap, robust: as ``ShieldOptions``.
         later_rollouts: whether the policy itself may certify an action.
         uncertainty: robust mode: what is certified must hold in every member.
         believed: worlds at the alert as the shield takes them to be; None: as they are, which is what the policy sees.
@@ -153,6 +154,7 @@ class StepShieldAgent(AgentAround):
         logging: bool = False,
         later_rollouts: bool = True,
         uncertainty: Uncertainty | str | None = None,
+        cap: Cap | None = None,
         robust: str = "corners",
         believed: Worlds | None = None,
     ) -> None:
@@ -167,12 +169,9 @@ class StepShieldAgent(AgentAround):
         self.predicted_harm: Floats = np.zeros(0)
         self._believed = believed
         self._settings = {
-            "harm_count": harm_count,
-            "allowance": allowance,
+            "harm_count": harm_count, "allowance": allowance, "uncertainty": uncertainty, "cap": cap, "robust": robust,
             "logging": logging,
-            "uncertainty": uncertainty,
-            "robust": robust,
-        }
+        }  # fmt: skip
         self._later_rollouts = later_rollouts
         self._wanted: Floats = np.zeros(0)
         self._first_s: Floats = np.zeros(0)  # [n] time of the first decision

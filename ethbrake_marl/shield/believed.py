@@ -9,29 +9,33 @@ Mode ``episode`` is in ``shield.factories``.
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import product
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 
 from ethbrake_marl.actions import action_to_command
 from ethbrake_marl.agents.believed import Foretold, Ranges, Told, believed_worlds, ranges_of, told_to
 from ethbrake_marl.agents.believing import SUFFIX, Odometer
-from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place
-from ethbrake_marl.agents.rollout import script_agents, set_others
-from ethbrake_marl.engine.stream import begin_script
+from ethbrake_marl.agents.protocol import Agent, place
+from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import state_columns, worlds_at
-from ethbrake_marl.shield.certify import plan_harm
-from ethbrake_marl.shield.rollouts import Proposer, proposed_action, put
+from ethbrake_marl.shield.certify import Decision
+from ethbrake_marl.shield.held import Held, held_in, hold_better
+from ethbrake_marl.shield.interior import CORNERS, INTERIOR, checked_robust
+from ethbrake_marl.shield.rollouts import Proposer
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty
 
+PER_WORLD = ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s")  # arrays [n, ...]
 SURPRISE = 1e-6  # by more than this (m, m/s) what is measured is not what was foretold
 
 
@@ -47,28 +51,34 @@ class _Corners:
         return self._members
 
 
-class BelievedShieldAgent(AgentAround):
-    """Drives by ``policy`` as far as a ``StepShield`` certifies it on what was really received.
+class BelievedShield:
+    """A ``StepShield`` that certifies what one vehicle proposes on what was really received.
 
-    The shield begins at the first decision, and anew whenever another vehicle is heard for the first time, is heard to
-    react, or moves otherwise than was foretold; what is left of its plan is a candidate for the next one. After the
-    first decision ``predicted_harm`` [n] is the first bound. ``robust``: certified in the middle of what is not known
-    and in all corners of its range, else in the middle alone. Raises ``InvalidInput`` for what is not an agent, a
-    mixture, and a scenario with more than ``MOST_CORNERS`` corners.
+    It begins at the first decision, and anew whenever another vehicle is heard for the first time, is heard to react,
+    or moves otherwise than was foretold; what is left of its plan is a candidate for the next one. After the first
+    decision ``predicted_harm`` [n] is the first bound; infinite where the vehicle had an impact before, whose harm
+    nobody told it. ``robust`` says in which worlds it certifies: None in the middle of what is not known, ``corners``
+    also in all corners of its range, and ``interior`` in all worlds of the box around them, once, at the first
+    decision. Raises ``InvalidInput`` for a mixture, and a scenario with more than ``MOST_CORNERS`` corners. ``others``
+    are scripts of the other vehicles, by index; None: those of the scenario.
     """
 
-    adds = Source.BELIEFS
-
     def __init__(
-        self, policy: Agent, scenario: Scenario, *, harm_count: HarmCount = "first", robust: bool = False
+        self,
+        scenario: Scenario,
+        *,
+        harm_count: HarmCount = "first",
+        robust: str | None = None,
+        others: Mapping[int, Script] | None = None,
     ) -> None:
-        check_agent(policy, "believed")
-        super().__init__(policy, f"{policy.name}+{'robust' if robust else 'step'}:{SUFFIX}")
-        self.scenario, self.robust = scenario, robust
+        self.scenario = scenario
+        self.robust = None if robust is None else checked_robust(robust, SUFFIX)
         self.shield: StepShield | None = None
         self.predicted_harm: Floats = np.zeros(0)
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
+        self.decision: Decision | None = None  # the last one
         self._harm_count: HarmCount = harm_count
+        self._others = others  # None: the scenario's scripts
         self._odometer = Odometer()
         self._heard: Floats = np.zeros((0, 0))  # what the shield began on; NaN where it has not begun
         self._asked_s: Floats = np.zeros(0)  # [n] time of the last decision
@@ -78,16 +88,32 @@ class BelievedShieldAgent(AgentAround):
         self._ranges: tuple[int, Ranges] | None = None
         self._ranges_of(scenario.learners[0] if scenario.learners else 0)
 
+    @property
+    def members(self) -> int:
+        """Worlds that are certified for each one: the middle, and all corners."""
+        assert self._ranges is not None
+        vehicle, ranges = self._ranges
+        return 1 if self.robust is None else 1 + 2 ** len(ranges.uncertain(vehicle))
+
+    def branch(self) -> BelievedShield:
+        """A copy that goes on apart: what it decides leaves this one as it is."""
+        apart = copy.copy(self)
+        apart._odometer, apart.shield = copy.deepcopy(self._odometer), copy.copy(self.shield)
+        for name in PER_WORLD:
+            setattr(apart, name, getattr(self, name).copy())
+        return apart
+
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
         """Remember where these episodes start; nothing has been received yet."""
+        self._ranges_of(vehicle)
         if len(rows) >= len(self._wanted) or self.shield is None or self.shield.vehicle != vehicle:
-            self.shield = StepShield(self.scenario, vehicle, harm_count=self._harm_count)
-            self._odometer, nothing = Odometer(), np.zeros(0)
-            self.predicted_harm = self._asked_s = self._wanted = nothing
+            certain = self.robust or CORNERS
+            self.shield = StepShield(
+                self.scenario, vehicle, harm_count=self._harm_count, others=self._others, robust=certain
+            )
+            self._odometer, self.interventions = Odometer(), np.zeros(0, np.int64)
+            self.predicted_harm = self._asked_s = self._wanted = np.zeros(0)
             self._heard, self._impact_s, self._totals = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0, 0))
-            self.interventions = np.zeros(0, np.int64)
-        set_others(self.policy, vehicle, script_agents(self.scenario, except_for=vehicle))
-        begin_script(self.policy, worlds, vehicle, rows)
         self._odometer.begin(worlds, vehicle, rows)
         none = np.full(len(rows), np.nan)
         self.predicted_harm = place(self.predicted_harm, rows, none)
@@ -98,11 +124,23 @@ class BelievedShieldAgent(AgentAround):
         counted[rows] = 0
         self.interventions = counted
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """The certified command, [n] m/s2; before its latency has elapsed none. Asked again, it says the same."""
+    def decide(
+        self, worlds: Worlds, vehicle: int, propose: Callable[[], Floats], policies: Mapping[int, Agent] | None = None
+    ) -> Floats:
+        """The certified command, [n] m/s2, 0 before the vehicle's latency has elapsed; the same if asked again.
+
+        Args:
+            worlds: as they are; of them only what the vehicle received is read.
+            vehicle: index from 0, the one that began.
+            propose: gives the actions [n] that are proposed; not asked where there is nothing to decide.
+            policies: who is rolled out in the believed worlds where nothing else certifies a proposal, by vehicle.
+
+        Raises ``InvalidInput`` if an episode never began.
+
+        """
         n, shield = worlds.n, self.shield
         if shield is None or n > len(self._heard):
-            raise InvalidInput(f"agent {self.name!r}: act on {count_of(n, 'world')}, but begin was not called for each")
+            raise InvalidInput(f"shield: {SUFFIX}: act on {count_of(n, 'world')}, but begin was not called for each")
         if n < len(self._heard):  # a smaller batch has begun
             self._keep(n)
         way = self._odometer.look(worlds, vehicle)
@@ -113,8 +151,8 @@ class BelievedShieldAgent(AgentAround):
             self._begin_anew(worlds, believed, vehicle, way, due)
             assert shield.running is not None
             due &= ~shield.running.finished
-            proposed = proposed_action(self.policy, worlds, vehicle)
-            decision = shield.decide(proposed, only=due, proposer=Proposer({vehicle: self.policy}, believed))
+            proposer = None if policies is None else Proposer(policies, believed)
+            self.decision = decision = shield.decide(propose(), only=due, proposer=proposer)
             command = action_to_command(decision.applied, worlds.vehicles, vehicle)
             self._wanted[due] = command[due]
             self.interventions = self.interventions + (decision.intervened & due)
@@ -123,7 +161,7 @@ class BelievedShieldAgent(AgentAround):
 
     def _keep(self, n: int) -> None:
         """Keep the first ``n`` rows only."""
-        for name in ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s"):
+        for name in PER_WORLD:
             setattr(self, name, getattr(self, name)[:n])
         if self.shield is not None and self.shield.running is not None:
             self.shield.keep(n)
@@ -134,25 +172,30 @@ class BelievedShieldAgent(AgentAround):
         assert shield is not None
         heard = np.concatenate([told.known, told.reacts], axis=1).astype(np.float64)
         fresh, begun = np.isnan(self._heard[:, 0]), shield.running is not None
-        if begun:
-            self._note_impacts(worlds)
-        keeps = self._keeps(told, worlds.time_s, vehicle)
-        surprised = self._is_surprised(believed, told.known & ~keeps) if begun else fresh
-        rows = np.flatnonzero(due & (fresh | surprised | (heard != self._heard).any(axis=1)))
+        keeps, anew = np.zeros_like(told.known), fresh
+        if self.robust != INTERIOR:  # its plans are certified from the first decision on, whatever is heard later
+            if begun:
+                self._note_impacts(worlds)
+            keeps = self._keeps(told, worlds.time_s, vehicle)
+            surprised = self._is_surprised(believed, told.known & ~keeps) if begun else fresh
+            anew = fresh | surprised | (heard != self._heard).any(axis=1)
+        rows = np.flatnonzero(due & anew)
         rows = rows if begun else np.arange(worlds.n)
         if not rows.size:
             return
-        old = _held(shield, rows) if begun else None
+        old = held_in(shield, rows) if begun and self.robust != INTERIOR else None
         keeps = keeps & ~fresh[:, np.newaxis]
         self._begin_shield(worlds.take(rows), believed.take(rows), vehicle, way_m[rows], rows, keeps[rows], old)
         if old is not None:
-            _hold_better(shield, rows, old, ~fresh[rows])
+            hold_better(shield, rows, old, ~fresh[rows])
         rows = rows[due[rows]]  # the others begin anew at their own first decision
         first, self._heard[rows] = rows[fresh[rows]], heard[rows]
-        self.predicted_harm[first] = shield.backup.harm[first]
+        felt = worlds.pair_hit[first, max(vehicle - 1, 0) : vehicle + 1].any(axis=1)
+        felt |= worlds.obstacle_hit[first] & (vehicle == 0)
+        self.predicted_harm[first] = np.where(felt, np.inf, shield.backup.harm[first])
 
     def _begin_shield(
-        self, worlds: Worlds, believed: Worlds, vehicle: int, way_m: Floats, rows: Ints, keeps: Bools, old: _Held | None
+        self, worlds: Worlds, believed: Worlds, vehicle: int, way_m: Floats, rows: Ints, keeps: Bools, old: Held | None
     ) -> None:
         """Begin in ``rows``: in the middle of what is open, and for a robust shield in its corners."""
         shield, shares = self.shield, [None, *self._corners(vehicle)]
@@ -165,7 +208,7 @@ class BelievedShieldAgent(AgentAround):
                 known = keeps.any(axis=1, keepdims=True)
                 foretold = Foretold(replace(expected, pair_hit=expected.pair_hit & known), keeps)
             parts.append(self._believe(worlds, vehicle, way_m, share, foretold))
-        if self.robust:
+        if self.robust is not None:
             shield.uncertainty = cast(Uncertainty, _Corners(parts))
         shield.begin(parts[0], rows)
 
@@ -204,16 +247,17 @@ class BelievedShieldAgent(AgentAround):
         seen, wrong = state_columns(believed), np.zeros(believed.n, np.bool_)
         first = (seen.shape[1] + 2) // 3 - believed.N  # 1: an obstacle ahead is vehicle 0 of the columns
         foretold = self.shield.running.states.reshape(believed.n, self.shield.running.members, -1)
-        low, high = foretold.min(axis=1) - SURPRISE, foretold.max(axis=1) + SURPRISE
+        outside: Bools = (seen < (foretold.min(axis=1) - SURPRISE)[:, : seen.shape[1]]) | (
+            seen > (foretold.max(axis=1) + SURPRISE)[:, : seen.shape[1]]
+        )
         for i in range(believed.N):
-            wrong |= heard[:, i] & _outside(seen, low, high, first + i)
+            wrong |= heard[:, i] & outside[:, first + i]
         for p in range(believed.N - 1):
-            both = heard[:, p] & heard[:, p + 1]
-            wrong |= both & _outside(seen, low, high, 2 * first + believed.N + p)
+            wrong |= heard[:, p] & heard[:, p + 1] & outside[:, 2 * first + believed.N + p]
         return wrong
 
     def _corners(self, vehicle: int) -> list[dict[tuple[str, int], float]]:
-        if not self.robust:
+        if self.robust is None:
             return []
         uncertain = self._ranges_of(vehicle).uncertain(vehicle)
         return [dict(zip(uncertain, shares, strict=True)) for shares in product((0.0, 1.0), repeat=len(uncertain))]
@@ -226,58 +270,18 @@ class BelievedShieldAgent(AgentAround):
         share: dict[tuple[str, int], float] | None,
         foretold: Foretold | None = None,
     ) -> Worlds:
-        others, ranges = script_agents(self.scenario, except_for=vehicle), self._ranges_of(vehicle)
+        others, ranges = self._others, self._ranges_of(vehicle)
+        others = script_agents(self.scenario, except_for=vehicle) if others is None else others
         return believed_worlds(worlds, vehicle, ranges, others, way_m, share=share, foretold=foretold)
 
     def _ranges_of(self, vehicle: int) -> Ranges:
         if self._ranges is None or self._ranges[0] != vehicle:
             ranges = ranges_of(self.scenario, vehicle)
             numbers = len(ranges.uncertain(vehicle))
-            if self.robust and 2**numbers > MOST_CORNERS:
+            if self.robust is not None and 2**numbers > MOST_CORNERS:
                 raise InvalidInput(
                     f"robust:{SUFFIX}: scenario {self.scenario.name!r} leaves {numbers} numbers of the other vehicles"
                     f" open, which make {2**numbers} corners; at most {MOST_CORNERS} can be certified"
                 )
             self._ranges = vehicle, ranges
         return self._ranges[1]
-
-
-def _outside(seen: Floats, low: Floats, high: Floats, column: int) -> Bools:
-    outside: Bools = (seen[:, column] < low[:, column]) | (seen[:, column] > high[:, column])
-    return outside
-
-
-class _Held(NamedTuple):
-    """What a shield holds in some rows."""
-
-    rest: Floats  # [m, L] its plans from the present decision on; full braking after them
-    states: Floats  # [m, M, S] of its members now, their harm so far included
-
-
-def _held(shield: StepShield, rows: Ints) -> _Held:
-    running = shield.running
-    assert running is not None
-    plan, done = shield.backup.plan[rows], running.steps[rows]
-    column, last = np.arange(plan.shape[1]) + done[:, np.newaxis], plan.shape[1] - 1
-    rest = np.take_along_axis(plan, np.minimum(column, last), axis=1)
-    states = running.states.reshape(running.n, running.members, -1)[rows]
-    return _Held(np.where(column <= last, rest, -1.0), states)
-
-
-def _hold_better(shield: StepShield, rows: Ints, old: _Held, held_before: Bools) -> None:
-    """Count the members' harm so far, and hold what is left of the old plans where it harms no more than the new."""
-    running = shield.running
-    assert running is not None
-    if not held_before.any():
-        return
-    rows, states, at = rows[held_before], running.states.copy(), running.rows_of(rows[held_before])
-    pairs = (states.shape[1] - 1) // 5
-    states[at, -2 * pairs :] = old.states[held_before].reshape(len(at), -1)[:, -2 * pairs :]
-    shield.running = running._replace(states=states)
-    part, plan = shield.running.take(rows), shield.backup.plan[rows].copy()
-    harm, before = plan_harm(part, plan), plan_harm(part, old.rest[held_before])
-    kept = before <= harm
-    plan[kept] = old.rest[held_before][kept]
-    shield.backup = shield.backup._replace(
-        plan=put(shield.backup.plan, rows, plan), harm=put(shield.backup.harm, rows, np.where(kept, before, harm))
-    )

@@ -11,6 +11,7 @@ from ethbrake_marl.actions import command_to_action
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.shield.agents import HybridAgent
+from ethbrake_marl.shield.engine_believed import AttachedBelieved
 from ethbrake_marl.shield.engine_shield import Attached, AttachedShield, Proposing, Sent
 from ethbrake_marl.shield.options import ShieldOptions
 from ethbrake_marl.shield.settings import proposing_agent, shielded_vehicles
@@ -89,7 +90,7 @@ class AttachedHybrid(Attached):
             "bound_harm": float(self.hybrid.bound_harm[k]),
         }
 
-    def start_info(self, k: int) -> dict[str, Any]:
+    def start_info(self, k: int, c: int = 0) -> dict[str, Any]:
         """Who will drive the episode of world ``k``, before the first decision."""
         return {
             "mode": "episode",
@@ -109,4 +110,6 @@ def attach(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> 
     """The shield of the options' mode on a running engine."""
     if options.mode == "episode":
         return AttachedHybrid(engine, policy, options)
+    if options.believed:
+        return AttachedBelieved(engine, policy, options)
     return AttachedShield(engine, policy, options)

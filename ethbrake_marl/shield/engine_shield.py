@@ -38,7 +38,7 @@ from ethbrake_marl.shield.options import ShieldOptions
 from ethbrake_marl.shield.rollouts import Proposer, proposed_actions
 from ethbrake_marl.shield.settings import proposing_agents, shielded_vehicles
 from ethbrake_marl.shield.step_shield import Certified, StepShield
-from ethbrake_marl.shield.told import by_vehicle, columns_of, told_before
+from ethbrake_marl.shield.told import SharesTold, by_vehicle, columns_of, told_before
 from ethbrake_marl.shield.uncertainty import checked_uncertainty
 
 ADVICE = (
@@ -62,7 +62,8 @@ class Sent(NamedTuple):
     steps_made: int  # by the engine until then
     applied: Floats  # [n] actions
     asked: Bools  # [n] worlds whose episode runs
-    certified: Certified | None  # None: episode mode
+    certified: Certified | None  # None: episode mode, and a believed world
+    after: object = None  # the memory to come, of a shield over a believed world
 
 
 class Attached(ABC):
@@ -163,7 +164,7 @@ class Attached(ABC):
         """What the shield decided in world ``k`` for its vehicle number ``c``, for ``infos[agent]["shield"]``."""
 
     @abstractmethod
-    def start_info(self, k: int) -> dict[str, Any]:
+    def start_info(self, k: int, c: int = 0) -> dict[str, Any]:
         """The same keys before the first decision of world ``k``; 0 for what was not proposed or chosen yet."""
 
     @abstractmethod
@@ -195,7 +196,7 @@ class AttachedShield(Attached):
             logging=options.logging,
         )  # fmt: skip
         self.policies = None if policy is None else proposing_agents(policy, shield.vehicles, options.where)
-        self._warned = False
+        self._warned, self._shares = False, SharesTold()
         super().__init__(engine, options, shield)
 
     @property
@@ -249,11 +250,17 @@ class AttachedShield(Attached):
             "reason": REASONS[int(decision.reason[at])],
             "bound_harm": float(decision.bound[k]),
             "margin": float(decision.margin[at]),
+            **self._shares_of(after, k, c),
         }
 
-    def start_info(self, k: int) -> dict[str, Any]:
+    def start_info(self, k: int, c: int = 0) -> dict[str, Any]:
         """The bound that was told at the alert of world ``k``, before anything was decided."""
-        return told_before(self.shield, k)
+        return told_before(self.shield, k) | self._shares_of(self.shield, k, c)
+
+    def _shares_of(self, shield: StepShield, k: int, c: int) -> dict[str, Any]:
+        """What the shield's vehicle number ``c`` bears, where that is asked for."""
+        wanted = self.options.shares or self.options.cap is not None
+        return self._shares.told(shield, k, self.vehicles[c]) if wanted else {}
 
     def begun(self, memory: StepShield, alert: Worlds, rows: Ints) -> StepShield:
         """The shield once episodes start in these rows."""

@@ -15,7 +15,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Ints, Worlds
 from ethbrake_marl.physics.worlds import vehicles_at_once
 from ethbrake_marl.shield.agents import Bound, HybridAgent, StepShieldAgent
-from ethbrake_marl.shield.believed import BelievedShieldAgent
+from ethbrake_marl.shield.believed_agent import BelievedShieldAgent
 from ethbrake_marl.shield.interior import CORNERS, checked_robust
 from ethbrake_marl.shield.team_agent import ShieldedTeam
 from ethbrake_marl.shield.uncertainty import mode_uncertainty
@@ -69,16 +69,14 @@ def shield_steps(policy: Driver, argument: str | None, settings: AgentSettings) 
 
 
 def shield_steps_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """``+robust`` or ``+robust:interior``, against the uncertainty of the settings; ``+robust:believed``, without one.
+    """``+robust`` or ``+robust:interior``, against the uncertainty of the settings.
 
-    The last one is against all that was not received, in its corners.
+    With ``:believed`` behind, against all that was not received, without one.
     """
     scenario, where, harm_count = settings.needed_scenario(), f"agent {settings.spec!r}", settings.harm_count
     certainty, believes = split_believed(argument)
     robust = checked_robust(certainty or CORNERS, where)
-    if not believes:
-        uncertainty = mode_uncertainty("robust", settings.uncertainty, where)
-        return StepShieldAgent(policy, scenario, harm_count=harm_count, uncertainty=uncertainty, robust=robust)
-    if robust != CORNERS:
-        raise InvalidInput(f"{where}: {robust} and believed together are not covered; take one of them")
-    return BelievedShieldAgent(policy, scenario, harm_count=harm_count, robust=True)
+    if believes:
+        return BelievedShieldAgent(policy, scenario, harm_count=harm_count, robust=robust)
+    uncertainty = mode_uncertainty("robust", settings.uncertainty, where)
+    return StepShieldAgent(policy, scenario, harm_count=harm_count, uncertainty=uncertainty, robust=robust)

@@ -32,8 +32,12 @@ class ShieldOptions:
         cap: ``baseline``: no vehicle ever bears more harm than it would under the constants of least harm, whose sum is
             the bound at the alert. None: the sum alone is bounded. Mode ``step`` alone.
         robust: what mode ``robust`` certifies of an uncertainty: its ``corners`` (fast), or its whole ``interior``.
+        believed: certify on what the vehicle received, mode ``robust`` against all that it did not. Modes ``step`` and
+            ``robust`` of one learner, without ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
         intervention_penalty: taken off the reward of a step in which something else than the proposal was applied.
         logging: keep every intervention in ``shield.log``; not in mode ``episode``.
+        shares: tell in ``infos`` what each vehicle itself bears under the plan held now, and under the baseline plan;
+            with a ``cap`` it is told always. Costs a few percent of a step; not in mode ``episode``.
         where: who is given them, for messages.
 
     Raises ``InvalidInput`` naming the setting that does not fit, ``UnknownName`` for a mode.
@@ -51,17 +55,22 @@ class ShieldOptions:
     uncertainty: Uncertainty | str | None = None
     cap: Cap | None = None
     robust: str = CORNERS
+    believed: bool = False
     intervention_penalty: float = 0.0
     logging: bool = False
+    shares: bool = False
     where: str = field(default="shield", compare=False)
 
     def __post_init__(self) -> None:
         mode = self.mode if self.mode is not None else "step" if self.uncertainty is None else "robust"
         if mode not in MODES:
             raise unknown_name("shield mode", mode, MODES)
-        uncertainty = mode_uncertainty(mode, self.uncertainty, self.where)
-        if mode == "episode" and (self.allowance != 0.0 or self.logging):
-            name = "allowance" if self.allowance != 0.0 else "logging"
+        if self.believed:
+            self._check_believed(mode)
+        uncertainty = None if self.believed else mode_uncertainty(mode, self.uncertainty, self.where)
+        given = [name for name in ("allowance", "logging", "shares") if getattr(self, name)]
+        if mode == "episode" and given:
+            name = given[0]
             raise InvalidInput(
                 f"{self.where}: {name} = {getattr(self, name)!r}: mode episode takes none; step and robust do"
             )
@@ -75,6 +84,20 @@ class ShieldOptions:
         check_amount("intervention_penalty", self.intervention_penalty, self.where)
         object.__setattr__(self, "mode", mode)
         object.__setattr__(self, "uncertainty", uncertainty)
+
+    def _check_believed(self, mode: str) -> None:
+        """Raise ``InvalidInput`` for what a shield on what was received does not take."""
+        if self.believed is not True:
+            raise InvalidInput(f"{self.where}: believed = {self.believed!r}: must be True or False")
+        if mode == "episode":
+            raise InvalidInput(f"{self.where}: believed = True: mode episode takes none; step and robust do")
+        without = {"uncertainty": None, "allowance": 0.0, "cap": None, "logging": False, "shares": False}
+        for name, value in without.items():
+            if getattr(self, name) != value:
+                raise InvalidInput(
+                    f"{self.where}: {name} = {getattr(self, name)!r}: not together with believed = True, which"
+                    " certifies against what was not received"
+                )
 
 
 def read_options(where: str, given: Mapping[str, Any]) -> ShieldOptions:

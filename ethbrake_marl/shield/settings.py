@@ -105,7 +105,8 @@ def proposing_agents(
 ) -> dict[int, Agent]:
     """Who proposes for each shielded vehicle: a team, policies by name of vehicle, or copies of one for all.
 
-    Raises ``InvalidInput`` for what is none of these, and for a team of other vehicles.
+    Raises ``InvalidInput`` for what is none of these, a team of other vehicles, and one agent given for two of them,
+    which may remember its episodes.
     """
     if isinstance(policy, Team):
         given: dict[int, Agent] = policy.drivers
@@ -118,4 +119,6 @@ def proposing_agents(
     if set(given) != set(vehicles):
         names = ", ".join(f"vehicle_{i + 1}" for i in vehicles)
         raise InvalidInput(f"{where}: policy: one for each of {names} is needed, and for nobody else")
+    if len({id(agent) for agent in given.values()}) < len(given):
+        raise InvalidInput(f"{where}: policy: one object drives two vehicles; alone it is copied for each of them")
     return {i: given[i] for i in vehicles}

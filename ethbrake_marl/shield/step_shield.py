@@ -21,14 +21,7 @@ from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import PER_WORLD as OF_PROBLEM
 from ethbrake_marl.shield import interior
 from ethbrake_marl.shield.alert import CAPS, Cap, Settings, Start, start_of
-from ethbrake_marl.shield.certify import (
-    Backup,
-    Decision,
-    Running,
-    certify,
-    from_now,
-    plan_harm,
-)
+from ethbrake_marl.shield.certify import Backup, Decision, Running, certify, from_now, plan_harm
 from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE
 from ethbrake_marl.shield.interventions import Intervention, interventions, write_down
 from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, merged, put
@@ -38,7 +31,7 @@ from ethbrake_marl.shield.uncertainty import Uncertainty
 
 BROKEN = ENDED + 1  # a reason that the kernel does not know
 PER_WORLD = (  # a shield's arrays [n, ...]
-    "first_bound", "alone_harm", "settles", "interventions", "distrusted", "episode", "baseline_shares",
+    "first_bound", "alone_harm", "settles", "replaced", "distrusted", "episode", "baseline_shares",
 )  # fmt: skip
 
 
@@ -114,7 +107,7 @@ class StepShield:
         self.first_bound: Floats = np.zeros(0)  # [n] harm of the backup at the first decision
         self.alone_harm: Floats = np.zeros(0)  # [n] of the policy rolled out; infinity without one
         self.settles: Bools = np.zeros(0, np.bool_)  # [n] under the plan of the first decision all rest at the horizon
-        self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
+        self.replaced: Ints = np.zeros(0, np.int64)  # [n] or [n, K] actions so far in the running episodes
         self.episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode
         self.distrusted: Bools = np.zeros(0, np.bool_)
         self.baseline_shares: Floats = np.zeros((0, 0))  # [n, N] what each vehicle bears under the best constants
@@ -130,6 +123,12 @@ class StepShield:
             return self.backup.harm
         granted = np.where(self.running.finished, 0.0, self.first_bound + self.allowance)
         return np.maximum(self.backup.harm, granted)
+
+    @property
+    def interventions(self) -> Ints:
+        """Actions that were replaced so far in each running episode, of all vehicles together, [n]."""
+        every: Ints = self.replaced.reshape(len(self.replaced), -1).sum(axis=1)
+        return every
 
     def shares(self) -> Floats:
         """What each vehicle bears of the harm if the plan that is held now is executed, [n, N] m2/s2."""
@@ -222,8 +221,7 @@ class StepShield:
             decision = merged(decision, rows, certify_rollouts(now, given, rows, budget, held.plan, proposer))
         decision = interior.certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
         decision.reason[asked & self.distrusted] = BROKEN
-        replaced = decision.intervened.reshape(len(asked), -1).sum(axis=1)
-        self.interventions = self.interventions + replaced * asked
+        self.replaced = self.replaced + (decision.intervened.T & asked).T
         self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
         self.backup = decision.backup
         decision = decision._replace(bound=self.bound)
@@ -267,7 +265,7 @@ class StepShield:
         count, old, running, backup = len(rows), self.running, start.running, start.backup
         new: dict[str, NDArray[Any]] = {
             "first_bound": backup.harm, "alone_harm": start.alone, "settles": start.settles,
-            "interventions": np.zeros(count, np.int64), "distrusted": np.zeros(count, np.bool_),
+            "replaced": np.zeros((count, *backup.plan.shape[2:]), np.int64), "distrusted": np.zeros(count, np.bool_),
             "baseline_shares": start.baseline,
         }  # fmt: skip
         if old is None or count >= old.n:

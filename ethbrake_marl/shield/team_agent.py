@@ -18,7 +18,7 @@ from ethbrake_marl.shield.step_shield import StepShield
 class ShieldedTeam(Team):
     """Every driver of a ``team`` proposes, and one ``StepShield`` certifies or replaces what they do together.
 
-    The settings are those of ``StepShieldAgent``, and ``cap``. After ``begin``, ``predicted_harm`` [n] is the bound.
+    The settings are those of ``StepShieldAgent``. After ``begin``, ``predicted_harm`` [n] is the bound.
     Raises ``InvalidInput`` for a learner of the scenario that the team does not drive, and what ``StepShield`` raises.
 
     >>> import ethbrake_marl as eb
@@ -37,6 +37,11 @@ class ShieldedTeam(Team):
             )
         self.together = _Together(copy.deepcopy(team), scenario, settings)
         super().__init__({i: _Member(self.together, i) for i in team.drivers}, f"{team.name}+step")
+
+    @property
+    def policy(self) -> Team:
+        """Who proposes: the team as it is without a shield."""
+        return Team(self.together.policies, self.name.removesuffix("+step"))
 
     @property
     def shield(self) -> StepShield | None:
@@ -96,6 +101,13 @@ class _Member(AgentAround):
     def after_step(self, packed: Packed) -> None:
         """Follow the engine; the first member that is told does it for all."""
         self.together.after_step(packed)
+
+
+def shield_around(agent: Agent) -> StepShield | None:
+    """The step shield of an agent, or of the shielded team that it is a member of; None where there is none yet."""
+    if isinstance(agent, _Member):
+        return agent.together.shield
+    return agent.shield if isinstance(agent, StepShieldAgent) else None
 
 
 def drives_alone(driver: Driver) -> Agent | ShieldedTeam | None:

@@ -8,7 +8,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.physics import Floats
 from ethbrake_marl.shield.step_shield import StepShield
+
+
+class SharesTold:
+    """What each vehicle bears under the plans of a shield, for infos: found once in each step, if anybody asks."""
+
+    def __init__(self) -> None:
+        self._last: tuple[StepShield, Floats] | None = None
+
+    def told(self, shield: StepShield, k: int, vehicle: int) -> dict[str, Any]:
+        """The keys of one vehicle in world ``k``."""
+        if self._last is None or self._last[0] is not shield:
+            self._last = shield, shield.shares()
+        return {
+            "own_harm": float(self._last[1][k, vehicle]),
+            "baseline_own_harm": float(shield.baseline_shares[k, vehicle]),
+        }
 
 
 def told_before(shield: StepShield, k: int) -> dict[str, Any]:

@@ -99,8 +99,8 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         """Start an episode; the bound stands in ``infos[agent]["shield"]`` already."""
         self.attached.check_open()
         observations, infos = super().reset(seed=seed, options=options)
-        for agent in self.shielded:
-            infos[agent]["shield"] = self.attached.start_info(0)
+        for c, agent in enumerate(self.shielded):
+            infos[agent]["shield"] = self.attached.start_info(0, c)
         return observations, infos
 
     def step(self, actions: Mapping[str, Any]) -> Told:

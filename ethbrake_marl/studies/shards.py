@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
@@ -13,12 +13,10 @@ from operator import add
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, check_whole_number
 from ethbrake_marl.evaluation.shards.question import BLOCK, LEAF, Asked, answer_shard, shard_bounds
 from ethbrake_marl.evaluation.shards.tally import Tally
-from ethbrake_marl.files.durable import remove_unfinished, write_file
+from ethbrake_marl.files.durable import hold_lock, remove_unfinished, write_file
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.studies.jobs.local import LocalWorkers
@@ -65,15 +63,10 @@ class ShardFolder:
             raise AlreadyExists(f"{self.path}: is there already, and no folder of shards; give another name")
         write_file(file, _to_bytes(told))
 
-    @contextmanager
-    def alone(self) -> Iterator[None]:
+    def alone(self) -> AbstractContextManager[None]:
         """Keep others out of the folder while the block runs; raises ``InvalidInput`` where one is in it."""
         self.path.mkdir(parents=True, exist_ok=True)
-        try:
-            with FileLock(self.path / _LOCK, timeout=0):
-                yield
-        except Timeout:
-            raise InvalidInput(f"{self.path}: another evaluation works in it; wait for it, or end it") from None
+        return hold_lock(self.path / _LOCK, "another evaluation works in it; wait for it, or end it")
 
     def rows_of(self, bounds: Bounds) -> Path | None:
         """The file with the rows of a shard; None where none are kept."""

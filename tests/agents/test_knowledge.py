@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import copy
+import itertools
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,21 +11,19 @@ import pytest
 
 from ethbrake_marl.agents import believed
 from ethbrake_marl.agents.believed import told_to
+from ethbrake_marl.agents.honesty import changed_decisions
 from ethbrake_marl.agents.knowledge import Source, combine, knowledge_of, knowledge_text, sees_through
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.registry import agent_names, find_entry
-from ethbrake_marl.agents.rollout import script_agents, set_others
+from ethbrake_marl.agents.registry import agent_entries, find_entry
 from ethbrake_marl.agents.spelling import parse_spec
 from ethbrake_marl.agents.team import Team
-from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.physics import Worlds
-from ethbrake_marl.physics.estimates import age_s, is_periodic, links_of
-from ethbrake_marl.physics.messages import KEY, LINK, TAKEN, TOLD_S, link_at, place_at, ring_at
+from ethbrake_marl.physics.estimates import is_periodic
 from ethbrake_marl.policies.policy import save_policy
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.scenario.v2x import hidden_from
+from ethbrake_marl.scenario.v2x import PRESETS, hidden_from
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.test_contact_features import contact_policy
 
 PAPER = load_scenario("paper-random")
@@ -43,12 +42,13 @@ STATED = {  # every agent there is: all of the registry, and what ``make_lineup`
     "e_v2x_bm:pairwise": (STATE,),
     "e_v2x_bm": (MODEL,),
     "planner:20": (MODEL,),
-    "best_harm:100": (MODEL,),
+    "best_harm:20": (MODEL,),
     "e_v2x_bm:believed": (BELIEFS,),
     "e_v2x_bm:pairwise:believed": (BELIEFS,),
     "planner:20:believed": (BELIEFS,),
     "coast+step:believed": (SENSORS, BELIEFS),
     "coast+robust:believed": (SENSORS, BELIEFS),
+    "coast+robust:interior:believed": (SENSORS, BELIEFS),
     "ppo@shipped/ppo+step:believed": (MESSAGES, BELIEFS),
     "ppo@shipped/ppo+episode:believed": (MESSAGES, BELIEFS),
     "ppo@shipped/ppo+episode:pairwise:believed": (MESSAGES, BELIEFS),
@@ -62,15 +62,22 @@ STATED = {  # every agent there is: all of the registry, and what ``make_lineup`
     "ppo@shipped/ppo+refined+episode": (MESSAGES, MODEL),
     "ppo@shipped/ppo+step": (MESSAGES, MODEL),
     "ppo@shipped/ppo+refined+step": (MESSAGES, MODEL),
+    "ppo@shipped/ppo+refined:profile": (MESSAGES, MODEL),
+    "ppo@shipped/ppo+refined:50": (MESSAGES, MODEL),
+    "ppo@shipped/ppo+robust": (MESSAGES, MODEL),
+    "ppo@shipped/ppo+robust:interior": (MESSAGES, MODEL),
 }
+APART = {"counterfactual@PATH", "team@RUN"}  # they need a run, and have tests of their own
+USUAL = {"planner": "planner:20", "planner:believed": "planner:20:believed", "best_harm": "best_harm:20"}  # budgets
+WORDS = {"A": "3", "CANDIDATES": "20", "20ms": "20", "200us": "50", "PATH": "shipped", "RUN": "shipped"}
 HONEST = [spec for spec, knows in STATED.items() if not sees_through(knows)]
 CHANNELS = [
-    "blocked",
-    "sensors-only",
+    *PRESETS,
+    *({"preset": preset, "persistence": "periodic"} for preset in PRESETS if preset not in ("paper", "sensors-only")),
     {"preset": "paper", "hears": "front"},
-    {"preset": "blocked", "persistence": "periodic"},
     {"preset": "nominal", "persistence": "periodic", "senses": "front", "sensing_s": [1.5, 1.5]},
 ]
+HIDING = [channel for channel in CHANNELS if channel not in ("paper", "clear", "nominal")]
 
 
 class Silent:
@@ -95,16 +102,52 @@ class Leaking(Silent):
 
 
 def agent_of(spec: str, scenario: Scenario = PAPER) -> Agent:
-    return make_lineup([spec], scenario)[spec]
+    uncertainty = parse_uncertainty("gaps_m=0.5") if parse_spec(spec).shield in ("robust", "robust:interior") else None
+    return make_lineup([spec], scenario, uncertainty=uncertainty)[spec]
 
 
-def test_knowledge__every_agent_of_the_registry_states_it():
-    kinds = {spec.partition("@")[0].partition(":")[0] for spec in STATED} | {"team", "counterfactual"}
-    assert set(agent_names()) <= kinds, "an agent is registered that this test does not know"
-    for spec, knows in STATED.items():
-        assert knowledge_of(agent_of(spec)) == knows, spec
-        if "+" not in spec and spec != "e_v2x_bm:pairwise" and not spec.endswith(":believed"):
-            assert find_entry(parse_spec(spec)).knows == knows, f"{spec}: `ethbrake agents` says something else"
+def written_forms():
+    """Every way in which an agent of the registry, or what goes around one, can be written."""
+    for form in (entry.form for entry in agent_entries() if isinstance(entry.make, str)):  # not those of other tests
+        parts = re.split(r"\[([^]]*)\]", form)  # what must be there, and between what may be, as A|B
+        choices = [(part,) if k % 2 == 0 else ("", *part.split("|")) for k, part in enumerate(parts)]
+        yield form, {"".join(each) for each in itertools.product(*choices)}
+
+
+def with_words(form):
+    """A form with numbers and paths in it, as the table above has them."""
+    return USUAL.get(form) or re.sub(r"[A-Za-z0-9]+", lambda found: WORDS.get(found[0], found[0]), form)
+
+
+def stands_in_table(form):
+    """Whether the table has that agent, or somebody with that around it."""
+    wanted = with_words(form)
+    if form.startswith("+"):
+        return any(f"+{around}" == wanted for spec in STATED for around in parse_spec(spec).around)
+    own = {str(replace(parse_spec(spec), around=())).replace("shipped/ppo", "shipped") for spec in STATED}
+    return wanted in {each.replace("shipped/sac", "shipped") for each in own}
+
+
+def test_knowledge__every_agent_of_the_registry_stands_in_the_table():
+    missing = [each for form, variants in written_forms() for each in sorted(variants) if form not in APART
+               and not stands_in_table(each)]  # fmt: skip
+    assert not missing, "registered, and not in STATED, so nobody tests whether they are honest"
+
+
+@pytest.mark.parametrize("form", ["+step:believed", "e_v2x_bm[:pairwise][:believed]"])
+def test_knowledge__an_agent_that_nobody_wrote_down_is_found(form, monkeypatch):
+    for spec in [spec for spec in STATED if spec.endswith(":believed")]:
+        monkeypatch.delitem(STATED, spec)
+    with pytest.raises(AssertionError, match="nobody tests whether they are honest"):
+        test_knowledge__every_agent_of_the_registry_stands_in_the_table()
+
+
+@pytest.mark.parametrize("spec", STATED)
+def test_knowledge__every_agent_states_it(spec):
+    knows = STATED[spec]
+    assert knowledge_of(agent_of(spec)) == knows
+    if "+" not in spec and spec != "e_v2x_bm:pairwise" and not spec.endswith(":believed"):
+        assert find_entry(parse_spec(spec)).knows == knows, "`ethbrake agents` says something else"
 
 
 def test_knowledge__a_wrapper_adds_the_model_to_what_its_policy_knows():
@@ -135,108 +178,30 @@ def test_knowledge__another_word_is_refused(knows):
         knowledge_of(agent)
 
 
-def altered(worlds: Worlds, observer: int, rng: np.random.Generator) -> Worlds:
-    """The same worlds with everything changed that has not reached ``observer`` by now, the future included."""
-    vehicles, now = worlds.vehicles, worlds.time_s[:, np.newaxis]
-    n, N = worlds.speeds_mps.shape
-    unknown = vehicles.known_from_s[:, observer] > now
-    unknown[:, observer] = False  # of itself it knows
-    stale = unknown.copy()  # whose present it does not know
-    if is_periodic(worlds).all():
-        stale |= age_s(worlds)[:, observer] > 0.0
-    beside = np.zeros((n, N - 1), np.bool_)
-    for pair in range(N - 1):
-        far = pair if pair < observer else pair + 1
-        beside[:, pair] = stale[:, far]
-
-    def other(values, low, high, where):
-        return np.where(where, rng.uniform(low, high, values.shape), values)
-
-    later = np.where(vehicles.latency_s > now, vehicles.latency_s + rng.uniform(0.01, 1.0, (n, N)), vehicles.latency_s)
-    latency = np.where(unknown, rng.uniform(0.0, 2.0, (n, N)), vehicles.latency_s)
-    latency[:, observer] = later[:, observer]
-    news = vehicles.known_from_s
-    news = np.where(news > now[:, :, np.newaxis], news + rng.uniform(0.01, 1.0, news.shape), news)
-    changed = replace(
-        vehicles,
-        braking_capacity_mps2=other(vehicles.braking_capacity_mps2, 3.0, 9.0, unknown),
-        driving_capacity_mps2=other(vehicles.driving_capacity_mps2, 0.0, 9.0, unknown),
-        mass_t=other(vehicles.mass_t, 1.0, 40.0, unknown),
-        speed_limit_mps=other(vehicles.speed_limit_mps, 30.0, 60.0, unknown),
-        latency_s=latency,
-        own_latency_s=other(vehicles.own_latency_s, 0.0, 2.0, unknown),
-        known_from_s=news,
-    )
-    of_pair = beside.copy()
-    of_pair[:, [pair for pair in (observer - 1, observer) if 0 <= pair < N - 1]] &= unknown[:, [
-        far for far in (observer - 1, observer + 1) if 0 <= far < N]]  # fmt: skip
-    return replace(
-        worlds,
-        vehicles=changed,
-        messages=unheard(worlds, observer, rng),
-        gaps_m=other(worlds.gaps_m, 2.0, 15.0, beside),
-        speeds_mps=other(worlds.speeds_mps, 5.0, 30.0, stale),
-        command_mps2=other(worlds.command_mps2, -6.0, 6.0, stale),
-        pair_hit=worlds.pair_hit ^ (of_pair & (now > 0.0)),  # at the alert nobody has hit anything
-    )
-
-
-def unheard(worlds: Worlds, observer: int, rng: np.random.Generator) -> np.ndarray:
-    """The columns of messages with all changed that ``observer`` has not heard: chance, what is on its way, others'."""
-    columns, N = worlds.messages.copy(), worlds.N
-    if not columns.shape[1]:
-        return columns
-    kept = links_of(worlds)[:, observer].copy()
-    own = columns[:, place_at(N) + observer].copy()
-    columns[:, [KEY, TAKEN]] += 5.0
-    columns[:, place_at(N) :] += rng.uniform(0.5, 3.0, columns[:, place_at(N) :].shape)
-    links = columns[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK)
-    heard = (worlds.vehicles.known_from_s[:, observer] <= worlds.time_s[:, np.newaxis])[..., np.newaxis]
-    told = np.arange(LINK) >= TOLD_S
-    links[:, observer] = np.where(heard & told, kept, links[:, observer])
-    columns[:, place_at(N) + observer] = own
-    return columns
-
-
-def changed_actions(agent: Agent, scenario: Scenario, vehicle: int = 1, *, steps: int = 8, n: int = 40) -> int:
-    """Decisions that differ when what has not been received is altered, at the alert and at each of the first steps."""
-    rng = np.random.default_rng(3)
-    alert = scenario.sample(n, 11).worlds
-    scripts = script_agents(scenario, except_for=vehicle)
-    knowing, wondering = copy.deepcopy(agent), copy.deepcopy(agent)
-    engine = Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=alert)
-    for driver, at_alert in ((knowing, alert), (wondering, altered(alert, vehicle, rng))):
-        set_others(driver, vehicle, scripts)
-        driver.begin(at_alert, vehicle, np.arange(n))
-    differing = 0
-    for _ in range(steps):
-        now = engine.worlds
-        command = knowing.act(now, vehicle)
-        differing += int((wondering.act(altered(now, vehicle, rng), vehicle) != command).sum())
-        engine.step({vehicle: np.clip(command / 7.0, -1.0, 1.0)})
-    return differing
-
-
 @pytest.mark.parametrize("channel", CHANNELS, ids=str)
 @pytest.mark.parametrize("spec", HONEST)
 def test_own_sensors_and_messages__what_was_not_received_changes_no_action(spec, channel):
-    scenario = BLOCKED.replace(v2x=channel)
-    worlds = scenario.sample(60, 11).worlds
-    assert (hidden_from(worlds.vehicles, 1) | is_periodic(worlds)).sum() > 20
-    assert changed_actions(agent_of(spec, scenario), scenario) == 0
+    scenario, n = BLOCKED.replace(v2x=channel), 2 if "interior" in spec else 30  # a box takes its time
+    assert changed_decisions(agent_of(spec, scenario), scenario, n=n) == 0
 
 
-@pytest.mark.parametrize("channel", CHANNELS, ids=str)
+@pytest.mark.parametrize("channel", HIDING, ids=str)
+def test_channels__hide_something_to_be_altered(channel):
+    worlds = BLOCKED.replace(v2x=channel).sample(60, 11).worlds
+    assert (hidden_from(worlds.vehicles, 1) | is_periodic(worlds)).sum() > 3
+
+
+@pytest.mark.parametrize("channel", ["blocked", {"preset": "blocked", "persistence": "periodic"}], ids=str)
 def test_messages__contact_features_tell_nothing_that_was_not_received(channel, tmp_path):
     scenario = BLOCKED.replace(v2x=channel)
     save_policy(contact_policy(scenario.model_dump(mode="json")), tmp_path / "policy")
     agent = agent_of(f"counterfactual@{tmp_path}", scenario)
     assert knowledge_of(agent) == (MESSAGES,)
-    assert changed_actions(agent, scenario) == 0
+    assert changed_decisions(agent, scenario) == 0
 
 
 def test_own_sensors_and_messages__a_planted_leak_is_found():
-    assert changed_actions(Leaking(), BLOCKED) > 50
+    assert changed_decisions(Leaking(), BLOCKED) > 50
 
 
 @pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo@shipped/ppo+episode:believed"])
@@ -248,9 +213,9 @@ def test_believed_model__a_planted_leak_is_found(spec, leak, monkeypatch):
             return told._replace(known=np.ones_like(told.known))
         return told._replace(speed_mps=worlds.speeds_mps.copy())
 
-    scenario = BLOCKED.replace(v2x=CHANNELS[3])
+    scenario = BLOCKED.replace(v2x={"preset": "blocked", "persistence": "periodic"})
     monkeypatch.setattr(believed, "told_to", leaking)
-    assert changed_actions(agent_of(spec, scenario), scenario) > 0
+    assert changed_decisions(agent_of(spec, scenario), scenario) > 0
 
 
 @pytest.mark.parametrize("spec", [spec for spec in STATED if spec not in HONEST])
@@ -259,7 +224,8 @@ def test_true_state_and_model__is_not_said_without_need(spec):
         scenario, vehicle = BLOCKED.with_learners(["vehicle_3"]), 2
     else:
         scenario, vehicle = BLOCKED.replace(v2x={"preset": "paper", "hears": "front"}), 1
-    assert changed_actions(agent_of(spec, scenario), scenario, vehicle, steps=1, n=40 if vehicle == 2 else 6) > 0
+    n = 40 if vehicle == 2 else 6
+    assert changed_decisions(agent_of(spec, scenario), scenario, vehicle=vehicle, decisions=1, n=n) > 0
 
 
 def test_hidden__only_where_news_or_a_reaction_is_late():

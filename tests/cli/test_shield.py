@@ -66,6 +66,48 @@ def test_picture__shows_the_modes(ethbrake, tmp_path):
     assert out.read_bytes().startswith(b"\x89PNG")
 
 
+TEAM = ("--scenario", "cooperation-3-pair", "--agents", "full_brake,policy@shipped", "--episodes", "12")
+
+
+def test_shield__of_several_learners_tells_bound_interventions_and_shares(ethbrake, tmp_path):
+    answer = ethbrake("shield", *TEAM, "--json")
+    assert answer.status == 0
+    rows = json.loads(answer.out)
+    assert [row["mode"] for row in rows] == ["none", "step", "step-alert", "step-cap"] * 2
+    step, capped = rows[1], rows[3]
+    assert step["harm"] <= step["bound"] and step["against_none"] < 0.0 and step["against_episode"] is None
+    assert [each["vehicle"] for each in step["vehicles"]] == ["vehicle_1", "vehicle_2", "vehicle_3"]
+    assert step["vehicles"][0]["replaced"] is None and step["vehicles"][1]["replaced"] > 0.0
+    assert {row["above_bound"] for row in rows if row["mode"] != "none"} == {0}
+    assert {each["above_baseline"] for each in capped["vehicles"]} == {0.0}
+    assert set(rows[5]["policy_sha256"]) == {"vehicle_2", "vehicle_3"} and rows[0]["policy_sha256"] == {}
+    table = ethbrake("shield", *TEAM, "--harm-count", "total").out
+    assert "minus no shield" in table and "What each vehicle bears" in table and "full_brake, step-cap" in table
+
+
+def test_compare__takes_the_results_of_a_shielded_team(ethbrake, tmp_path):
+    file = tmp_path / "shield.json"
+    file.write_text(ethbrake("shield", *TEAM, "--json").out)
+    answer = ethbrake("compare", file, file)
+    assert answer.status == 0 and "step-cap" in answer.out
+
+
+@pytest.mark.parametrize("command", [("picture", "shield"), ("picture", "shield-modes")])
+def test_picture__draws_a_shielded_team(ethbrake, tmp_path, command):
+    out = tmp_path / "team.png"
+    words = ("--scenario", "cooperation-3-pair", "--agents", "full_brake", "--episodes", "6", "--output", out)
+    answer = ethbrake(*command, *words)
+    assert (answer.status, answer.out) == (0, "") and out.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("words", [("shield",), ("picture", "shield", "--output", "x.png")])
+def test_shield__a_shielded_team_and_a_vehicle_that_is_no_learner_are_refused(ethbrake, words):
+    told = ethbrake(*words, "--scenario", "cooperation-3-pair", "--agents", "coast+step", "--episodes", "3")
+    assert told.status == 2 and "agent 'coast+step': has a shield already" in told.err
+    told = ethbrake(*words, "--scenario", "cooperation-0-sensors", "--agents", "coast", "--episodes", "3")
+    assert told.status == 2 and "no learner to drive" in told.err and len(told.err.strip().splitlines()) == 1
+
+
 @pytest.mark.parametrize("spec", ["ppo@shipped+episode", "full_brake+step", "ppo@shipped+refined+step"])
 @pytest.mark.parametrize("command", ["shield", "picture shield", "picture robustness"])
 def test_shield__what_has_a_shield_already_is_refused(ethbrake, tmp_path, command, spec):

@@ -156,6 +156,7 @@ TABLES: dict[str, How] = {
     "| scheme | first-impact harm": TRAINED,
     "| level | collisions": TRAINED,
     "| level | first-impact harm: reached": TRAINED,
+    "| level | first-impact harm: without": TRAINED,
     "| level | seed | collisions": TRAINED,
     "| step | first-impact harm": TRAINED,
     "| step | Vehicle 1": TRAINED,

@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 import ethbrake_marl as eb
+from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.learning.recipe import shipped_recipes
 from ethbrake_marl.learning.recipe_schema import recipe_json_schema
 from ethbrake_marl.learning.recipe_text import new_recipe_text
@@ -44,6 +45,16 @@ def test_schema__that_ships_is_the_one_that_the_command_prints(
 ) -> None:
     assert (ROOT / file).read_text("utf-8") == json.dumps(schema(), indent=2) + "\n"
     assert f"# yaml-language-server: $schema={Path(file).name}\n" in text("mine")
+
+
+@pytest.mark.parametrize(("command", "file"), [("sweep", "sweep"), ("tune", "tuning")])
+def test_schema__of_sweeps_and_tunings_is_printed_by_the_command_and_named_by_the_examples(
+    command: str, file: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command([command, "--schema"]) == 0
+    assert (ROOT / "docs" / f"{file}.schema.json").read_text("utf-8") == capsys.readouterr().out
+    for example in (ROOT / "docs").glob(f"{file}-*.yaml"):
+        assert example.read_text("utf-8").startswith(f"# yaml-language-server: $schema={file}.schema.json\n")
 
 
 def test_schemas__are_no_scenario_and_no_recipe() -> None:

@@ -73,6 +73,9 @@ def test_results__say_worlds_scenario_policy_and_versions() -> None:
     assert found.outcome("ppo").take(np.array([0])).policies == found.outcome("ppo").policies
 
 
+PRICE = (
+    "picture", "price", "--scenario", "paper-random", "--channels", "paper", "--agents", "coast,e_v2x_bm:believed"
+)  # fmt: skip
 ABOUT = {"worlds_sha256": worlds_sha256(SAMPLE.worlds, SAMPLE.index), "scenario_sha256": scenario_sha256(SCENARIO)}
 
 
@@ -84,6 +87,7 @@ ABOUT = {"worlds_sha256": worlds_sha256(SAMPLE.worlds, SAMPLE.index), "scenario_
         ("equal-time", ("equal-time", "--agents", "coast", "--against", "coast", "--repeats", "1", "--seed", "7")),
         ("best-harm", ("best-harm", "--budget", "20")),
         ("robustness", ("picture", "robustness", "--output", "x.png")),
+        ("price", (*PRICE, "--output", "x.png")),
     ],
     ids=lambda each: each if isinstance(each, str) else "",
 )

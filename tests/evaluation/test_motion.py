@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.evaluation import Evaluation, record_episode
 from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes, state_at
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.shield import ShieldedTeam
 
 
 def at(motion: EpisodeMotion, time_s: float) -> Floats:
@@ -55,6 +58,19 @@ def test_motion__tells_where_a_shield_stepped_in(paper_random: Scenario) -> None
         motions = follow_episodes(worlds, make_agent(spec, scenario=paper_random), paper_random)
         assert any(motion.stepped_in_s.size for motion in motions)
         assert all((motion.stepped_in_s >= 0.5).all() for motion in motions)  # Vehicle 2 acts from then on
+
+
+def test_motion__tells_where_the_shield_of_a_team_stepped_in_as_its_log_does() -> None:
+    scenario = load_scenario("cooperation-3-pair")
+    worlds = scenario.sample(6, 7).worlds
+    team = ShieldedTeam(Team.copies(make_agent("constant:3"), (1, 2)), scenario, logging=True)
+    drive(worlds, team, scenario)
+    assert team.shield is not None and team.shield.log is not None
+    motions = follow_episodes(worlds, make_agent("constant:3+step", scenario=scenario), scenario)
+    for k, motion in enumerate(motions):
+        times = sorted({entry.time_s for entry in team.shield.log if entry.world == k})
+        np.testing.assert_allclose(motion.stepped_in_s, times)
+    assert sum(motion.stepped_in_s.size for motion in motions) > 10
 
 
 def test_motion__of_a_line_with_an_obstacle_ends_where_the_record_does() -> None:

@@ -9,15 +9,25 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.evaluation.shield_modes import ModeRow, compare_behind_shields, compare_modes, modes_table
+from ethbrake_marl.evaluation.shield_modes import (
+    ModeRow,
+    compare_behind_shields,
+    compare_modes,
+    modes_tables,
+)
 from ethbrake_marl.evaluation.statistics import paired_difference
 from ethbrake_marl.figures.shield import shield_modes_figure
+from ethbrake_marl.pages.evidence import ShieldEvidence, shield_section
+from ethbrake_marl.pages.frame import page
 from ethbrake_marl.scenario import Task, load_scenario
-from ethbrake_marl.shield import HybridAgent, StepShieldAgent
+from ethbrake_marl.shield import HybridAgent, ShieldedTeam, StepShieldAgent
+from ethbrake_marl.shield.review import review
 from tests.failing_worlds import plant, without
+from tests.pages.hostile import Page
 
-PAPER = load_scenario("paper-random")
+PAPER, PAIR = (load_scenario(name) for name in ("paper-random", "cooperation-3-pair"))
 WORLDS = PAPER.sample(60, 3).worlds
 
 
@@ -57,7 +67,7 @@ def test_rows__do_not_depend_on_the_size_of_a_chunk(rows: list[ModeRow], monkeyp
 
 
 def test_table_and_figure__show_every_row(rows: list[ModeRow]) -> None:
-    assert modes_table(rows).row_count == 5
+    assert [table.row_count for table in modes_tables(rows)] == [5]
     axes = shield_modes_figure(rows).axes[0]
     drawn = [float(container.lines[0].get_xdata()[0]) for container in axes.containers]
     expected = [row.against_episode.value for row in rows if row.against_episode is not None]
@@ -85,3 +95,61 @@ def test_worlds_that_cannot_be_advanced__are_out_for_all_modes_and_named(
 def test_behind_shields__those_that_do_not_know_the_world_are_left_out(spec: str) -> None:
     agent = make_agent(spec, scenario=PAPER, uncertainty="gaps_m=0.5")
     assert compare_behind_shields({spec: agent}, WORLDS, Task(PAPER, (1,))) == []
+
+
+@pytest.fixture(scope="module")
+def team_rows() -> list[ModeRow]:
+    agents = {name: make_agent(name) for name in ("full_brake", "coast")}
+    return compare_modes(agents, PAIR.sample(60, 3).worlds, Task(PAIR, (1, 2), "total"))
+
+
+def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: list[ModeRow]) -> None:
+    worlds = PAIR.sample(60, 3).worlds
+    assert [row.mode for row in team_rows] == ["none", "step", "step-alert", "step-cap"] * 2
+    alone = drive(worlds, Team.copies(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("total")
+    for row, cap in ((team_rows[5], None), (team_rows[7], "baseline")):
+        team = ShieldedTeam(Team.copies(make_agent("coast"), (1, 2)), PAIR, harm_count="total", cap=cap, logging=True)
+        ledger = drive(worlds, team, PAIR).ledger
+        harm, borne = ledger.world_harm("total"), ledger.vehicle_harm("total")
+        assert team.shield is not None and team.shield.running is not None and team.shield.log is not None
+        assert row.harm.value == harm.mean() and row.against_none == paired_difference(harm, alone)
+        assert row.bound is not None and row.bound.value == team.predicted_harm.mean() and row.above_bound == 0
+        decisions = team.shield.running.steps.sum()
+        own = [sum(entry.vehicle == i for entry in team.shield.log) / decisions for i in (1, 2)]
+        assert [each.replaced for each in row.vehicles] == [None, *own]
+        assert row.replaced == pytest.approx(sum(own) / 2) and min(own) > 0.1
+        assert [each.harm for each in row.vehicles] == pytest.approx(borne.mean(axis=0))
+        more = (borne > team.shield.baseline_shares).mean(axis=0)
+        assert [each.above_baseline for each in row.vehicles] == pytest.approx(more, abs=0.02)
+        assert (max(more) > 0.0) == (cap is None)
+    assert all(row.against_episode is None for row in team_rows)
+
+
+def test_team__an_intervention_is_simulated_again_without_it_for_the_whole_team() -> None:
+    worlds = PAIR.sample(40, 3).worlds
+    team = ShieldedTeam(Team.copies(make_agent("coast"), (1, 2)), PAIR, logging=True)
+    harm = drive(worlds, team, PAIR).ledger.world_harm("first")
+    found = review(team, worlds)
+    assert found.realised.tolist() == harm[found.world].tolist() and set(found.vehicle) == {1, 2}
+    alone = drive(worlds, Team.copies(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("first")
+    first = {world: k for k, world in reversed(list(enumerate(found.world.tolist())))}
+    assert all(found.without[k] == alone[world] for world, k in first.items()) and len(first) > 20
+    assert found.share("needed") > 0.5
+
+
+def test_team__tables_and_figure_show_bound_and_shares(team_rows: list[ModeRow]) -> None:
+    modes, shares = modes_tables(team_rows)
+    assert (modes.row_count, shares.row_count) == (10, 6 * 4)
+    assert [column.header for column in modes.columns][2:4] == ["minus no shield", "bound"]
+    axes = shield_modes_figure(team_rows).axes[0]
+    assert len(axes.containers) == 6 and "without a shield" in axes.get_xlabel()
+    told = team_rows[1].to_json()
+    assert told["vehicles"][0] == {**told["vehicles"][0], "vehicle": "vehicle_1", "replaced": None}
+    text = Page(page("Shield", [shield_section(ShieldEvidence(team_rows, "60 worlds"))])).text
+    assert "Minus no shield" in text and "coast, step-cap, vehicle_3" in text.replace("\u200b", "")
+
+
+def test_team__what_is_behind_a_shield_is_compared_without_it() -> None:
+    worlds, task = PAIR.sample(5, 3).worlds, Task(PAIR, (1, 2))
+    agents = {name: make_agent(name, scenario=PAIR) for name in ("full_brake", "coast+step")}
+    assert {row.agent for row in compare_behind_shields(agents, worlds, task)} == {"coast"}

@@ -13,7 +13,7 @@ from tests.hostile.yaml_changes import NOBODY
 from tests.hostile.yaml_parts import SPECS
 from tests.pages.hostile import HOSTILE
 
-YAML = ("scenario", "recipe", "sweep", "worlds")
+YAML = ("scenario", "recipe", "sweep", "worlds", "tuning")
 
 
 def kind_rows(seed: int = 0) -> Iterator[str]:

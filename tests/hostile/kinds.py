@@ -26,6 +26,7 @@ from tests.hostile.plan_cases import SWEEP, named_worlds, sweeps, worlds_text
 from tests.hostile.run_cases import checkpoints, runs
 from tests.hostile.stopped_runs import stopped
 from tests.hostile.table_cases import COMMAND, best_harm_tables
+from tests.hostile.tuning_cases import TUNING, tunings
 from tests.hostile.yaml_cases import recipes, scenarios
 from tests.hostile.yaml_parts import RECIPE, SCENARIO
 
@@ -34,6 +35,7 @@ KINDS: dict[str, Generator] = {
     "recipe": recipes,
     "sweep": sweeps,
     "worlds": named_worlds,
+    "tuning": tunings,
     "CSV": tables_of_states,
     "table": best_harm_tables,
     "place": places,
@@ -82,6 +84,8 @@ def warm_up(folder: Path) -> None:
         run_command([*few, "--per-world", str(folder / "worlds-out.csv")])
         write(folder / "sweep.yaml", SWEEP)
         run_command(["sweep", str(folder / "sweep.yaml"), "--output", str(folder / "mine.yaml")])
+        write(folder / "tuning.yaml", TUNING)
+        run_command(["tune", str(folder / "tuning.yaml"), "--output", str(folder / "mine.yaml")])
         write(folder / "worlds.yaml", worlds_text())
         run_command(["falsify", "--again", str(folder / "worlds.yaml")])
         write(folder / "t.npz", good_bytes())

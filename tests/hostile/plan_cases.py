@@ -143,10 +143,10 @@ IN_SWEEP: dict[str, tuple[str, tuple[str, ...]]] = {
 
 def sweeps(rng: random.Random) -> Iterator[Case]:
     """Files of sweeps: 4 of each way of every file, each of their own once, and damaged ones."""
-    for category, content in _of_every_file(rng, SWEEP):
+    for category, content in of_every_file(rng, SWEEP):
         yield _sweep(category, content)
     yield from (_sweep("too large", SWEEP + "#" + "x" * size) for size in (1 << 16, 1 << 20, 10 << 20))
-    for category, content in _of_own_keys(SWEEP, IN_SWEEP):
+    for category, content in of_own_keys(SWEEP, IN_SWEEP):
         yield _sweep(category, content)
     for _ in range(40):
         yield _sweep("damaged", damaged(rng, SWEEP.encode()), certain=False)
@@ -222,7 +222,7 @@ def _in_worlds() -> dict[str, tuple[str, tuple[str, ...]]]:
 def named_worlds(rng: random.Random) -> Iterator[Case]:
     """Files of named worlds: 4 of each way of every file, each of their own once, and damaged ones."""
     text = worlds_text()
-    for category, content in _of_every_file(rng, text):
+    for category, content in of_every_file(rng, text):
         yield _worlds(category, content)
     for category, (begin, others) in _in_worlds().items():
         at = text.index(begin)
@@ -238,7 +238,8 @@ def named_worlds(rng: random.Random) -> Iterator[Case]:
         yield _worlds("damaged", damaged(rng, text.encode()), certain=False)
 
 
-def _of_every_file(rng: random.Random, text: str) -> Iterator[tuple[str, bytes | str]]:
+def of_every_file(rng: random.Random, text: str) -> Iterator[tuple[str, bytes | str]]:
+    """(category, content) of every way in which any such file is changed."""
     for category in OF_EVERY_FILE:
         for _ in range(EACH):
             yield category, encoded(rng, category, CERTAIN[category](rng, text))
@@ -247,7 +248,8 @@ def _of_every_file(rng: random.Random, text: str) -> Iterator[tuple[str, bytes |
             yield "nasty last line", f"{text}{nasty}\n"
 
 
-def _of_own_keys(text: str, changes: dict[str, tuple[str, tuple[str, ...]]]) -> Iterator[tuple[str, str]]:
+def of_own_keys(text: str, changes: dict[str, tuple[str, tuple[str, ...]]]) -> Iterator[tuple[str, str]]:
+    """(category, content) of each change of a value."""
     for category, (old, others) in changes.items():
         yield from ((category, replaced(text, old, other)) for other in others)
 

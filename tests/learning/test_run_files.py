@@ -2,13 +2,14 @@ from __future__ import annotations
 
 import csv
 import json
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ethbrake_marl.errors import AlreadyExists
-from ethbrake_marl.files.durable import new_folder, write_file
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.files.durable import hold_lock, new_folder, write_file
 from ethbrake_marl.learning.run_folder import create_run
 from ethbrake_marl.learning.run_log import ProgressTable
 
@@ -44,6 +45,22 @@ def test_new_folder__does_not_take_a_name_that_was_taken_meanwhile(tmp_path: Pat
     with pytest.raises(AlreadyExists, match="good: is there already"), new_folder(tmp_path / "good"):
         (tmp_path / "good").mkdir()
     assert list(tmp_path.iterdir()) == [tmp_path / "good"]
+
+
+def test_hold_lock__is_for_one_and_free_afterwards(tmp_path: Path) -> None:
+    def hold() -> AbstractContextManager[None]:
+        return hold_lock(tmp_path / "some.lock", "somebody works here")
+
+    for _ in range(2):
+        with hold(), pytest.raises(InvalidInput, match=f"^{tmp_path}: somebody works here$"), hold():
+            pass
+
+
+def test_hold_lock__names_what_cannot_be_one(tmp_path: Path) -> None:
+    lock = tmp_path / "some.lock"
+    lock.mkdir()
+    with pytest.raises(InvalidInput, match=r"some\.lock: cannot be used as a lock .*; delete it"), hold_lock(lock, ""):
+        pass
 
 
 def test_create_run__refuses_what_exists(tmp_path: Path) -> None:

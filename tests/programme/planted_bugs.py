@@ -20,10 +20,10 @@ from tests.programme.copies import mutated, working_copy
 from tests.programme.planting import Patch, first_red, misfits
 from tests.programme.suites import ROOT
 
-REWARDS, V2X, ENGINE, STEPPING, STARTS, OBJECTIVES = (
+REWARDS, V2X, ENGINE, TERMS, STEPPING, STARTS, OBJECTIVES = (
     f"ethbrake_marl/{name}.py"
     for name in (
-        "rewards/terms", "scenario/v2x", "engine/engine", "engine/step", "engine/stream", "objectives",
+        "rewards/terms", "scenario/v2x", "engine/engine", "engine/terms", "engine/step", "engine/stream", "objectives",
     )
 )  # fmt: skip
 SB3 = "ethbrake_marl/envs/sb3.py"
@@ -71,8 +71,8 @@ BUGS: dict[str, Bug] = {
     # ------------------------------------------------------------ rewards
     "shaping potential not renewed after autoreset": Bug(
         ENGINE,
-        "        if self.reward.shaping > 0.0:\n            self._potential[rows] =",
-        "        if self.reward.shaping > 0.0 and len(rows) == self.n:\n            self._potential[rows] =",
+        "        if self.reward.shaping > 0.0:\n            worlds =",
+        "        if self.reward.shaping > 0.0 and len(rows) == self.n:\n            worlds =",
         OF_REWARDS,
     ),
     "collision counts first impacts only": Bug(
@@ -95,9 +95,9 @@ BUGS: dict[str, Bug] = {
         OF_REWARDS,
     ),
     "discount on the wrong side of the shaping": Bug(
-        ENGINE,
-        "self.reward.shaping_discount * self._potential - before",
-        "self._potential - self.reward.shaping_discount * before",
+        TERMS,
+        "self.params.shaping_discount * running._potential - before",
+        "running._potential - self.params.shaping_discount * before",
         OF_REWARDS,
     ),
     "potential of several learners with everybody's first choice": Bug(
@@ -110,9 +110,9 @@ BUGS: dict[str, Bug] = {
         OBJECTIVES, "(math.cos(angle), math.sin(angle))", "(math.sin(angle), math.cos(angle))", OF_REWARDS
     ),
     "an objective's harm so far paid again in every step": Bug(
-        ENGINE,
-        'step.further["harm"] = before - self._obj',
-        'step.further["harm"] = 0.0 * before - self._obj',
+        TERMS,
+        'step.further["harm"] = before - self.obj',
+        'step.further["harm"] = 0.0 * before - self.obj',
         OF_REWARDS,
     ),
     # ------------------------------------------------------------ V2X
@@ -152,7 +152,7 @@ BUGS: dict[str, Bug] = {
     "one step more where the division rounds up": Bug(
         "ethbrake_marl/physics/episode.py", " / time_step_s - _ROUNDING)", " / time_step_s)", OF_ENGINE
     ),
-    "rows that have ended are paid again": Bug(ENGINE, "        extra[standing] = 0.0\n", "", OF_ENGINE),
+    "rows that have ended are paid again": Bug(TERMS, "        extra[standing] = 0.0\n", "", OF_ENGINE),
     "the last observation taken from the next episode": Bug(
         SB3,
         "            self._close_episodes(ended, step, infos)\n            engine.renew(ended)\n",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import shutil
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,3 +79,45 @@ def misfits(bugs: Mapping[str, tuple[Patch, ...]]) -> list[str]:
             if count != 1:
                 wrong.append(f"{name}: {patch.file} holds {patch.old!r} {count} times, not once")
     return wrong
+
+
+def try_bugs(
+    what: str, bugs: Mapping[str, tuple[Patch, ...]], quick: tuple[str, ...], whole: tuple[str, ...], *, jobs: int
+) -> int:
+    """The command of a list of bugs: plant each, and print which test finds it.
+
+    Args:
+        what: whose bugs, for the last line.
+        bugs: name -> patches.
+        quick: tests that run first, with compilation switched off; green without any bug.
+        whole: tests that run, compiled, where those stay green.
+        jobs: bugs at once, where the command line does not say.
+
+    Returns the exit status: 1 where a bug was missed, a patch does not fit, or the quick tests are red anyway.
+
+    """
+    parser = argparse.ArgumentParser(description=f"Plant {what} in copies of the repository, and see them found.")
+    parser.add_argument("--jobs", type=int, default=jobs)
+    parser.add_argument("--only", default="", help="only bugs whose name contains this")
+    parser.add_argument("--quick", action="store_true", help="only the tests that need no compilation")
+    given = parser.parse_args()
+    errors = misfits(bugs)
+    if not errors and (red := red_with((), quick, compiled=False)):
+        errors = [f"red without any bug: {red}"]
+    for wrong in errors:
+        print(f"ERROR  {wrong}")
+    if errors:
+        return 1
+
+    def find(name: str) -> str:
+        red = red_with(bugs[name], quick, compiled=False)
+        return red if red or given.quick else red_with(bugs[name], whole, compiled=True)
+
+    names = [name for name in bugs if given.only in name]
+    found = 0
+    with ThreadPoolExecutor(given.jobs) as pool:
+        for name, red in zip(names, pool.map(find, names), strict=True):
+            found += bool(red)
+            print(f"{'found ' if red else 'MISSED'}  {name:55s} {red.removeprefix('tests/')}", flush=True)
+    print(f"{what}: {found}/{len(names)} found: {'PASS' if found == len(names) else 'FAIL'}")
+    return 0 if found == len(names) else 1

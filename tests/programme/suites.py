@@ -98,7 +98,15 @@ STEPS = (
     "tests/engine/test_obstacle.py",
 )
 ENGINE = Suite(
-    files=("engine/engine.py", "engine/stream.py", "engine/step.py", "actions.py", "engine/snapshot.py"),
+    files=(
+        "engine/engine.py",
+        "engine/running.py",
+        "engine/terms.py",
+        "engine/stream.py",
+        "engine/step.py",
+        "actions.py",
+        "engine/snapshot.py",
+    ),
     quick={
         "engine/step.py": STEPS,
         "actions.py": ("tests/test_actions.py", *STEPS[2:3]),

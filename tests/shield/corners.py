@@ -12,7 +12,7 @@ import numpy as np
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield.believed import BelievedShieldAgent
+from ethbrake_marl.shield.believed_agent import BelievedShieldAgent
 
 WAYS = ("coast", "drive", "chance")
 ABOVE = 1e-6  # m2/s2; what is told is moved on with rounding
@@ -51,7 +51,9 @@ class Hostile:
         return high.copy() if self.name == "drive" else np.zeros(worlds.n)
 
 
-def shielded(way: str, scenario: Scenario, n: int, seed: int, *, robust: bool = True) -> tuple[Floats, Floats, int]:
+def shielded(
+    way: str, scenario: Scenario, n: int, seed: int, *, robust: str | None = "corners"
+) -> tuple[Floats, Floats, int]:
     """Harm realised and first bound of ``n`` worlds [n] m2/s2, and how many proposals were replaced."""
     agent = BelievedShieldAgent(Hostile(way, seed), scenario, robust=robust)
     harm = drive(scenario.sample(n, seed).worlds, agent, scenario, 1).ledger.world_harm("first")

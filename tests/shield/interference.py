@@ -17,8 +17,11 @@ import numpy as np
 
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.shield import MovingAtHorizon
-from tests.shield.plays import PLAYS, Evaluation, Failure, Play
+from tests.shield.plays import PLAYS as ONE_SHIELDED
+from tests.shield.plays import Evaluation, Failure, Play
+from tests.shield.team_plays import TEAM_PLAYS
 
+PLAYS: dict[str, type[Play]] = {**ONE_SHIELDED, **TEAM_PLAYS}
 LINES = (50, 200, 800)  # an interrupt comes at one of the first so many lines of a call, if it has so many
 
 

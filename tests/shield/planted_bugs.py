@@ -8,10 +8,9 @@ without any bug.
 
 from __future__ import annotations
 
-import argparse
 import sys
 
-from tests.programme.planting import Patch, misfits, red_with
+from tests.programme.planting import Patch, try_bugs
 
 BY_HAND = "test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner"
 OF_BOXES = tuple(
@@ -245,31 +244,5 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "a surprise is not flagged": (Patch(GUARD, "if not surprising.any():", "if surprising.any() or True:"),),
 }
 
-
-def main() -> int:
-    """Plant every bug and print which test finds it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", default="", help="only bugs whose name contains this")
-    parser.add_argument("--quick", action="store_true", help="only the tests that need no compilation")
-    given = parser.parse_args()
-    for wrong in (unfit := misfits(BUGS)):
-        print(f"ERROR  {wrong}")
-    if unfit:
-        return 1
-    if red := red_with((), QUICK, compiled=False):
-        print(f"ERROR  red without any bug: {red}")
-        return 1
-    names = [name for name in BUGS if given.only in name]
-    found = 0
-    for name in names:
-        red = red_with(BUGS[name], QUICK, compiled=False)
-        if not red and not given.quick:
-            red = red_with(BUGS[name], WHOLE, compiled=True)
-        found += bool(red)
-        print(f"{'found ' if red else 'MISSED'}  {name:55s} {red.removeprefix('tests/')}", flush=True)
-    print(f"planted shield bugs: {found}/{len(names)} found: {'PASS' if found == len(names) else 'FAIL'}")
-    return 0 if found == len(names) else 1
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(try_bugs("planted shield bugs", BUGS, QUICK, WHOLE, jobs=1))

@@ -60,6 +60,8 @@ class Failing:
 class Play:
     """One interface, shielded: ``step`` makes a step with fresh proposals, ``bad`` are calls that must raise."""
 
+    scenario = SCENARIO
+
     def __init__(self, seed: int) -> None:
         self.rng, self.policy = np.random.default_rng(seed), Failing()
         self.raises: str | None = None  # where the wrapper in between raises
@@ -102,7 +104,7 @@ class Parallel(Play):
     """PettingZoo parallel."""
 
     def _watched(self) -> None:
-        inner = _ParallelBetween(parallel_env(SCENARIO), self)
+        inner = _ParallelBetween(parallel_env(self.scenario), self)
         self.env = HybridShield(inner, self.policy, mode="step")
         self.bad = [
             lambda: self.env.step({"vehicle_2": np.zeros(1), "vehicle_9": np.zeros(1)}),
@@ -138,7 +140,7 @@ class Aec(Play):
     """PettingZoo AEC."""
 
     def _watched(self) -> None:
-        self.env = shielded_aec(_ParallelBetween(parallel_env(SCENARIO), self), mode="step")
+        self.env = shielded_aec(_ParallelBetween(parallel_env(self.scenario), self), mode="step")
         shielded: Any = self.env
         while not isinstance(shielded, HybridShield):
             shielded = shielded.env
@@ -225,13 +227,13 @@ class Sb3(Vector):
     """Stable-Baselines3."""
 
     def _watched(self) -> None:
-        inner = make_sb3_vec_env(SCENARIO, ROWS, seed=int(self.rng.integers(10**6)))
+        inner = make_sb3_vec_env(self.scenario, ROWS, seed=int(self.rng.integers(10**6)))
         inner.__class__ = _Sb3Between
         inner.play = self
         self.env = ShieldedVecEnv(inner)
         self.bad = [
             lambda: self.env.step(self._one_bad(np.nan)),
-            lambda: self.env.step(np.zeros((ROWS, 2))),
+            lambda: self.env.step(np.zeros((self.env.num_envs, 2))),
             lambda: self.env.env_method("no_such_method"),
             self._options,
         ]
@@ -243,9 +245,10 @@ class Sb3(Vector):
         self.env.reset()
 
     def step(self) -> None:
+        rows = self.env.num_envs
         if self.rng.random() < 0.2:  # one too many
-            self.env.step_async(self.drawn(ROWS, 1))
-        super().step()
+            self.env.step_async(self.drawn(rows, 1))
+        self.env.step(self.drawn(rows, 1).astype(np.float32))
 
 
 class Evaluation(Play):
@@ -256,14 +259,18 @@ class Evaluation(Play):
         self.bad = [self._policy_fails]
 
     def _begin(self) -> None:
-        worlds = SCENARIO.sample(ROWS, int(self.rng.integers(10**6))).worlds
-        self.agent = StepShieldAgent(self.policy, SCENARIO)
+        worlds = self.scenario.sample(ROWS, int(self.rng.integers(10**6))).worlds
         before = getattr(self, "_engine", None)
-        self._engine = episode_engine(worlds, self.agent, SCENARIO, 1)
+        self._engine = self._driven(worlds)
         self.recorder = Recorder(self.shield)
         self.done = [*getattr(self, "done", []), *([] if before is None else before.memory(before.watchers[0]))]
         self._engine.watch(self.recorder, [])
         self._engine.step({})
+
+    def _driven(self, worlds: Any) -> Any:
+        """An engine over these worlds in which a new agent drives."""
+        self.agent: Any = StepShieldAgent(self.policy, self.scenario)
+        return episode_engine(worlds, self.agent, self.scenario, 1)
 
     def _policy_fails(self) -> None:
         self.policy.fails = True

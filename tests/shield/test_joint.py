@@ -23,6 +23,7 @@ from ethbrake_marl.shield.shares import borne_under
 from tests.shield.joint_attack import ADVERSARIES, joint_attack, scenario_of
 
 STEPS = 81
+COAST = make_agent("coast")
 PAIR = load_scenario("cooperation-3-pair")
 
 
@@ -291,6 +292,10 @@ def test_parallel__a_team_proposes_where_nobody_does_and_one_may_be_left_out():
         (
             lambda env: HybridShield(env, {"vehicle_2": make_agent("coast")}, mode="step"),
             "one for each of vehicle_2, v",
+        ),
+        (
+            lambda env: HybridShield(env, dict.fromkeys(("vehicle_2", "vehicle_3"), COAST), mode="step"),
+            "one object drives two vehicles",
         ),
         (lambda env: HybridShield(env, mode="step", cap="mine"), "cap = 'mine': must be baseline or None"),
         (lambda env: HybridShield(env, make_agent("coast"), cap="baseline"), "mode step alone takes one"),

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
+
 from ethbrake_marl.evaluation.seed_statistics import (
     interquartile_mean,
     mean_over_seeds,
@@ -18,6 +20,7 @@ from ethbrake_marl.evaluation.seed_statistics import (
 )
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics import Bools, Floats
+from ethbrake_marl.shield.behind import Shielded
 from ethbrake_marl.studies.ablation.run import Harms, Measured
 
 TOLERANCE = 1e-6  # m2/s2; a vehicle whose harm rose by more is worse off
@@ -81,6 +84,28 @@ def _under_count(one: Measured, harm_count: HarmCount, searched: int) -> Json:
         "searched": _compare_searched(
             reached[:, :searched], braking[:, :searched], None if one.best is None else one.best[harm_count]
         ),
+        "shielded": None if one.shielded is None else _behind(one, one.shielded[harm_count], harm_count, searched),
+    }
+
+
+def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
+    """The same teams in the same worlds behind the shield that guards this count, beside what they do without it."""
+    before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
+    actions = shielded.decisions * shielded.replaced.shape[2]
+    return {
+        "harm": mean_over_seeds(shielded.harm).to_json(),
+        "each_seed": shielded.harm.mean(axis=1).tolist(),
+        "difference": mean_over_seeds(shielded.harm - one.reached.world[harm_count]).to_json(),
+        "bound": mean_over_seeds(shielded.bound).to_json(),
+        "above_bound": int((shielded.harm > shielded.bound).sum()),
+        "replaced": float(shielded.replaced.sum() / actions.sum()),
+        "replaced_vehicles": (shielded.replaced.sum(axis=(0, 1)) / shielded.decisions.sum()).tolist(),
+        "stepped_in": rate_over_seeds((shielded.replaced > 0).any(axis=2)).to_json(),
+        "vehicles": [mean_over_seeds(column).to_json() for column in np.moveaxis(after - before, 2, 0)],
+        "worse_off": rate_over_seeds((after > before + TOLERANCE).any(axis=2)).to_json(),
+        "above_baseline": rate_over_seeds((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
+        "moving": int(shielded.moving.sum()),
+        "searched": {"harm": mean_over_seeds(shielded.harm[:, :searched]).to_json()},
     }
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from ethbrake_marl.agents.registry import make_single_agent
+from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.limits.best_harm import best_harm
-from ethbrake_marl.scenario import Sample
+from ethbrake_marl.scenario import Sample, Task
+from ethbrake_marl.shield.behind import drive_chunks
 from ethbrake_marl.studies.ablation.joint_optimum import parts_left, questions
 from ethbrake_marl.studies.ablation.plan import Plan, common_worlds
 from ethbrake_marl.studies.jobs.cost import time_training, told_seconds, training_seconds, world_seconds
@@ -65,8 +68,24 @@ def cost_of(plan: Plan) -> Cost:
     if not worlds_s:
         worlds_s.append(world_seconds(left[0][0].folder, left[0][0].level.scenario, samples[left[0][0].level.name]))
     driving_s = sum(worlds_s) / len(worlds_s) * plan.episodes * (len(left) + len(plan.levels))
+    driving_s += 0.0 if plan.shield is None else _shielding_s(plan, samples)
     trainings, decisions = sum(1 for _, steps in left if steps), sum(steps for _, steps in left)
     return Cost(trainings, decisions, training_s, driving_s, *_search(plan, lists))
+
+
+def _shielding_s(plan: Plan, samples: Mapping[str, Sample]) -> float:
+    """Seconds behind the shield, of both counts; timed with learners that brake fully, which it replaces most often."""
+    seconds = 0.0
+    for level in plan.levels:
+        if level.trained:
+            worlds, task = samples[level.name].worlds, Task(level.scenario, level.scenario.learners)
+            braking = make_single_agent("full_brake")
+            drive_chunks(braking, worlds.take(np.arange(1)), task)  # compiles
+            started = time.monotonic()
+            drive_chunks(braking, worlds, task)
+            each = (time.monotonic() - started) / worlds.n
+            seconds += each * plan.episodes * plan.seeds * len(plan.recipes) * len(HARM_COUNTS)
+    return seconds
 
 
 def _first(sample: Sample) -> Sample:

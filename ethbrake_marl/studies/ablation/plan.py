@@ -115,7 +115,9 @@ def _but_channel(one: Scenario, other: Scenario) -> bool:
 
 
 TRAININGS, OPTIMUM, SETTINGS = "trainings", "optimum", "settings.json"  # inside the ablation's folder
+SHIELDS = ("step",)  # that may be put around every level's learners
 _NUMBERS = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
+_TOLD = (*_NUMBERS, "shield")  # settings whose values are told where they differ
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +163,7 @@ class Plan:
     budget: int  # candidates per world and count of that search
     folder: Path
     noted: tuple[str, ...] = ()  # see ``Training``
+    shield: str | None = None  # one of ``SHIELDS``: everything drives a second time, behind it
 
     @property
     def algorithms(self) -> tuple[str, ...]:
@@ -189,7 +192,8 @@ class Plan:
         """Everything that shapes the results, as plain data."""
         scenarios = [level.scenario.model_dump(mode="json", exclude=set(WORDS)) for level in self.levels]
         recipes = [recipe.model_dump(mode="json", exclude=set(WORDS)) for recipe in self.recipes]
-        return {"levels": scenarios, "recipes": recipes, **{name: getattr(self, name) for name in _NUMBERS}}
+        numbers = {name: getattr(self, name) for name in _NUMBERS}
+        return {"levels": scenarios, "recipes": recipes, **numbers, "shield": self.shield}
 
     def optimum_folder(self, level: Level) -> Path:
         """Where the parts of its search stand."""
@@ -206,13 +210,17 @@ def _algorithm(recipe: TrainingRecipe) -> str:
 
 
 def check_plan(plan: Plan) -> None:
-    """Raise ``InvalidInput`` for recipes of one name, numbers below 1, or nothing to train."""
+    """Raise ``InvalidInput`` for recipes of one name, numbers below 1, an unknown shield, or nothing to train."""
     names = [recipe.name for recipe in plan.recipes]
     if not names or len(set(names)) < len(names):
         raise InvalidInput(f"recipes {', '.join(names) or 'none'}: give at least one, each with a name of its own")
     for name in _NUMBERS:
         if name != "list_seed" and not getattr(plan, name) >= 1:
             raise InvalidInput(f"{name.replace('_', '-')} {getattr(plan, name)}: must be at least 1")
+    if plan.shield not in (None, *SHIELDS):
+        raise InvalidInput(
+            f"shield {plan.shield!r}: must be {', '.join(SHIELDS)}; episode and robust shield one vehicle"
+        )
     if plan.search_episodes > plan.episodes:
         raise InvalidInput(
             f"search-episodes {plan.search_episodes}: must be at most the {plan.episodes} worlds of --episodes"
@@ -241,7 +249,7 @@ def check_settings(plan: Plan) -> None:
     other = [name for name, value in wanted.items() if kept.get(name) != value]
     if other:
         told = "; ".join(
-            f"{name.replace('_', '-')} {kept.get(name)!s:.40}, here {wanted[name]}" if name in _NUMBERS else f"{name}"
+            f"{name.replace('_', '-')} {kept.get(name)!s:.40}, here {wanted[name]}" if name in _TOLD else f"{name}"
             for name in other
         )
         raise InvalidInput(

@@ -1,9 +1,7 @@
-"""The findings of an ablation: Markdown tables, a page, and one CSV row per level, algorithm and seed."""
+"""The findings of an ablation: Markdown tables, and a page."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -20,13 +18,13 @@ from ethbrake_marl.pages.parts import facts, table
 from ethbrake_marl.pages.vector import drawing
 from ethbrake_marl.studies.ablation.comparison import compare
 from ethbrake_marl.studies.ablation.episodes import episodes_section
+from ethbrake_marl.studies.ablation.levels_csv import levels_csv
 from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, LineResult
 from ethbrake_marl.studies.ablation.plan import Plan
 from ethbrake_marl.studies.ablation.run import Measured
 
 NONE = "–"
 _ALGORITHM = "Algorithm"
-_SUMS = ("", "full_brake_", "searched_", "searched_full_brake_", "searched_best_known_")  # columns of each count
 _HARM = {"first": "first-impact harm", "total": "total harm"}
 
 Json = dict[str, Any]
@@ -71,6 +69,9 @@ def _blocks(found: Json) -> list[tuple[str, list[_Table]]]:
     blocks = [("Levels", [_levels(found["levels"], harm_count) for harm_count in HARM_COUNTS])]
     optima = [_optima(found["levels"], harm_count) for harm_count in HARM_COUNTS]
     blocks.append((f"How near the joint optimum, in the first {count_of(worlds, 'world')}", optima))
+    if any(level["first"]["shielded"] for level in found["levels"]):
+        behind = [_shielded(found["levels"], harm_count) for harm_count in HARM_COUNTS]
+        blocks.append(("Behind the step shield that guards the count of the table", behind))
     for title, key in (("What each step is worth", "steps"), ("Price of lost messages", "channels")):
         if found[key]:
             blocks.append((title, [_changes(found[key])]))
@@ -78,32 +79,6 @@ def _blocks(found: Json) -> list[tuple[str, list[_Table]]]:
         changes = found["steps"] + found["channels"]
         blocks.append(("Who pays", [_who_pays(changes, harm_count) for harm_count in HARM_COUNTS]))
     return blocks
-
-
-def levels_csv(measured: Sequence[Measured], searched: int) -> str:
-    """One row per level, algorithm and seed: means over the worlds (m2/s2).
-
-    ``searched``: over the worlds in which the joint optimum was searched.
-    """
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    vehicles = measured[0].reached.vehicle["first"].shape[2]
-    harms = [f"{_column(harm_count)}_{i + 1}" for harm_count in HARM_COUNTS for i in range(vehicles)]
-    sums = [f"{name}{_column(harm_count)}" for harm_count in HARM_COUNTS for name in _SUMS]
-    writer.writerow(["level", "algorithm", "seed", "worlds", "collision_rate", *sums, *harms])
-    for one in measured:
-        for seed in range(len(one.reached.collided)):
-            row: list[object] = [one.level.name, one.algorithm or "", seed if one.algorithm else ""]
-            row += [one.reached.collided.shape[1], float(one.reached.collided[seed].mean())]
-            for harm_count in HARM_COUNTS:
-                best = "" if one.best is None else float(one.best[harm_count].mean())
-                reached, braking = one.reached.world[harm_count][seed], one.full_brake.world[harm_count]
-                row += [float(reached.mean()), float(braking.mean())]
-                row += [float(reached[:searched].mean()), float(braking[:, :searched].mean()), best]
-            for harm_count in HARM_COUNTS:
-                row += [float(harm) for harm in one.reached.vehicle[harm_count][seed].mean(axis=0)]
-            writer.writerow(row)
-    return text.getvalue()
 
 
 def interval_words(seeds: int) -> str:
@@ -161,6 +136,23 @@ def _optima(levels: Sequence[Json], harm_count: HarmCount) -> _Table:
             row = [f"`{level['level']}`", level["algorithm"], _value(own["full_brake"]), _cell(own["harm"])]
             rows.append([*row, _value(own["best_known"]), _cell(own["realised_share"], 100.0, 1, " %")])
     return _Table(head, rows, left=2)
+
+
+def _shielded(levels: Sequence[Json], harm_count: HarmCount) -> _Table:
+    head = ["Level", _ALGORITHM, f"Without, {_HARM[harm_count]}", "With", "Change", "Bound", "Replaced", "Stepped in"]
+    rows = []
+    for level in levels:
+        own, behind = level[harm_count], level[harm_count]["shielded"]
+        if behind is not None:
+            row = [f"`{level['level']}`", level["algorithm"], _value(own["harm"]), _value(behind["harm"])]
+            row += [
+                _cell(behind["difference"], sign=True),
+                _value(behind["bound"]),
+                f"{100.0 * behind['replaced']:.1f} %",
+            ]
+            row += [_cell(behind[key], 100.0, 1, " %") for key in ("stepped_in", "worse_off", "above_baseline")]
+            rows.append([*row, str(behind["above_bound"])])
+    return _Table([*head, "Somebody worse off", "Above the baseline plan", "Above the bound"], rows, left=2)
 
 
 def _changes(changes: Sequence[Json]) -> _Table:
@@ -225,10 +217,6 @@ def _cell(estimate: Json | None, scale: float = 1.0, digits: int = 2, unit: str 
 
 def _value(estimate: Json | None) -> str:
     return NONE if estimate is None else f"{estimate['value']:.2f}"
-
-
-def _column(harm_count: HarmCount) -> str:
-    return "first_impact_harm" if harm_count == "first" else "total_harm"
 
 
 SUMMARY, TABLE, TEXT, PAGE = "ablation.json", "ablation.csv", "ablation.md", "ablation.html"

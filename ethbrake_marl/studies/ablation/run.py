@@ -17,7 +17,8 @@ from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.learning.team_file import load_team
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.scenario import Sample, Scenario, Task
+from ethbrake_marl.shield.behind import Shielded, drive_chunks, stack
 from ethbrake_marl.studies.ablation.joint_optimum import LevelOptimum, best_known, search_all
 from ethbrake_marl.studies.ablation.plan import Level, Plan, Training, common_worlds
 from ethbrake_marl.studies.jobs.training import finish_trainings
@@ -59,6 +60,7 @@ class Measured:
     full_brake: Harms  # of all vehicles, whatever their roles
     best: dict[HarmCount, Floats] | None  # [1, search_episodes] joint optimum, best known; None: nobody to control
     identity: Mapping[str, Any] = field(default_factory=dict)  # of worlds and scenario, and what computed it
+    shielded: dict[HarmCount, Shielded] | None = None  # [seeds, worlds] behind the shield that guards that count
 
 
 def load_teams(plan: Plan) -> dict[tuple[str, str], list[Team]]:
@@ -97,8 +99,10 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
         known = best_known(answers[level.name], list(answers.values()))
         best = {harm_count: harm[np.newaxis] for harm_count, harm in known.items()}
         for algorithm in plan.algorithms:
-            reached = _drive(level.scenario, sample, teams[level.name, algorithm], say)
-            found.append(Measured(level, algorithm, reached, braking, best, about))
+            own = teams[level.name, algorithm]
+            reached = _drive(level.scenario, sample, own, say)
+            behind = None if plan.shield is None else _drive_behind(level.scenario, sample, own, say)
+            found.append(Measured(level, algorithm, reached, braking, best, about, behind))
     return found
 
 
@@ -116,6 +120,21 @@ def _drive(scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: OnPr
         tell(Progress(f"driving {team.name}", sample.worlds.n, sample.worlds.n))
     policies = tuple(policies_by_name(outcome.policies, scenario) for outcome in outcomes)
     return replace(harms_of(outcomes), policies=policies)
+
+
+def _drive_behind(
+    scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: OnProgress
+) -> dict[HarmCount, Shielded]:
+    """Several teams of one level behind one step shield, once for each count, which that shield guards."""
+    found: dict[HarmCount, Shielded] = {}
+    for harm_count in HARM_COUNTS:
+        task = Task(scenario, scenario.learners, harm_count)
+        parts = []
+        for team in teams:
+            parts.append(drive_chunks(team, sample.worlds, task))
+            tell(Progress(f"driving {team.name} behind the shield, {harm_count}", sample.worlds.n, sample.worlds.n))
+        found[harm_count] = stack(parts)
+    return found
 
 
 def harms_of(outcomes: Sequence[Outcome]) -> Harms:

@@ -15,6 +15,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    PrivateAttr,
     Tag,
     ValidationError,
     field_validator,
@@ -22,14 +23,16 @@ from pydantic import (
 )
 
 from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.files.json_schema import FileSchema, OneOrMore, publish
 from ethbrake_marl.files.messages import Wording, explain
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 
 MOST_JOBS = 200_000
+_GRID: YamlPath = ("grid",)
 LEVEL = "cooperation-"  # how the scenario of a level of cooperation begins
 
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
-_Names = Annotated[tuple[str, ...], Field(strict=False, min_length=1)]
+_Names = Annotated[tuple[str, ...], Field(strict=False, min_length=1), OneOrMore]
 _Values = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
 
 
@@ -50,7 +53,7 @@ _Lists = Annotated[dict[str, _Values], AfterValidator(_check_keys)]
 class Request:
     """One job as the file asks for it."""
 
-    place: str  # in the file
+    path: YamlPath  # in the file: of the grid, or of a listed job
     scenario: str  # a name or a path
     level: str  # of cooperation; empty where a scenario was named
     recipe: str  # a name or a path
@@ -58,9 +61,18 @@ class Request:
     settings: tuple[str, ...]  # KEY=VALUE each, as for ``train --set``
 
     @property
+    def place(self) -> str:
+        """The path, as messages name it."""
+        return _place(self.path)
+
+    @property
     def kind(self) -> tuple[str, str, tuple[str, ...]]:
         """The job without its seed."""
         return self.scenario, self.recipe, self.settings
+
+
+def _place(path: YamlPath) -> str:
+    return "grid" if path == _GRID else f"jobs[{path[1]}]"
 
 
 class _Part(BaseModel):
@@ -70,8 +82,8 @@ class _Part(BaseModel):
 class SeedRange(_Part):
     """``count`` seeds from ``first`` on."""
 
-    first: _Seed = 0
-    count: Annotated[int, Field(ge=1, le=MOST_JOBS)]
+    first: _Seed = Field(default=0, description="the smallest seed")
+    count: int = Field(ge=1, le=MOST_JOBS, description="how many seeds")
 
 
 def _form_of_seeds(value: Any) -> str:
@@ -79,7 +91,8 @@ def _form_of_seeds(value: Any) -> str:
 
 
 _Seeds = Annotated[
-    Annotated[tuple[_Seed, ...], Field(strict=False, min_length=1), Tag("#list")] | Annotated[SeedRange, Tag("#range")],
+    Annotated[tuple[_Seed, ...], Field(strict=False, min_length=1), OneOrMore, Tag("#list")]
+    | Annotated[SeedRange, Tag("#range")],
     Discriminator(_form_of_seeds),
 ]
 
@@ -87,7 +100,9 @@ _Seeds = Annotated[
 class _Lines(_Part):
     """What a grid and a job have in common: a scenario, or the level of cooperation in its place."""
 
-    settings: _Settings = Field(default={}, alias="set")
+    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["scenario"]}, {"required": ["level"]}]})
+
+    settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as train --set")
 
     @model_validator(mode="after")
     def _one_of_two(self) -> _Lines:
@@ -99,11 +114,11 @@ class _Lines(_Part):
 class Grid(_Lines):
     """All combinations of what is listed."""
 
-    scenario: _Names | None = None
-    level: _Names | None = None
-    recipe: _Names
-    seed: _Seeds = (0,)
-    settings: _Lists = Field(default={}, alias="set")
+    scenario: _Names | None = Field(default=None, description="names or paths, as train --scenario")
+    level: _Names | None = Field(default=None, description="in its place: 3-pair is the scenario cooperation-3-pair")
+    recipe: _Names = Field(description="names or paths, as train --recipe")
+    seed: _Seeds = Field(default=(0,), description="of the trainings")
+    settings: _Lists = Field(default={}, alias="set", description="a list of values for each dotted key")
 
     @field_validator("scenario", "level", "recipe", "seed", mode="before")
     @classmethod
@@ -125,19 +140,20 @@ class Grid(_Lines):
 class ListedJob(_Lines):
     """One job."""
 
-    scenario: str | None = None
-    level: str | None = None
-    recipe: str
-    seed: _Seed = 0
+    scenario: str | None = Field(default=None, description="a name or a path, as train --scenario")
+    level: str | None = Field(default=None, description="in its place: 3-pair is the scenario cooperation-3-pair")
+    recipe: str = Field(description="a name or a path, as train --recipe")
+    seed: _Seed = Field(default=0, description="of the training")
 
 
 class SweepFile(_Part):
     """The whole file; ``settings`` hold for every job."""
 
-    title: str = ""
-    settings: _Settings = Field(default={}, alias="set")
-    grid: Grid | None = None
-    jobs: Annotated[tuple[ListedJob, ...], Field(strict=False)] = ()
+    title: str = Field(default="", description="one line, for you")
+    settings: _Settings = Field(default={}, alias="set", description="settings of every job, as train --set")
+    grid: Grid | None = Field(default=None, description="every combination of what it lists")
+    jobs: tuple[ListedJob, ...] = Field(default=(), strict=False, description="single jobs, after those of the grid")
+    _document: Document = PrivateAttr(Document("the sweep", {}, {}))  # where it stands, for messages
 
     def requests(self) -> Iterator[Request]:
         """The jobs: of the grid, seed by seed, so that first results of all are there early; then those listed."""
@@ -145,23 +161,37 @@ class SweepFile(_Part):
             yield from self._of_grid(self.grid)
         for k, job in enumerate(self.jobs):
             scenario, level = (job.scenario, "") if job.level is None else (LEVEL + job.level, job.level)
-            texts = self._texts(job.settings, f"jobs[{k}]")
-            yield Request(f"jobs[{k}]", str(scenario), level, job.recipe, job.seed, texts)
+            texts = self._texts(job.settings, ("jobs", k))
+            yield Request(("jobs", k), str(scenario), level, job.recipe, job.seed, texts)
 
     def _of_grid(self, grid: Grid) -> Iterator[Request]:
         lines = [(name, "") for name in grid.scenario or ()] + [(LEVEL + name, name) for name in grid.level or ()]
         changes = [
-            self._texts(dict(zip(grid.settings, values, strict=True)), "grid")
+            self._texts(dict(zip(grid.settings, values, strict=True)), _GRID)
             for values in itertools.product(*grid.settings.values())
         ]
         for seed in grid.seeds():
             for (scenario, level), recipe, texts in itertools.product(lines, grid.recipe, changes):
-                yield Request("grid", scenario, level, recipe, seed, texts)
+                yield Request(_GRID, scenario, level, recipe, seed, texts)
 
-    def _texts(self, own: dict[str, Any], place: str) -> tuple[str, ...]:
+    def where(self, asked: Request, part: str = "") -> str:
+        """File and line of a job; of a ``part`` of it: ``recipe``, ``scenario``, or the key of a setting."""
+        path = (*asked.path, "set", part) if part else asked.path
+        if part in self.settings:
+            path = ("set", part)
+        elif part in ("recipe", "scenario"):
+            key = "level" if part == "scenario" and asked.level else part
+            listed = getattr(self.grid, key) if asked.path == _GRID else ()
+            named = {"recipe": asked.recipe, "scenario": asked.scenario, "level": asked.level}[key]
+            path = (*asked.path, key, *(k for k, each in enumerate(listed) if each == named))
+        return self._document.where(path)
+
+    def _texts(self, own: dict[str, Any], path: YamlPath) -> tuple[str, ...]:
         twice = [key for key in own if key in self.settings]
         if twice:
-            raise InvalidInput(f"{place}.set.{twice[0]}: stands in the file's own set too; leave one of them out")
+            where = self._document.where((*path, "set", twice[0]))
+            key = f"{_place(path)}.set.{twice[0]}"
+            raise InvalidInput(f"{where}: {key}: stands in the file's own set too; leave one of them out")
         return tuple(f"{key}={flow_text(value)}" for key, value in {**self.settings, **own}.items())
 
 
@@ -174,8 +204,15 @@ def read_sweep(path: str | Path) -> SweepFile:
         found = SweepFile.model_validate(document.content)
     except ValidationError as error:
         raise explain(error, document, _SweepWording()) from None
+    found._document = document
     _check_size(found, document)
     return found
+
+
+def sweep_json_schema() -> dict[str, Any]:
+    """JSON Schema of the file of a sweep, for editors that complete and check YAML."""
+    schema = SweepFile.model_json_schema(schema_generator=FileSchema)
+    return publish({**schema, "title": "Sweep", "anyOf": [{"required": ["grid"]}, {"required": ["jobs"]}]})
 
 
 def _check_size(found: SweepFile, document: Document) -> None:

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.inputs import load_runnable
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.learning.settings import read_settings
+from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.learning.training import Training, resolve, training_content, training_identity
 from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.studies.jobs.parts import load_parts, refused_part
 from ethbrake_marl.studies.sweep.file import Request, SweepFile
 
 
@@ -59,7 +58,7 @@ def plan_sweep(file: SweepFile) -> SweepPlan:
     Raises ``InvalidInput`` naming the job: an unknown scenario or recipe, a setting that neither has, what does not fit
     each other, two jobs with one hash.
     """
-    planned = _Planning()
+    planned = _Planning(file)
     for asked in file.requests():
         planned.add(asked)
     return SweepPlan(planned.rows, planned.loaded)
@@ -69,6 +68,7 @@ def plan_sweep(file: SweepFile) -> SweepPlan:
 class _Planning:
     """The rows so far."""
 
+    file: SweepFile
     rows: list[Row] = field(default_factory=list)
     loaded: dict[_Kind, tuple[TrainingRecipe, Scenario]] = field(default_factory=dict)
     _kinds: dict[_Kind, Training] = field(default_factory=dict)
@@ -84,9 +84,8 @@ class _Planning:
         content["recipe"]["seed"] = asked.seed
         identity = training_identity(content)
         if identity in self._seen:
-            raise InvalidInput(
-                f"{_describe(asked)}: is the same training as {_describe(self._seen[identity])}; leave one of them out"
-            )
+            where, other = self.file.where(asked), _describe(self._seen[identity])
+            raise InvalidInput(f"{where}: {_describe(asked)}: is the same training as {other}; leave one of them out")
         self._seen[identity] = asked
         recipe = first.recipe
         name = f"{first.scenario.name}-{recipe.name}-seed{asked.seed}-{identity[:16]}"
@@ -94,12 +93,11 @@ class _Planning:
 
     def _load(self, asked: Request, kind: _Kind) -> None:
         try:
-            recipe = load_recipe(asked.recipe)
-            given = read_settings(asked.settings, [recipe])
-            scenario, recipe = load_runnable(asked.scenario, given.scenario), given.change(recipe)
+            scenario, recipe = load_parts(asked.scenario, asked.recipe, asked.settings)
             first = resolve(recipe, scenario, seed=asked.seed)
         except InvalidInput as error:
-            raise type(error)(f"{_describe(asked)}: {error}") from None
+            where = self.file.where(asked, refused_part(asked.scenario, asked.recipe, asked.settings))
+            raise type(error)(f"{where}: {_describe(asked)}: {error}") from None
         self.loaded[kind] = (recipe, scenario)
         self._kinds[kind], self._contents[kind] = first, training_content(first.recipe, first.scenario)
 

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.durable import remove_unfinished
+from ethbrake_marl.files.durable import hold_lock, remove_unfinished
 from ethbrake_marl.learning.run_folder import RunDirectory
 from ethbrake_marl.policies.policy import has_bundle
 from ethbrake_marl.studies.jobs.run import RETRIES, Attempt, run_jobs
@@ -83,7 +79,7 @@ def run_sweep(
     folder = folder.absolute()  # a worker may stand elsewhere
     for name in (RUNS, LOGS):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    with _only_sweep(folder):
+    with hold_lock(folder / _LOCK, "another process runs a sweep here"):
         for place in (folder, folder / RUNS):
             remove_unfinished(place)
         results, left, damaged = kept_results(plan, folder)
@@ -181,16 +177,3 @@ class _Course:
 def _log(folder: Path, row: Row) -> Path:
     """What the job prints."""
     return folder / LOGS / f"{row.name}.log"
-
-
-@contextmanager
-def _only_sweep(folder: Path) -> Iterator[None]:
-    lock = FileLock(folder / _LOCK, blocking=False, mode=0o666)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise InvalidInput(f"{folder}: another process runs a sweep here") from None
-    try:
-        yield
-    finally:
-        lock.release()

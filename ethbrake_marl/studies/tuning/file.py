@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,14 +14,17 @@ from pydantic import (
     Discriminator,
     Field,
     PlainValidator,
+    PrivateAttr,
     Tag,
     ValidationError,
+    WithJsonSchema,
     model_validator,
 )
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.json_schema import publish
 from ethbrake_marl.files.messages import Wording, explain
-from ethbrake_marl.files.yaml import YamlPath, flow_text, read_yaml
+from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 
 _Seed = Annotated[int, Field(ge=0, lt=2**32)]
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
@@ -35,7 +39,7 @@ def _check_number(value: Any) -> int | float:
     return value
 
 
-_Number = Annotated[int | float, PlainValidator(_check_number)]
+_Number = Annotated[int | float, PlainValidator(_check_number), WithJsonSchema({"type": "number"})]
 
 
 class _Part(BaseModel):
@@ -45,9 +49,9 @@ class _Part(BaseModel):
 class Range(_Part):
     """From ``low`` to ``high``, both included; whole numbers where both are written without a point."""
 
-    low: _Number
-    high: _Number
-    log: bool = False  # the logarithm is searched, not the number
+    low: _Number = Field(description="the least value, included")
+    high: _Number = Field(description="the largest value, included; with low: whole numbers where neither has a point")
+    log: bool = Field(default=False, description="the logarithm is searched, not the number")
 
     def __str__(self) -> str:
         """The range in words."""
@@ -71,7 +75,7 @@ class Range(_Part):
 class Choices(_Part):
     """One of a list of values, of any kind."""
 
-    choices: Annotated[tuple[Any, ...], Field(strict=False, min_length=2)]
+    choices: tuple[Any, ...] = Field(strict=False, min_length=2, description="values of any kind that the recipe takes")
 
     def __str__(self) -> str:
         """The values in words."""
@@ -106,39 +110,48 @@ def _check_keys(value: dict[str, Any]) -> dict[str, Any]:
 class Measuring(_Part):
     """The list by which trials are judged and pruned, and how often in a training."""
 
-    worlds: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
-    seed: _Seed = 4007
-    times: Annotated[int, Field(ge=1, le=1000)] = 10
+    worlds: int = Field(default=1000, ge=1, le=1_000_000, description="of the list")
+    seed: _Seed = Field(default=4007, description="of the list")
+    times: int = Field(default=10, ge=1, le=1000, description="how often a training is measured")
 
 
 class Pruning(_Part):
     """A trial stops whose least harm so far is beyond what the share ``keep`` of the finished ones had by then."""
 
-    keep: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
-    after_trials: _Count = 5  # that have finished
-    after_times: _Count = 3  # it was measured
+    keep: float = Field(default=0.5, gt=0.0, lt=1.0, description="the share of finished trials to be as good as")
+    after_trials: _Count = Field(default=5, description="so many finish before one is stopped")
+    after_times: _Count = Field(default=3, description="nobody is stopped before it was measured so often")
 
 
 class Sampling(_Part):
     """Who proposes: Optuna's TPE, or chance."""
 
-    name: Literal["tpe", "random"] = "tpe"
-    seed: _Seed = 0
-    random_trials: _Count = 10  # before TPE begins
+    name: Literal["tpe", "random"] = Field(default="tpe", description="Optuna's TPE, or chance")
+    seed: _Seed = Field(default=0, description="of what is proposed")
+    random_trials: _Count = Field(default=10, description="trials by chance before TPE begins")
 
 
 class TuningFile(_Part):
     """The whole file."""
 
-    title: str = ""
-    scenario: str
-    recipe: str
-    seed: _Seed = 0  # of every training
-    settings: Annotated[dict[str, Any], AfterValidator(_check_keys)] = Field(default={}, alias="set")
-    search: Annotated[dict[str, Dimension], Field(min_length=1), AfterValidator(_check_keys)]
-    measure: Measuring = Measuring()
-    prune: Pruning | None = Pruning()  # null: every trial is trained to its end
-    sampler: Sampling = Sampling()
+    title: str = Field(default="", description="one line, for you")
+    scenario: str = Field(description="a name or a path, as train --scenario")
+    recipe: str = Field(description="a name or a path, as train --recipe")
+    seed: _Seed = Field(default=0, description="of every training")
+    settings: Annotated[dict[str, Any], AfterValidator(_check_keys)] = Field(
+        default={}, alias="set", description="settings of every trial, as train --set"
+    )
+    search: Annotated[dict[str, Dimension], AfterValidator(_check_keys)] = Field(
+        min_length=1, description="the space: a dotted key of the recipe, with a range or a list of choices"
+    )
+    measure: Measuring = Field(default=Measuring(), description="the list on which trials are judged, and how often")
+    prune: Pruning | None = Field(default=Pruning(), description="when a trial is given up; null: never")
+    sampler: Sampling = Field(default=Sampling(), description="who proposes")
+    _document: Document = PrivateAttr(Document("the tuning", {}, {}))  # where it stands, for messages
+
+    def refusing_at(self, *path: str | int) -> AbstractContextManager[None]:
+        """Begin the message of an ``InvalidInput`` from inside with file and line of what stands at ``path``."""
+        return self._document.refusing_at(path)
 
 
 def read_tuning(path: str | Path) -> TuningFile:
@@ -147,9 +160,16 @@ def read_tuning(path: str | Path) -> TuningFile:
     if not isinstance(document.content, dict):
         raise InvalidInput(f"{document.file}: must be a mapping with scenario, recipe and search")
     try:
-        return TuningFile.model_validate(document.content)
+        found = TuningFile.model_validate(document.content)
     except ValidationError as error:
         raise explain(error, document, _TuningWording()) from None
+    found._document = document
+    return found
+
+
+def tuning_json_schema() -> dict[str, Any]:
+    """JSON Schema of the file of a tuning, for editors that complete and check YAML."""
+    return publish({**TuningFile.model_json_schema(), "title": "Tuning"})
 
 
 class _TuningWording(Wording):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.files.plugins import noted_plugins
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
@@ -20,6 +20,7 @@ from ethbrake_marl.learning.settings import read_settings
 from ethbrake_marl.learning.training import Training, resolve, training_content
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.studies.jobs.parts import load_parts, refused_part
 from ethbrake_marl.studies.tuning.file import Choices, Range, TuningFile
 
 Values = Mapping[str, Any]  # of a trial: key -> value, as YAML has it
@@ -74,14 +75,14 @@ def plan_tuning(file: TuningFile) -> TuningPlan:
     Raises ``InvalidInput``: an unknown scenario or recipe, a key that the recipe does not have or that is not to be
     searched, a value that it does not allow, values that do not go together.
     """
-    recipe = load_recipe(file.recipe)
+    with file.refusing_at("recipe"):
+        recipe = load_recipe(file.recipe)
     for key in file.search:
-        _check_searched(key, recipe, file)
-    _check_set(file)
-    given = read_settings(texts_of(file.settings), [recipe])
-    scenario = load_runnable(file.scenario, given.scenario)
-    changed = given.change(recipe).replace(seed=file.seed)
-    resolve(changed, scenario)
+        with file.refusing_at("search", key):
+            _check_searched(key, recipe, file)
+    scenario, changed = _set_parts(file)
+    with file.refusing_at("scenario"):
+        resolve(changed, scenario)
     content = training_content(changed, scenario)
     told = {"training": content, **file.model_dump(mode="json", include={"search", "measure", "prune", "sampler"})}
     told |= {"order": [*file.search], "versions": installed_versions(), "plugins": noted_plugins()}
@@ -110,19 +111,43 @@ def _check_searched(key: str, recipe: TrainingRecipe, file: TuningFile) -> None:
         )
 
 
-def _check_set(file: TuningFile) -> None:
+def _set_parts(file: TuningFile) -> tuple[Scenario, TrainingRecipe]:
+    """Scenario and recipe with what the file sets."""
     for key in file.settings:
-        if key.removeprefix("recipe.").partition(".")[0] in _NOT_SET:
-            raise InvalidInput(f"set.{key}: is no setting here; give seed and measure beside it")
+        with file.refusing_at("set", key):
+            if key.removeprefix("recipe.").partition(".")[0] in _NOT_SET:
+                raise InvalidInput(f"set.{key}: is no setting here; give seed and measure beside it")
+    asked = file.scenario, file.recipe, texts_of(file.settings)
+    try:
+        scenario, recipe = load_parts(*asked)
+    except InvalidInput:
+        part = refused_part(*asked)
+        with file.refusing_at(*(("set", part) if part in file.settings else (part or "set",))):
+            raise
+    return scenario, recipe.replace(seed=file.seed)
 
 
 def _check_space(plan: TuningPlan) -> None:
     """Raise ``InvalidInput`` for an end that the recipe does not allow, and for ends or points that do not fit."""
     for key, dimension in plan.file.search.items():
-        for value in _ends(dimension):
-            _check_point(plan, {key: value})
-    for point in _points(plan):
-        _check_point(plan, point)
+        with plan.file.refusing_at("search", key):
+            _check_dimension(plan, key, dimension)
+    with plan.file.refusing_at("search"):
+        for point in _points(plan):
+            _check_point(plan, point)
+
+
+def _check_dimension(plan: TuningPlan, key: str, dimension: Range | Choices) -> None:
+    own = _value_at(plan.recipe.model_dump(mode="json"), key)
+    if isinstance(dimension, Range) and not dimension.whole and type(own) is int:
+        try:
+            plan.training({key: math.nextafter(dimension.low, math.inf)})
+        except InvalidInput:
+            written = f"{{low: {dimension.low!r}, high: {dimension.high!r}}}"  # with the points that make it wrong
+            right = "must be whole numbers, written without a decimal point"
+            raise InvalidInput(f"search.{key} = {written}: {right}") from None
+    for value in _ends(dimension):
+        _check_point(plan, {key: value})
 
 
 def _check_point(plan: TuningPlan, values: Values) -> None:

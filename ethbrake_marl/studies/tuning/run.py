@@ -5,16 +5,13 @@ from __future__ import annotations
 import json
 import uuid
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.files.durable import remove_unfinished, write_file
+from ethbrake_marl.files.durable import hold_lock, remove_unfinished, write_file
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.run_folder import read_object
 from ethbrake_marl.policies.manifest import installed_versions
@@ -89,7 +86,7 @@ def run_tuning(
     folder = folder.absolute()  # a worker may stand elsewhere
     for name in (RUNS, LOGS):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    with _only_tuning(folder):
+    with hold_lock(folder / _LOCK, "another process tunes here"):
         for each in (folder, folder / RUNS):
             remove_unfinished(each)
         place = place_of(plan, folder, storage)
@@ -234,16 +231,3 @@ def _owner(plan: TuningPlan, folder: Path) -> str:
         }
         write_file(file, json.dumps(content, indent=2).encode() + b"\n")
     return str(read_object(file).get("owner"))
-
-
-@contextmanager
-def _only_tuning(folder: Path) -> Iterator[None]:
-    lock = FileLock(folder / _LOCK, blocking=False, mode=0o666)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise InvalidInput(f"{folder}: another process tunes here") from None
-    try:
-        yield
-    finally:
-        lock.release()

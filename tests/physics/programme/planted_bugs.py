@@ -9,11 +9,9 @@ green. (The second one is what ``make test`` runs.) A patch that does not fit th
 
 from __future__ import annotations
 
-import argparse
 import sys
-from concurrent.futures import ThreadPoolExecutor
 
-from tests.programme.planting import Patch, misfits, red_with
+from tests.programme.planting import Patch, try_bugs
 
 BY_HAND = (
     "tests/physics/test_instants.py::test_plastic_cluster__three_vehicles_do_not_hand_the_last_bit_to_and_fro",
@@ -155,34 +153,5 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     ),
 }
 
-
-def try_bug(name: str) -> str:
-    """The test that finds one planted bug, or an empty string."""
-    return red_with(BUGS[name], QUICK, compiled=False) or red_with(BUGS[name], WHOLE, compiled=True)
-
-
-def main() -> int:
-    """Plant every bug and print which test finds it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--only", default="", help="only bugs whose name contains this")
-    given = parser.parse_args()
-    for wrong in (unfit := misfits(BUGS)):
-        print(f"ERROR  {wrong}")
-    if unfit:
-        return 1
-    if red := red_with((), QUICK, compiled=False):
-        print(f"ERROR  red without any bug: {red}")
-        return 1
-    names = [name for name in BUGS if given.only in name]
-    found = 0
-    with ThreadPoolExecutor(given.jobs) as pool:
-        for name, red in zip(names, pool.map(try_bug, names), strict=True):
-            found += bool(red)
-            print(f"{'found ' if red else 'MISSED'}  {name:52s} {red.removeprefix('tests/')}", flush=True)
-    print(f"planted bugs: {found}/{len(names)} found: {'PASS' if found == len(names) else 'FAIL'}")
-    return 0 if found == len(names) else 1
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(try_bugs("planted bugs", BUGS, QUICK, WHOLE, jobs=2))

@@ -67,6 +67,31 @@ def test_ablate__writes_tables_and_figures(ablation):
     assert pair["searched"]["best_known"]["value"] <= pair["searched"]["full_brake"]["value"]
 
 
+def test_ablate__the_shield_goes_around_what_was_trained(ablation, tmp_path, tiny, capsys):
+    """The trainings of the other ablation are used, in a copy without its settings."""
+    folder = tmp_path / "shielded"
+    shutil.copytree(ablation, folder)
+    words = ["--output", folder, "--recipes", tiny, *SMALL, "--shield"]
+    assert "other settings (shield None, here step)" in refused(capsys, *words, "step")
+    (folder / "settings.json").unlink()
+    assert "shield 'robust': must be step" in refused(capsys, *words, "robust")
+    assert run_command(["ablate", *map(str, words), "step"]) == 0
+    assert "to do: 0 trainings" in capsys.readouterr().err
+    found, alone = content(folder), content(ablation)
+    assert found["settings"]["shield"] == "step" and alone["settings"]["shield"] is None
+    assert found["levels"][0]["first"]["shielded"] is None
+    for level, before in zip(found["levels"][1:], alone["levels"][1:], strict=True):
+        for count in ("first", "total"):
+            told = level[count].pop("shielded")
+            assert told["above_bound"] == 0 and told["harm"]["value"] <= told["bound"]["value"]
+            difference = told["harm"]["value"] - level[count]["harm"]["value"]
+            assert told["difference"]["value"] == pytest.approx(difference) and difference < -1.0
+            assert 0.1 < told["replaced"] == pytest.approx(sum(told["replaced_vehicles"]) / 2)
+            assert before[count].pop("shielded") is None
+    assert found["levels"][1:] == alone["levels"][1:]  # without the shield as before
+    assert "Behind the step shield" in (folder / "ablation.html").read_text("utf-8")
+
+
 @pytest.mark.parametrize("column", [0, 1])
 def test_page__plays_the_same_worlds_at_every_level(ablation, column):
     html = (ablation / "ablation.html").read_text("utf-8")

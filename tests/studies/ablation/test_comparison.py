@@ -11,9 +11,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from ethbrake_marl.figures.ablation import change_figure, harm_curve, signed_ticks, who_pays
 from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield.behind import Shielded
 from ethbrake_marl.studies.ablation.comparison import compare
+from ethbrake_marl.studies.ablation.levels_csv import levels_csv
 from ethbrake_marl.studies.ablation.plan import Level
-from ethbrake_marl.studies.ablation.report import FIGURES, ablation_page, interval_words, levels_csv, markdown
+from ethbrake_marl.studies.ablation.report import FIGURES, ablation_page, interval_words, markdown
 from ethbrake_marl.studies.ablation.run import Harms, Measured
 from tests.pages.hostile import Page
 
@@ -107,6 +109,55 @@ def test_tables__hold_the_same_figures(ablation, found):
     ]  # fmt: skip
     assert float(rows[2]["first_impact_harm"]) == 12.0 and float(rows[2]["total_harm_2"]) == 10.0
     assert float(rows[1]["searched_best_known_total_harm"]) == 12.0 and rows[0]["searched_best_known_total_harm"] == ""
+
+
+@pytest.fixture(scope="module")
+def behind(ablation) -> list[Measured]:
+    """The shield takes 2 from Vehicle 2 and gives 0.5 to Vehicle 3, in the first seed alone, in every second world."""
+    shielded = {}
+    for count in ("first", "total"):
+        after = ablation[2].reached.vehicle[count].copy()
+        after[0, ::2] += [0.0, -2.0, 0.5]
+        replaced = np.zeros((2, WORLDS, 2), np.int64)
+        replaced[0, ::2] = [10, 0]
+        shielded[count] = Shielded(
+            after.sum(axis=2), after, after.sum(axis=2) + 1.0, after, replaced, np.full((2, WORLDS), 50),
+            np.zeros((2, WORLDS), np.bool_),
+        )  # fmt: skip
+    shielded["total"].bound[1, 3] = 0.0
+    return [*ablation[:2], replace(ablation[2], shielded=shielded), ablation[3]]
+
+
+def test_compare__behind_the_shield_stands_the_same_level_without_it(behind):
+    found = compare(behind, SEARCHED)
+    sensors, paper, pair, _ = found["levels"]
+    assert sensors["first"]["shielded"] is None and paper["first"]["shielded"] is None
+    told = pair["first"]["shielded"]
+    assert told["harm"]["value"] == pytest.approx(5.0 - 1.5 / 4) and pair["first"]["harm"]["value"] == pytest.approx(
+        5.0
+    )
+    assert told["difference"]["value"] == pytest.approx(-1.5 / 4) and told["each_seed"] == pytest.approx([4.25, 5.0])
+    assert [one["value"] for one in told["vehicles"]] == pytest.approx([0.0, -0.5, 0.125])
+    assert told["replaced"] == pytest.approx(0.25 * 0.2 / 2) and told["replaced_vehicles"] == pytest.approx([0.05, 0.0])
+    assert told["stepped_in"]["value"] == told["worse_off"]["value"] == 0.25
+    assert told["bound"]["value"] == pytest.approx(told["harm"]["value"] + 1.0)
+    assert told["above_bound"] == 0 and pair["total"]["shielded"]["above_bound"] == 1
+    assert told["above_baseline"]["value"] == 0.0 and told["searched"]["harm"]["value"] == pytest.approx(4.625)
+
+
+def test_tables_and_figure__show_what_is_behind_the_shield(behind):
+    found = compare(behind, SEARCHED)
+    page = markdown(found, "40 worlds.")
+    assert "Behind the step shield" in page and "| `cooperation-3-pair` | 5.00 | 4.62 | -0.38 [" in page
+    assert "Behind" not in markdown(compare(behind[:2], SEARCHED), "40 worlds.")
+    rows = list(csv.DictReader(levels_csv(behind, SEARCHED).splitlines()))
+    assert rows[1]["shielded_first_impact_harm"] == "" and float(rows[3]["shielded_first_impact_harm"]) == 4.25
+    assert float(rows[3]["actions_replaced_total_harm"]) == pytest.approx(0.05)
+    assert float(rows[4]["bound_first_impact_harm"]) == pytest.approx(6.0)
+    labels = [text.get_text() for text in harm_curve(found, "40 worlds").legends[0].get_texts()]
+    assert "ppo, shielded" in labels
+    texts = [text.get_text() for text in harm_curve(compare(behind[:2], 10), "").legends[0].get_texts()]
+    assert "ppo, shielded" not in texts
 
 
 def test_page__holds_the_tables_and_figures(found):

@@ -78,6 +78,49 @@ def test_bad_files__are_refused(write_sweep, content, reason):
         plan_sweep(read_sweep(write_sweep(**content)))
 
 
+WRITTEN = """title: One mistake
+set:
+  vf_coef: 0.4
+grid:
+  scenario: paper-random
+  recipe:
+  - ppo
+  - ppo-total
+  set:
+    gamma: [0.9]
+    n_epochs: [2, 3]
+jobs:
+- level: 3-pair
+  recipe: cooperation-ppo
+  set: {scheme: shared}
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "reason"),
+    [
+        ("vf_coef: 0.4", "vf_coef: -1", 3, r"grid \(.*\): .*vf_coef = -1: must be greater"),
+        ("paper-random", "paper-randon", 5, r"grid \(.*\): unknown scenario 'paper-randon'"),
+        ("paper-random", "cooperation-0-sensors", 4, r"grid \(.*\): .*no vehicle learns"),
+        ("ppo-total", "ppo-totl", 8, r"grid \(.*\): unknown recipe 'ppo-totl'"),
+        ("gamma", "gama", 10, "unknown setting 'gama'"),
+        ("gamma", "vf_coef", 10, "grid.set.vf_coef: stands in the file's own set too"),
+        ("[2, 3]", "[2, 0]", 11, "n_epochs = 0: must be greater"),
+        ("3-pair", "9-pair", 13, r"jobs\[0\] \(.*\): unknown scenario 'cooperation-9-pair'"),
+        ("scheme: shared", "scheme: sharde", 15, "scheme = sharde: must be"),
+        ("scheme: shared", "vf_coef: 1", 15, r"jobs\[0\].set.vf_coef: stands in"),
+        ("[2, 3]", "[2, 2]", 4, r"grid \(.*\): is the same training as grid"),
+    ],
+)
+def test_bad_files__are_refused_with_file_and_line(tmp_path, old, new, line, reason):
+    path = tmp_path / "mine.yaml"
+    path.write_text(WRITTEN)
+    plan_sweep(read_sweep(path))
+    path.write_text(WRITTEN.replace(old, new, 1))
+    with pytest.raises(InvalidInput, match=f"^{path}, line {line}: (?!.*, line ).*{reason}"):
+        plan_sweep(read_sweep(path))
+
+
 def test_example__of_the_page_is_in_order():
     plan = plan_sweep(read_sweep(DOCS / "sweep-example.yaml"))
     assert len(plan.rows) == 42 and {row.steps for row in plan.rows} == {200_000}

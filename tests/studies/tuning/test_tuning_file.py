@@ -20,6 +20,7 @@ def searching(**search):
     return {"search": {key.replace("__", "."): value for key, value in search.items()}}
 
 
+WHOLE = "must be whole numbers, written without a decimal point"
 BAD = [
     ({"search": {}}, r"search = .*: must not be empty"),
     ({"search": "-"}, "search: missing; it is needed; docs/tuning.md shows an example"),
@@ -34,7 +35,10 @@ BAD = [
         "search, at gamma=1.5: .*gamma = 1.5: must be less than or equal to 1",
     ),
     (searching(n_epochs={"low": 0, "high": 4}), "search, at n_epochs=0: .*must be greater than or equal to 1"),
-    (searching(n_epochs={"low": 1.5, "high": 4}), "n_epochs = 1.5: must be a whole number"),
+    *(
+        (searching(n_epochs={"low": low, "high": high}), rf"search.n_epochs = \{{low: {low}, high: {high}\}}: {WHOLE}")
+        for low, high in ((1.0, 4.0), (1.5, 4), (1, 4.0))
+    ),
     (searching(n_epochs={"low": 4, "high": 4}), r"n_epochs = \{.*\}: low 4 must be less than high 4"),
     (searching(gamma={"low": 0, "high": 1, "log": True}), "low 0 must be greater than 0"),
     (searching(gamma={"low": 0.5, "high": float("nan")}), "gamma.high = .nan: must be a finite number"),
@@ -71,6 +75,47 @@ BAD = [
 def test_bad_files__are_refused(write_tuning, changes, reason):
     with pytest.raises(InvalidInput, match=reason):
         plan_tuning(read_tuning(write_tuning(**changes)))
+
+
+WRITTEN = """title: One mistake
+scenario: paper-random
+recipe: ppo
+set:
+  gamma: 0.9
+  vf_coef: 0.5
+search:
+  learning_rate.start: {low: 0.001, high: 0.1}
+  n_epochs: {low: 1, high: 4}
+measure:
+  worlds: 10
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "reason"),
+    [
+        ("paper-random", "paper-randon", 2, "unknown scenario 'paper-randon'; did you mean 'paper-random"),
+        ("paper-random", "cooperation-0-sensors", 2, "no vehicle learns"),
+        ("ppo", "pppo", 3, "unknown recipe 'pppo'"),
+        ("gamma", "gama", 5, "unknown setting 'gama'"),
+        ("vf_coef: 0.5", "vf_coef: -0.5", 6, "vf_coef = -0.5: must be greater"),
+        ("vf_coef: 0.5", "seed: 3", 6, "set.seed: is no setting here"),
+        ("learning_rate.start", "learning_rate", 8, "search, at learning_rate=0.001"),
+        ("learning_rate.start", "gamma", 8, "search.gamma: gamma stands there too"),
+        ("n_epochs", "n_epoch", 9, "unknown setting 'n_epoch'; did you mean 'n_epochs'"),
+        ("low: 1,", "low: 1.0,", 9, WHOLE),
+        ("low: 1,", "low: 0,", 9, "search, at n_epochs=0: .*must be greater than or equal to 1"),
+        ("n_epochs: {low: 1, high: 4}", "seed: {low: 1, high: 4}", 9, "search.seed: is not searched"),
+        ("worlds: 10", "worlds: 10.0", 11, "measure.worlds = 10.0: must be a whole number"),
+    ],
+)
+def test_bad_files__are_refused_with_file_and_line(tmp_path, old, new, line, reason):
+    path = tmp_path / "mine.yaml"
+    path.write_text(WRITTEN)
+    plan_tuning(read_tuning(path))
+    path.write_text(WRITTEN.replace(old, new, 1))
+    with pytest.raises(InvalidInput, match=f"^{path}, line {line}: (?!.*, line ).*{reason}"):
+        plan_tuning(read_tuning(path))
 
 
 @pytest.mark.parametrize("changes", [{"recipe": "pppo"}, searching(gama=RATE), {"prune": 1}])

@@ -1,0 +1,130 @@
+"""The test of what agents say they know: what was not received is altered, and their actions are compared."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+
+from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.agents.protocol import Agent, check_agent
+from ethbrake_marl.agents.rollout import script_agents, set_others
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number
+from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.physics.estimates import age_s, is_periodic, links_of
+from ethbrake_marl.physics.messages import KEY, LINK, TAKEN, TOLD_S, link_at, place_at, ring_at
+from ethbrake_marl.scenario import Scenario
+
+
+def changed_decisions(
+    agent: Agent, scenario: Scenario, *, vehicle: int | None = None, n: int = 40, decisions: int = 8, seed: int = 11
+) -> int:
+    """How many decisions change when all is altered that has not reached the vehicle by then: 0 for an honest agent.
+
+    Two copies of the agent drive the first ``n`` worlds of a list, or are asked what they would do in them: one sees
+    the worlds as they are, the other one with random numbers for what was not received, at the alert and anew at each
+    of the first ``decisions``. Take a scenario with a channel that hides something, or nothing is altered.
+
+    Args:
+        agent: any; it is left as it is.
+        scenario: whose worlds.
+        vehicle: the driven one, from 0; None: the scenario's learner.
+        n: number of worlds.
+        decisions: in each world.
+        seed: of the list, and of the random numbers.
+
+    Raises ``InvalidInput`` for what is not an agent, several learners, or less than one world or decision.
+
+    >>> import ethbrake_marl as eb
+    >>> from ethbrake_marl.agents.honesty import changed_decisions
+    >>> blocked = eb.load_scenario("cooperation-2-blocked")
+    >>> [changed_decisions(eb.make_agent(name), blocked) > 0 for name in ("full_brake", "gentlest_front")]
+    [False, True]
+
+    """
+    check_agent(agent, "honesty")
+    check_whole_number("honesty: n", n, 1)
+    check_whole_number("honesty: decisions", decisions, 1)
+    if vehicle is None:
+        learners = [scenario.vehicle_names[i] for i in scenario.learners]
+        check_one_learner(scenario.name, learners, "honesty needs exactly one learner; or give the vehicle")
+        if not learners:
+            raise InvalidInput(f"honesty: no vehicle of scenario {scenario.name!r} learns; give the vehicle")
+        vehicle = scenario.learners[0]
+    rng, alert = np.random.default_rng(seed), scenario.sample(n, seed).worlds
+    scripts = script_agents(scenario, except_for=vehicle)
+    knowing, wondering = copy.deepcopy(agent), copy.deepcopy(agent)
+    engine = Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=alert)
+    for driver, at_alert in ((knowing, alert), (wondering, alter_unreceived(alert, vehicle, rng))):
+        set_others(driver, vehicle, scripts)
+        driver.begin(at_alert, vehicle, np.arange(n))
+    changed = 0
+    for _ in range(decisions):
+        now = engine.worlds
+        command = knowing.act(now, vehicle)
+        changed += int((wondering.act(alter_unreceived(now, vehicle, rng), vehicle) != command).sum())
+        engine.step({vehicle: command_to_action(command, now.vehicles, vehicle)})
+    return changed
+
+
+def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> Worlds:
+    """The same worlds with random numbers for all that has not reached ``vehicle`` by now, the future included."""
+    vehicles, now = worlds.vehicles, worlds.time_s[:, np.newaxis]
+    n, N = worlds.speeds_mps.shape
+    unknown = vehicles.known_from_s[:, vehicle] > now
+    unknown[:, vehicle] = False  # of itself it knows
+    stale = unknown.copy()  # whose present it does not know
+    if is_periodic(worlds).all():
+        stale |= age_s(worlds)[:, vehicle] > 0.0
+    far = np.array([pair if pair < vehicle else pair + 1 for pair in range(N - 1)])  # of each pair, seen from here
+
+    def other(values: Floats, low: float, high: float, where: Bools) -> Floats:
+        return np.where(where, rng.uniform(low, high, values.shape), values)
+
+    own = vehicles.own_latency_s
+    waits = (vehicles.latency_s > now) & ((vehicles.latency_s > own) | (np.arange(N) == vehicle))  # for its own news
+    latency = np.where(waits, np.maximum(own, now) + rng.uniform(0.01, 1.0, (n, N)), vehicles.latency_s)
+    latency = np.where(unknown, rng.uniform(0.0, 2.0, (n, N)), latency)
+    news = vehicles.known_from_s
+    changed = replace(
+        vehicles,
+        braking_capacity_mps2=other(vehicles.braking_capacity_mps2, 3.0, 9.0, unknown),
+        driving_capacity_mps2=other(vehicles.driving_capacity_mps2, 0.0, 9.0, unknown),
+        mass_t=other(vehicles.mass_t, 1.0, 40.0, unknown),
+        speed_limit_mps=other(vehicles.speed_limit_mps, 30.0, 60.0, unknown),
+        latency_s=latency,
+        own_latency_s=other(own, 0.0, 2.0, unknown),
+        known_from_s=np.where(news > now[:, :, np.newaxis], news + rng.uniform(0.01, 1.0, news.shape), news),
+    )
+    hit = stale[:, far]
+    beside = [pair for pair in (vehicle - 1, vehicle) if 0 <= pair < N - 1]
+    hit[:, beside] &= unknown[:, far[beside]]  # an own impact with somebody who is known is felt
+    gaps = other(worlds.gaps_m, 2.0, 15.0, stale[:, far])
+    return replace(
+        worlds,
+        vehicles=changed,
+        messages=_alter_messages(worlds, vehicle, rng),
+        gaps_m=gaps,
+        speeds_mps=other(worlds.speeds_mps, 5.0, 30.0, stale),
+        command_mps2=other(worlds.command_mps2, -6.0, 6.0, stale),
+        pair_hit=worlds.pair_hit ^ (hit & (now > 0.0)),  # at the alert nobody has hit anything
+    )
+
+
+def _alter_messages(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> Floats:
+    """The columns of messages with all altered that is unheard: chance, what is on its way, what others know."""
+    columns, N = worlds.messages.copy(), worlds.N
+    if not columns.shape[1]:
+        return columns
+    kept = links_of(worlds)[:, vehicle].copy()
+    own = columns[:, place_at(N) + vehicle].copy()
+    columns[:, [KEY, TAKEN]] += 5.0
+    columns[:, place_at(N) :] += rng.uniform(0.5, 3.0, columns[:, place_at(N) :].shape)
+    links = columns[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK)
+    heard = (worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis])[..., np.newaxis]
+    told = np.arange(LINK) >= TOLD_S
+    links[:, vehicle] = np.where(heard & told, kept, links[:, vehicle])
+    columns[:, place_at(N) + vehicle] = own
+    return columns
