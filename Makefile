@@ -47,7 +47,7 @@ help:
 	@echo "make test-libraries   train with other people's libraries, each in its own environment below .venvs/, and print the matrix"
 	@echo "make proofs           statements about the code that a solver proves, one line each"
 	@echo "make test-cluster     a sweep on a Ray cluster of two nodes on this machine, whose workers are killed at random, its driver once"
-	@echo "make shield-bugs      plant 30 bugs in copies of the shield; each must turn a test red"
+	@echo "make shield-bugs      plant 36 bugs in copies of the shield; each must turn a test red"
 	@echo "make test-bounds      the tests at the lowest versions that pyproject.toml allows, and at the newest"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
 	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"

@@ -151,6 +151,9 @@ def picture_robustness(
     uncertainty: Annotated[
         str, typer.Option(metavar="QUANTITY=WIDTH,...", help="The intervals; drawn at 0 to 2 times their width.")
     ] = "braking_capacity_mps2=10%,gaps_m=0.5",
+    robust: Annotated[
+        str, typer.Option(help="What the robust shield certifies of the intervals: their corners, or their interior.")
+    ] = "corners",
     scenario: ScenarioOption = "paper-random",
     episodes: Annotated[int, typer.Option(help="Worlds of the list.", min=1)] = 200,
     harm_count: Annotated[HarmCount, typer.Option(help="Harm that is guaranteed.")] = "first",
@@ -174,12 +177,13 @@ def picture_robustness(
     assert not isinstance(policy, Team)  # one vehicle learns
     with interruptible("nothing was written"), progress_bars() as bars:
         points = robustness(
-            sample.worlds, policy, Task(chosen, chosen.learners, harm_count), intervals,
+            sample.worlds, policy, Task(chosen, chosen.learners, harm_count), intervals, robust=robust,
             on_progress=lambda what, done: bars.show(what, done, episodes),
         )  # fmt: skip
     caption = (
         f"{chosen.name}, {count_of(episodes, 'world')} of the list of seed {LIST_SEED}; {agent} proposes;"
         f" {harm_count} harm. Intervals of width 1: {intervals}."
+        + (f" Robust mode certifies their {robust}." if robust != "corners" else "")
     )
     caption += counted_without(points[0].left_out)
     write_picture(target, robustness_figure(points, caption=caption), force=force)

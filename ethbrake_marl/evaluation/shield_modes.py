@@ -112,7 +112,7 @@ def compare_behind_shields(agents: Mapping[str, Driver], worlds: Worlds, task: T
     proposers = {
         agent.policy.name: agent.policy
         for name, agent in agents.items()
-        if isinstance(agent, HybridAgent | StepShieldAgent | ShieldedTeam) and not name.endswith("+robust")
+        if isinstance(agent, HybridAgent | StepShieldAgent | ShieldedTeam) and "+robust" not in name
     }
     return compare_modes(proposers, worlds, task) if proposers else []
 

@@ -30,7 +30,8 @@ from ethbrake_marl.physics.rows import TIME, Packed
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search.problem import state_columns
 from ethbrake_marl.shield.alert import Cap
-from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
+from ethbrake_marl.shield.comparison import difference, seen_columns
+from ethbrake_marl.shield.interior import expects
 from ethbrake_marl.shield.rollouts import Proposer, proposed_actions
 from ethbrake_marl.shield.settings import check_scenario
 from ethbrake_marl.shield.step_shield import Certified, StepShield
@@ -175,7 +176,7 @@ class StepShieldAgent(AgentAround):
         self._wanted: Floats = np.zeros(0)
         self._first_s: Floats = np.zeros(0)  # [n] time of the first decision
         self._asked: _Asked | None = None
-        self._make(0)  # refuses bad settings at once
+        self._make(scenario.learners[0] if len(scenario.learners) == 1 else 0)  # refuses bad settings at once
 
     @property
     def chosen_policy(self) -> Bools:
@@ -257,7 +258,7 @@ class StepShieldAgent(AgentAround):
         assert shield.running is not None
         seen = seen_columns(packed)
         compared = asked.certified.asked & (time_s > asked.time_s) & ~shield.distrusted
-        wrong = compared & ~as_predicted(shield.running, seen)
+        wrong = compared & ~expects(shield.boxes, shield.running, seen)
         if self._believed is None and wrong.any():
             k = int(np.argmax(wrong))
             told = difference(shield.running.nominal().states[k], seen[k])

@@ -15,7 +15,7 @@ from ethbrake_marl.physics import Floats
 from ethbrake_marl.physics.compiled import compiled_apart
 from ethbrake_marl.physics.events import TOUCH_SPEED_MPS
 from ethbrake_marl.shield.enclosure_contact import approach, may_meet, noise
-from ethbrake_marl.shield.enclosure_impact import Stack, branch, keep_worst
+from ethbrake_marl.shield.enclosure_impact import Stack, branch, keep_rough, keep_worst
 from ethbrake_marl.shield.enclosure_motion import (
     FREE,
     MAY_STOP,
@@ -29,7 +29,7 @@ from ethbrake_marl.shield.enclosure_motion import (
     Path,
     move_alone,
 )
-from ethbrake_marl.shield.enclosure_touch import embrace, is_blurred, move_together
+from ethbrake_marl.shield.enclosure_touch import embrace, is_blurred, move_together, pressing_together
 from ethbrake_marl.shield.forms import (
     add,
     high,
@@ -57,24 +57,31 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
         top = stack.size[0]
         here.forms[:], here.touch[:], here.marks[:] = stack.forms[top], stack.touch[top], stack.marks[top]
         worst = follow(cell, here, stack, motion, worst, out)
-        if worst > most or worst == math.inf:
+        if worst > most:
             return worst
         if paths > MOST_PATHS:
-            return math.inf
+            return give_up(cell, stack, worst, out)
     return worst if worst >= 0.0 else math.inf  # each world goes some way
+
+
+@compiled_apart
+def give_up(cell: Cell, stack: Stack, worst: float, out: Floats) -> float:
+    """The larger one of ``worst`` and of what is certain of all paths that wait."""
+    for k in range(stack.size[0]):
+        worst = keep_rough(cell, Path(stack.forms[k], stack.touch[k], stack.marks[k]), -1, worst, out)
+    return worst
 
 
 @compiled_apart
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Follow a path to its end; the larger one of ``worst`` and its harm and that of the paths that end with it."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
-    quiet = 0  # from this piece of time on nobody drives
-    for j in range(cell.action.shape[0]):
-        if cell.action[j] > 0.0:
-            quiet = j + 1
+    quiet = quiet_from(cell)
     while path.marks[2 * P] < cell.action.shape[0]:
         piece = path.marks[2 * P]
-        move_alone(cell, path.forms, piece, motion)
+        move_alone(cell, path, piece, motion)
+        if may_meet_unseen(cell, path, motion):
+            return keep_rough(cell, path, -1, worst, out)
         worst = meet(cell, path, stack, motion, worst, out)
         if not go_on(cell, path, motion):
             return worst
@@ -85,12 +92,37 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
 
 
 @compiled_apart
+def quiet_from(cell: Cell) -> int:
+    """The piece of time from which on nobody drives."""
+    quiet = 0
+    for j in range(cell.action.shape[0]):
+        if cell.action[j] > 0.0:
+            quiet = j + 1
+    for i in range(cell.constant.shape[0]):
+        if i != cell.vehicle and cell.constant[i] > 0.0:
+            quiet = cell.action.shape[0]
+    return quiet
+
+
+@compiled_apart
+def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
+    """Whether a pair that touched without an impact may open in this piece and meet again, which would be its first."""
+    P = cell.gap.shape[0]
+    for p in range(P):
+        if path.marks[P + p] == TOUCHES and path.marks[p] == 0:
+            least, most = pressing_together(motion, p)
+            if least < 0.0 <= most and not (motion.rest[p : p + 2] == STANDS).all():
+                return True
+    return False
+
+
+@compiled_apart
 def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Pairs in contact, and those that may come into contact, in one piece of time; ``worst`` as ``follow``."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
     for p in range(P):
-        again = path.marks[P + p] == FREE and path.marks[p] == 1
+        again = path.marks[P + p] == FREE and path.marks[p] == 1 and (P == 1 or path.marks[2 * P - 1 - p] == FREE)
         if again and may_meet(cell, path, motion, p, length) and is_blurred(path, motion, N, p, length):
             embrace(cell, path, p)
         if path.marks[P + p] == TOUCHES:
@@ -107,8 +139,9 @@ def impacts(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, worst:
     P = cell.gap.shape[0]
     length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
     for i in range(p, p + 2):
-        if motion.rest[i] == MOVES:
-            motion.speed[i, -1] += TOUCH_SPEED_MPS  # by a touch, which is no impact
+        motion.way[i, -1] += TOUCH_SPEED_MPS * length  # by a touch, which is no impact
+        if motion.rest[i] == MOVES or high(motion.speed[i]) > 0.0 or high(motion.pull[i]) + motion.vague[i] >= 0.0:
+            motion.speed[i, -1] += TOUCH_SPEED_MPS
     for stands in range(2):
         if (motion.rest[p] == STANDS) == (stands == 1) or motion.rest[p] == MAY_STOP:
             how, there = approach(cell, path, motion, p, length, stands == 1)

@@ -15,13 +15,13 @@ from ethbrake_marl.shield.enclosure_motion import (
     FREE,
     MAY_STOP,
     MOVES,
+    REACH,
     STANDS,
-    WIDE,
     Cell,
     Motion,
     Path,
 )
-from ethbrake_marl.shield.enclosure_touch import apart, part_of
+from ethbrake_marl.shield.enclosure_touch import blur
 from ethbrake_marl.shield.forms import (
     add,
     between,
@@ -52,12 +52,12 @@ class Approach(NamedTuple):
 
 @compiled_apart
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """By how much speeds (or gap) of a pair may differ because a neighbouring pair is in contact."""
+    """By how much speeds (or gap) of a pair may differ in this piece because a neighbouring pair is in contact."""
     P, most = cell.gap.shape[0], 0.0
     if p > 0 and path.marks[P + p - 1] != FREE:
-        most += part_of(cell, path, p - 1, 1) * (path.touch[p - 1, WIDE] if of_gap else apart(path.touch[p - 1]))
+        most += high(cell.share[p - 1, 1]) * path.touch[p - 1, REACH] if of_gap else blur(cell, path, p - 1, 1)
     if p < P - 1 and path.marks[P + p + 1] != FREE:
-        most += part_of(cell, path, p + 1, 0) * (path.touch[p + 1, WIDE] if of_gap else apart(path.touch[p + 1]))
+        most += high(cell.share[p + 1, 0]) * path.touch[p + 1, REACH] if of_gap else blur(cell, path, p + 1, 0)
     return most
 
 
@@ -105,16 +105,16 @@ def approach(
     N, width = cell.speed.shape[0], cell.speed.shape[1]
     slack, vague = noise(cell, path, p, False), motion.vague[p] + motion.vague[p + 1]
     gap, closing = cut(path.forms[N + p], 0.0, math.inf).copy(), path.forms[p + 1].copy()
-    gap[-1] += noise(cell, path, p, True)
+    gap[-1] += noise(cell, path, p, True) + slack * length
     press = motion.pull[p + 1].copy()
     if front_stands:
         if motion.rest[p] == MAY_STOP:
-            add(gap, 1.0, cut(_stopping_way(path.forms[p], motion.pull[p], length), 0.0, math.inf))
+            way = _stopping_way(path.forms[p], motion.pull[p], motion.vague[p], length)
+            add(gap, 1.0, cut(way, 0.0, math.inf))
     else:
         add(closing, -1.0, path.forms[p])
         if motion.rest[p] != STANDS:
             add(press, -1.0, motion.pull[p])
-    closing[-1] += slack
     squared = square(closing)
     add(squared, 2.0, product(press, gap))
     if vague > 0.0:  # the way there and back
@@ -122,6 +122,12 @@ def approach(
         squared[-1] += 2.0 * vague * (max(high(gap), 0.0) + 2.0 * length * opening)
     squared[-1] += NEVER
     there = high(squared) > TOUCH_SPEED_MPS * TOUCH_SPEED_MPS
+    if slack > 0.0:  # at contact
+        least = math.sqrt(max(low(squared), 0.0)) - slack
+        rough = square_root(cut(squared, 0.0, math.inf))
+        rough[-1] += slack
+        squared = square(cut(rough, max(least, 0.0), math.inf))
+        closing[-1] += slack
     fastest = max(high(closing), 0.0) + (max(high(press), 0.0) + vague) * length
     squared = cut(squared, 0.0, fastest * fastest + NEVER)
     if not there or fastest <= TOUCH_SPEED_MPS:
@@ -129,7 +135,7 @@ def approach(
     speed = square_root(squared)
     time, whole = between(0.0, length, width), closing.copy()
     add(whole, 1.0, speed)
-    if low(whole) > SLOWEST and vague == 0.0:
+    if low(whole) > SLOWEST and vague == 0.0 and slack == 0.0:
         time = product(gap, reciprocal(whole))
         time *= 2.0
         if low(time) > length + NEVER or high(time) < -NEVER:
@@ -139,10 +145,11 @@ def approach(
 
 
 @compiled_apart
-def _stopping_way(speed: Floats, pull: Floats, length: float) -> Floats:
+def _stopping_way(speed: Floats, pull: Floats, vague: float, length: float) -> Floats:
     """Way of a braking vehicle until it stands, which it does within the piece."""
-    if not high(pull) < 0.0:
-        return between(0.0, max(high(speed), 0.0) * length, speed.shape[0])
+    if vague > 0.0 or not high(pull) < 0.0:
+        fastest = max(high(speed), 0.0) + max(high(pull) + vague, 0.0) * length
+        return between(0.0, fastest * length, speed.shape[0])
     way = product(square(speed), reciprocal(negative(pull)))
     way *= 0.5
     return way

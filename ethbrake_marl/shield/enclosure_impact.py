@@ -11,35 +11,11 @@ from ethbrake_marl.physics import Floats, Ints
 from ethbrake_marl.physics.compiled import compiled_apart
 from ethbrake_marl.physics.events import PLASTIC_SPEED_MPS
 from ethbrake_marl.shield.enclosure_contact import NEVER, Approach, pressing
-from ethbrake_marl.shield.enclosure_motion import (
-    CLOSING,
-    FREE,
-    HARDEST,
-    OPENING,
-    PARTS,
-    SINCE,
-    SOFTEST,
-    TOUCH_WIDTH,
-    TOUCHES,
-    WIDE,
-    Cell,
-    Motion,
-    Path,
-)
-from ethbrake_marl.shield.enclosure_touch import apart, common, pressing_together
-from ethbrake_marl.shield.forms import (
-    add,
-    between,
-    cut,
-    difference,
-    high,
-    low,
-    negative,
-    positive_part,
-    product,
-    square,
-    square_root,
-)
+from ethbrake_marl.shield.enclosure_motion import FREE, PARTS, TOUCH_WIDTH, TOUCHES, Cell, Motion, Path
+from ethbrake_marl.shield.enclosure_rebound import ceasing_drive, settle_down, spring_apart, stay
+from ethbrake_marl.shield.enclosure_rough import driven, rough_harm
+from ethbrake_marl.shield.enclosure_touch import begin_touch
+from ethbrake_marl.shield.forms import add, between, cut, difference, high, low, negative, product, square, square_root
 
 STACK = 256  # most paths that wait to be followed
 
@@ -75,12 +51,20 @@ def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
 
 
 @compiled_apart
+def keep_rough(cell: Cell, path: Path, hit: int, worst: float, out: Floats) -> float:
+    """``keep_worst`` of a path that is not followed any further."""
+    harm = np.zeros(cell.speed.shape[1])
+    harm[0] = rough_harm(cell, path, hit)
+    return keep_worst(harm, worst, out)
+
+
+@compiled_apart
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
     """The worlds in which pair ``p`` has an impact in this piece: their harm where it is final, else a path of its own.
 
-    Infinity where such a path cannot be followed.
+    Where such a path cannot be followed, what is certain without it.
     """
     P = cell.gap.shape[0]
     harm = path.forms[-1].copy()
@@ -90,7 +74,7 @@ def branch(
     if P == 1 or path.marks[other] == 1:
         return keep_worst(harm, worst, out)
     if path.marks[P + other] != FREE:
-        return math.inf
+        return keep_with(harm, rough_harm(cell, path, p) - high(path.forms[-1]), worst, out)
     speed = cut(square_root(how.squared), 0.0, math.inf)
     length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
     closing = closing_after(cell, path, motion, p, speed, how.time, length)
@@ -99,8 +83,16 @@ def branch(
         add(both, 1.0, square(cut(closing, 0.0, math.inf)))
         worst = keep_worst(both, worst, out)
     if not strike(cell, path, stack, motion, p, how, speed, harm):
-        return math.inf
+        worst = keep_with(harm, rough_harm(cell, path, p) - high(path.forms[-1]), worst, out)
     return worst
+
+
+@compiled_apart
+def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
+    """``keep_worst`` of a harm to which at most ``rest`` is added."""
+    whole = harm.copy()
+    whole[0] += rest
+    return keep_worst(whole, worst, out)
 
 
 @compiled_apart
@@ -111,6 +103,7 @@ def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats,
     push *= 1.0 + cell.restitution
     softest, hardest = pressing(motion, other)
     hold = max(pressing(motion, p)[1], 0.0) * length  # what pair p, pressing on, adds to the push
+    hold *= max(1.0, (1.0 + cell.restitution) * high(cell.share[p, other]))
     begin, after = path.forms[N + other], path.forms[N + other].copy()
     add(after, 1.0, motion.way[other])
     add(after, -1.0, motion.way[other + 1])
@@ -146,14 +139,19 @@ def strike(
     bounces = cell.restitution if high(speed) >= PLASTIC_SPEED_MPS else 0.0
     returns = cell.restitution if low(speed) >= PLASTIC_SPEED_MPS else 0.0
     _, most = pressing(motion, p)
+    unlimited = ceasing_drive(cell, motion, p, speed, length)
     if most < 0.0 or -returns * low(speed) + max(most, 0.0) * high(left) < 0.0:
         jump = speed * (1.0 + bounces)
         jump[-1] = abs(jump[-1]) + (bounces - returns) * PLASTIC_SPEED_MPS
         spring_apart(cell, path, motion, p, how, jump, left, after, way)
     else:
-        settle_down(motion, p, bounces * high(speed), length, after.touch[p])
+        settle_down(cell, motion, p, bounces * high(speed), length, after.touch[p])
         stay(cell, path, motion, p, how, speed, left, after, way)
         after.marks[P + p] = TOUCHES
+    for i in range(p, p + 2):
+        if unlimited > 0.0 and (i == p or after.marks[P + p] == TOUCHES):
+            add(after.forms[i], 1.0, between(-unlimited * high(left), 0.0, width))
+            add(way[i], 1.0, between(-0.5 * unlimited * high(left) * high(left), 0.0, width))
     for q in range(P):
         add(after.forms[N + q], 1.0, way[q])
         add(after.forms[N + q], -1.0, way[q + 1])
@@ -173,7 +171,7 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int) -> bool:
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     piece = path.marks[2 * P]
-    changed = piece == 0 or motion.vague[p] + motion.vague[p + 1] > 0.0
+    changed = piece == 0 or motion.vague[p] + motion.vague[p + 1] > 0.0 or (P == 2 and path.marks[1 - p] == 1)
     for i in range(p, p + 2):
         if i != cell.vehicle:
             changed = changed or high(cell.onset[i]) == cell.times[piece]
@@ -194,92 +192,18 @@ def touch_only(path: Path, stack: Stack, p: int) -> bool:
     )  # fmt: skip
     stack.forms[size, -1] = path.forms[-1]
     stack.marks[size, p] = 0
+    begin_touch(stack.touch[size, p])
     stack.size[0] = size + 1
     return True
 
 
 @compiled_apart
 def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats) -> bool:
-    """Whether the striking vehicle may move backwards after the impact."""
-    share = (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0
+    """Whether the striking vehicle may move backwards after the impact, and be met again.
+
+    The last one of a line, if it never drives, meets nobody then: it may as well stand.
+    """
+    P, share = cell.gap.shape[0], (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0
     slowest = 0.0 if how.front_stands else max(min(low(path.forms[p]), low(motion.speed[p])), 0.0)
-    return share * high(speed) > slowest
-
-
-@compiled_apart
-def spring_apart(
-    cell: Cell, path: Path, motion: Motion, p: int, how: Approach, jump: Floats, left: Floats, after: Path, way: Floats
-) -> None:
-    """Speeds and ways of a pair whose impact changes its relative speed by ``jump``, ``left`` before the piece ends."""
-    front, rear = product(cell.share[p, 0], jump), product(cell.share[p, 1], jump)
-    after.forms[p + 1] = difference(motion.onward[p + 1], rear)
-    way[p + 1] = difference(motion.reach[p + 1], product(rear, left))
-    if how.front_stands:
-        from_standstill(path, motion, p, front, left, after.forms[p], way[p])
-    else:
-        after.forms[p], way[p] = motion.onward[p], motion.reach[p]
-        add(after.forms[p], 1.0, front)
-        add(way[p], 1.0, product(front, left))
-    for i in range(p, p + 2):
-        stand_still(motion.pull[i], after.forms[i], way[i])
-
-
-@compiled_apart
-def from_standstill(
-    path: Path, motion: Motion, i: int, start: Floats, left: Floats, speed: Floats, way: Floats
-) -> None:
-    """``speed`` at the end and ``way`` of a vehicle that stood when it was given ``start`` (m/s); then it brakes."""
-    speed[:] = start
-    add(speed, 1.0, product(motion.pull[i], left))
-    add(way, 1.0, product(start, left))
-    add(way, 0.5, product(motion.pull[i], square(left)))
-    vague, most = motion.vague[i], high(left)
-    speed[-1] += vague * most
-    way[-1] += 0.5 * vague * most * most
-
-
-@compiled_apart
-def stand_still(pull: Floats, speed: Floats, way: Floats) -> None:
-    """Where a braking vehicle's speed would have become negative, it stood before."""
-    least = low(speed)
-    if least < 0.0:
-        if high(pull) < 0.0:
-            add(way, 1.0, between(0.0, 0.5 * least * least / -high(pull), way.shape[0]))
-        speed[:] = positive_part(speed)
-
-
-@compiled_apart
-def stay(
-    cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats, left: Floats, after: Path, way: Floats
-) -> None:
-    """Speeds and ways of a pair that stays in contact after its impact: those of its centre of mass."""
-    N = cell.speed.shape[0]
-    pull = common(cell, p, motion.pull[p], motion.pull[p + 1])
-    gap = path.forms[N + p]
-    if how.front_stands:
-        from_standstill_together = product(cell.share[p, 0], speed)
-        after.forms[p] = from_standstill_together
-        add(after.forms[p], 1.0, product(pull, left))
-        add(way[p], 1.0, product(from_standstill_together, left))
-        add(way[p], 0.5, product(pull, square(left)))
-    else:
-        after.forms[p] = common(cell, p, motion.onward[p], motion.onward[p + 1])
-        way[p] = common(cell, p, motion.reach[p], motion.reach[p + 1])
-        add(way[p], -1.0, product(cell.share[p, 0], gap))
-    if low(after.forms[p]) < 0.0:  # one of them may stand before the other
-        way[p, -1] += apart(after.touch[p]) * high(left)
-    stand_still(pull, after.forms[p], way[p])
-    after.forms[p + 1], way[p + 1] = after.forms[p], way[p]
-    add(way[p + 1], 1.0, gap)
-
-
-@compiled_apart
-def settle_down(motion: Motion, p: int, most_apart: float, length: float, touch: Floats) -> None:
-    """Largest difference of speeds and gap of a pair in contact; its impact opens it by ``most_apart`` at most."""
-    least, most = pressing_together(motion, p)
-    touch[SOFTEST], touch[HARDEST], touch[SINCE] = math.inf, 0.0, 0.0
-    touch[OPENING], touch[CLOSING] = most_apart - min(least, 0.0) * length, max(most, 0.0) * length
-    touch[WIDE] = touch[OPENING] * length
-    if least > 0.0 and motion.vague[p] + motion.vague[p + 1] == 0.0:
-        touch[CLOSING], touch[WIDE] = most_apart, min(0.5 * most_apart * most_apart / least, most_apart * length)
-        touch[SOFTEST], touch[HARDEST] = least, most
+    last = p == P - 1 and driven(cell, p + 1, 0.0, cell.times[path.marks[2 * P]]) <= 0.0
+    return share * high(speed) > slowest and not last

@@ -32,8 +32,11 @@ from ethbrake_marl.shield.forms import (
 MOVES, MAY_STOP, STANDS = 0, 1, 2  # in this piece of time
 FREE, TOUCHES, PARTS = 0, 1, 2  # what a pair does; the last: it was in contact when this piece of time began
 ROUNDING = 1e-12  # of a number and of 1: added to the remainders in each piece of time, far above the engine's own
-OPENING, CLOSING, WIDE, SOFTEST, HARDEST, SINCE = range(6)  # columns of Path.touch
-TOUCH_WIDTH = 6
+# columns of Path.touch, of a pair in contact: by how much it opens and closes at most (m/s), its largest gap (m), least
+# and largest pressing acceleration (m/s2) since it is pressed together, and the time since then (s); the largest speed
+# of the rear one in the worlds that creep (m/s, 0: none do); in this piece the largest difference of speeds, and gap
+OPENING, CLOSING, WIDE, SOFTEST, HARDEST, SINCE, CREEP, SPREAD, REACH = range(9)
+TOUCH_WIDTH = 9
 
 
 class Cell(NamedTuple):
@@ -57,9 +60,8 @@ class Path(NamedTuple):
     """Worlds of a cell that have gone one way so far."""
 
     forms: Floats  # [N + P + 1, W] speeds, gaps, harm so far
-    # [P, TOUCH_WIDTH] of pairs in contact: by how much they open and close at most (m/s), largest gap (m), least and
-    # largest pressing acceleration (m/s2) and time since that is so (s). Their two speeds are that of their common
-    # centre of mass, from which their neighbours' gaps are counted
+    # [P, TOUCH_WIDTH] of pairs in contact, else meaningless. Their two speeds are that of their common centre of mass,
+    # from which their neighbours' gaps are counted
     touch: Floats
     marks: Ints  # [2 P + 1] 1 where the pair had an impact; FREE, TOUCHES or PARTS; number of the piece of time
 
@@ -86,17 +88,56 @@ def new_motion(N: int, width: int) -> Motion:
 
 
 @compiled_apart
-def move_alone(cell: Cell, forms: Floats, piece: int, motion: Motion) -> None:
+def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
     """Every vehicle through one piece of time under its command, as if it were alone."""
     for i in range(cell.speed.shape[0]):
         command(cell, i, piece, motion)
-        drift(cell, forms[i], i, piece, motion)
+    for i in range(cell.speed.shape[0]):
+        speed, length = path.forms[i], cell.times[piece + 1] - cell.times[piece]
+        drift(cell, speed, i, piece, motion)
+        if high(motion.pull[i]) + motion.vague[i] > 0.0:
+            fastest = high(speed) + length * high(motion.pull[i]) + beside(cell, path, motion, i, length)
+            if fastest > cell.limit[i]:
+                stop_driving(i, length, motion)
+        motion.onward[i, -1] += ROUNDING * (1.0 + abs(motion.onward[i, 0]))
+        motion.reach[i, -1] += ROUNDING * (1.0 + abs(motion.reach[i, 0]))
         motion.speed[i], motion.way[i] = motion.onward[i], motion.reach[i]
-        if _stands(forms[i]) and high(motion.pull[i]) <= 0.0:
+        if _stands(speed) and high(motion.pull[i]) + motion.vague[i] <= 0.0:
             motion.rest[i] = STANDS
             motion.speed[i], motion.way[i] = 0.0, 0.0
-        elif low(motion.onward[i]) < 0.0 and high(motion.pull[i]) - motion.vague[i] < 0.0:
-            stop(forms[i], i, cell.times[piece + 1] - cell.times[piece], motion)
+        elif low(motion.onward[i]) < 0.0 and low(motion.pull[i]) - motion.vague[i] < 0.0:
+            stop(speed, i, length, motion)
+
+
+@compiled_apart
+def beside(cell: Cell, path: Path, motion: Motion, i: int, length: float) -> float:
+    """By how much a vehicle in contact with another one may be faster than its form within the piece."""
+    P, most = cell.gap.shape[0], 0.0
+    for p in range(max(i - 1, 0), min(i + 1, P)):
+        if path.marks[P + p] == TOUCHES:
+            touch = path.touch[p]
+            most += max(touch[OPENING], touch[CLOSING], 0.0) + 5.0 * touch[CREEP]
+            for k in range(p, p + 2):
+                most += length * (abs(motion.pull[k, 0]) + radius(motion.pull[k]) + motion.vague[k])
+    return most
+
+
+@compiled_apart
+def stop_driving(i: int, length: float, motion: Motion) -> None:
+    """The speed limit may end a vehicle's drive anywhere within the piece: it gives any part of it then."""
+    drive = high(motion.pull[i]) + motion.vague[i]
+    motion.onward[i] = between_shifted(motion.onward[i], -length * drive)
+    motion.reach[i] = between_shifted(motion.reach[i], -0.5 * length * length * drive)
+    motion.vague[i] = 0.5 * drive
+    motion.pull[i] = between(0.5 * drive, 0.5 * drive, motion.pull.shape[1])
+
+
+@compiled_apart
+def between_shifted(x: Floats, shift: float) -> Floats:
+    """A number between what ``x`` stands for and that plus ``shift``."""
+    out = x.copy()
+    add(out, 1.0, between(min(shift, 0.0), max(shift, 0.0), x.shape[0]))
+    return out
 
 
 @compiled_apart
@@ -133,15 +174,8 @@ def drift(cell: Cell, speed: Floats, i: int, piece: int, motion: Motion) -> None
     if i != cell.vehicle and high(cell.onset[i]) > cell.times[piece]:
         begin_later(cell, i, piece, motion)
     else:
-        if high(pull) > 0.0 and high(speed) + length * high(pull) > cell.limit[i]:  # the limit may end the drive
-            motion.vague[i] = 0.5 * high(pull)
-            pull[:] = between(motion.vague[i], motion.vague[i], pull.shape[0])
-            onward[-1] += length * motion.vague[i]
-            reach[-1] += 0.5 * length * length * motion.vague[i]
         add(onward, length, pull)
         add(reach, 0.5 * length * length, pull)
-    onward[-1] += ROUNDING * (1.0 + abs(onward[0]))
-    reach[-1] += ROUNDING * (1.0 + abs(reach[0]))
 
 
 @compiled_apart
@@ -157,8 +191,9 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     )
     add(motion.onward[i], 1.0, product(pull, acting))
     add(motion.reach[i], 0.5, product(pull, square(acting)))
-    motion.vague[i] = 0.5 * (abs(pull[0]) + radius(pull))
-    pull[:] = between(min(low(pull), 0.0) * 0.5, max(high(pull), 0.0) * 0.5, pull.shape[0])
+    least, most = min(low(pull), 0.0), max(high(pull), 0.0)
+    motion.vague[i] = 0.5 * (most - least)
+    pull[:] = between(0.5 * (least + most), 0.5 * (least + most), pull.shape[0])
 
 
 @compiled_apart
@@ -178,7 +213,8 @@ def stop(speed: Floats, i: int, length: float, motion: Motion) -> None:
     motion.rest[i] = MAY_STOP
     motion.speed[i] = positive_part(motion.onward[i])
     if vague > 0.0 or not high(pull) < 0.0:
-        motion.way[i] = between(0.0, max(high(speed), 0.0) * length, width)
+        fastest = max(high(speed), 0.0) + max(high(pull) + vague, 0.0) * length
+        motion.way[i] = between(0.0, fastest * length, width)
     elif least > 0.0:
         add(motion.way[i], 0.5, product(square(beyond), reciprocal(negative(pull))))
     else:

@@ -1,4 +1,10 @@
-"""Pairs of a box of worlds that stay in contact: they bounce a little, then move as one, then part."""
+"""Pairs of a box of worlds that stay in contact: they bounce a little, then move as one, then part.
+
+A pair in contact is told by the motion of its centre of mass, as forms, and by bounds on how far the two are from it.
+While both of them move forward, their commands are the only forces on the pair, so its centre of mass moves by the
+commands alone, however often the two collide. A world *creeps* once one of the two stands or moves backwards: its
+brakes then hold instead of pulling, and nothing but bounds on its speeds is known of it.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +15,15 @@ from ethbrake_marl.physics.compiled import compiled_apart
 from ethbrake_marl.physics.events import PLASTIC_SPEED_MPS
 from ethbrake_marl.shield.enclosure_motion import (
     CLOSING,
+    CREEP,
     HARDEST,
     MOVES,
     OPENING,
     PARTS,
+    REACH,
     SINCE,
     SOFTEST,
+    SPREAD,
     STANDS,
     TOUCHES,
     WIDE,
@@ -45,44 +54,6 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
 
 
 @compiled_apart
-def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """A pair in contact through one piece of time; ``motion`` holds both as if alone, and then as one.
-
-    Its speeds are those of its centre of mass, from which they may differ by what ``path.touch`` says.
-    """
-    touch, front, rear = path.touch[p], p, p + 1
-    least, most = pressing_together(motion, p)
-    if motion.rest[front] == STANDS and motion.rest[rear] == STANDS:
-        brakes = -max(high(motion.pull[front]), high(motion.pull[rear]))
-        motion.way[front, -1] += apart(touch) * length
-        motion.way[rear, -1] += apart(touch) * length
-        for column in (OPENING, CLOSING):
-            touch[column] = max(touch[column] - max(brakes, 0.0) * length, 0.0)
-        return
-    if most < 0.0 and touch[CLOSING] <= 0.0 and touch[OPENING] + touch[CLOSING] <= SHARP:
-        part(cell, path, motion, p, length)
-        return
-    vague = max(motion.vague[front], motion.vague[rear])
-    brakes = -max(high(motion.pull[front]), high(motion.pull[rear])) - vague
-    for rows in (motion.pull, motion.onward, motion.reach):
-        rows[front] = common(cell, p, rows[front], rows[rear])
-    motion.rest[front], motion.vague[front] = MOVES, vague
-    motion.speed[front], motion.way[front] = motion.onward[front], motion.reach[front]
-    if low(motion.onward[front]) < 0.0 and high(motion.pull[front]) - vague < 0.0:
-        stop(path.forms[front], front, length, motion)
-        motion.way[front, -1] += apart(touch) * length  # one of them may stand before the other
-    for rows in (motion.pull, motion.onward, motion.reach, motion.speed, motion.way):
-        rows[rear] = rows[front]
-    motion.rest[rear], motion.vague[rear] = motion.rest[front], vague
-    fastest = max(high(path.forms[front]), 0.0) + apart(touch)
-    bounce(touch, least, most, length, cell.restitution)
-    share = max(high(cell.share[p, 0]), high(cell.share[p, 1]))
-    if brakes > 0.0 and share * (1.0 + cell.restitution) <= 1.0:  # no impact makes the faster one faster
-        for column in (OPENING, CLOSING):
-            touch[column] = min(touch[column], max(fastest - brakes * length, 0.0))
-
-
-@compiled_apart
 def apart(touch: Floats) -> float:
     """Largest difference of speeds of a pair in contact."""
     most: float = max(touch[OPENING], touch[CLOSING], 0.0)
@@ -90,12 +61,123 @@ def apart(touch: Floats) -> float:
 
 
 @compiled_apart
-def part_of(cell: Cell, path: Path, p: int, side: int) -> float:
-    """Share of the difference of speeds of a pair in contact that one of them has against their common speed.
+def largest_share(cell: Cell, p: int) -> float:
+    """Of a difference of speeds, the most that one of a pair has against their centre of mass."""
+    share: float = max(high(cell.share[p, 0]), high(cell.share[p, 1]))
+    return share
 
-    All of it, where one may stand while the other one still moves: then it is not their commands that act on both.
+
+@compiled_apart
+def faster(cell: Cell, p: int) -> float:
+    """How many times the rear one's speed its impacts may give the front one, at least 1."""
+    times: float = max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0]))
+    return times
+
+
+@compiled_apart
+def backwards(cell: Cell, p: int) -> float:
+    """How many times its speed the rear one may have backwards after an impact, at least 0."""
+    times: float = max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0)
+    return times
+
+
+@compiled_apart
+def stray(cell: Cell, touch: Floats, p: int) -> float:
+    """Largest difference between the speed of a pair's centre of mass and its form.
+
+    In a world that creeps the form's speed is between 0 and ``CREEP``, the rear one's between minus ``backwards`` and 1
+    times that, the front one's between 0 and ``faster`` times that: no impact makes a rear one faster.
     """
-    return 1.0 if low(path.forms[p]) <= apart(path.touch[p]) else high(cell.share[p, side])
+    most: float = max(faster(cell, p), 1.0 + backwards(cell, p)) * touch[CREEP]
+    return most
+
+
+@compiled_apart
+def blur(cell: Cell, path: Path, p: int, side: int) -> float:
+    """By how much the speed of one of a pair may differ from the form at any time in the present piece."""
+    most: float = high(cell.share[p, side]) * path.touch[p, SPREAD] + stray(cell, path.touch[p], p)
+    return most
+
+
+@compiled_apart
+def begin_touch(touch: Floats) -> None:
+    """Forget what a pair did when it was in contact before."""
+    spread, reach = touch[SPREAD], touch[REACH]  # of the present piece
+    touch[:] = 0.0
+    touch[SPREAD], touch[REACH], touch[SOFTEST] = spread, reach, math.inf
+
+
+@compiled_apart
+def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
+    """A pair in contact through one piece of time; ``motion`` holds both as if alone, and then as one."""
+    touch, front, rear = path.touch[p], p, p + 1
+    touch[SPREAD], touch[REACH] = apart(touch), touch[WIDE]
+    if motion.rest[front] == STANDS and motion.rest[rear] == STANDS:
+        come_to_rest(cell, path, motion, p, length)
+        return
+    least, most = pressing_together(motion, p)
+    opens = most < 0.0 and touch[CLOSING] <= 0.0 and touch[OPENING] + touch[CLOSING] <= SHARP
+    if opens and (touch[CREEP] <= 0.0 or backwards(cell, p) <= 0.0):
+        part(cell, path, motion, p, length)
+        return
+    vague = max(motion.vague[front], motion.vague[rear])
+    weakest, hardest = own_pulls(motion, p)
+    for rows in (motion.pull, motion.onward, motion.reach):
+        rows[front] = common(cell, p, rows[front], rows[rear])
+    slowest = min(low(path.forms[front]), low(motion.onward[front]))
+    bounce(cell, touch, p, least, most, length, vague)
+    creep(cell, touch, p, slowest, weakest, hardest, length)
+    settle(touch, cell.restitution, length)
+    motion.rest[front], motion.vague[front] = MOVES, vague
+    motion.speed[front], motion.way[front] = motion.onward[front], motion.reach[front]
+    if low(motion.onward[front]) < 0.0 and weakest < 0.0:
+        stop(path.forms[front], front, length, motion)
+    motion.way[front, -1] += stray(cell, touch, p) * length
+    for rows in (motion.pull, motion.onward, motion.reach, motion.speed, motion.way):
+        rows[rear] = rows[front]
+    motion.rest[rear], motion.vague[rear] = motion.rest[front], vague
+
+
+@compiled_apart
+def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
+    """Least and largest acceleration that a command of a pair gives."""
+    weakest = min(low(motion.pull[p]) - motion.vague[p], low(motion.pull[p + 1]) - motion.vague[p + 1])
+    return weakest, max(high(motion.pull[p]) + motion.vague[p], high(motion.pull[p + 1]) + motion.vague[p + 1])
+
+
+@compiled_apart
+def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, hardest: float, length: float) -> None:
+    """Note that worlds may creep by now, the pair's centre of mass being as slow as ``slowest`` in this piece."""
+    if weakest < 0.0 and touch[SPREAD] > 0.0 and slowest <= largest_share(cell, p) * touch[SPREAD]:
+        touch[CREEP] = max(touch[CREEP], touch[SPREAD])
+    if touch[CREEP] > 0.0:
+        touch[CREEP] += max(hardest, 0.0) * length
+        touch[CLOSING] = max(touch[CLOSING], 0.0)
+        if backwards(cell, p) > 0.0:
+            most = (faster(cell, p) + backwards(cell, p)) * touch[CREEP]
+            touch[OPENING] = max(touch[OPENING], most)
+            touch[CLOSING], touch[SPREAD] = max(touch[CLOSING], touch[CREEP]), max(touch[SPREAD], most)
+            touch[WIDE] = max(touch[WIDE], touch[REACH] + most * length)
+            touch[SOFTEST] = math.inf
+    touch[REACH] = max(touch[REACH], touch[WIDE])
+
+
+@compiled_apart
+def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
+    """A pair whose form stands: each of its worlds stands, or creeps and is braked.
+
+    The rear one's speed falls by the brakes b, the front one's is at most ``faster`` times what the rear one's was.
+    """
+    touch = path.touch[p]
+    touch[CREEP] = max(touch[CREEP], touch[SPREAD])
+    for i in range(p, p + 2):
+        motion.way[i, -1] += stray(cell, touch, p) * length
+    touch[WIDE] += max(touch[OPENING], 0.0) * length
+    touch[REACH], touch[SOFTEST] = touch[WIDE], math.inf
+    brakes = max(-own_pulls(motion, p)[1], 0.0)
+    touch[CREEP] = max(touch[CREEP] - brakes * length / faster(cell, p), 0.0)
+    touch[OPENING] = min(touch[OPENING], (faster(cell, p) + backwards(cell, p)) * touch[CREEP])
+    touch[CLOSING] = min(max(touch[CLOSING], 0.0), touch[CREEP])
 
 
 @compiled_apart
@@ -103,52 +185,84 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     """A pair that was in contact opens in this piece: from now on each moves alone."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     touch, width = path.touch[p], cell.speed.shape[1]
-    opening, wide = touch[OPENING], touch[WIDE]
+    opening, wide, astray = max(touch[OPENING], 0.0), touch[WIDE], stray(cell, touch, p)
     path.marks[P + p] = PARTS
-    path.forms[N + p] = between(0.0, wide + opening * length, width)  # by its speeds alone; commands act on top
+    touch[REACH] = wide + opening * length
+    path.forms[N + p] = between(0.0, touch[REACH], width)  # by its speeds alone; commands act on top
     for side in range(2):
-        share = (2.0 * side - 1.0) * part_of(cell, path, p, side)
-        speed = between(min(-share * opening, 0.0), max(-share * opening, 0.0), width)
+        share = (2.0 * side - 1.0) * high(cell.share[p, side])
+        speed = between(min(-share * opening, 0.0) - astray, max(-share * opening, 0.0) + astray, width)
         for rows in (motion.onward, motion.speed):
             add(rows[p + side], 1.0, speed)
         for rows in (motion.reach, motion.way):
-            rows[p + side, -1] += abs(share) * opening * length
+            rows[p + side, -1] += (abs(share) * opening + astray) * length
         neighbour = p - 1 + 2 * side
         if 0 <= neighbour < P:
             add(path.forms[N + neighbour], 1.0, between(-abs(share) * wide, 0.0, width))
 
 
 @compiled_apart
-def bounce(touch: Floats, least: float, most: float, length: float, restitution: float) -> None:
+def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length: float, vague: float) -> None:
     """What becomes of the difference of speeds and of the gap of a pair in contact within one piece.
 
-    While it is pressed together by b between b- and b+, a flight that begins with separating speed s ends after at most
-    2 s / b-, with a closing speed of at most s sqrt(b+ / b-); an impact leaves the share e of it, none below the
-    plastic speed. So after 2 s / (b- (1 - e sqrt(b+ / b-))) the two move as one.
+    Its closing acceleration is between ``least`` and ``most``. No impact makes the difference larger, so it grows by
+    what the commands give. While the pair is pressed together by b between b- and b+, it does not grow: from gap g and
+    difference w a flight is never higher than h = g + w^2 / (2 b-), and closes with at most sqrt(2 b+ h), which leaves
+    the share e of it: less than before, if e sqrt(b+ / b-) < 1. (Where a vehicle creeps, its brakes that hold make a
+    flight lower and slower.)
     """
-    if touch[OPENING] == 0.0 and touch[CLOSING] <= 0.0 and touch[WIDE] == 0.0 and least >= 0.0:
-        touch[CLOSING] = 0.0
+    e, fastest, wide = cell.restitution, apart(touch), touch[WIDE]
+    if fastest == 0.0 and wide == 0.0 and least >= 0.0:
+        touch[CLOSING], touch[OPENING] = 0.0, 0.0
         return
-    if not least > 0.0:
-        struck = restitution * max(touch[CLOSING] + max(most, 0.0) * length, 0.0)
-        touch[OPENING] = max(touch[OPENING], struck) - least * length
-        touch[CLOSING] += most * length
-        touch[WIDE] += max(touch[OPENING], 0.0) * length
-        touch[SOFTEST], touch[HARDEST], touch[SINCE] = math.inf, 0.0, 0.0
+    if least > 0.0 and vague == 0.0 and (touch[CREEP] <= 0.0 or backwards(cell, p) <= 0.0):
+        if least < touch[SOFTEST] or most > touch[HARDEST]:
+            begin_run(touch, e, min(least, touch[SOFTEST]), max(most, touch[HARDEST]), least, most)
+        if touch[SOFTEST] < math.inf:
+            fastest = apart(touch)
+            height = 0.5 * fastest * fastest / touch[HARDEST]
+            touch[SPREAD] = fastest
+            touch[WIDE] = max(wide, min(height, wide + fastest * length))
+            touch[SINCE] += length
+            return
+    closing = max(touch[CLOSING] + most * length, 0.0) if most > 0.0 else touch[CLOSING]
+    struck = max(touch[CLOSING], closing, 0.0)
+    opening = max(touch[OPENING], e * struck) - min(least, 0.0) * length
+    touch[CLOSING] = closing if most > 0.0 else touch[CLOSING] + most * length
+    touch[OPENING], touch[SOFTEST], touch[HARDEST] = opening, math.inf, 0.0
+    touch[SPREAD] = max(touch[SPREAD], struck, opening)
+    touch[WIDE] += max(opening, 0.0) * length
+
+
+@compiled_apart
+def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
+    """A pair is pressed together in another way than before: between both ways, or if need be in the new one alone."""
+    if not e * math.sqrt(hardest / softest) < 1.0:
+        softest, hardest = least, most
+    fastest = apart(touch)
+    if not e * math.sqrt(hardest / softest) < 1.0:
+        touch[SOFTEST], touch[HARDEST] = math.inf, 0.0
         return
-    wide, fastest = touch[WIDE], apart(touch)
-    if least < touch[SOFTEST] or most > touch[HARDEST]:
-        touch[SOFTEST], touch[HARDEST] = min(least, touch[SOFTEST]), max(most, touch[HARDEST])
-        height = wide + 0.5 * fastest * fastest / touch[SOFTEST]
-        fastest = math.sqrt(fastest * fastest + 2.0 * touch[HARDEST] * height)
-        touch[WIDE], touch[SINCE] = min(height, wide + fastest * length), 0.0
-    touch[OPENING], touch[CLOSING] = fastest, fastest
-    touch[SINCE] += length
-    ratio = restitution * math.sqrt(touch[HARDEST] / touch[SOFTEST])
-    if fastest < PLASTIC_SPEED_MPS:
-        ratio = 0.0
-    if ratio < 1.0 and touch[SINCE] * touch[SOFTEST] * (1.0 - ratio) > 2.0 * fastest * (1.0 + 1e-9) + 1e-9:
-        touch[OPENING], touch[CLOSING], touch[WIDE] = 0.0, 0.0, 0.0
+    height = touch[WIDE] + 0.5 * fastest * fastest / softest
+    touch[SOFTEST], touch[HARDEST], touch[SINCE] = softest, hardest, 0.0
+    touch[OPENING] = math.sqrt(2.0 * hardest * height)
+    touch[CLOSING] = touch[OPENING]
+
+
+@compiled_apart
+def settle(touch: Floats, e: float, length: float) -> None:
+    """Whether a pair moves as one by the end of the piece.
+
+    A flight that begins with separating speed s ends after at most 2 s / b-, with a closing speed of at most
+    s sqrt(b+ / b-). So after 2 s / (b- (1 - e sqrt(b+ / b-))) the two move as one, if none of them creeps.
+    """
+    if touch[SOFTEST] == math.inf or touch[CREEP] > 0.0:
+        touch[SINCE] = 0.0
+        return
+    fastest = touch[OPENING]
+    ratio = 0.0 if fastest < PLASTIC_SPEED_MPS else e * math.sqrt(touch[HARDEST] / touch[SOFTEST])
+    if touch[SINCE] * touch[SOFTEST] * (1.0 - ratio) > 2.0 * fastest * (1.0 + 1e-9) + 1e-9:
+        begin_touch(touch)
 
 
 @compiled_apart
@@ -167,8 +281,8 @@ def embrace(cell: Cell, path: Path, p: int) -> None:
     front, rear, gap = path.forms[p].copy(), path.forms[p + 1].copy(), path.forms[N + p]
     closing = difference(rear, front)
     touch = path.touch[p]
+    begin_touch(touch)
     touch[OPENING], touch[CLOSING], touch[WIDE] = max(-low(closing), 0.0), high(closing), max(high(gap), 0.0)
-    touch[SOFTEST], touch[HARDEST], touch[SINCE] = math.inf, 0.0, 0.0
     path.forms[p] = common(cell, p, front, rear)
     path.forms[p + 1] = path.forms[p]
     inside = cut(gap, 0.0, math.inf)

@@ -32,7 +32,8 @@ from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.rows import params_at
 from ethbrake_marl.shield.certify import REASONS, Decision
-from ethbrake_marl.shield.comparison import as_predicted, difference, seen_columns
+from ethbrake_marl.shield.comparison import difference, seen_columns
+from ethbrake_marl.shield.interior import expects
 from ethbrake_marl.shield.options import ShieldOptions
 from ethbrake_marl.shield.rollouts import Proposer, proposed_actions
 from ethbrake_marl.shield.settings import proposing_agents, shielded_vehicles
@@ -291,7 +292,7 @@ class AttachedShield(Attached):
                 f" {running.steps[k]}; {ADVICE}"
             )
         seen = seen_columns(after.packed)
-        if (wrong := np.flatnonzero(wanted & ~as_predicted(running, seen))).size:
+        if (wrong := np.flatnonzero(wanted & ~expects(sent.certified.after.boxes, running, seen))).size:
             k = int(wrong[0])
             told = difference(running.nominal().states[k], seen[k])
             raise UncertifiedStep(f"shield: after this step {told} (world {k}); {ADVICE}")

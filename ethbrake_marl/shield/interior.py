@@ -14,12 +14,13 @@ import numpy as np
 
 from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.episode import HARM_IS_TOTAL
 from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
 from ethbrake_marl.shield.certify_kernel import NO_CERTIFICATE
+from ethbrake_marl.shield.comparison import as_predicted
 from ethbrake_marl.shield.interior_kernel import Known, bound_box
 from ethbrake_marl.shield.rollouts import put
 
@@ -62,22 +63,47 @@ def placed(old: Boxes | None, new: Boxes, rows: Ints) -> Boxes:
     return new.take(np.argsort(rows)) if old is None or len(rows) >= len(old.low) else old.put(rows, new)
 
 
+def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
+    """Raise ``InvalidInput`` for a setting that interior mode cannot certify, whatever its worlds.
+
+    That is: total harm, more than three vehicles, an obstacle ahead, or others that do anything else than brake fully,
+    coast, or hold one deceleration.
+    """
+    if robust != INTERIOR:
+        return
+    if harm_count == "total":
+        raise _refusal("total harm")
+    if scenario.vehicles > MOST_VEHICLES:
+        raise _refusal(f"{scenario.vehicles} vehicles")
+    if scenario.has_obstacle:
+        raise _refusal("an obstacle ahead")
+    for i, script in sorted(others.items()):
+        name = getattr(script, "name", type(script).__name__)
+        if name.split(":")[0] not in SCRIPTS:
+            raise InvalidInput(
+                f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, which it cannot enclose; full_brake,"
+                " coast and constant:A are possible; robust corners takes every script"
+            )
+
+
+def _refusal(what: str) -> InvalidInput:
+    return InvalidInput(
+        f"shield: robust interior: {what}: it certifies first-impact harm of at most {MOST_VEHICLES} vehicles without"
+        " an obstacle; robust corners takes every scenario"
+    )
+
+
 def boxes_of(possible: Worlds, running: Running, scenario: Scenario, others: Mapping[int, Script]) -> Boxes:
     """The boxes of the n worlds of ``running`` at the alert, their members being ``possible`` [n * M].
 
-    Raises ``InvalidInput`` for what interior mode cannot
-    certify: more than three vehicles, an obstacle ahead, total harm, or others that do anything else than brake fully,
-    coast, or hold one deceleration.
+    Raises ``InvalidInput`` for worlds that interior mode cannot certify: with an obstacle ahead, or in which another
+    vehicle's command is not the same in the whole box. ``check_possible`` says what no world of a scenario changes.
     """
-    n, vehicle, total = running.n, int(running.problem.vehicles[0]), running.problem.clock[0, HARM_IS_TOTAL] == 1.0
+    n, vehicle = running.n, int(running.problem.vehicles[0])
     v, N = possible.vehicles, possible.N
     command = running.problem.command[:, running.problem.command.shape[1] - N :]
-    if N > MOST_VEHICLES or obstacle_ahead(possible).any() or total:
-        what = "total harm" if total else f"{N} vehicles" if N > MOST_VEHICLES else "an obstacle ahead"
-        raise InvalidInput(
-            f"shield: robust interior: {what}: it certifies first-impact harm of at most {MOST_VEHICLES} vehicles"
-            " without an obstacle; robust corners takes every scenario"
-        )
+    if obstacle_ahead(possible).any():
+        raise _refusal("an obstacle ahead")
     numbers = np.concatenate(
         [v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, possible.speeds_mps, possible.gaps_m],
         axis=1,
@@ -98,19 +124,27 @@ def _constants(others: Mapping[int, Script], vehicle: int, command: Floats) -> F
         kind = name.split(":")[0]
         if i == vehicle or kind == "full_brake":
             continue
-        same = bool((command[:, :, i] == command[:, :1, i]).all())
-        if kind not in SCRIPTS or not same:
-            why = (
-                "whose command is another one in each world of the box"
-                if kind in SCRIPTS
-                else "which it cannot enclose"
-            )
+        if not (command[:, :, i] == command[:, :1, i]).all():
             raise InvalidInput(
-                f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, {why}; full_brake, coast and"
-                " constant:A are possible, A being at most every capacity of the box"
+                f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, whose command is another one in each"
+                " world of the box; full_brake, coast and constant:A are possible, A being at most every capacity of"
+                " the box"
             )
         constant[:, i] = command[:, 0, i]
     return constant
+
+
+def expects(boxes: Boxes | None, running: Running, seen: Floats) -> Bools:
+    """Where what is seen now [n, columns] may be, as far as is known, [n].
+
+    Where the own latency of a box is uncertain a decision falls at another time in each of its worlds. No range of the
+    corners holds them then: any finite numbers may be.
+    """
+    expected = as_predicted(running, seen)
+    if boxes is not None:
+        own = 2 * boxes.limit.shape[1] + boxes.vehicle
+        expected |= (boxes.high[:, own] > boxes.low[:, own]) & np.isfinite(seen).all(axis=1)
+    return expected
 
 
 def bounds_at_alert(boxes: Boxes, plans: Floats, harm: Floats) -> Floats:
@@ -155,8 +189,9 @@ def certify_inside(
     """
     if boxes is None:
         return decision
-    plan, bound = decision.backup.plan.copy(), decision.bound.copy()
-    changed = np.flatnonzero(asked & (plan != held.plan).any(axis=1))
+    plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)
+    bound = np.where(asked & ~other, held.harm, decision.bound)  # of the corners alone, where the plan is the same
+    changed = np.flatnonzero(asked & other)
     found = bound_plans(boxes.take(changed), plan[changed], budget[changed], CELLS, only_enough=True)
     least = np.where(decision.intervened, held.harm, budget)[changed]
     good = found <= least

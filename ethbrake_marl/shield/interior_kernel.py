@@ -12,7 +12,18 @@ from ethbrake_marl.physics.compiled import compiled_apart
 from ethbrake_marl.shield.enclosure import most_harm
 from ethbrake_marl.shield.enclosure_impact import Stack, new_stack
 from ethbrake_marl.shield.enclosure_motion import Cell, Motion, new_motion
-from ethbrake_marl.shield.forms import add, difference, high, low, negative, product, radius, reciprocal, square
+from ethbrake_marl.shield.enclosure_rough import rough_at_alert
+from ethbrake_marl.shield.forms import (
+    add,
+    difference,
+    high,
+    low,
+    negative,
+    positive_part,
+    product,
+    reciprocal,
+    square,
+)
 
 # groups of the numbers of a box, N of each but P gaps
 BRAKING, DRIVING, LATENCY, MASS, SPEED, GAP = range(6)
@@ -46,8 +57,8 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
 
 
 @compiled_apart
-def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, bool]:
-    """The cell of a box [Q]; False where an impact may come before the first piece of time.
+def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
+    """The cell of a box [Q], its worlds at the alert, and how long after it the first piece of time begins (s).
 
     The first decision falls at another time in each world where the shielded vehicle's latency is uncertain: time is
     counted from it, and the first piece begins as long before it as the earliest one comes after the alert.
@@ -57,9 +68,10 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
     speed, gap, brake, onset = np.empty((N, W)), np.empty((P, W)), np.empty((N, W)), np.empty((N, W))
     share = np.empty((P, 2, W))
     first = form_of(low_, high_, LATENCY * N + v, free)
-    if high(first) <= known.begin_s:
-        first[:] = 0.0
-        first[0] = known.begin_s
+    first[0] -= known.begin_s
+    first = positive_part(first)
+    earliest = known.begin_s + max(low(first), 0.0)
+    first[0] += known.begin_s
     for i in range(N):
         speed[i] = form_of(low_, high_, SPEED * N + i, free)
         brake[i] = form_of(low_, high_, BRAKING * N + i, free)
@@ -74,39 +86,38 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
         share[p, 1, 0] += 1.0
         share[p, 1, -1] = share[p, 0, -1]
     drive = form_of(low_, high_, DRIVING * N + v, free)
-    earliest = max(low(first), known.begin_s)
     times, action = pieces(known, onset, earliest, plan)
     cell = Cell(
         speed, gap, brake, drive, share, onset, known.constant, known.limit, v, known.restitution, times, action
     )  # fmt: skip
-    late = first.copy()
-    late[0] -= earliest
-    return cell, wait(cell, known, late)
+    first[0] -= earliest
+    return cell, first
 
 
 @compiled_apart
-def wait(cell: Cell, known: Known, late: Floats) -> bool:
-    """Move a cell's worlds on by ``late`` (s), each by its own; False where a pair may meet until then."""
+def wait(cell: Cell, late: Floats) -> bool:
+    """Move a cell's worlds on by ``late`` (s), each by its own; False where that may not be all that happens."""
     if high(late) <= 1e-12:
         return True
     if low(late) < -1e-12:
         return False
-    N, slowest = cell.speed.shape[0], np.empty(cell.speed.shape[0])
+    N = cell.speed.shape[0]
+    slowest, way = np.empty(N), np.empty_like(cell.speed)
     for i in range(N):
         pull, certain = early_pull(cell, i, late)
-        way = product(cell.speed[i], late)
-        add(way, 0.5, product(pull, square(late)))
+        begin = cell.speed[i].copy()
+        way[i] = product(begin, late)
+        add(way[i], 0.5, product(pull, square(late)))
         add(cell.speed[i], 1.0, product(pull, late))
-        slowest[i] = low(cell.speed[i])
-        if slowest[i] < 0.0 or not certain:
+        slowest[i], fastest = min(low(begin), low(cell.speed[i])), max(high(begin), high(cell.speed[i]))
+        limited = high(pull) > 0.0 and fastest >= cell.limit[i]
+        if not certain or limited or slowest[i] < 0.0:
             return False
-        if i > 0:
-            closing = max(high(cell.speed[i]) - slowest[i - 1], 0.0)
-            if low(cell.gap[i - 1]) <= (closing + radius(pull) + abs(pull[0])) * high(late):
-                return False
-            add(cell.gap[i - 1], -1.0, way)
-        if i < N - 1:
-            add(cell.gap[i], 1.0, way)
+        if i > 0 and low(cell.gap[i - 1]) <= max(fastest - slowest[i - 1], 0.0) * high(late) + 1e-9:
+            return False
+    for p in range(N - 1):
+        add(cell.gap[p], 1.0, way[p])
+        add(cell.gap[p], -1.0, way[p + 1])
     return True
 
 
@@ -163,10 +174,15 @@ def bound_of(
     most: float,
 ) -> float:  # fmt: skip
     """Upper bound on the harm of a plan over one box, unless it is above ``most``."""
-    cell, good = cell_of(low_, high_, free, known, plan)
-    if not good:
-        return math.inf
-    return most_harm(cell, stack, motion, out, most)
+    cell, late = cell_of(low_, high_, free, known, plan)
+    rough = rough_at_alert(cell, late)
+    if wait(cell, late):
+        harm = most_harm(cell, stack, motion, out, most)
+        if harm <= rough:
+            return harm
+    out[:] = 0.0
+    out[0] = rough
+    return rough
 
 
 @compiled_apart
@@ -190,8 +206,8 @@ def bound_box(
         if bounds[at] <= enough:
             break
         share = (highs[at] - lows[at])[free] / (high_ - low_)[free]
-        weight = share if bounds[at] == math.inf else np.abs(slopes[at, 1:-1])
-        which = free[int(np.argmax(weight))]
+        weight = np.abs(slopes[at, 1:-1])
+        which = free[int(np.argmax(weight if weight.max() > 0.0 else share))]
         middle = 0.5 * (lows[at, which] + highs[at, which])
         lows[size], highs[size] = lows[at], highs[at]
         highs[at, which], lows[size, which] = middle, middle

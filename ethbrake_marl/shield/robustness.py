@@ -15,6 +15,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shield.agents import StepShieldAgent
+from ethbrake_marl.shield.interior import CORNERS, checked_robust
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 WIDTHS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of a curve, in units of the intervals that are given
@@ -46,15 +47,18 @@ def robustness(
     *,
     widths: Sequence[float] = WIDTHS,
     seed: int = 0,
+    robust: str = CORNERS,
     on_progress: Progress | None = None,
 ) -> list[RobustnessPoint]:
     """Both shields around ``policy`` in every kind of truth at each width; ``worlds`` is what the shields are told.
 
     The engine runs the truth, and the policy sees it; the shields begin with what they are told and see what happens.
-    The numbers that place a truth in its box are those of ``seed``, the same for all widths. A world that cannot be
-    advanced in one of the cases is left out of all, and named in ``left_out``. Raises ``InvalidInput`` for no width or
-    a negative one, ``PhysicsError`` where no world is left, and what ``StepShieldAgent`` raises.
+    The numbers that place a truth in its box are those of ``seed``, the same for all widths. ``robust`` says what the
+    robust shield certifies of a box, as in ``ShieldOptions``. A world that cannot be advanced in one of the cases is
+    left out of all, and named in ``left_out``. Raises ``InvalidInput`` for no width or a negative one, ``UnknownName``
+    for another ``robust``, ``PhysicsError`` where no world is left, and what ``StepShieldAgent`` raises.
     """
+    checked_robust(robust, "robustness")
     if not widths or not all(0.0 <= width < np.inf for width in widths):
         raise InvalidInput(f"robustness: widths {tuple(widths)}: at least one is needed, each at least 0")
     try:
@@ -72,6 +76,7 @@ def robustness(
                 shielded = StepShieldAgent(
                     copy.deepcopy(policy), task.scenario, harm_count=task.harm_count, believed=told,
                     uncertainty=intervals if mode == "robust" else None,
+                    robust=robust if mode == "robust" else CORNERS,
                 )  # fmt: skip
                 driven = worlds
                 if key[1] != "as told":  # drawn for all worlds: a truth does not depend on which of them are left out

@@ -23,7 +23,6 @@ from ethbrake_marl.shield import interior
 from ethbrake_marl.shield.alert import CAPS, Cap, Settings, Start, start_of
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify, from_now, plan_harm
 from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE
-from ethbrake_marl.shield.comparison import as_predicted
 from ethbrake_marl.shield.interventions import Intervention, interventions, write_down
 from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, merged, put
 from ethbrake_marl.shield.settings import check_amount, check_scenario, checked_vehicles, policies_of
@@ -69,7 +68,7 @@ class StepShield:
     fallback ``best constant`` drives: the better one of the plan's rest and the constants, chosen again after every
     surprise. With an ``uncertainty`` (robust mode) all of this holds for the worst member of each world, and what is
     seen must lie within the range of their predictions. Raises ``InvalidInput`` for an unknown count or vehicle, a
-    negative allowance, or others whose commands are not fixed.
+    negative allowance, others whose commands are not fixed, or what ``robust`` interior cannot certify.
     """
 
     fallback = "best constant"
@@ -114,6 +113,7 @@ class StepShield:
         self.baseline_shares: Floats = np.zeros((0, 0))  # [n, N] what each vehicle bears under the best constants
         scripts = script_agents(scenario, except_for=self.vehicles) if others is None else others
         self._others = {i: script for i, script in scripts.items() if i not in self.vehicles}
+        interior.check_possible(self.robust, scenario, harm_count, self._others)
         self._width = int(number_of_decisions(np.zeros(1), scenario.time_step_s, scenario.horizon_s)[0]) + 1
 
     @property
@@ -241,7 +241,7 @@ class StepShield:
         """Find the worlds that did not do what was predicted, and choose anew there from what is seen."""
         assert self.running is not None
         running, columns = self.running, seen.shape[1]
-        surprising = asked & ~as_predicted(running, seen)
+        surprising = asked & ~interior.expects(self.boxes, running, seen)
         if not surprising.any():
             return
         self.distrusted = self.distrusted | surprising

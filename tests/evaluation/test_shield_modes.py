@@ -11,7 +11,12 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.evaluation.shield_modes import ModeRow, compare_behind_shields, compare_modes, modes_tables
+from ethbrake_marl.evaluation.shield_modes import (
+    ModeRow,
+    compare_behind_shields,
+    compare_modes,
+    modes_tables,
+)
 from ethbrake_marl.evaluation.statistics import paired_difference
 from ethbrake_marl.figures.shield import shield_modes_figure
 from ethbrake_marl.pages.evidence import ShieldEvidence, shield_section
@@ -84,6 +89,12 @@ def test_worlds_that_cannot_be_advanced__are_out_for_all_modes_and_named(
     assert found[0].to_json()["left_out"][1]["world"] == 40 and rows[0].to_json()["left_out"] == []
     with pytest.raises(PhysicsError):
         compare_modes(agents, plant(WORLDS, list(range(60))), task)
+
+
+@pytest.mark.parametrize("spec", ["full_brake+robust", "full_brake+robust:interior"])
+def test_behind_shields__those_that_do_not_know_the_world_are_left_out(spec: str) -> None:
+    agent = make_agent(spec, scenario=PAPER, uncertainty="gaps_m=0.5")
+    assert compare_behind_shields({spec: agent}, WORLDS, Task(PAPER, (1,))) == []
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Thirty bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
+"""Thirty-six bugs that a shield could have: each, planted in a copy of the repository, must turn some test red.
 
 ``make shield-bugs`` (or ``python -m tests.shield.planted_bugs [--only WORD]``). A bug is a textual patch of the shield,
 applied to a temporary copy. There ``test_certify``, ``test_step_shield`` and some other tests run with
@@ -13,7 +13,15 @@ import sys
 from tests.programme.planting import Patch, try_bugs
 
 BY_HAND = "test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner"
-FORMS_TEST = "tests/shield/test_interior.py::test_forms__enclose_what_they_stand_for"
+OF_BOXES = tuple(
+    f"tests/shield/test_interior.py::test_{name}"
+    for name in (
+        "forms__enclose_what_they_stand_for",
+        "states__of_every_world_are_those_of_some_path",
+        "by_hand__an_impact_before_the_first_decision_is_not_waited_for",
+        "bound__is_never_above_what_speeds_allow",
+    )
+)
 OF_TEAMS = tuple(
     f"tests/shield/test_joint.py::test_{name}"
     for name in (
@@ -27,19 +35,23 @@ OF_TEAMS = tuple(
 )
 QUICK = (
     "tests/shield/test_certify.py", "tests/shield/test_step_shield.py", f"tests/shield/test_robust.py::{BY_HAND}",
-    *OF_TEAMS, FORMS_TEST,
+    *OF_TEAMS, *OF_BOXES,
 )  # fmt: skip
 WHOLE = tuple(
     f"tests/shield/test_{name}.py"
     for name in ("joint", "engine_shield", "step", "rollouts", "interfaces", "interference", "interior")
 )
-KERNEL, MEMBERS, CERTIFY, ALERT, GUARD, ROLLOUTS, ATTACHED, COMPARISON, TEAM, FORMS, INSIDE = (
+KERNEL, MEMBERS, CERTIFY, ALERT, GUARD, ROLLOUTS, ATTACHED, COMPARISON, TEAM = (
     f"ethbrake_marl/shield/{name}.py"
     for name in (
         "certify_kernel", "members", "certify", "alert", "step_shield", "rollouts", "engine_shield", "comparison",
-        "team_agent", "forms", "interior",
+        "team_agent",
     )
 )  # fmt: skip
+FORMS, INSIDE, WAIT, MOTION, TOUCH, ROUGH = (
+    f"ethbrake_marl/shield/{name}.py"
+    for name in ("forms", "interior", "interior_kernel", "enclosure_motion", "enclosure_touch", "enclosure_rough")
+)
 
 BUGS: dict[str, tuple[Patch, ...]] = {
     "pairwise bound used as if it were coupled": (
@@ -145,7 +157,11 @@ BUGS: dict[str, tuple[Patch, ...]] = {
         Patch(ATTACHED, "if sent is None or sent.memory is not memory:", "if sent is None:"),
     ),
     "what a step led to is not compared": (
-        Patch(ATTACHED, "wanted & ~as_predicted(running, seen)", "wanted & (seen != seen).all(axis=1)"),
+        Patch(
+            ATTACHED,
+            "wanted & ~expects(sent.certified.after.boxes, running, seen)",
+            "wanted & (seen != seen).all(axis=1)",
+        ),
     ),
     "a step that was not made is not noticed": (
         Patch(ATTACHED, "if self.engine.steps_made != self.sent.steps_made + 1:", "if self.engine.steps_made < 0:"),
@@ -208,6 +224,22 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "a square root is taken for its chord": (Patch(FORMS, "error = 0.5 * (0.25 / slope - start)", "error = 0.0"),),
     "a plan without a certificate inside the box is held": (
         Patch(INSIDE, "good = found <= least", "good = found <= np.inf"),
+    ),
+    "a plan that is kept is told the harm of its corners": (
+        Patch(INSIDE, "np.where(asked & ~other, held.harm, decision.bound)", "decision.bound.copy()"),
+    ),
+    "an impact before the first decision is passed over in a box": (
+        Patch(WAIT, "max(fastest - slowest[i - 1], 0.0) * high(late) + 1e-9", "-1.0"),
+    ),
+    "in a box no speed limit ends a drive": (Patch(MOTION, "if fastest > cell.limit[i]:", "if fastest > math.inf:"),),
+    "a gap in contact stays as wide as it was": (
+        Patch(TOUCH, "touch[WIDE] = max(wide, min(height, wide + fastest * length))", "touch[WIDE] = wide"),
+    ),
+    "what no path follows does no harm": (
+        Patch(ROUGH, "return high(path.forms[-1]) + rough_rest(", "return high(path.forms[-1]) + 0.0 * rough_rest("),
+    ),
+    "with an uncertain own latency worlds of the box are distrusted": (
+        Patch(INSIDE, "expected |= (boxes.high[:, own] > boxes.low[:, own])", "expected |= (boxes.high[:, own] < 0.0)"),
     ),
     "a surprise is not flagged": (Patch(GUARD, "if not surprising.any():", "if surprising.any() or True:"),),
 }

@@ -6,7 +6,7 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.figures.shield import robustness_figure, robustness_table
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.scenario.task import Task
@@ -52,6 +52,21 @@ def test_step__breaks_its_bound_where_the_truth_differs_and_robust_pays_for_keep
     assert found["robust", "corner"].distrusted == found["robust", "inside"].distrusted == 0.0
     assert found["robust", "as told"].bound > told.bound + 1.0
     assert found["robust", "as told"].harm > told.harm
+
+
+def test_interior__keeps_its_bound_inside_and_is_refused_for_what_it_cannot_certify():
+    found = of(
+        robustness(
+            WORLDS.take([3, 4]), make_agent("full_brake"), TASK, parse_uncertainty("gaps_m.pair_1=0.5"), widths=(1.0,),
+            robust="interior",
+        ),
+        1.0,
+    )  # fmt: skip
+    assert found["robust", "inside"].above == found["robust", "corner"].above == 0.0
+    with pytest.raises(UnknownName, match="corners"):
+        robustness(WORLDS, make_agent("full_brake"), TASK, INTERVALS, robust="edges")
+    with pytest.raises(InvalidInput, match="total harm"):
+        robustness(WORLDS, make_agent("full_brake"), Task(SCENARIO, (1,), "total"), INTERVALS, robust="interior")
 
 
 def test_same_case__is_driven_once(monkeypatch):
