@@ -213,9 +213,7 @@ PICTURES: dict[str, How] = {
     "shield-robustness.png": _by(
         SEARCH, "ethbrake picture robustness --agent ppo@shipped --episodes 300 --output shield-robustness.png"
     ),
-    "price-of-not-knowing.png": _by(
-        SEARCH, "ethbrake picture price --episodes 1000 --output price-of-not-knowing.png"
-    ),
+    "price-of-not-knowing.png": _by(SEARCH, "ethbrake picture price --episodes 1000 --output price-of-not-knowing.png"),
     "shield-operating.png": _by(TRAINING),
     "shield-modes.png": _by(TRAINING),
     "regimes.png": _by(NIGHTLY, "the program on its page"),
