@@ -106,6 +106,7 @@ TABLES: dict[str, How] = {
     "| what | first-impact harm | of the best known": TRAINED,
     "| training seed | default, tuning": TRAINED,
     "| what the vehicles do | first-impact harm": TRAINED,
+    "| list | above B, interior": _by(SEARCH, "make test-shield"),
     "| channel | `": _by(SEARCH, "ethbrake picture price --episodes 1000 --output price-of-not-knowing.png"),
     "| level | who proposes | alone": _by(SEARCH),
     "| robust mode | worlds | above": _by(SEARCH, "make test-shield"),
