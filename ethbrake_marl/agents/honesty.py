@@ -102,11 +102,13 @@ def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> 
     beside = [pair for pair in (vehicle - 1, vehicle) if 0 <= pair < N - 1]
     hit[:, beside] &= unknown[:, far[beside]]  # an own impact with somebody who is known is felt
     gaps = other(worlds.gaps_m, 2.0, 15.0, stale[:, far])
+    hidden = unknown[:, 0] & np.isfinite(worlds.obstacle_gap_m)
     return replace(
         worlds,
         vehicles=changed,
         messages=_alter_messages(worlds, vehicle, rng),
         gaps_m=gaps,
+        obstacle_gap_m=other(worlds.obstacle_gap_m, 5.0, 80.0, hidden),
         speeds_mps=other(worlds.speeds_mps, 5.0, 30.0, stale),
         command_mps2=other(worlds.command_mps2, -6.0, 6.0, stale),
         pair_hit=worlds.pair_hit ^ (hit & (now > 0.0)),  # at the alert nobody has hit anything

@@ -185,6 +185,16 @@ def test_own_sensors_and_messages__what_was_not_received_changes_no_action(spec,
     assert changed_decisions(agent_of(spec, scenario), scenario, n=n) == 0
 
 
+@pytest.mark.parametrize("channel", ["blocked", {"preset": "blocked", "persistence": "periodic"}], ids=str)
+@pytest.mark.parametrize(
+    "spec", ["ppo@shipped/ppo-paper-random-obstacle", "e_v2x_bm:believed", "coast+robust:believed"]
+)
+def test_own_sensors_and_messages__nor_where_an_obstacle_is_that_was_not_received(spec, channel):
+    scenario = load_scenario("cooperation-4-all").with_learners(["vehicle_2"]).replace(v2x=channel)
+    assert changed_decisions(agent_of(spec, scenario), scenario, n=20) == 0
+    assert changed_decisions(agent_of("gentlest_front", scenario), scenario, n=20) > 0
+
+
 @pytest.mark.parametrize("channel", HIDING, ids=str)
 def test_channels__hide_something_to_be_altered(channel):
     worlds = BLOCKED.replace(v2x=channel).sample(60, 11).worlds

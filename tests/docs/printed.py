@@ -106,7 +106,8 @@ TABLES: dict[str, How] = {
     "| what | first-impact harm | of the best known": TRAINED,
     "| training seed | default, tuning": TRAINED,
     "| what the vehicles do | first-impact harm": TRAINED,
-    "| channel | `full_brake` | `ppo@shipped/ppo`": _by(SEARCH),
+    "| list | above B, interior": _by(SEARCH, "make test-shield"),
+    "| channel | `": _by(SEARCH, "ethbrake picture price --episodes 1000 --output price-of-not-knowing.png"),
     "| level | who proposes | alone": _by(SEARCH),
     "| robust mode | worlds | above": _by(SEARCH, "make test-shield"),
     "| intervals | mode | above": _by(SEARCH, "make test-shield"),
@@ -215,7 +216,7 @@ PICTURES: dict[str, How] = {
     "shield-robustness.png": _by(
         SEARCH, "ethbrake picture robustness --agent ppo@shipped --episodes 300 --output shield-robustness.png"
     ),
-    "price-of-not-knowing.png": _by(SEARCH),
+    "price-of-not-knowing.png": _by(SEARCH, "ethbrake picture price --episodes 1000 --output price-of-not-knowing.png"),
     "shield-operating.png": _by(TRAINING),
     "shield-modes.png": _by(TRAINING),
     "regimes.png": _by(NIGHTLY, "the program on its page"),

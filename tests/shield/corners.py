@@ -1,4 +1,4 @@
-"""Worlds that are corners of what a vehicle does not know, and attacks on ``+robust:believed`` in them.
+"""Worlds that are corners of what a vehicle does not know, or inside, and attacks on ``+robust:believed`` in them.
 
 Every quantity of another vehicle that is open is one of two numbers, so each world of these lists is a member of what
 is certified at its first decision. None of the numbers are round: in a world of equal gaps and equal speeds two impacts
@@ -29,6 +29,16 @@ HEARD_LATE = NEVER_HEARD.replace(  # a while after the first decision, by messag
     latency_s=[0.0, 0.2, 0.6],
 )
 LISTS = {"never heard": NEVER_HEARD, "heard late": HEARD_LATE}
+_INSIDE = {
+    "gaps_m": [{"uniform": [5.13, 9.71]}, {"uniform": [5.37, 9.58]}],
+    "speeds_mps": [{"uniform": [18.23, 21.87]}, {"uniform": [18.11, 21.93]}, {"uniform": [18.41, 22.19]}],
+    "mass_t": [4.5, 5.5, {"uniform": [3.0, 9.0]}],
+}
+INSIDE = {  # the same ranges, and worlds from between the corners
+    **{name: scenario.replace(**_INSIDE) for name, scenario in LISTS.items()},
+    "blocked": NEVER_HEARD.replace(**_INSIDE, v2x={"preset": "blocked", "persistence": "periodic"}),
+    "sensors-only": NEVER_HEARD.replace(**_INSIDE, v2x="sensors-only"),
+}
 
 
 class Hostile:
@@ -58,6 +68,22 @@ def shielded(
     agent = BelievedShieldAgent(Hostile(way, seed), scenario, robust=robust)
     harm = drive(scenario.sample(n, seed).worlds, agent, scenario, 1).ledger.world_harm("first")
     return harm, agent.predicted_harm, int(agent.interventions.sum())
+
+
+def ranges_gate(worlds: int, seed: int) -> bool:
+    """Wherever in the ranges the world is, no harm is above the first bound of ``+robust:interior:believed``."""
+    good, each = True, max(1, worlds // (len(INSIDE) * len(WAYS)))
+    for name, scenario in INSIDE.items():
+        for way in WAYS:
+            harm, bound, replaced = shielded(way, scenario, each, seed, robust="interior")
+            above, kept = int((harm > bound + ABOVE).sum()), np.isfinite(bound)
+            good = good and above == 0 and replaced > 0
+            print(
+                f"  inside, {name:12s} {way:7s} {each:7,} worlds {replaced:9,} replaced  above the bound: {above},"
+                f" without one: {int((~kept).sum())}; harm {harm.mean():.1f}, bound {bound[kept].mean():.1f}",
+                flush=True,
+            )
+    return good
 
 
 def corners_gate(worlds: int, seed: int) -> bool:

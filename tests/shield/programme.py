@@ -40,7 +40,7 @@ from ethbrake_marl.shield import StepShieldAgent
 from ethbrake_marl.shield.certify import certify
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
-from tests.shield.corners import corners_gate
+from tests.shield.corners import corners_gate, ranges_gate
 from tests.shield.inside import inside_gate
 from tests.shield.interface_attack import INTERFACES
 from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
@@ -304,6 +304,7 @@ def main() -> int:
     parser.add_argument("--interface-worlds", type=int, default=10_000, help="through each interface")
     parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each interface")
     parser.add_argument("--corner-worlds", type=int, default=60_000, help="of the gate 'believed'")
+    parser.add_argument("--range-worlds", type=int, default=1_200, help="of that gate, from between the corners")
     parser.add_argument("--restarts", type=int, default=1_000, help="of the search")
     parser.add_argument("--intervals", default="gaps_m=0.5", help="of the gate 'inside'")
     parser.add_argument("--boxes", type=int, default=20, help="of that gate")
@@ -325,7 +326,7 @@ def main() -> int:
         "search": lambda: search_gate(given.restarts, given.seed),
         "interference": lambda: interference_gate(given.interfered, given.seed),
         "joint": lambda: run_chunks(list(joint_chunks(given.joint_worlds)), joint_chunk, given, code),
-        "believed": lambda: corners_gate(given.corner_worlds, given.seed),
+        "believed": lambda: corners_gate(given.corner_worlds, given.seed) & ranges_gate(given.range_worlds, given.seed),
         "interfaces": lambda: run_chunks(list(interface_chunks(given.interface_worlds)), interface_chunk, given, code),
         "bound": lambda: run_chunks(list(bound_chunks(given.worlds)), attack_chunk, given, code),
     }

@@ -11,8 +11,12 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.shield import interior
+from ethbrake_marl.shield.believed import BelievedShield
 from ethbrake_marl.shield.believed_agent import BelievedShieldAgent
-from tests.shield.corners import ABOVE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded
+from ethbrake_marl.shield.interior import Boxes, boxes_of
+from tests.shield import corners
+from tests.shield.corners import ABOVE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded
 
 BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
@@ -30,6 +34,33 @@ def test_robust__at_the_corners_no_world_is_above_the_first_bound(scenario: Scen
     harm, bound, replaced = shielded(way, scenario, 60, 7)
     assert (harm <= bound + ABOVE).all()
     assert replaced > 60
+
+
+@pytest.mark.parametrize(("name", "n"), [("never heard", 2), ("heard late", 12), ("sensors-only", 6)])
+def test_interior__between_the_corners_no_world_is_above_the_first_bound(name: str, n: int) -> None:
+    harm, bound, replaced = shielded("drive", INSIDE[name], n, 7, robust="interior")
+    assert np.isfinite(bound).any() and (harm <= bound + ABOVE).all() and replaced > 0
+    _, at_corners, _ = shielded("drive", INSIDE[name], n, 7)
+    assert (bound >= at_corners - 1e-4).all()
+
+
+def test_interior__a_box_that_is_the_middle_alone_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    def middle(*given: object) -> Boxes:
+        boxes = boxes_of(*given)
+        half = 0.5 * (boxes.low + boxes.high)
+        return boxes._replace(low=half, high=half)
+
+    monkeypatch.setattr(interior, "boxes_of", middle)
+    monkeypatch.setattr(BelievedShield, "_corners", lambda self, vehicle: [{}])
+    harm, bound, _ = shielded("coast", INSIDE["never heard"], 12, 7, robust="interior")
+    assert (harm > bound + 1.0).any()
+
+
+def test_gate__of_the_ranges_is_red_where_a_world_is_above(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(corners, "INSIDE", {"heard late": INSIDE["heard late"]})
+    assert corners.ranges_gate(6, 7)
+    monkeypatch.setattr(corners, "shielded", lambda *given, **more: (np.ones(1), np.zeros(1), 1))
+    assert not corners.ranges_gate(6, 7)
 
 
 def test_step__in_the_middle_promises_nothing_of_the_corners() -> None:
