@@ -112,7 +112,8 @@ def lower_bound(
     none = np.zeros(worlds.n, dtype=np.bool_)
     has_front = open_pair[:, vehicle - 1] if vehicle > 0 else none
     has_rear = open_pair[:, vehicle] if vehicle < worlds.N - 1 else none
-    unavoidable = has_front & has_rear & (verdict.reason >= 2)
+    struck = at_onset.obstacle_hit & (harm_count == "first")  # whoever is pushed there is not charged for it again
+    unavoidable = has_front & has_rear & (verdict.reason >= 2) & ~struck
     out = np.empty((worlds.n, BOUNDS))
     bound_worlds(onset_states(at_onset, vehicle, time_step_s), horizon_s - start, has_front, has_rear, unavoidable, out)
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))

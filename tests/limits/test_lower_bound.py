@@ -421,3 +421,14 @@ def test_decisions__leave_less_room_than_any_time():
 def test_bad_input__is_refused(call, message):
     with pytest.raises(InvalidInput, match=message):
         call(line([7, 7], [20, 18, 20], [6, 7, 6], latency=[0, 0.5, 0.8]))
+
+
+def test_lower_bound__an_obstacle_that_was_struck_is_not_charged_again():
+    """Of a state in mid-episode: the first impact on the obstacle is over, and what is pushed there again is free."""
+    worlds = load_scenario("paper-random-obstacle").sample(300, 7).worlds
+    again = replace(worlds, obstacle_hit=np.ones(worlds.n, np.bool_))
+    fresh = lower_bound(worlds, time_step_s=0.1)
+    struck, total = (lower_bound(again, time_step_s=0.1, harm_count=count) for count in ("first", "total"))
+    assert (fresh.combined > fresh.front_pair + fresh.rear_pair).sum() > 20
+    assert not struck.combined.any() and (struck.harm == struck.early + struck.front_pair + struck.rear_pair).all()
+    assert (total.harm == fresh.harm).all()
