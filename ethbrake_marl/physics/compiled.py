@@ -51,9 +51,12 @@ def cache_folder() -> Path:
 
 @cache
 def kernel_folder(source: Path) -> Path:
-    """Folder of the kernels of one file, below ``cache_folder``: another one after every edit that can change them."""
+    """Folder of the kernels of one file, below ``cache_folder``: another one after every edit that can change them.
+
+    Code that is in no file (a shell, a test) has one folder for all of it.
+    """
     digest = hashlib.sha256(numba.__version__.encode())
-    for needed in kernel_sources(source):
+    for needed in kernel_sources(source) if source.is_file() else ():
         digest.update(needed.read_bytes())
     return cache_folder() / digest.hexdigest()[:16]
 

@@ -159,6 +159,7 @@ class StepShieldAgent(AgentAround):
         believed: Worlds | None = None,
     ) -> None:
         check_agent(policy, "step")
+        check_scenario(scenario, "step")
         if not (believed is None or isinstance(believed, Worlds)):
             raise InvalidInput(f"step: believed = {believed!r}: must be worlds at the alert, or None")
         uncertainty = checked_uncertainty(uncertainty)

@@ -177,6 +177,10 @@ def test_kernel_folder__changes_with_what_its_kernels_are_made_of(copied, kernel
     assert (folder_of(copied, kernel) != before) == moves
 
 
+def test_kernel_folder__of_code_that_is_in_no_file_is_one_for_all():
+    assert kernel_folder(Path("<stdin>")) == kernel_folder(Path("nowhere.py")) != kernel_folder(Path(__file__))
+
+
 def test_kernel_folder__changes_with_numba(copied, monkeypatch):
     before = folder_of(copied, "physics/advance.py")
     monkeypatch.setattr(numba, "__version__", "0.0")
