@@ -59,8 +59,8 @@ class BelievedShield:
     decision ``predicted_harm`` [n] is the first bound; infinite where the vehicle had an impact before, whose harm
     nobody told it. ``robust`` says in which worlds it certifies: None in the middle of what is not known, ``corners``
     also in all corners of its range, and ``interior`` in all worlds of the box around them, once, at the first
-    decision. Raises ``InvalidInput`` for a mixture, and a scenario with more than ``MOST_CORNERS`` corners. ``others``
-    are scripts of the other vehicles, by index; None: those of the scenario.
+    decision. Raises ``InvalidInput`` for a mixture, a scenario with more than ``MOST_CORNERS`` corners, and what
+    interior mode cannot certify. ``others`` are scripts of the other vehicles, by index; None: those of the scenario.
     """
 
     def __init__(
@@ -87,6 +87,12 @@ class BelievedShield:
         self._impact_s: Floats = np.zeros((0, 0))  # [n, N] last time at which an impact of this vehicle was foretold
         self._ranges: tuple[int, Ranges] | None = None
         self._ranges_of(scenario.learners[0] if scenario.learners else 0)
+        if len(scenario.learners) == 1:
+            self._make(scenario.learners[0])  # refuses at once what interior mode cannot certify
+
+    def _make(self, vehicle: int) -> StepShield:
+        certain = self.robust or CORNERS
+        return StepShield(self.scenario, vehicle, harm_count=self._harm_count, others=self._others, robust=certain)
 
     @property
     def members(self) -> int:
@@ -107,10 +113,7 @@ class BelievedShield:
         """Remember where these episodes start; nothing has been received yet."""
         self._ranges_of(vehicle)
         if len(rows) >= len(self._wanted) or self.shield is None or self.shield.vehicle != vehicle:
-            certain = self.robust or CORNERS
-            self.shield = StepShield(
-                self.scenario, vehicle, harm_count=self._harm_count, others=self._others, robust=certain
-            )
+            self.shield = self._make(vehicle)
             self._odometer, self.interventions = Odometer(), np.zeros(0, np.int64)
             self.predicted_harm = self._asked_s = self._wanted = np.zeros(0)
             self._heard, self._impact_s, self._totals = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0, 0))

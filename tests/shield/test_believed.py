@@ -139,6 +139,13 @@ def test_believed__what_cannot_be_is_refused(spec: str, words: str) -> None:
         make_agent(spec, scenario=BASE)
 
 
+def test_interior__what_it_cannot_certify_is_refused_when_the_agent_is_made() -> None:
+    with pytest.raises(InvalidInput, match="robust interior: total harm"):
+        make_agent("coast+robust:interior:believed", scenario=BASE, harm_count="total")
+    with pytest.raises(InvalidInput, match="robust interior: an obstacle ahead"):
+        make_agent("coast+robust:interior:believed", scenario=BASE.replace(obstacle_gap_m=60.0))
+
+
 def test_believed__bounds_nothing_where_its_vehicle_had_an_impact_before_the_first_decision() -> None:
     late = BASE.replace(latency_s=[0.0, 1.2, 0.5])
     for spec in ("coast+step:believed", "coast+robust:believed"):
