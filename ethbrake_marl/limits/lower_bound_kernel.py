@@ -39,6 +39,7 @@ from ethbrake_marl.physics.worlds import Bools, Floats
 FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
 LARGE = 1e6  # m2/s2: more harm than any impact of vehicles does
 _TOUCH_HARM = 2.0 * TOUCH_SPEED_MPS * TOUCH_SPEED_MPS  # what two touches may hide
+_TOUCHING_M = 1e-9  # more than rounding leaves between two that touch
 _HALVINGS = 60
 _GRAZE_S = 1e-3  # more than rounding can move a graze
 _PARTS = 8  # into which the times of soft meetings are divided
@@ -108,6 +109,8 @@ def front_first(
     can be met as late as that.
     """
     first = meet_front(at, math.inf, plan, other)
+    if first == math.inf and at[GAP_L] <= _TOUCHING_M:  # it stands at the leader, and stays: both are struck at once
+        return min(best, rear_bound(at, plan, other)[0])
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
         return best
     touches = spare_gap(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F]) >= 0.0

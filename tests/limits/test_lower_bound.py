@@ -432,3 +432,20 @@ def test_lower_bound__an_obstacle_that_was_struck_is_not_charged_again():
     assert (fresh.combined > fresh.front_pair + fresh.rear_pair).sum() > 20
     assert not struck.combined.any() and (struck.harm == struck.early + struck.front_pair + struck.rear_pair).all()
     assert (total.harm == fresh.harm).all()
+
+
+@pytest.mark.parametrize("time_step_s", [None, 0.1])
+@pytest.mark.parametrize("mass_t", [[1.0, 1.0, 1.0], [4.5, 5.5, 5.9], [50.0, 1.0, 1.0]])
+@pytest.mark.parametrize("restitution", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("drive_mps2", [0.0, 1e-9, 3.0])
+def test_lower_bound__who_stands_at_the_leader_is_struck_together_with_it(time_step_s, mass_t, restitution, drive_mps2):
+    """One impact of all three: the front pair closes at 0 in it, and no second one follows."""
+    worlds = make_worlds(
+        [[0.0, 20.0]], [[0.0, 0.0, 20.0]], braking_capacity_mps2=6.0, driving_capacity_mps2=drive_mps2,
+        latency_s=0.0, mass_t=mass_t, restitution=restitution,
+    )  # fmt: skip
+    bound = lower_bound(worlds, horizon_s=60.0, time_step_s=time_step_s)
+    still = np.zeros((1, 3))
+    _, ledger = play_profile(worlds, 1, still, still)
+    assert ledger.world_harm("first")[0] == pytest.approx(20.0**2 - 2 * 6 * 20)
+    assert 0.0 < bound.harm[0] <= ledger.world_harm("first")[0]
