@@ -19,7 +19,7 @@ from ethbrake_marl.scenario import Scenario
 
 
 def changed_decisions(
-    agent: Agent, scenario: Scenario, *, vehicle: int | None = None, n: int = 40, decisions: int = 8, seed: int = 11
+    agent: Agent, scenario: Scenario, *, vehicle: int | None = None, n: int = 100, decisions: int = 8, seed: int = 11
 ) -> int:
     """How many decisions change when all is altered that has not reached the vehicle by then: 0 for an honest agent.
 
@@ -30,8 +30,8 @@ def changed_decisions(
     Args:
         agent: any; it is left as it is.
         scenario: whose worlds.
-        vehicle: the driven one, from 0; None: the scenario's learner.
-        n: number of worlds.
+        vehicle: the driven one, from 0, beside which other learners brake fully; None: the scenario's learner.
+        n: number of worlds; more find rarer leaks.
         decisions: in each world.
         seed: of the list, and of the random numbers.
 
@@ -45,14 +45,17 @@ def changed_decisions(
 
     """
     check_agent(agent, "honesty")
+    if not isinstance(scenario, Scenario):
+        raise InvalidInput(f"honesty: scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")
     check_whole_number("honesty: n", n, 1)
     check_whole_number("honesty: decisions", decisions, 1)
+    check_whole_number("honesty: seed", seed, 0)
     if vehicle is None:
         learners = [scenario.vehicle_names[i] for i in scenario.learners]
         check_one_learner(scenario.name, learners, "honesty needs exactly one learner; or give the vehicle")
-        if not learners:
-            raise InvalidInput(f"honesty: no vehicle of scenario {scenario.name!r} learns; give the vehicle")
         vehicle = scenario.learners[0]
+    check_whole_number("honesty: vehicle", vehicle, 0, scenario.vehicles - 1)
+    scenario = scenario.with_learners([vehicle])
     rng, alert = np.random.default_rng(seed), scenario.sample(n, seed).worlds
     scripts = script_agents(scenario, except_for=vehicle)
     knowing, wondering = copy.deepcopy(agent), copy.deepcopy(agent)
@@ -88,6 +91,8 @@ def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> 
     latency = np.where(waits, np.maximum(own, now) + rng.uniform(0.01, 1.0, (n, N)), vehicles.latency_s)
     latency = np.where(unknown, rng.uniform(0.0, 2.0, (n, N)), latency)
     news = vehicles.known_from_s
+    heard = np.zeros(news.shape, np.bool_)  # by this vehicle: what others have heard it is not told
+    heard[:, vehicle] = ~unknown
     changed = replace(
         vehicles,
         braking_capacity_mps2=other(vehicles.braking_capacity_mps2, 3.0, 9.0, unknown),
@@ -96,7 +101,7 @@ def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> 
         speed_limit_mps=other(vehicles.speed_limit_mps, 30.0, 60.0, unknown),
         latency_s=latency,
         own_latency_s=other(own, 0.0, 2.0, unknown),
-        known_from_s=np.where(news > now[:, :, np.newaxis], news + rng.uniform(0.01, 1.0, news.shape), news),
+        known_from_s=np.where(heard | np.eye(N, dtype=np.bool_), news, _altered_news(now, news.shape, vehicle, rng)),
     )
     hit = stale[:, far]
     beside = [pair for pair in (vehicle - 1, vehicle) if 0 <= pair < N - 1]
@@ -113,6 +118,14 @@ def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> 
         command_mps2=other(worlds.command_mps2, -6.0, 6.0, stale),
         pair_hit=worlds.pair_hit ^ (hit & (now > 0.0)),  # at the alert nobody has hit anything
     )
+
+
+def _altered_news(now: Floats, shape: tuple[int, ...], vehicle: int, rng: np.random.Generator) -> Floats:
+    """When who is known of by whom, [n, N, N] s; often never. Of what this vehicle waits for, not before now."""
+    since = np.zeros((len(now), shape[1], 1))
+    since[:, vehicle] = now
+    never = rng.random(shape) < 0.25
+    return np.where(never, np.inf, since + rng.uniform(0.01, 2.0, shape))
 
 
 def _alter_messages(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> Floats:

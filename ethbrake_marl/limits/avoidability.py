@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.limits.avoidability_kernel import (
     DRIVE,
     FOLLOW,
@@ -99,6 +99,7 @@ def _check(worlds: Worlds, vehicle: int, scripts: Mapping[int, str]) -> None:
     An obstacle that Vehicle 1 cannot reach by braking fully changes nothing: only a push could bring it there, and that
     is an impact already.
     """
+    check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)
     own = np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
     way = stopping_distances(worlds.speeds_mps[:, 0], own, worlds.vehicles.braking_capacity_mps2[:, 0])
     _refuse(

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 
@@ -93,13 +94,7 @@ def lower_bound(
     Covers the same lines as ``avoidability``, and raises ``InvalidInput`` for others, for an unknown ``harm_count``, a
     time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
     """
-    check_harm_count(harm_count)
-    number = isinstance(time_step_s, (int, float)) and not isinstance(time_step_s, bool)
-    if time_step_s is not None and not (number and LEAST_TIME_STEP_S <= time_step_s < np.inf):
-        raise InvalidInput(
-            f"lower_bound: time_step_s {time_step_s!r}: must be a number of seconds from {LEAST_TIME_STEP_S:g} on, or"
-            " None"
-        )
+    check_asked("lower_bound", harm_count, horizon_s, time_step_s)
     verdict = avoidability(worlds, vehicle, scripts=scripts)
     start = np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
@@ -119,6 +114,21 @@ def lower_bound(
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
     early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)
+
+
+def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: object) -> None:
+    """Raise ``InvalidInput`` for an unknown count, a horizon that is no number, or a time step that cannot be."""
+    check_harm_count(harm_count)
+    if not _is_number(horizon_s):
+        raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be a number of seconds")
+    if time_step_s is not None and not (_is_number(time_step_s) and LEAST_TIME_STEP_S <= time_step_s < np.inf):  # type: ignore[operator]  # a number
+        raise InvalidInput(
+            f"{where}: time_step_s {time_step_s!r}: must be a number of seconds from {LEAST_TIME_STEP_S:g} on, or None"
+        )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def rounding(worlds: Worlds, vehicle: int) -> Floats:

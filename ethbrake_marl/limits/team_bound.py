@@ -12,15 +12,15 @@ Bounds of different pairs add up, as each holds for every joint command. All par
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HarmCount, check_harm_count, empty_ledger
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.harm import HarmCount, empty_ledger
 from ethbrake_marl.limits.front_three import Line, behind_wall, combined_bound
-from ethbrake_marl.limits.lower_bound import BOUND_EPS, EPS, LEAST_TIME_STEP_S
+from ethbrake_marl.limits.lower_bound import BOUND_EPS, EPS, check_asked
 from ethbrake_marl.limits.pair_kernel import (
     FOLLOWER_A,
     FOLLOWER_ONSET,
@@ -57,7 +57,7 @@ class TeamBound:
 
 def team_bound(
     worlds: Worlds,
-    vehicles: Sequence[int],
+    vehicles: Iterable[int],
     *,
     harm_count: HarmCount = "first",
     horizon_s: float = 8.0,
@@ -80,7 +80,8 @@ def team_bound(
     Raises ``InvalidInput`` for vehicles that are none, not there or given twice, another script, an unknown count, a
     time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before any of them may act.
     """
-    chosen = _checked(worlds, vehicles, harm_count, scripts or {}, time_step_s)
+    check_asked("team_bound", harm_count, horizon_s, time_step_s)
+    chosen = _checked(worlds, vehicles, scripts or {})
     latency = worlds.vehicles.latency_s
     start = np.maximum(latency[:, chosen].min(axis=1), worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
@@ -150,30 +151,20 @@ def _bound(at: Floats, columns: Mapping[int, Floats | float], until: Floats, cou
     return found
 
 
-def _checked(
-    worlds: Worlds,
-    vehicles: Sequence[int],
-    harm_count: HarmCount,
-    scripts: Mapping[int, str],
-    time_step_s: float | None,
-) -> Ints:
+def _checked(worlds: Worlds, vehicles: Iterable[int], scripts: Mapping[int, str]) -> Ints:
     """The controlled vehicles in order; refuse what the bound does not cover."""
-    check_harm_count(harm_count)
-    number = isinstance(time_step_s, (int, float)) and not isinstance(time_step_s, bool)
-    if time_step_s is not None and not (number and LEAST_TIME_STEP_S <= time_step_s < np.inf):
-        raise InvalidInput(
-            f"team_bound: time_step_s {time_step_s!r}: must be a number of seconds from {LEAST_TIME_STEP_S:g} on, or"
-            " None"
-        )
-    chosen = sorted(set(vehicles))
-    if not chosen or len(chosen) != len(vehicles) or not set(chosen) <= set(range(worlds.N)):
-        raise InvalidInput(
-            f"team_bound: vehicles {tuple(vehicles)}: at least one is needed, each once, from 0 to {worlds.N - 1}"
-        )
+    if not isinstance(vehicles, Iterable):
+        raise InvalidInput(f"team_bound: vehicles {vehicles!r}: must be a list of vehicles, for instance (1, 2)")
+    given = tuple(vehicles)
+    for vehicle in given:
+        check_whole_number("team_bound: a vehicle", vehicle, 0, worlds.N - 1)
+    if not given or len(set(given)) != len(given):
+        raise InvalidInput(f"team_bound: vehicles {given}: at least one is needed, each once")
     for index, script in scripts.items():
-        if index not in chosen and script != "full_brake":
+        check_whole_number("team_bound: a vehicle of scripts", index, 0, worlds.N - 1)
+        if index not in given and script != "full_brake":
             raise InvalidInput(f"team_bound: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
-    return np.array(chosen, np.int64)
+    return np.array(sorted(given), np.int64)
 
 
 def _rounding(worlds: Worlds, chosen: Ints) -> Floats:

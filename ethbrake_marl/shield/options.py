@@ -65,6 +65,9 @@ class ShieldOptions:
         mode = self.mode if self.mode is not None else "step" if self.uncertainty is None else "robust"
         if mode not in MODES:
             raise unknown_name("shield mode", mode, MODES)
+        for name in ("believed", "logging", "shares"):
+            if not isinstance(getattr(self, name), bool):
+                raise InvalidInput(f"{self.where}: {name} = {getattr(self, name)!r}: must be True or False")
         if self.believed:
             self._check_believed(mode)
         uncertainty = None if self.believed else mode_uncertainty(mode, self.uncertainty, self.where)
@@ -87,8 +90,6 @@ class ShieldOptions:
 
     def _check_believed(self, mode: str) -> None:
         """Raise ``InvalidInput`` for what a shield on what was received does not take."""
-        if self.believed is not True:
-            raise InvalidInput(f"{self.where}: believed = {self.believed!r}: must be True or False")
         if mode == "episode":
             raise InvalidInput(f"{self.where}: believed = True: mode episode takes none; step and robust do")
         without = {"uncertainty": None, "allowance": 0.0, "cap": None, "logging": False, "shares": False}

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents import believed
+from ethbrake_marl.agents import believed, make_agent
 from ethbrake_marl.agents.believed import told_to
 from ethbrake_marl.agents.honesty import changed_decisions
 from ethbrake_marl.agents.knowledge import Source, combine, knowledge_of, knowledge_text, sees_through
@@ -214,6 +214,38 @@ def test_own_sensors_and_messages__a_planted_leak_is_found():
     assert changed_decisions(Leaking(), BLOCKED) > 50
 
 
+class Guessing(Leaking):
+    """Decides on what others have heard, or on what it will never hear."""
+
+    def __init__(self, reads):
+        self.reads = reads
+
+    def act(self, worlds, vehicle):
+        known = worlds.vehicles.known_from_s
+        seen = known[:, 2, 0] <= worlds.time_s if self.reads == "others" else np.isinf(known[:, vehicle]).any(axis=1)
+        return np.where(seen, -1.0, -0.5) * worlds.vehicles.braking_capacity_mps2[:, vehicle]
+
+
+@pytest.mark.parametrize(("reads", "vehicle"), [("others", 1), ("never", 2)])
+def test_changed_decisions__finds_who_reads_what_others_heard_or_what_will_never_come(reads, vehicle):
+    assert changed_decisions(Guessing(reads), BLOCKED, vehicle=vehicle) > 10
+
+
+def test_changed_decisions__lets_other_learners_brake_fully_and_refuses_what_does_not_fit():
+    pair = load_scenario("cooperation-3-pair").replace(v2x="blocked")
+    assert [changed_decisions(make_agent("full_brake"), pair, vehicle=i) for i in (1, 2)] == [0, 0]
+    for wrong, words in (
+        ({"vehicle": 7}, r"honesty: vehicle = 7: must be a whole number in 0\.\.2"),
+        ({"vehicle": "vehicle_2"}, "honesty: vehicle = 'vehicle_2'"),
+        ({"seed": -1}, "honesty: seed = -1"),
+        ({}, "exactly one learner"),
+    ):
+        with pytest.raises(InvalidInput, match=words):
+            changed_decisions(make_agent("full_brake"), pair, **wrong)
+    with pytest.raises(InvalidInput, match="scenario = 'paper-random': must be a Scenario"):
+        changed_decisions(make_agent("full_brake"), "paper-random")
+
+
 @pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo@shipped/ppo+episode:believed"])
 @pytest.mark.parametrize("leak", ["known", "speed_mps"])
 def test_believed_model__a_planted_leak_is_found(spec, leak, monkeypatch):
@@ -225,7 +257,7 @@ def test_believed_model__a_planted_leak_is_found(spec, leak, monkeypatch):
 
     scenario = BLOCKED.replace(v2x={"preset": "blocked", "persistence": "periodic"})
     monkeypatch.setattr(believed, "told_to", leaking)
-    assert changed_decisions(agent_of(spec, scenario), scenario) > 0
+    assert changed_decisions(agent_of(spec, scenario), scenario, n=200) > 0
 
 
 @pytest.mark.parametrize("spec", [spec for spec in STATED if spec not in HONEST])

@@ -151,9 +151,15 @@ def test_bound__does_not_depend_on_the_batch_or_the_order_of_the_vehicles():
 @pytest.mark.parametrize(
     ("vehicles", "given", "told"),
     [
-        ((), {}, r"vehicles \(\): at least one is needed, each once, from 0 to 2"),
+        ((), {}, r"vehicles \(\): at least one is needed, each once"),
         ((1, 1), {}, r"vehicles \(1, 1\)"),
-        ((1, 3), {}, r"vehicles \(1, 3\)"),
+        ((1, 3), {}, r"a vehicle = 3: must be a whole number in 0\.\.2"),
+        (1, {}, "vehicles 1: must be a list of vehicles"),
+        ((1.0, 2.0), {}, "a vehicle = 1.0: must be a whole number"),
+        ((True,), {}, "a vehicle = True: must be a whole number"),
+        ("12", {}, "a vehicle = '1': must be a whole number"),
+        ((1, 2), {"horizon_s": "8"}, "horizon_s '8': must be a number of seconds"),
+        ((1, 2), {"scripts": {"vehicle_1": "coast"}}, "a vehicle of scripts = 'vehicle_1'"),
         ((1, 2), {"harm_count": "worst"}, "count 'worst'"),
         ((1, 2), {"time_step_s": 0.0}, "time_step_s 0.0: must be a number of seconds from 0.001 on"),
         ((1, 2), {"horizon_s": 0.2}, "horizon_s 0.2: must be finite and at least 0.5"),
