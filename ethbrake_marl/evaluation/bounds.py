@@ -21,7 +21,6 @@ from ethbrake_marl.limits.best_harm_table import BestHarmTable
 from ethbrake_marl.limits.limits import Unproven, prove, unproven_because
 from ethbrake_marl.limits.shipped import shipped_tables
 from ethbrake_marl.physics import Floats, Ints, Worlds, leaving_out_failed
-from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.scenario import Task, load_scenario
 
 
@@ -38,9 +37,9 @@ class Proven:
 def proven_of(worlds: Worlds, task: Task, first: Floats, total: Floats) -> Proven | None:
     """What is proven about worlds at the alert, ``first`` and ``total`` [n] being the least harms known; or None."""
     proof = prove(worlds, task)
-    if isinstance(proof, Unproven) or proof.harm is None:
+    if isinstance(proof, Unproven):
         return None
-    contact, impact = proof.contact, proof.harm > 0.0
+    contact, impact = proof.contact, proof.impact
     harm, impact_rate = float(proof.harm.mean()), float(impact.mean())
     if contact is None:
         return Proven(harm, None, impact_rate, None)
@@ -107,8 +106,6 @@ def bounds_of(table: BestHarmTable) -> ShippedBounds:
         float(table.best[harm_count].harm.mean()) if harm_count in table.best else None for harm_count in HARM_COUNTS
     )
     why = unproven_because(worlds, task)
-    if why is None and obstacle_ahead(worlds).any():
-        why = "an obstacle stands ahead; no least harm is proven"
     proven = None if why is not None else proven_of_table(worlds, task, table)
     return ShippedBounds(
         scenario.name,

@@ -137,8 +137,8 @@ def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
         regrets.first_impact_harm,
         regrets.total_harm,
         regrets.source,
-        np.full(n, None) if proof.impact is None else proof.impact.astype(int),
-        np.full(n, None) if proof.harm is None else proof.harm,
+        proof.impact.astype(int),
+        proof.harm,
         regrets.regret(outcome, "first"),
         regrets.regret(outcome, "total"),
     )

@@ -137,16 +137,16 @@ def distance(regrets: Regrets | None, outcome: Outcome, full_brake: Outcome | No
     reference = full_brake if bool(known.all()) else None
     return Distance(
         unavoidable_rate=None if avoidable is None else rate(int((~avoidable).sum()), worlds),
-        impact_proven_rate=None if certain is None else rate(int(certain.sum()), worlds),
+        impact_proven_rate=rate(int(certain.sum()), worlds),
         between=None
-        if certain is None or avoidable is None
+        if avoidable is None
         else between(~avoidable, certain, regrets.first_impact_harm, regrets.total_harm),
         avoidable_collision_rate=None if avoidable is None else rate(int((outcome.collided & avoidable).sum()), worlds),
         best_known_first=mean(regrets.first_impact_harm),
         best_known_total=mean(regrets.total_harm),
-        proven_harm=None if proven is None else mean(proven),
-        gap_first=None if proven is None else mean(regrets.first_impact_harm - proven),
-        gap_total=None if proven is None else mean(regrets.total_harm - proven),
+        proven_harm=mean(proven),
+        gap_first=mean(regrets.first_impact_harm - proven),
+        gap_total=mean(regrets.total_harm - proven),
         regret_first=mean(first),
         regret_total=mean(total),
         realised_first=relative_decrease(first, regrets.regret(reference, "first")) if reference else None,

@@ -160,11 +160,6 @@ def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
         impact = _bracket(percent_cell(found.impact_proven_rate, 1))
         text = f"In {impact} of these worlds no {_command_of(rows[0])} avoids an impact (proven)."
         text += _tell_proven(found, first, total)
-    elif found.proven_harm is None:
-        text += (
-            f" (proven). Best known harm: {first:.2f} first-impact, {total:.2f} total; with an obstacle ahead no least"
-            " harm is proven."
-        )
     else:
         impact = _bracket(percent_cell(found.impact_proven_rate, 1))
         text += f", in {impact} none avoids an impact (both proven).{_tell_gap(found.between)}"

@@ -2,8 +2,8 @@
 
 Three vehicles, Vehicle 2 driven, the others braking fully: for these it is proven world by world whether some command
 avoids all contact (``limits.avoidability``) and which harm no command undercuts (``limits.lower_bound``). The least
-harm known is the first proof's witness (harm 0), or the result of a search (``limits.best_harm``). An obstacle that
-Vehicle 1 does not reach by itself leaves the first proof as it is (only a push brings it there); the second knows none.
+harm known is the first proof's witness (harm 0), or the result of a search (``limits.best_harm``). Both proofs cover an
+obstacle that Vehicle 1 does not reach by itself: only a push brings it there.
 
 Several driven vehicles, and lines of more than three: which harm no joint command undercuts (``limits.team_bound``).
 Whether contact can be avoided is decided for Vehicles 2 and 3 of three, and not for other teams.
@@ -23,7 +23,6 @@ from ethbrake_marl.limits.shipped import best_known
 from ethbrake_marl.limits.team_bound import team_bound
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.physics.events import stopping_distances
-from ethbrake_marl.physics.obstacle import obstacle_ahead
 from ethbrake_marl.scenario import Task
 
 _VEHICLES, _DRIVEN = 3, 1
@@ -43,12 +42,13 @@ class Proof:
 
     avoidable: Bools | None  # some admissible command avoids all contact; None where that is not decided
     reason: NDArray[np.str_] | None  # why not: "early", "front" or "rear"; "" where avoidable
-    harm: Floats | None  # no command does less (m2/s2), under either count; None: not proven
+    harm: Floats  # no command does less (m2/s2), under either count
 
     @property
-    def impact(self) -> Bools | None:
-        """Worlds in which every command leads to an impact, not only to contact; None where no harm is proven."""
-        return None if self.harm is None else self.harm > 0.0
+    def impact(self) -> Bools:
+        """Worlds in which every command leads to an impact, not only to contact."""
+        certain: Bools = self.harm > 0.0
+        return certain
 
     @property
     def contact(self) -> Bools | None:
@@ -93,9 +93,6 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
             return Proof(None, None, harm)
         contact = avoidability(worlds, _DRIVEN)
         return Proof(contact.avoidable, contact.reason_name, harm)
-    if obstacle_ahead(worlds).any():
-        contact = avoidability(worlds, task.vehicle)
-        return Proof(contact.avoidable, contact.reason_name, None)
     bound = lower_bound(worlds, task.vehicle, horizon_s=horizon_s, time_step_s=time_step_s)
     return Proof(bound.contact.avoidable, bound.contact.reason_name, bound.harm)
 

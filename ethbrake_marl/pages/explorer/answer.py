@@ -93,7 +93,7 @@ class Explored:
         proof = prove(world, self.task)
         if isinstance(proof, Unproven):
             return {"avoidable": None, "why": shown(proof.because), "proven_harm": None}
-        harm = None if proof.harm is None else float(proof.harm[0])
+        harm = float(proof.harm[0])
         if proof.avoidable is None or proof.reason is None:
             return {"avoidable": None, "why": "not decided for these vehicles", "proven_harm": harm}
         avoidable, reason = bool(proof.avoidable[0]), str(proof.reason[0])
