@@ -272,7 +272,7 @@ def test_leaning__is_contact_but_no_impact():
     [
         (lambda: avoidability(wide_worlds(2, 3, seed=1), 0), "vehicle_1 of 3 vehicles"),
         (lambda: avoidability(wide_worlds(2, 4, seed=1), 1), "vehicle_2 of 4 vehicles.*avoidable_by_lp"),
-        (lambda: avoidability(wide_worlds(2, 3, seed=1), -1), "vehicle_0"),
+        (lambda: avoidability(wide_worlds(2, 3, seed=1), -1), "vehicle = -1: must be a whole number"),
         (lambda: avoidability(wide_worlds(2, 3, seed=1), scripts={2: "coast"}), "vehicle_3 follows 'coast'"),
         (
             lambda: avoidability(line([5, 5], [9, 9, 9], 5, [1, 0.5, 0])),
