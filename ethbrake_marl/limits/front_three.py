@@ -11,32 +11,14 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.limits.avoidability import avoidability
-from ethbrake_marl.limits.meetings import (
-    A_F,
-    A_L,
-    A_R,
-    FRONT_SHARE,
-    GAP_L,
-    GAP_R,
-    LIMIT_F,
-    OBSTACLE,
-    ONSET_R,
-    REAR_SHARE,
-    RESTITUTION,
-    TIME_STEP,
-    U_F,
-    V_F,
-    V_L,
-    V_R,
-    WIDTH,
-)
+from ethbrake_marl.limits.lower_bound import onset_states
 from ethbrake_marl.limits.team_kernel import bound_threes
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.events import stopping_distances
 from ethbrake_marl.physics.obstacle import with_obstacle
 from ethbrake_marl.physics.worlds import vehicles_at_once
 
-_FRONT, _MIDDLE, _REAR = range(3)
+_MIDDLE, _REAR = 1, 2
 _UNMOVED_T = 1e30  # an obstacle: its share of any two masses is 1
 
 
@@ -93,7 +75,7 @@ def combined_bound(line: Line, chosen: Ints, until: Floats, pairs: Floats, time_
         full = v.braking_capacity_mps2[rows, _REAR] + v.driving_capacity_mps2[rows, _REAR]
         since, power = onset[rows, _REAR], full if _REAR in chosen else np.zeros(len(rows))
     found, out = np.zeros(now.n), np.empty(len(rows))
-    bound_threes(_states(three, steps), until[rows], pairs[rows], since, power, out)
+    bound_threes(onset_states(three, _MIDDLE, steps), until[rows], pairs[rows], since, power, out)
     found[rows] = out
     return found
 
@@ -122,30 +104,3 @@ def _front_three(now: Worlds, rows: Ints) -> Worlds:
         command_mps2=some.command_mps2[:, :3].copy(),
         messages=np.zeros((some.n, 0)),
     )
-
-
-def _states(three: Worlds, steps: Floats) -> Floats:
-    """The rows of the compiled bound [n, WIDTH]."""
-    v, at = three.vehicles, np.zeros((three.n, WIDTH))
-    mass = v.mass_t
-    columns = {
-        GAP_L: three.gaps_m[:, 0],
-        V_L: three.speeds_mps[:, _FRONT],
-        A_L: v.braking_capacity_mps2[:, _FRONT],
-        V_F: three.speeds_mps[:, _MIDDLE],
-        A_F: v.braking_capacity_mps2[:, _MIDDLE],
-        U_F: v.driving_capacity_mps2[:, _MIDDLE],
-        LIMIT_F: v.speed_limit_mps[:, _MIDDLE],
-        GAP_R: three.gaps_m[:, 1],
-        V_R: three.speeds_mps[:, _REAR],
-        A_R: v.braking_capacity_mps2[:, _REAR],
-        ONSET_R: np.maximum(v.latency_s[:, _REAR] - three.time_s, 0.0),
-        FRONT_SHARE: mass[:, _FRONT] / (mass[:, _FRONT] + mass[:, _MIDDLE]),
-        REAR_SHARE: mass[:, _REAR] / (mass[:, _REAR] + mass[:, _MIDDLE]),
-        RESTITUTION: v.restitution,
-        TIME_STEP: steps,
-        OBSTACLE: three.obstacle_gap_m,
-    }
-    for column, values in columns.items():
-        at[:, column] = values
-    return at

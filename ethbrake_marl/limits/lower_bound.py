@@ -152,7 +152,7 @@ def rounding(worlds: Worlds, vehicle: int) -> Floats:
     return outward
 
 
-def onset_states(worlds: Worlds, i: int, time_step_s: float | None) -> Floats:
+def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> Floats:
     """The worlds, in which vehicle ``i`` may act, as the compiled bounds take them [n, WIDTH] (``limits.meetings``).
 
     Columns of a neighbour that is not there stay 0, as does the time step where there is none.
