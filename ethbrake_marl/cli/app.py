@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import typer
 from typer.exceptions import TyperException
@@ -25,7 +25,7 @@ from ethbrake_marl.cli.falsify import falsify_command
 from ethbrake_marl.cli.options import VersionOption, rename_old_options
 from ethbrake_marl.cli.parts import CommandWithParts
 from ethbrake_marl.cli.picture import picture_app
-from ethbrake_marl.cli.plugins import accept_plugins, check_commands, keep_results_alone
+from ethbrake_marl.cli.plugins import accept_plugins, check_commands, prepare_commands
 from ethbrake_marl.cli.recipe import recipe_app
 from ethbrake_marl.cli.record import record_command
 from ethbrake_marl.cli.replay import replay_command
@@ -125,19 +125,18 @@ def main() -> None:
     """Entry point: run the command line and exit with its status."""
     tolerate_narrow_streams()
     tell_old_spellings()
-    tell_compilation()
-    sys.exit(run_command(sys.argv[1:]))
+    sys.exit(run_command(sys.argv[1:], tell_compilation))
 
 
-def run_command(arguments: Sequence[str]) -> int:
+def run_command(arguments: Sequence[str], first: Callable[[], None] | None = None) -> int:
     """Exit status of a command line: 2 with one line on stderr for bad input, bad usage or a file that fails.
 
-    Other errors, which are defects, pass through.
+    ``first`` is called before a command does its work. Other errors, which are defects, pass through.
     """
     try:
         check_commands(app)
         variable = None if shell_asks(os.environ) else _NO_VARIABLE  # None: the usual one
-        command = keep_results_alone(accept_plugins(get_command(app)))
+        command = prepare_commands(accept_plugins(get_command(app)), first)
         arguments = rename_old_options(arguments, command)
         with naming_extras():
             status = command(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)

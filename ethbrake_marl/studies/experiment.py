@@ -13,9 +13,10 @@ from typing import Any, Literal
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.defaults import EPISODES, LIST_SEED
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, evaluate, parameter_line, summarise
-from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, PROGRESS_EVERY, make_agents
+from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, make_agents
 from ethbrake_marl.evaluation.paper import TESTS, other_tests
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.learning.recipe import TrainingRecipe
