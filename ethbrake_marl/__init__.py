@@ -17,6 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ethbrake_marl.envs.registration import register_environments
 from ethbrake_marl.errors import naming_extras
 
 if TYPE_CHECKING:
@@ -133,13 +134,6 @@ def _usable() -> list[str]:
     return [name for name in _HOMES if name not in missing]
 
 
-def _register() -> None:
-    """Register the environments; again changes nothing."""
-    from ethbrake_marl.envs.registration import register_environments
-
-    register_environments()
-
-
 def _import_public(name: str) -> Any:
     """Import a public name from the file it lives in, once."""
     if name == "__all__":
@@ -148,7 +142,7 @@ def _import_public(name: str) -> Any:
         close = get_close_matches(name, _HOMES, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
-    _register()
+    register_environments()
     with naming_extras():
         value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value
@@ -165,4 +159,4 @@ def __dir__() -> list[str]:
 
 # The command `ethbrake` registers them when it calls a command: Gymnasium takes longer to import than --help may take.
 if Path(sys.argv[0] if sys.argv else "").name != "ethbrake":
-    _register()
+    register_environments()

@@ -10,6 +10,7 @@ from typer.main import get_command
 
 from ethbrake_marl.cli.late import import_late
 from ethbrake_marl.cli.terminal import results_alone
+from ethbrake_marl.envs.registration import register_environments
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.files.plugins import load_plugin
 
@@ -17,6 +18,7 @@ from ethbrake_marl.files.plugins import load_plugin
 def _load_all(sources: list[str] | None) -> None:
     with results_alone():
         for source in sources or ():
+            register_environments()
             load_plugin(source)
 
 
@@ -67,8 +69,6 @@ def prepare_commands(command: Any, first: Callable[[], None] | None) -> Any:
 def _prepared(callback: Callable[..., Any], first: Callable[[], None] | None) -> Callable[..., Any]:
     @results_alone()
     def call(*arguments: Any, **options: Any) -> Any:
-        from ethbrake_marl.envs.registration import register_environments
-
         register_environments()
         import_late(callback.__module__)
         if first is not None:

@@ -13,7 +13,7 @@ import pytest
 from typer.main import get_command
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli import doctor, terminal
+from ethbrake_marl.cli import doctor, parts, terminal
 from ethbrake_marl.cli.app import app, run_command
 from ethbrake_marl.physics.compiled import cache_folder
 
@@ -41,6 +41,10 @@ def test_short_help__is_the_long_one_for_every_command(ethbrake):
         short, long = ethbrake(*line, "-h"), ethbrake(*line, "--help")
         assert (short.status, short.out) == (0, long.out)
         assert "-h, --help" in short.out
+
+
+def test_help__tells_the_parts_of_the_package_without_importing_them():
+    assert parts.part_names() == parts.OF_THE_PACKAGE
 
 
 COMPLETION = [
