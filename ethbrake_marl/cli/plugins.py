@@ -52,30 +52,32 @@ def accept_plugins(command: Any) -> Any:
 
 
 def prepare_commands(command: Any, first: Callable[[], None] | None) -> Any:
-    """The command, or group of them, of which those of this package leave stdout to their results.
+    """The command, or group of them, made ready to be called: then environments are registered, and ``first`` called.
 
-    When one of these is called, the environments are registered, its late imports made, and ``first`` is called. A
-    command of somebody's plug-in prints where it likes.
+    Those of this package also make their late imports, and leave stdout to their results. A command of somebody's
+    plug-in prints where it likes.
     """
     waiting = [command]
     for each in waiting:
         inner = getattr(each, "commands", None)
         waiting += (inner or {}).values()
-        if inner is None and each.callback.__module__.startswith("ethbrake_marl."):
+        if inner is None:
             each.callback = _prepared(each.callback, first)
     return command
 
 
 def _prepared(callback: Callable[..., Any], first: Callable[[], None] | None) -> Callable[..., Any]:
-    @results_alone()
+    ours = callback.__module__.startswith("ethbrake_marl.")
+
     def call(*arguments: Any, **options: Any) -> Any:
         register_environments()
-        import_late(callback.__module__)
+        if ours:
+            import_late(callback.__module__)
         if first is not None:
             first()
         return callback(*arguments, **options)
 
-    return call
+    return results_alone()(call) if ours else call
 
 
 def check_commands(app: typer.Typer) -> None:
