@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import typer
 from typer.exceptions import TyperException
@@ -125,18 +125,19 @@ def main() -> None:
     """Entry point: run the command line and exit with its status."""
     tolerate_narrow_streams()
     tell_old_spellings()
-    sys.exit(run_command(sys.argv[1:], tell_compilation))
+    tell_compilation()
+    sys.exit(run_command(sys.argv[1:]))
 
 
-def run_command(arguments: Sequence[str], first: Callable[[], None] | None = None) -> int:
+def run_command(arguments: Sequence[str]) -> int:
     """Exit status of a command line: 2 with one line on stderr for bad input, bad usage or a file that fails.
 
-    ``first`` is called before a command does its work. Other errors, which are defects, pass through.
+    Other errors, which are defects, pass through.
     """
     try:
         check_commands(app)
         variable = None if shell_asks(os.environ) else _NO_VARIABLE  # None: the usual one
-        command = prepare_commands(accept_plugins(get_command(app)), first)
+        command = prepare_commands(accept_plugins(get_command(app)))
         arguments = rename_old_options(arguments, command)
         with naming_extras():
             status = command(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)

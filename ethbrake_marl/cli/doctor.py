@@ -20,6 +20,7 @@ from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import JsonOption
 from ethbrake_marl.cli.terminal import show, write_json
 from ethbrake_marl.defaults import LIST_SEED
+from ethbrake_marl.kernel_store import cache_folder, is_temporary
 
 if TYPE_CHECKING or LATE:
     import numpy as np
@@ -133,8 +134,6 @@ def _processor() -> tuple[bool, str]:
 
 
 def _kernel_cache() -> tuple[bool, str]:
-    from ethbrake_marl.physics.compiled import cache_folder, is_temporary
-
     folder = cache_folder()
     note = "temporary: kernels are compiled anew in every process; set NUMBA_CACHE_DIR to a writable folder"
     return True, f"{folder} ({note})" if is_temporary(folder) else str(folder)

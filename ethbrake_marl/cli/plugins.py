@@ -51,33 +51,29 @@ def accept_plugins(command: Any) -> Any:
     return command
 
 
-def prepare_commands(command: Any, first: Callable[[], None] | None) -> Any:
-    """The command, or group of them, made ready to be called: then environments are registered, and ``first`` called.
+def prepare_commands(command: Any) -> Any:
+    """The command, or group of them, of which those of this package leave stdout to their results.
 
-    Those of this package also make their late imports, and leave stdout to their results. A command of somebody's
-    plug-in prints where it likes.
+    Each of these registers the environments and makes its late imports first. A command of somebody's plug-in prints
+    where it likes.
     """
     waiting = [command]
     for each in waiting:
         inner = getattr(each, "commands", None)
         waiting += (inner or {}).values()
-        if inner is None:
-            each.callback = _prepared(each.callback, first)
+        if inner is None and each.callback.__module__.startswith("ethbrake_marl."):
+            each.callback = _prepared(each.callback)
     return command
 
 
-def _prepared(callback: Callable[..., Any], first: Callable[[], None] | None) -> Callable[..., Any]:
-    ours = callback.__module__.startswith("ethbrake_marl.")
-
+def _prepared(callback: Callable[..., Any]) -> Callable[..., Any]:
+    @results_alone()
     def call(*arguments: Any, **options: Any) -> Any:
         register_environments()
-        if ours:
-            import_late(callback.__module__)
-        if first is not None:
-            first()
+        import_late(callback.__module__)
         return callback(*arguments, **options)
 
-    return results_alone()(call) if ours else call
+    return call
 
 
 def check_commands(app: typer.Typer) -> None:
