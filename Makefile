@@ -1,4 +1,4 @@
-# Everything runs in the project's own environment, .venv, made from Python >= 3.11 and this file alone.
+# Everything runs in the project's own environment, .venv, made from Python >= 3.11, this file and .ci/install.
 # TORCH_INDEX: index to take torch from, e.g. make run TORCH_INDEX=ADDRESS; without it uv picks the build (see below)
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # PEERS:       the environment of `make bench-peers`, apart from the project's own.
@@ -16,6 +16,8 @@ PYTHON ?=
 ARGS ?=
 WORKERS ?= 2
 INSTALL := sh .ci/install $(VENV)
+# uv compiles nothing (all of it would take 48 CPU-s), Python what it imports, once: every start would, were this passed on.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist benchmark audit figures
@@ -84,6 +86,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "== Installing what it needs to train and to be tested, at the versions of constraints.txt"
 	@$(INSTALL) -e ".[train,dev]"
 	@echo "== torch $$($(BIN)/python -c 'from importlib.metadata import version; print(version("torch"))')"
+	@$(BIN)/ethbrake evaluate --help >/dev/null
 	@echo "$(CURDIR)" > $@
 	@echo "== Environment ready"
 
