@@ -16,7 +16,7 @@ PYTHON ?=
 ARGS ?=
 WORKERS ?= 2
 INSTALL := sh .ci/install $(VENV)
-# uv compiles nothing (all of it would take 48 CPU-s), Python what it imports, once: every start would, were this passed on.
+# uv compiles nothing (all of it would take 48 CPU-s). Python compiles what it imports, once, unless this is passed on.
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
