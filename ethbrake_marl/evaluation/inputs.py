@@ -25,7 +25,7 @@ from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 EPISODES = 10_000
-PROGRESS_EVERY = 500  # worlds between two signs of life
+PROGRESS_EVERY = 2_500  # worlds between two signs of life
 TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only checked
 LIST_SEED = 7  # of the worlds on which everything is measured; has nothing to do with the seed of a training
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numba
 import pytest
+from numba.core import event
 from typer.main import get_command
 
 from ethbrake_marl import __version__
@@ -79,9 +81,9 @@ def test_completion__a_variable_that_no_shell_set_changes_nothing(ethbrake, monk
 @pytest.mark.parametrize(
     ("kernels", "temporary", "told"),
     [
-        ([], False, f"compiling the physics, once, about {terminal.COMPILE_S} s\n"),
-        (["older/one.nbi"], False, f"compiling the physics, once, about {terminal.COMPILE_S} s\n"),
-        (["today/one.nbi"], False, "compiling a part of the physics that was not used before, once, some seconds\n"),
+        ([], False, "compiling the physics, once: minutes of one core, then it is kept\n"),
+        (["older/one.nbi"], False, "compiling the physics, once: minutes of one core, then it is kept\n"),
+        (["today/one.nbi"], False, "compiling what was not used before, once, then it is kept\n"),
         ([], True, "no folder can be written"),
     ],
 )
@@ -93,6 +95,7 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, kernels,
         (folder / name).touch()
     monkeypatch.setattr("ethbrake_marl.physics.compiled.cache_folder", lambda: folder)
     monkeypatch.setattr("ethbrake_marl.physics.compiled.kernel_folder", lambda source: folder / "today")
+    monkeypatch.setitem(event._registered, "numba:compile", [])  # nobody listens any more after this test
     terminal.tell_compilation()
 
     @numba.njit
@@ -103,6 +106,9 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, kernels,
     assert next_number(1.5) == 2.5
     captured = capsys.readouterr()
     assert captured.out == "" and told in captured.err and captured.err.count("\n") == 1
+    monkeypatch.setattr(terminal, "EVERY_S", 0.0)
+    assert next_number(1j) == 1 + 1j
+    assert re.search(r"^compiling: \d+ kernels in \d+ s so far$", capsys.readouterr().err, re.MULTILINE)
 
 
 def test_doctor__warms_up_only_when_asked(ethbrake, monkeypatch):
