@@ -98,9 +98,10 @@ def _count_kernels() -> None:
     """Say every ten seconds how many kernels this process has compiled, as long as it does."""
     from numba.core import event  # loaded by whatever compiles, and by nothing that does not
 
+    events: Any = event  # numba's own types end here
     begun, said, count = time.monotonic(), time.monotonic(), 0
 
-    class Count(event.Listener):  # type: ignore[misc]  # numba has no types
+    class Count(event.Listener):
         def on_start(self, event_: event.Event) -> None:
             """Nothing: it counts what is done."""
 
@@ -111,7 +112,7 @@ def _count_kernels() -> None:
                 said = now
                 say(f"compiling: {count} kernels in {now - begun:.0f} s so far")
 
-    event.register("numba:compile", Count())
+    events.register("numba:compile", Count())
 
 
 def shell_asks(environment: Mapping[str, str]) -> bool:
