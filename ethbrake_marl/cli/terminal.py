@@ -101,7 +101,7 @@ def _count_kernels() -> None:
     events: Any = event  # numba's own types end here
     begun, said, count = time.monotonic(), time.monotonic(), 0
 
-    class Count(event.Listener):
+    class Count(event.Listener):  # type: ignore[misc]  # numba has no types
         def on_start(self, event_: event.Event) -> None:
             """Nothing: it counts what is done."""
 

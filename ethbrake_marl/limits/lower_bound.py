@@ -20,6 +20,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
+from typing import Any
 
 import numpy as np
 
@@ -112,7 +113,14 @@ def lower_bound(
     struck = at_onset.obstacle_hit & (harm_count == "first")  # whoever is pushed there is not charged for it again
     unavoidable = has_front & has_rear & (verdict.reason >= 2) & ~struck
     out = np.empty((worlds.n, BOUNDS))
-    given = (onset_states(at_onset, vehicle, time_step_s), horizon_s - start, has_front, has_rear, unavoidable, out)
+    given: tuple[Any, ...] = (
+        onset_states(at_onset, vehicle, time_step_s),
+        horizon_s - start,
+        has_front,
+        has_rear,
+        unavoidable,
+        out,
+    )
     by_parts(lambda part: bound_worlds(*(array[part] for array in given)), worlds.n, os.cpu_count() or 1)
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
     early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
