@@ -24,7 +24,7 @@ from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
-PROGRESS_EVERY = 500  # worlds between two signs of life
+PROGRESS_EVERY = 2_500  # worlds between two signs of life
 TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only checked
 
 LADDER = (  # from no decision at all up to the best that is known
