@@ -37,7 +37,10 @@ REMAINS = {
     ("evaluation/exact.py", "**"): SQUARES,
     ("evaluation/seed_statistics.py", "scipy.stats"): "resampling and sorting: sums and products alone",
     ("evaluation/shards/tally.py", "**"): SQUARES,
-    ("evaluation/statistics.py", "scipy.special"): "quantiles for the ends of an interval; the last bit of the t quantile"
+    (
+        "evaluation/statistics.py",
+        "scipy.special",
+    ): "quantiles for the ends of an interval; the last bit of the t quantile"
     " differs for 1 in 1,000 counts where the processor has no FMA. Means and errors are exact sums",
     ("figures/criticality.py", "**"): SQUARES,
     ("learning/algorithms/counterfactual_model.py", "**"): TRAINED,

@@ -14,9 +14,9 @@ import numpy as np
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.worlds import Floats
 
-_PER_LN2 = 1.4426950408889634
-_LN2_HIGH = 0.693147180369123816490  # its last 32 bits are 0: times a whole number below 2^32 it is exact
-_LN2_LOW = 1.90821492927058770002e-10
+PER_LN2 = 1.4426950408889634
+LN2_HIGH = 0.693147180369123816490  # its last 32 bits are 0: times a whole number below 2^32 it is exact
+LN2_LOW = 1.90821492927058770002e-10
 _SQRT2 = 1.4142135623730951
 _PER_SQRT_2PI = 0.3989422804014327
 _LARGEST_EXPONENT = 709.782712893384  # of e; from here on the result is beyond the doubles
@@ -86,18 +86,24 @@ def power_of_two(k: int) -> float:
 
 
 @compiled
+def exp_of_small(s: float) -> float:
+    """``e^s`` for ``|s| <= ln(2) / 2``: Taylor's series to s^13, which leaves 5e-18."""
+    return _polynomial(_EXP, s)
+
+
+@compiled
 def exp(x: float) -> float:
     """``e^x`` within 1.5 ulp; infinite above 709.78, 0 below -708.
 
-    ``e^x = 2^k e^s`` with k whole and ``|s| <= ln(2) / 2``; Taylor's series to s^13 leaves 5e-18.
+    ``e^x = 2^k e^s`` with k whole and s small.
     """
     if not x < _LARGEST_EXPONENT:
         return np.inf if x >= _LARGEST_EXPONENT else np.nan
     if x < _LEAST_EXPONENT:
         return 0.0
-    k = math.floor(x * _PER_LN2 + 0.5)
-    s = (x - k * _LN2_HIGH) - k * _LN2_LOW
-    return _polynomial(_EXP, s) * power_of_two(k - 1) * 2.0
+    k = math.floor(x * PER_LN2 + 0.5)
+    s = (x - k * LN2_HIGH) - k * LN2_LOW
+    return exp_of_small(s) * power_of_two(k - 1) * 2.0
 
 
 @compiled
@@ -117,7 +123,7 @@ def _log_parts(x: float) -> tuple[float, float]:
     s = f / (2.0 + f)
     half = 0.5 * f * f
     z = s * s
-    return k * _LN2_HIGH, f - (half - (s * (half + z * _polynomial(_LOG, z)) + k * _LN2_LOW))
+    return k * LN2_HIGH, f - (half - (s * (half + z * _polynomial(_LOG, z)) + k * LN2_LOW))
 
 
 @compiled
