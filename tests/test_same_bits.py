@@ -7,7 +7,6 @@ of them is listed here, each with why it may stay; ``make test-machines`` tries 
 from __future__ import annotations
 
 import ast
-from collections import defaultdict
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1] / "ethbrake_marl"

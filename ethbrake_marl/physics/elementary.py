@@ -1,8 +1,8 @@
 """Exponential, logarithm and normal quantile from sums, products, quotients and square roots alone.
 
-The C library and numpy choose their own exp, log and pow by processor, with other last bits on each. These take the same
-IEEE operations in the same order everywhere, so the worlds of a list are the same bits on any machine. Each error bound
-is the largest error that a comparison with 40 digits found, rounded up (tests/physics/test_elementary.py).
+The C library and numpy choose their own exp, log and pow by processor, with other last bits on each. These take the
+same IEEE operations in the same order everywhere, so the worlds of a list are the same bits on any machine. Each error
+bound is the largest error that a comparison with 40 digits found, rounded up (tests/physics/test_elementary.py).
 """
 
 from __future__ import annotations
@@ -26,14 +26,6 @@ _LOG = tuple(2.0 / k for k in range(25, 1, -2))  # of 2 artanh(s) / s - 2 in s^2
 
 # x = q (sqrt(2 pi) + q^2 P(q^2)) for q = p - 1/2 up to 1/4; else x = C - t N(t) / Q(t) - r for r = sqrt(-2 ln p): one
 # set for t = r - 1.65 up to r = 4, one for t = r - 4 up to 10.3. Fitted to quantiles of 60 digits at Chebyshev nodes.
-_SQRT_2PI = 0.3989422804014327
-_LARGEST_EXPONENT = 709.782712893384  # of e; from here on the result is beyond the doubles
-_LEAST_EXPONENT = -708.0  # below, 0: what is smaller than 3e-308 plays no part here
-_EXP = tuple(1.0 / math.factorial(k) for k in range(13, -1, -1))  # Taylor's series, highest power first
-_LOG = tuple(2.0 / k for k in range(25, 1, -2))  # of 2 artanh(s) / s - 2 in s^2, highest power first
-
-# x = q (sqrt(2 pi) + q^2 C(q^2)) for q = p - 1/2 up to 1/4; else x = P / Q - r for r = sqrt(-2 ln p), one pair in r - 1.65
-# up to r = 4 and one in r - 4 up to 10.3. Fitted to quantiles of 60 digits at Chebyshev nodes; highest power first.
 _SQRT_2PI = 2.5066282746310005
 _SQRT_2PI_LOW = -1.8328579980459168e-16
 _CENTRE = (

@@ -1,9 +1,10 @@
 """The same bits on other processors: ``make test-machines`` (or ``python -m tests.programme.machines [--sample]``).
 
 Computes one hash for each thing that is recorded somewhere: worlds of every shipped scenario and of the benchmark,
-physics, episodes with rewards and observations, E-V2X-BM, searches, bounds, shield decisions, tallies, intervals and the
-actions of policies. First as this machine does, then in one process for each of the settings below, which make numpy, the
-C library, OpenBLAS or numba behave as on an older processor. One line for each; exit status 1 when a hash differs.
+physics, episodes with rewards and observations, E-V2X-BM, searches, bounds, shield decisions, tallies, intervals and
+the actions of policies. First as this machine does, then in one process for each of the settings below, which make
+numpy, the C library, OpenBLAS or numba behave as on an older processor. One line for each; exit status 1 when a hash
+differs.
 ``--sample`` leaves out those for which numba must compile everything anew.
 """
 
