@@ -1,7 +1,7 @@
-"""Nothing that shapes a world, an episode, a list or a recorded result may have other last bits on another processor.
+"""Nothing that shapes a world, an episode, a list or a recorded result has other last bits on another processor.
 
-The C library, numpy and scipy choose their exponentials, powers and matrix products by processor. What the package calls
-of them is listed here, each with why it may stay; ``make test-machines`` tries recorded results on other processors.
+The C library, numpy and scipy choose their exponentials, powers and matrix products by processor. What the package
+calls of them is listed here, each with why it may stay; ``make test-machines`` tries recorded results on others.
 """
 
 from __future__ import annotations
@@ -56,40 +56,40 @@ REMAINS = {
 }
 
 
-def is_whole(node: ast.expr) -> bool:
-    return isinstance(node, ast.Constant) and isinstance(node.value, int)
+def is_exact(base: ast.expr) -> bool:
+    """Whether its powers are: of whole numbers and of two they are."""
+    return isinstance(base, ast.Constant) and (isinstance(base.value, int) or base.value == 2.0)
 
 
-def by_machine(tree: ast.Module) -> set[str]:
-    """What a module calls whose last bits a processor, or a library for it, chooses."""
-    found = set()
-    for node in ast.walk(tree):
-        match node:
-            case ast.Attribute(value=ast.Name(id="np" | "math" | "numpy" as module), attr=name):
-                if name in TRANSCENDENTAL | BY_MACHINE:
-                    found.add(f"{module}.{name}")
-            case ast.Attribute(value=ast.Name(id="rng" | "random" as generator), attr=name) if name in DRAWN:
-                found.add(f"{generator}.{name}")
-            case ast.ImportFrom(module=str(module)) if module.split(".")[0] == "scipy":
-                found.add(module)
-            case ast.ImportFrom(module="math" | "cmath" | "numpy" as module, names=names):
-                found |= {f"{module}.{a.name}" for a in names if a.name in TRANSCENDENTAL | BY_MACHINE}
-            case ast.Import(names=names):
-                found |= {a.name for a in names if a.name.split(".")[0] in {"scipy", "cmath"}}
-            case ast.BinOp(op=ast.MatMult()):
-                found.add("@")
-            case ast.BinOp(op=ast.Pow(), left=base, right=exponent):
-                exact = is_whole(base) or (isinstance(base, ast.Constant) and base.value == 2.0)
-                if not exact:  # powers of whole numbers and of two are exact
-                    found.add("**")
-            case ast.Call(func=ast.Name(id="pow")):
-                found.add("**")
-    return found
+def imported(module: str, names: list[ast.alias]) -> set[str]:
+    """Of a ``from module import names``."""
+    if module.startswith("scipy"):
+        return {module}
+    chosen = {f"{module}.{each.name}" for each in names if each.name in TRANSCENDENTAL | BY_MACHINE}
+    return chosen if module in {"math", "cmath", "numpy"} else set()
+
+
+def called(node: ast.AST) -> set[str]:
+    """What a piece of code calls whose last bits a processor, or a library for it, chooses."""
+    match node:
+        case ast.Attribute(value=ast.Name(id="np" | "math" | "numpy" as module), attr=name):
+            return {f"{module}.{name}"} & {f"{module}.{each}" for each in TRANSCENDENTAL | BY_MACHINE}
+        case ast.Attribute(value=ast.Name(id="rng" | "random" as generator), attr=name) if name in DRAWN:
+            return {f"{generator}.{name}"}
+        case ast.ImportFrom(module=str(module), names=names):
+            return imported(module, names)
+        case ast.Import(names=names):
+            return {each.name for each in names if each.name.split(".")[0] in {"scipy", "cmath"}}
+        case ast.BinOp(op=ast.MatMult()):
+            return {"@"}
+        case ast.BinOp(op=ast.Pow(), left=base):
+            return set() if is_exact(base) else {"**"}
+    return set()
 
 
 def test_the_package__calls_nothing_that_differs_by_processor_but_what_is_listed() -> None:
-    found: dict[tuple[str, str], None] = {}
+    found = set()
     for path in sorted(PACKAGE.rglob("*.py")):
-        names = by_machine(ast.parse(path.read_text("utf-8")))
-        found |= dict.fromkeys((path.relative_to(PACKAGE).as_posix(), name) for name in sorted(names))
-    assert set(found) == set(REMAINS)
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            found |= {(path.relative_to(PACKAGE).as_posix(), name) for name in called(node)}
+    assert found == set(REMAINS)
