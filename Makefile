@@ -32,7 +32,7 @@ endef
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
-	@echo "make test [ARGS=...]  the test suite, without the tests marked long"
+	@echo "make test [ARGS=...]  the test suite, without the tests marked slow or long (.ci/run runs the slow ones, too)"
 	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make check            lint and test"
 	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"

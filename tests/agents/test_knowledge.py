@@ -71,6 +71,7 @@ APART = {"counterfactual@PATH", "team@RUN"}  # they need a run, and have tests o
 USUAL = {"planner": "planner:20", "planner:believed": "planner:20:believed", "best_harm": "best_harm:20"}  # budgets
 WORDS = {"A": "3", "CANDIDATES": "20", "20ms": "20", "200us": "50", "PATH": "shipped", "RUN": "shipped"}
 HONEST = [spec for spec, knows in STATED.items() if not sees_through(knows)]
+BOXED = "coast+robust:interior:believed"  # a box takes its time
 CHANNELS = [
     *PRESETS,
     *({"preset": preset, "persistence": "periodic"} for preset in PRESETS if preset not in ("paper", "sensors-only")),
@@ -179,9 +180,12 @@ def test_knowledge__another_word_is_refused(knows):
 
 
 @pytest.mark.parametrize("channel", CHANNELS, ids=str)
-@pytest.mark.parametrize("spec", HONEST)
+@pytest.mark.parametrize(
+    "spec", [pytest.param(spec, marks=pytest.mark.slow if spec == BOXED else ()) for spec in HONEST]
+)
 def test_own_sensors_and_messages__what_was_not_received_changes_no_action(spec, channel):
-    scenario, n = BLOCKED.replace(v2x=channel), 2 if "interior" in spec else 30  # a box takes its time
+    n = 2 if spec == BOXED else 8 if "robust" in spec else 30
+    scenario = BLOCKED.replace(v2x=channel)
     assert changed_decisions(agent_of(spec, scenario), scenario, n=n) == 0
 
 

@@ -16,6 +16,7 @@ from tests.hostile.gates import gate_rows, kind_rows
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.slow
 def test_hostile_files__a_sample_of_the_attack_breaks_no_rule() -> None:
     command = [sys.executable, "-m", "tests.hostile", "--sample", "5", "--seed", "1"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

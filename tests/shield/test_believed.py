@@ -36,6 +36,7 @@ def test_robust__at_the_corners_no_world_is_above_the_first_bound(scenario: Scen
     assert replaced > 60
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "n"), [("never heard", 2), ("heard late", 12), ("sensors-only", 6)])
 def test_interior__between_the_corners_no_world_is_above_the_first_bound(name: str, n: int) -> None:
     harm, bound, replaced = shielded("drive", INSIDE[name], n, 7, robust="interior")
