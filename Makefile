@@ -99,9 +99,10 @@ run: $(STAMP)
 	@echo "== ethbrake run $(ARGS)"
 	@$(BIN)/ethbrake run $(ARGS)
 
+# With its bytecode kept, whatever the machine's setting: pytest rewrites every assertion, 10 s for each process.
 test: $(STAMP)
 	@echo "== pytest"
-	@$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal $(ARGS)
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal $(ARGS)
 
 lint: $(STAMP)
 	@echo "== ruff check"
