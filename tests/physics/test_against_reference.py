@@ -38,7 +38,7 @@ def random_case(seed: int, n: int, N: int, e: float | Floats, command_mps2: floa
     """Draw ``n`` worlds; commands are constant, uniform in [-command_mps2, command_mps2]."""
     rng = np.random.default_rng([seed, N])
     worlds = make_worlds(
-        rng.uniform(1.0, 12.0, (n, N - 1)),
+        rng.uniform(1.0, 8.0, (n, N - 1)),
         rng.uniform(5.0, 25.0, (n, N)),
         braking_capacity_mps2=7.0,
         driving_capacity_mps2=7.0,
@@ -94,7 +94,7 @@ def test_advance__agrees_with_the_tiny_step_reference(N: int) -> None:
     case = random_case(20, WORLDS, N, np.resize([0.0, 0.1, 0.3], WORLDS))
     end, impacts = advance(case.worlds, case.command_mps2, until_s=case.horizon_s)
     outcome = refer(case, np.arange(WORLDS), STEP_S)
-    assert np.mean(np.any(outcome.count > 0, axis=1)) > 0.5  # the worlds have something to say about impacts
+    assert np.mean(np.any(outcome.count > 0, axis=1)) > 0.4  # the worlds have something to say about impacts
 
     apart = np.flatnonzero(disagreements(outcome, end, impacts, case.horizon_s))
     certain = refers_to_itself(Outcome(*(column[apart] for column in outcome)), refer(case, apart, STEP_S / 2))
