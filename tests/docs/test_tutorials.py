@@ -34,7 +34,6 @@ def test_notebook__runs_from_its_first_cell_to_its_last(name: str, tmp_path: Pat
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=900,
         check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]
