@@ -1,4 +1,4 @@
-# Everything runs in the project's own environment, .venv, made from Python >= 3.11 and this file alone.
+# Everything runs in the project's own environment, .venv, made from Python >= 3.11, this file and .ci/install.
 # TORCH_INDEX: index to take torch from, e.g. make run TORCH_INDEX=ADDRESS; without it uv picks the build (see below)
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # PEERS:       the environment of `make bench-peers`, apart from the project's own.
@@ -15,17 +15,9 @@ TORCH_INDEX ?=
 PYTHON ?=
 ARGS ?=
 WORKERS ?= 2
-PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
-
-# The plain index has torch for NVIDIA's GPUs alone, with gigabytes of their libraries. uv looks what the machine has,
-# and takes the build for it (CPU where there is no GPU) from where torch publishes them, if that can be reached.
-define TORCH_FOR_THIS_MACHINE
-if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for this machine" \
-  && UV_HTTP_TIMEOUT=30 UV_HTTP_RETRIES=1 $(BIN)/uv pip install --quiet --python $(BIN)/python --torch-backend auto \
-    --no-deps -c constraints.txt torch; then :; else \
-  echo "== uv cannot reach it (above): torch from pip's own index, which may be the large build for GPUs"; \
-  $(PIP_INSTALL) --no-deps torch; fi
-endef
+INSTALL := sh .ci/install $(VENV)
+# uv compiles nothing (all of it would take 48 CPU-s). Python compiles what it imports, once, unless this is passed on.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist benchmark audit figures
@@ -87,11 +79,14 @@ $(STAMP): pyproject.toml constraints.txt
 	  echo "error: $$found cannot make a virtual environment (on Debian: apt install python3-venv)" >&2; \
 	  exit 1; \
 	fi
-	@$(if $(TORCH_INDEX),echo "== Installing torch from $(TORCH_INDEX)"; \
-	$(PIP_INSTALL) --no-deps --index-url "$(TORCH_INDEX)" torch,$(TORCH_FOR_THIS_MACHINE))
-	@echo "== Installing ethbrake_marl with what it needs to train and to be tested, at the versions of constraints.txt"
-	@$(PIP_INSTALL) -e ".[train,dev]"
+	@echo "== Installing ethbrake_marl"
+	@$(INSTALL) -e .
+	@echo "== Installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX),: uv looks for the build for this machine)"
+	@$(INSTALL) --torch "$(TORCH_INDEX)"
+	@echo "== Installing what it needs to train and to be tested, at the versions of constraints.txt"
+	@$(INSTALL) -e ".[train,dev]"
 	@echo "== torch $$($(BIN)/python -c 'from importlib.metadata import version; print(version("torch"))')"
+	@$(BIN)/ethbrake evaluate --help >/dev/null
 	@echo "$(CURDIR)" > $@
 	@echo "== Environment ready"
 
@@ -121,7 +116,7 @@ check: lint
 
 $(DOCS_STAMP): $(STAMP)
 	@echo "== Installing what builds the site"
-	@$(PIP_INSTALL) -e ".[docs]"
+	@$(INSTALL) -e ".[docs]"
 	@touch $@
 
 docs: $(DOCS_STAMP)
@@ -178,7 +173,7 @@ proofs: $(STAMP)
 	@NUMBA_DISABLE_JIT=1 $(BIN)/python -m tests.proofs
 test-cluster: $(STAMP)
 	@echo "== a sweep on a Ray cluster, disturbed"
-	@$(PIP_INSTALL) -e ".[cluster]"
+	@$(INSTALL) -e ".[cluster]"
 	@$(BIN)/python -m tests.studies.sweep.cluster $(ARGS)
 
 shield-bugs: $(STAMP)

@@ -13,17 +13,16 @@ The first can be gamed (a light early touch makes the later, harder impact free)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
+from ethbrake_marl.defaults import HARM_COUNTS as HARM_COUNTS
+from ethbrake_marl.defaults import HarmCount as HarmCount
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics.advance import Impacts, no_obstacle_harm
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
-
-HarmCount = Literal["first", "total"]
-HARM_COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
 
 _INJURY_SLOPE = 0.177  # per m/s of speed change
 _INJURY_OFFSET = {"front": -4.457, "rear": -4.888}  # side of the car that is hit

@@ -11,25 +11,30 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
-from packaging.requirements import Requirement
-from packaging.version import Version
 
 from ethbrake_marl import __version__
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import JsonOption
 from ethbrake_marl.cli.terminal import show, write_json
-from ethbrake_marl.evaluation import evaluate, summarise
-from ethbrake_marl.evaluation.inputs import LIST_SEED, make_lineup, make_proposers
-from ethbrake_marl.evaluation.shield_modes import compare_modes
+from ethbrake_marl.defaults import LIST_SEED
 from ethbrake_marl.kernel_store import cache_folder, is_temporary
-from ethbrake_marl.physics import Worlds, advance, make_worlds
-from ethbrake_marl.scenario import Task, list_scenarios, load_scenario, scenario_folder
-from ethbrake_marl.scenario.catalogue import SHIPPED
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+
+if TYPE_CHECKING or LATE:
+    import numpy as np
+    from packaging.requirements import Requirement
+    from packaging.version import Version
+
+    from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+    from ethbrake_marl.evaluation import evaluate, summarise
+    from ethbrake_marl.evaluation.inputs import make_lineup, make_proposers
+    from ethbrake_marl.evaluation.shield_modes import compare_modes
+    from ethbrake_marl.physics import Worlds, advance, make_worlds
+    from ethbrake_marl.scenario import Task, list_scenarios, load_scenario, scenario_folder
+    from ethbrake_marl.scenario.catalogue import SHIPPED
+    from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 DISTRIBUTION = "ethbrake-marl"
 EXTRAS = ("train", "marl", "export", "data", "render", "explore", "cluster", "tune")
