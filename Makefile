@@ -3,7 +3,7 @@
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # PEERS:       the environment of `make bench-peers`, apart from the project's own.
 # ARGS:        passed on by `make run` (to `ethbrake run`), `make test` (to pytest) and the long programmes.
-# WORKERS:     processes of `make test`; each compiles the kernels for itself, once. 0: one process, as a debugger needs.
+# WORKERS:     processes of `make test`. 0: one process, as a debugger needs.
 
 SHELL := /bin/sh
 VENV := .venv
@@ -94,10 +94,9 @@ run: $(STAMP)
 	@echo "== ethbrake run $(ARGS)"
 	@$(BIN)/ethbrake run $(ARGS)
 
-# With its bytecode kept, whatever the machine's setting: pytest rewrites every assertion, 10 s for each process.
 test: $(STAMP)
 	@echo "== pytest"
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal $(ARGS)
+	@$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal $(ARGS)
 
 lint: $(STAMP)
 	@echo "== ruff check"
