@@ -3,7 +3,7 @@
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # PEERS:       the environment of `make bench-peers`, apart from the project's own.
 # ARGS:        passed on by `make run` (to `ethbrake run`), `make test` (to pytest) and the long programmes.
-# WORKERS:     processes of `make test`; each compiles the kernels for itself, once. 0: one process, as a debugger needs.
+# WORKERS:     processes of `make test`. 0: one process, as a debugger needs.
 
 SHELL := /bin/sh
 VENV := .venv
@@ -24,7 +24,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
-	@echo "make test [ARGS=...]  the test suite, without the tests marked long"
+	@echo "make test [ARGS=...]  the test suite, without the tests marked slow or long (.ci/run runs the slow ones, too)"
 	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make check            lint and test"
 	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"

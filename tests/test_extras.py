@@ -54,7 +54,6 @@ def test_core__runs_where_no_extra_can_be_imported(tmp_path: Path) -> None:
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=600,
         check=False,
     )
     assert result.returncode == 2, result.stderr

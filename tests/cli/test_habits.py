@@ -29,7 +29,6 @@ def test_version__is_told_by_the_command_and_by_python_m(ethbrake):
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
     assert (result.returncode, result.stdout, result.stderr) == (0, f"ethbrake {__version__}\n", "")
