@@ -3,7 +3,7 @@
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # PEERS:       the environment of `make bench-peers`, apart from the project's own.
 # ARGS:        passed on by `make run` (to `ethbrake run`), `make test` (to pytest) and the long programmes.
-# WORKERS:     processes of `make test`; each compiles the kernels for itself, once. 0: one process, as a debugger needs.
+# WORKERS:     processes of `make test`. 0: one process, as a debugger needs.
 
 SHELL := /bin/sh
 VENV := .venv
@@ -28,7 +28,7 @@ if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for th
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist benchmark audit figures
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist kernels benchmark audit figures
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -38,6 +38,7 @@ help:
 	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"
 	@echo "make figures          the printed blocks, tables and pictures of README and docs made again and compared (minutes)"
 	@echo "make dist             wheel and sdist in dist/, built twice with the same SHA-256"
+	@echo "make kernels          a wheel of ready-made kernels for this Python in dist/ (Linux, x86-64)"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
@@ -135,6 +136,10 @@ figures: $(STAMP)
 dist: $(STAMP)
 	@echo "== wheel and sdist, twice"
 	@$(BIN)/python -m tests.wheel.reproducible $(ARGS)
+
+kernels: $(STAMP)
+	@echo "== ready-made kernels, for two levels of x86-64"
+	@$(BIN)/python -m tests.wheel.kernels $(ARGS)
 
 test-physics: $(STAMP)
 	@echo "== long programme on the physics"

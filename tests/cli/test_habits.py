@@ -46,7 +46,7 @@ def test_short_help__is_the_long_one_for_every_command(ethbrake):
 COMPLETION = [
     ({"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake sce", "COMP_CWORD": "1"}, "scenario\n"),
     ({"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake scenario val", "COMP_CWORD": "2"}, "validate\n"),
-    ({"_ETHBRAKE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --warm"}, '"--warm-up"'),
+    ({"_ETHBRAKE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --comp"}, '"--compile"'),
 ]
 
 
@@ -102,16 +102,16 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     assert captured.out == "" and told in captured.err and captured.err.count("\n") == 1
 
 
-def test_doctor__warms_up_only_when_asked(ethbrake, monkeypatch):
-    monkeypatch.setattr(doctor, "_warm_up", lambda: (True, "9 kernels ready"))
-    assert "warm-up" not in ethbrake("doctor").out
-    assert "9 kernels ready" in ethbrake("doctor", "--warm-up").out
+def test_doctor__compiles_only_when_asked(ethbrake, monkeypatch):
+    monkeypatch.setattr(doctor, "_compile", lambda: (True, "9 kernels ready"))
+    assert "compile" not in ethbrake("doctor").out
+    assert "9 kernels ready" in ethbrake("doctor", "--compile").out
 
 
 @pytest.mark.long
-def test_doctor_warm_up__leaves_nothing_to_compile(ethbrake):
-    answer = ethbrake("doctor", "--warm-up", "--json")
-    assert answer.status == 0 and '"name": "warm-up",\n    "ok": true' in answer.out
+def test_doctor_compile__leaves_nothing_to_compile(ethbrake):
+    answer = ethbrake("doctor", "--compile", "--json")
+    assert answer.status == 0 and '"name": "compile",\n    "ok": true' in answer.out
     kernels = set(cache_folder().iterdir())
     commands = [
         ("evaluate", "--agents", "full_brake,e_v2x_bm,ppo@shipped,ppo@shipped+episode", "--episodes", "3"),
