@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import ethbrake_marl
 from ethbrake_marl import kernel_store
 from ethbrake_marl.kernel_store import cache_folder, digest_of_sources, keep_kernel, kernel_sources, load_kernel
 from ethbrake_marl.physics import compiled
+from tests.wheel.kernels import pack
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
 PACKAGE = Path(ethbrake_marl.__file__).parent
@@ -348,3 +350,21 @@ def test_kernels__are_not_compiled_once_for_each_number_that_stands_in_a_source(
 
     assert outer(3) == 12
     assert len(twice._linked) == 1 and not twice.overloads
+
+
+@pytest.mark.skipif((sys.platform, platform.machine()) != ("linux", "x86_64"), reason="none are built for this machine")
+def test_ready_made_kernels__are_taken_where_the_own_store_has_none_unless_they_are_damaged(monkeypatch, tmp_path):
+    with monkeypatch.context() as chosen:
+        chosen.setenv("NUMBA_CPU_NAME", "x86-64-v2")
+        chosen.setenv("NUMBA_CPU_FEATURES", "")
+        assert run(PACKAGE, tmp_path) == COMPILED
+    wheel = pack({file.name: file.read_bytes() for file in cache_folder().glob("*.entry")}, tmp_path)
+    site = tmp_path / "site"
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
+    subprocess.run([*pip, str(wheel)], check=True, timeout=120)
+    shutil.copytree(PACKAGE, site / "ethbrake_marl", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "another"))
+    assert run(site / "ethbrake_marl", tmp_path) == SAME
+    (kernel,) = (site / "ethbrake_marl_kernels").glob("*.entry")
+    kernel.write_bytes(kernel.read_bytes()[:-1])
+    assert run(site / "ethbrake_marl", tmp_path) == COMPILED

@@ -42,6 +42,12 @@ _DOORS = (
     ("evaluate", "--agents", "full_brake,ppo@shipped+episode,full_brake+step", "--episodes", "1"),
     ("shield", "--agents", "full_brake", "--episodes", "3"),
 )
+_FIRST_STEP = """
+import ethbrake_marl as eb
+env = eb.parallel_env()
+env.reset(seed=0)
+env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+"""
 OLDEST_PYTHON = (3, 11)
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent  # or the folder of installed packages, where there is no pyproject.toml
@@ -168,11 +174,12 @@ def _golden_baseline() -> tuple[bool, str]:
 def _compile() -> tuple[bool, str]:
     """The commands of ``_DOORS`` on a few worlds, side by side on all cores; a line for each that ended."""
     begun, failed = perf_counter(), []
-    doors = [door for door in _DOORS if door[0] != "run" or find_spec("torch")]
+    doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if door[0] != "run" or find_spec("torch")]
+    doors.append(("-c", _FIRST_STEP))
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         called = {pool.submit(_call, door, folder): door for door in doors}
         for done, future in enumerate(as_completed(called), start=1):
-            door, error = called[future][0], future.result()
+            door, error = (called[future] + ("first step",))[2], future.result()
             say(f"compile: {done} of {len(called)}: {door}{f' failed: {error}' if error else ''}")
             failed += [f"{door}: {error}"] if error else []
     return not failed, "; ".join(failed) or f"what these commands use is compiled, after {perf_counter() - begun:.0f} s"
@@ -180,7 +187,7 @@ def _compile() -> tuple[bool, str]:
 
 def _call(arguments: tuple[str, ...], folder: str) -> str:
     """The last line of what a command says on stderr where it fails."""
-    command = [sys.executable, "-m", "ethbrake_marl", *arguments]
+    command = [sys.executable, *arguments]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 

@@ -20,13 +20,13 @@ import llvmlite
 import numba
 from llvmlite.binding import parse_assembly, parse_bitcode
 from numba.core import config as numba_config
+from numba.core import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult, Flags, compile_extra
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
-from numba.core.types import unliteral
 from numba.core.typing import make_concrete_template
 
 from ethbrake_marl.errors import check_whole_number
@@ -101,7 +101,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         if not _KNOWN:
             return super().get_call_template(args, kws)
         pysig, folded = self._compiler.fold_argument_types(args, kws)
-        arguments = tuple(unliteral(kind) for kind in folded)
+        arguments = tuple(types.unliteral(kind) for kind in folded)
         if arguments not in self._linked:
             self._obtain("linked", arguments, lambda: self._compile_linked(arguments), self._load_linked)
         signatures = [signature for signature, *_ in self._linked.values()]
@@ -137,10 +137,10 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self.targetctx.insert_user_function(library, fndesc, [library])
         self._linked[signature.args] = signature, library, environments
 
-    def _obtain(self, way: str, types: tuple[Any, ...], make: Callable[[], Any], load: Callable[..., None]) -> None:
+    def _obtain(self, way: str, kinds: tuple[Any, ...], make: Callable[[], Any], load: Callable[..., None]) -> None:
         """Load what is kept under this name, or make and keep it, while no other process does."""
-        name = self._name(way, types)
-        kept = load_kernel(name) or (self._ready_made(types) if way == "entry" else None)
+        name = self._name(way, kinds)
+        kept = load_kernel(name) or (self._ready_made(kinds) if way == "entry" else None)
         if kept is None:
             with alone(name):
                 kept = load_kernel(name)  # another process may have made it meanwhile
@@ -151,17 +151,17 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
                     return
         load(*pickle.loads(kept))
 
-    def _ready_made(self, types: tuple[Any, ...]) -> bytes | None:
+    def _ready_made(self, kinds: tuple[Any, ...]) -> bytes | None:
         """What was installed for a processor like this one, unless the user named another."""
         triple, _, features = self.targetctx.codegen().magic_tuple()
         for level, needed in _LEVELS.items() if numba_config.CPU_NAME is None else ():
             if needed <= set(features.split(",")):
-                kept = load_kernel(self._name("entry", types, (triple, level, "")), ready_made=True)
+                kept = load_kernel(self._name("entry", kinds, (triple, level, "")), ready_made=True)
                 if kept is not None:
                     return kept
         return None
 
-    def _name(self, way: str, types: tuple[Any, ...], processor: tuple[str, ...] = ()) -> str:
+    def _name(self, way: str, kinds: tuple[Any, ...], processor: tuple[str, ...] = ()) -> str:
         """Name of a signature's file in the store; empty where not all that makes the code is known."""
         code, source = self.py_func.__code__, Path(self.py_func.__code__.co_filename)
         digest, own = digest_of_sources(source), digest_of_sources(Path(__file__))
@@ -174,7 +174,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
             (own, digest, place_of(source), self.__module__, self.__qualname__, code.co_firstlineno, code.co_code),
             [constant for constant in code.co_consts if not isinstance(constant, CodeType)],
             sorted(self.targetoptions.items()),
-            [_described(kind) for kind in types],
+            [_described(kind) for kind in kinds],
         )
         return f"{self.__name__.strip('<>')}-{hashlib.sha256(repr(made_of).encode()).hexdigest()[:40]}.{way}"
 
