@@ -15,21 +15,25 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
-from packaging.requirements import Requirement
-from packaging.version import Version
 
 from ethbrake_marl import __version__
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import JsonOption
 from ethbrake_marl.cli.terminal import say, show, write_json
 from ethbrake_marl.kernel_store import cache_folder, is_temporary
-from ethbrake_marl.physics import Worlds, advance, make_worlds
-from ethbrake_marl.scenario import list_scenarios, scenario_folder
-from ethbrake_marl.scenario.catalogue import SHIPPED
+
+if TYPE_CHECKING or LATE:
+    import numpy as np
+    from packaging.requirements import Requirement
+    from packaging.version import Version
+
+    from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+    from ethbrake_marl.physics import Worlds, advance, make_worlds
+    from ethbrake_marl.scenario import list_scenarios, scenario_folder
+    from ethbrake_marl.scenario.catalogue import SHIPPED
 
 DISTRIBUTION = "ethbrake-marl"
 EXTRAS = ("train", "marl", "export", "data", "render", "explore", "cluster", "tune")
