@@ -90,7 +90,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(INSTALL) --torch "$(TORCH_INDEX)" || exit; \
 	echo "== Installing what it needs to train and to be tested, at the versions of constraints.txt"; \
 	$(INSTALL) -e ".[train,dev]" || exit; \
-	wait $$compiling && $(BIN)/ethbrake doctor --compile >/dev/null || \
+	wait $$compiling || \
 	  echo "== not all could be compiled (above): the rest is compiled when it is needed" >&2
 	@echo "== torch $$($(BIN)/python -c 'from importlib.metadata import version; print(version("torch"))')"
 	@$(BIN)/ethbrake evaluate --help >/dev/null

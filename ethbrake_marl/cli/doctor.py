@@ -37,12 +37,13 @@ if TYPE_CHECKING or LATE:
 
 DISTRIBUTION = "ethbrake-marl"
 EXTRAS = ("train", "marl", "export", "data", "render", "explore", "cluster", "tune")
-_TINY = ("n_envs=16", "n_steps=8", "counterfactuals=16", "evaluation.worlds=10")
+_TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=evaluation.worlds=10")
 _LINEUP = "ladder,ppo@shipped,ppo@shipped+refined+episode,full_brake+step,full_brake+robust"
 # Small calls of what people call first: what they use is what is compiled. One world alone lies otherwise in memory.
 _DOORS = (
-    ("run", "--steps", "128", "--episodes", "20", "--output", "run", *(f"--set={value}" for value in _TINY)),
-    ("evaluate", "--agents", _LINEUP, "--episodes", "20"),
+    ("run", "--steps", "128", "--episodes", "20", "--output", "run", "--set=counterfactuals=16", *_TINY),
+    ("train", "--recipe", "ppo", "--steps", "128", "--output", "ppo", "--set=batch_size=64", *_TINY),
+    ("evaluate", "--agents", _LINEUP, "--episodes", "20", "--uncertainty", "gaps_m=0.5"),
     ("evaluate", "--agents", "full_brake,ppo@shipped+episode,full_brake+step", "--episodes", "1"),
     ("shield", "--agents", "full_brake", "--episodes", "3"),
 )
