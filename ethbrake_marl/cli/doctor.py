@@ -73,14 +73,15 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
 
     ``compile_all``: call the usual commands on a few worlds first, so that all they use is compiled and kept.
     """
+    has_torch = find_spec("torch") is not None
     return [
         Check("ethbrake_marl", True, f"{__version__} in {_PACKAGE}"),
         _check("python", _python),
         *_dependencies(),
         _check("processor", _processor),
         _check("kernel cache", _kernel_cache),
+        *([_check("compile", lambda: compile_ahead(training=has_torch))] if compile_all else []),
         _check("scenarios", _scenarios),
-        *([_check("compile", _compile)] if compile_all else []),
         _check("physics", _golden_impact),
         _check("baseline", _golden_baseline),
     ]
@@ -177,12 +178,15 @@ def _golden_baseline() -> tuple[bool, str]:
     return found == wanted, f"E-V2X-BM at gaps 7 and 7 m: {found} (known: {wanted})"
 
 
-def _compile() -> tuple[bool, str]:
-    """The commands of ``_DOORS`` on a few worlds, side by side on all cores; tells how far it is as it goes."""
+def compile_ahead(*, training: bool) -> tuple[bool, str]:
+    """Call the commands of ``_DOORS`` on a few worlds, side by side on all cores, and tell how far they are.
+
+    ``training``: those that need torch, too. Whether all ended well, and what there is to say.
+    """
     if is_temporary(cache_folder()):
         return False, "no folder can be written to keep what is compiled; set NUMBA_CACHE_DIR to a writable folder"
     begun, failed = perf_counter(), []
-    doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if door[0] not in _TRAINING or find_spec("torch")]
+    doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if training or door[0] not in _TRAINING]
     doors.append(("-c", _FIRST_STEP, "first step"))
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         called = {pool.submit(_call, door, folder): door[2] for door in doors}

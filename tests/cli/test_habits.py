@@ -112,7 +112,7 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
 
 
 def test_doctor__compiles_only_when_asked(ethbrake, monkeypatch):
-    monkeypatch.setattr(doctor, "_compile", lambda: (True, "9 kernels ready"))
+    monkeypatch.setattr(doctor, "compile_ahead", lambda training: (True, "9 kernels ready"))
     assert "compile" not in ethbrake("doctor").out
     assert "9 kernels ready" in ethbrake("doctor", "--compile").out
 
