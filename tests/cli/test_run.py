@@ -103,6 +103,7 @@ def test_run__the_hybrid_is_in_no_world_worse_than_its_baseline(finished_run):
     assert all(harm["hybrid", str(k)] <= harm["e_v2x_bm", str(k)] for k in range(60))
 
 
+@pytest.mark.slow
 def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake, finished_run):
     answer = ethbrake(
         "evaluate",
@@ -132,6 +133,7 @@ def test_run_json__prints_the_rows_alone_and_force_replaces(ethbrake, tiny_recip
     assert str(folder / "report.html") in answer.err
 
 
+@pytest.mark.slow
 def test_train__names_its_folder_after_scenario_recipe_and_seed(ethbrake, tiny_recipe, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     answer = ethbrake("train", "--recipe", tiny_recipe, "--seed", "5", "--steps", "128", "--json")
@@ -188,6 +190,7 @@ def test_train__several_learners_share_a_policy(ethbrake, tiny_recipe, scenario_
     assert manifest["learners"] == ["vehicle_2", "vehicle_3"]
 
 
+@pytest.mark.slow
 def ctrl_c_when(monkeypatch: pytest.MonkeyPatch, *moments: Callable[[dict[str, Any]], bool]) -> None:
     """Press Ctrl-C when what is shown first fits the first moment, then when it first fits the second, ..."""
     waiting = list(moments)

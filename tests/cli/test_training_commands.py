@@ -82,6 +82,8 @@ def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_rec
     refused(ethbrake("resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 def test_resume__an_interrupted_run_goes_on_as_a_training(ethbrake, tiny_recipe, tmp_path, monkeypatch):
     folder = tmp_path / "stopped"
     with monkeypatch.context() as patch:
