@@ -20,7 +20,7 @@ INSTALL := sh .ci/install $(VENV)
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist benchmark audit figures
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds test-machines proofs test-cluster docs dist kernels benchmark audit figures
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -30,6 +30,7 @@ help:
 	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"
 	@echo "make figures          the printed blocks, tables and pictures of README and docs made again and compared (minutes)"
 	@echo "make dist             wheel and sdist in dist/, built twice with the same SHA-256"
+	@echo "make kernels          a wheel of ready-made kernels for this Python in dist/ (Linux, x86-64)"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
@@ -41,11 +42,12 @@ help:
 	@echo "make test-cluster     a sweep on a Ray cluster of two nodes on this machine, whose workers are killed at random, its driver once"
 	@echo "make shield-bugs      plant 36 bugs in copies of the shield; each must turn a test red"
 	@echo "make test-bounds      the tests at the lowest versions that pyproject.toml allows, and at the newest"
+	@echo "make test-machines    recorded results again, as on nine older processors: the same bits"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
 	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of the physics (ARGS='--modules rewards,v2x --sample 40': of others)"
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
-	@echo "make benchmark        drive suite v1 with the agents of docs/benchmark.md and make its tables (ARGS: some agents)"
+	@echo "make benchmark        drive suite v2 with the agents of docs/benchmark.md and make its tables (ARGS: some agents)"
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make clean            remove $(VENV), $(PEERS), .venvs, caches and builds (runs/ stays)"
 	@echo "TORCH_INDEX=URL       take torch from this index; else uv picks the build for this machine"
@@ -131,6 +133,10 @@ dist: $(STAMP)
 	@echo "== wheel and sdist, twice"
 	@$(BIN)/python -m tests.wheel.reproducible $(ARGS)
 
+kernels: $(STAMP)
+	@echo "== ready-made kernels, for two levels of x86-64"
+	@$(BIN)/python -m tests.wheel.kernels $(ARGS)
+
 test-physics: $(STAMP)
 	@echo "== long programme on the physics"
 	@$(BIN)/python -m tests.physics.programme $(ARGS)
@@ -150,6 +156,10 @@ test-light: $(STAMP)
 test-bounds: $(STAMP)
 	@echo "== the lowest and the highest versions"
 	@$(BIN)/python -m tests.programme.bounds $(ARGS)
+
+test-machines: $(STAMP)
+	@echo "== the same bits on other processors"
+	@$(BIN)/python -m tests.programme.machines $(ARGS)
 
 test-order: $(STAMP)
 	@echo "== the suite in random orders"

@@ -110,7 +110,7 @@ app.command("dataset", epilog="Example: ethbrake dataset --agents best_harm --ep
 )
 app.command("replay", epilog="Example: ethbrake replay PASSPORT --output again.html")(replay_command)
 app.command("explore", epilog="Example: ethbrake explore --agents full_brake,ppo@shipped")(explore_command)
-app.command("benchmark", epilog="Example: ethbrake benchmark v1 --agent ppo@shipped --output mine.json")(
+app.command("benchmark", epilog="Example: ethbrake benchmark v2 --agent ppo@shipped --output mine.json")(
     benchmark_command
 )
 app.command("leaderboard", epilog="Example: ethbrake leaderboard mine.json theirs.json --output table.html")(

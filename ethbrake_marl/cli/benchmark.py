@@ -25,7 +25,7 @@ _MARKDOWN = ".md"
 
 
 def benchmark_command(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite that ships, such as v1.")],
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite that ships, such as v2.")],
     agent: Annotated[str, typer.Option(metavar="SPEC", help="Who drives; any agent of `ethbrake evaluate`.")],
     output: Annotated[
         Path | None, typer.Option(metavar="ENTRY.json", help="Also write the entry to this file.")

@@ -29,7 +29,10 @@ def _import(line: ast.stmt, into: dict[str, object]) -> None:
     """One line ``from module import names``, or ``import module as name``."""
     if isinstance(line, ast.ImportFrom):
         found = importlib.import_module(str(line.module))
-        into |= {each.asname or each.name: getattr(found, each.name) for each in line.names}
+        for each in line.names:
+            if not hasattr(found, each.name):  # a module of the package
+                importlib.import_module(f"{line.module}.{each.name}")
+            into[each.asname or each.name] = getattr(found, each.name)
     elif isinstance(line, ast.Import):
         into |= {each.asname or each.name: importlib.import_module(each.name) for each in line.names}
     else:

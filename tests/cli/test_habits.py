@@ -51,7 +51,7 @@ def test_help__tells_the_parts_of_the_package_without_importing_them():
 COMPLETION = [
     ({"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake sce", "COMP_CWORD": "1"}, "scenario\n"),
     ({"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake scenario val", "COMP_CWORD": "2"}, "validate\n"),
-    ({"_ETHBRAKE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --warm"}, '"--warm-up"'),
+    ({"_ETHBRAKE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --comp"}, '"--compile"'),
 ]
 
 
@@ -111,16 +111,16 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     assert re.search(r"^compiling: \d+ kernels in \d+ s so far$", capsys.readouterr().err, re.MULTILINE)
 
 
-def test_doctor__warms_up_only_when_asked(ethbrake, monkeypatch):
-    monkeypatch.setattr(doctor, "_warm_up", lambda: (True, "9 kernels ready"))
-    assert "warm-up" not in ethbrake("doctor").out
-    assert "9 kernels ready" in ethbrake("doctor", "--warm-up").out
+def test_doctor__compiles_only_when_asked(ethbrake, monkeypatch):
+    monkeypatch.setattr(doctor, "_compile", lambda: (True, "9 kernels ready"))
+    assert "compile" not in ethbrake("doctor").out
+    assert "9 kernels ready" in ethbrake("doctor", "--compile").out
 
 
 @pytest.mark.long
-def test_doctor_warm_up__leaves_nothing_to_compile(ethbrake):
-    answer = ethbrake("doctor", "--warm-up", "--json")
-    assert answer.status == 0 and '"name": "warm-up",\n    "ok": true' in answer.out
+def test_doctor_compile__leaves_nothing_to_compile(ethbrake):
+    answer = ethbrake("doctor", "--compile", "--json")
+    assert answer.status == 0 and '"name": "compile",\n    "ok": true' in answer.out
     kernels = set(cache_folder().iterdir())
     commands = [
         ("evaluate", "--agents", "full_brake,e_v2x_bm,ppo@shipped,ppo@shipped+episode", "--episodes", "3"),
