@@ -103,7 +103,6 @@ def test_run__the_hybrid_is_in_no_world_worse_than_its_baseline(finished_run):
     assert all(harm["hybrid", str(k)] <= harm["e_v2x_bm", str(k)] for k in range(60))
 
 
-@pytest.mark.slow
 def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake, finished_run):
     answer = ethbrake(
         "evaluate",
@@ -121,6 +120,7 @@ def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake, fini
         assert row == {**then[names.get(row["agent"], row["agent"])], "agent": row["agent"]}
 
 
+@pytest.mark.slow
 def test_run_json__prints_the_rows_alone_and_force_replaces(ethbrake, tiny_recipe, finished_run, tmp_path):
     folder = tmp_path / "again"
     shutil.copytree(finished_run, folder)
@@ -133,7 +133,6 @@ def test_run_json__prints_the_rows_alone_and_force_replaces(ethbrake, tiny_recip
     assert str(folder / "report.html") in answer.err
 
 
-@pytest.mark.slow
 def test_train__names_its_folder_after_scenario_recipe_and_seed(ethbrake, tiny_recipe, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     answer = ethbrake("train", "--recipe", tiny_recipe, "--seed", "5", "--steps", "128", "--json")
@@ -147,6 +146,7 @@ def test_train__names_its_folder_after_scenario_recipe_and_seed(ethbrake, tiny_r
     assert run_json(Path("runs/mine"))["status"] == "finished"
 
 
+@pytest.mark.slow
 def test_run__vehicle_chooses_among_several_learners(ethbrake, tiny_recipe, scenario_file, tmp_path):
     scenario = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: learner\n")
     chosen = ["--scenario", scenario, "--vehicle", "vehicle_3", "--episodes", "20", "--output", tmp_path / "new"]
@@ -190,7 +190,6 @@ def test_train__several_learners_share_a_policy(ethbrake, tiny_recipe, scenario_
     assert manifest["learners"] == ["vehicle_2", "vehicle_3"]
 
 
-@pytest.mark.slow
 def ctrl_c_when(monkeypatch: pytest.MonkeyPatch, *moments: Callable[[dict[str, Any]], bool]) -> None:
     """Press Ctrl-C when what is shown first fits the first moment, then when it first fits the second, ..."""
     waiting = list(moments)
@@ -206,6 +205,7 @@ def ctrl_c_when(monkeypatch: pytest.MonkeyPatch, *moments: Callable[[dict[str, A
     monkeypatch.setattr("ethbrake_marl.cli.terminal.Bars", Pressing)
 
 
+@pytest.mark.slow
 def test_run_interrupted__the_policy_so_far_is_evaluated(ethbrake, tiny_recipe, tmp_path, monkeypatch):
     ctrl_c_when(monkeypatch, lambda shown: shown["done"] == 256)
     folder = tmp_path / "stopped"
