@@ -22,10 +22,10 @@ from ethbrake_marl.envs.setup import (
     make_engine,
     restart,
 )
-from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.envs.turns import in_turns
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.observations import Observation, Observations
+from ethbrake_marl.observations.state import full_state, state_features
 from ethbrake_marl.physics import Ints
 from ethbrake_marl.rewards import Reward
 
