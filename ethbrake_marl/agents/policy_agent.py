@@ -130,6 +130,7 @@ class PolicyAgent:
         self.weights_sha256 = weights_sha256  # of the policy as it is now; None where nobody can find its weights
         self.observation = observation
         self._infer, self._initial_state, self._clip = infer, initial_state, clip
+        self.remembers = initial_state is not None
         self._more = more  # what stands behind the own observation
         self._steps: Ints = np.zeros(0, np.int64)  # [n] decisions of the running episodes
         self._rows: Ints = np.zeros(0, np.int64)  # [n] their rows in the batch that began
