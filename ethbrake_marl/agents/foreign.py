@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium.wrappers import NormalizeObservation, RescaleObservation
 from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput, describe_error, naming_extras
@@ -30,7 +31,7 @@ def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | N
         policy = _open_onnx(Path(policy), name)
     if not (hasattr(policy, "run") and hasattr(policy, "get_inputs")) and not hasattr(policy, "predict"):
         if _is_torch_module(policy):
-            return _ask_torch(policy, initial_state is not None), initial_state
+            return _ask_torch(policy, name, initial_state is not None), initial_state
         if callable(policy):
             call = policy if initial_state else lambda seen, _: (_without_memory(policy(seen)), None)
             return call, initial_state
@@ -104,6 +105,26 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
     return infer, begin
 
 
+def training_environment(model: Any, name: str) -> Any:
+    """The environment of this package in which a Stable-Baselines3 model is trained, inside whatever wraps it.
+
+    None where that is not known. Raises ``InvalidInput`` where Gymnasium's own wrappers change what it observes.
+    """
+    env = getattr(model, "get_env", lambda: None)()
+    if env is None:
+        return None
+    for wrapper in (NormalizeObservation, RescaleObservation):
+        if any(env.env_is_wrapped(wrapper)):
+            raise InvalidInput(
+                f"agent {name!r}: the model is trained under {wrapper.__name__}, which this agent knows nothing of;"
+                " write a function around it that does the same, or train under Stable-Baselines3's VecNormalize"
+            )
+    try:
+        return env.get_attr("unwrapped")[0] if env.get_attr("engine") else None
+    except AttributeError:  # another library's
+        return None
+
+
 def _statistics(model: Any) -> Any:
     """Stable-Baselines3's ``VecNormalize`` that the model is trained under, as it counts now; None without one."""
     find = getattr(model, "get_vec_normalize_env", None)
@@ -117,8 +138,16 @@ def _ask_onnx(session: Any) -> Infer:
     return lambda seen, _: (session.run([wanted], {given: seen})[0], None)
 
 
-def _ask_torch(module: Any, with_state: bool) -> Infer:
+def _ask_torch(module: Any, name: str, with_state: bool) -> Infer:
     torch = sys.modules["torch"]
+    for layer in module.modules():
+        if layer.training and isinstance(
+            layer, torch.nn.modules.dropout._DropoutNd | torch.nn.modules.batchnorm._NormBase
+        ):
+            raise InvalidInput(
+                f"agent {name!r}: {type(layer).__name__} is in training mode, where it draws, or mixes the worlds of a"
+                " batch; call eval() of the module first"
+            )
 
     def call(seen: Observations, state: State) -> tuple[Any, State]:
         parameter = next(iter(module.parameters()), None)

@@ -15,7 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import LARGEST, action_to_command
-from ethbrake_marl.agents.foreign import Infer, State, adapt_policy, map_state, to_array, weights_sha256
+from ethbrake_marl.agents.foreign import (
+    Infer,
+    State,
+    adapt_policy,
+    map_state,
+    to_array,
+    training_environment,
+    weights_sha256,
+)
 from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, describe_error
 from ethbrake_marl.observations import (
@@ -53,12 +61,13 @@ def policy_agent(
         name: in tables and messages; None: the name of the function or class.
         scenario: the policy observes what learners of it do.
         observation: what it observes instead, as ``choose_observation`` reads it; None: that of the scenario, or of the
-            policy itself, or the usual one.
+            policy itself, or of the environment that a Stable-Baselines3 model has, or the usual one.
         initial_state: makes the memory of ``n`` episodes that begin: an array whose first axis is the world, or tuples
             and mappings of such. None: a function has no memory.
         clip: actions beyond -1 and 1 mean -1 and 1; otherwise they are refused.
         appended: ``number`` or ``state`` of ``make_sb3_vec_env``, where the policy was trained on such rows; needs the
-            scenario with its learners. Who sees the ``state`` knows the true state of the line.
+            scenario with its learners. None: as in the environment that the model has. Who sees the ``state`` knows
+            the true state of the line.
 
     Raises ``InvalidInput`` for what is no such policy, or one for another number of features.
 
@@ -70,7 +79,10 @@ def policy_agent(
 
     """
     named = name or _name_of(policy)
-    spec = _observation_of(policy, scenario, observation)
+    trained = training_environment(policy, named)
+    spec = _observation_of(policy, scenario, observation, trained)
+    if appended is None and (appended := getattr(trained, "appended", None)) is not None:
+        scenario = trained.engine.scenario if scenario is None else scenario
     if appended is not None and scenario is None:
         raise InvalidInput(f"agent {named!r}: appended = {appended!r} needs the scenario that it was trained in")
     size = spec.size if scenario is None else len(row_features(spec.features, appended, scenario))
@@ -79,6 +91,11 @@ def policy_agent(
         raise InvalidInput(
             f"agent {named!r}: the policy takes observations of shape {shape}, here are {size} features;"
             " give what it was trained on: scenario, observation, or appended (number or state, of make_sb3_vec_env)"
+        )
+    if trained is not None and [f.name for f in spec.features] != [f.name for f in trained.engine.observation.features]:
+        raise InvalidInput(
+            f"agent {named!r}: the model is trained on other features than {spec}: {trained.engine.observation}; leave"
+            " observation out, and give the scenario it was trained in, or none"
         )
     actions = getattr(policy, "action_space", None)
     ends = getattr(actions, "low", -1.0), getattr(actions, "high", 1.0)
@@ -95,12 +112,12 @@ def policy_agent(
     return agent
 
 
-def _observation_of(policy: Any, scenario: Scenario | None, given: Observation | None) -> ObservationSpec:
+def _observation_of(policy: Any, scenario: Scenario | None, given: Observation | None, trained: Any) -> ObservationSpec:
     if given is not None:
         return choose_observation(given, None if scenario is None else scenario.time_step_s)
     if scenario is not None:
         return observation_for(scenario)
-    own = getattr(policy, "observation", None)
+    own = getattr(policy, "observation", None) if trained is None else trained.engine.observation
     return own if isinstance(own, ObservationSpec) else ObservationSpec()
 
 

@@ -252,6 +252,37 @@ def test_model_of_actions_that_mean_something_else__is_refused():
         eb.policy_agent(model)
 
 
+def test_model_that_has_its_environment__observes_what_it_was_trained_on(model):
+    stable, wrappers = pytest.importorskip("stable_baselines3"), pytest.importorskip("gymnasium").wrappers
+    other = eb.ObservationSpec(front=2, rear=0)  # as many features as the usual ones
+    assert other.size == eb.ObservationSpec().size
+    settings = {"env_kwargs": {"observation": other}}
+    for rows in (
+        eb.make_sb3_vec_env("paper-random", 2, observation=other),
+        stable.common.env_util.make_vec_env("EthBrake-v0", **settings),
+    ):
+        theirs = stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=8)
+        assert eb.policy_agent(theirs).observation.front == 2
+        for settings in ({"scenario": SCENARIO}, {"observation": eb.ObservationSpec()}):
+            with pytest.raises(InvalidInput, match=r"trained on other features than ObservationSpec\(front=1, rear=1"):
+                eb.policy_agent(theirs, **settings)
+    rows = stable.common.env_util.make_vec_env("EthBrake-v0", wrapper_class=wrappers.NormalizeObservation)
+    with pytest.raises(InvalidInput, match="trained under NormalizeObservation, which this agent knows nothing of"):
+        eb.policy_agent(stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=8))
+
+
+@pytest.mark.parametrize(("layer", "setting"), [("Dropout", 0.5), ("BatchNorm1d", 4)])
+def test_torch_module__that_draws_or_mixes_worlds_must_be_in_evaluation_mode(layer, setting):
+    torch = pytest.importorskip("torch")
+    module = torch.nn.Sequential(
+        torch.nn.Linear(27, 4), getattr(torch.nn, layer)(setting), torch.nn.Linear(4, 1), torch.nn.Tanh()
+    )
+    with pytest.raises(InvalidInput, match=rf"{layer} is in training mode, .* call eval\(\) of the module first"):
+        eb.policy_agent(module)
+    agent = eb.policy_agent(module.eval())
+    assert harms(agent).tolist() == harms(agent).tolist()
+
+
 @pytest.mark.parametrize("appended", ["number", "state"])
 def test_model_trained_on_rows_with_something_appended__drives_as_there(appended):
     stable = pytest.importorskip("stable_baselines3")
@@ -259,10 +290,11 @@ def test_model_trained_on_rows_with_something_appended__drives_as_there(appended
     rows = eb.make_sb3_vec_env(scenario, 4, seed=3, appended=appended)
     model = stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=16, n_epochs=1, seed=1)
     with pytest.raises(InvalidInput, match=r"scenario, observation, or appended \(number or state"):
-        eb.policy_agent(model, scenario=scenario)
+        eb.policy_agent(model.policy, scenario=scenario)
     with pytest.raises(InvalidInput, match="needs the scenario that it was trained in"):
-        eb.policy_agent(model, appended=appended)
-    agents = {i: eb.policy_agent(model, scenario=scenario, appended=appended) for i in scenario.learners}
+        eb.policy_agent(model.policy, appended=appended)
+    told = {"scenario": scenario, "appended": appended}  # a model that has its environment needs none of it
+    agents = {1: eb.policy_agent(model.policy, **told), 2: eb.policy_agent(model)}
     assert agents[1].knows == (eb.agents.knowledge.Source.STATE if appended == "state" else "messages")
     team = drive(scenario.sample(4, 3, channel="training").worlds, eb.Team(agents, "theirs"), scenario)
     rows.seed(3)  # the model has set its own
