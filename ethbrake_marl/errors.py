@@ -9,9 +9,12 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
+from numbers import Integral
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 _NAMED = 5  # failed worlds that a message names one by one
 LINE_LIMIT = 1_500  # characters of a message; of a longer one the beginning and the end are shown
@@ -206,6 +209,10 @@ class FailedWorld(UserWarning):
     """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
 
 
+class IncompleteTable(UserWarning):
+    """A table of best known harm holds some of the worlds asked about, and not the others."""
+
+
 @contextmanager
 def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
     """Worlds that fail inside are told by the rows of the batch from which they were taken."""
@@ -233,7 +240,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
     """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no end)."""
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"
         raise InvalidInput(f"{what} = {value!r}: must be a whole number{right}")

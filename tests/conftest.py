@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
+import typer.main
 from hypothesis import settings
 
 # Before the first numerical import: each pool reads its variable once.
@@ -19,13 +20,10 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"
 os.environ["SDL_AUDIODRIVER"] = "dummy"
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 
-# In a parallel run each process compiles for itself, once: where two compile one function for different arguments at
-# the same moment, numba may keep the code of the one under the name of the other.
-_worker = os.environ.get("PYTEST_XDIST_WORKER")
-if _worker is not None:
-    os.environ["NUMBA_CACHE_DIR"] = str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "numba" / _worker)
-
 pytest_plugins = ["tests.fixtures.evaluation", "tests.fixtures.policies"]
+
+# Typer reads the signatures of all commands for each command line, 70 ms; the suite has a thousand in one process.
+typer.main.get_params_from_function = functools.cache(typer.main.get_params_from_function)
 
 # A shell's background job ignores Ctrl-C, and so would all processes that it starts; the tests send it.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,114 +1,199 @@
-"""The one way in which this package compiles a kernel: strict floating point, cached safely.
+"""The one way in which this package compiles a kernel: strict floating point, kept safely by ``kernel_store``.
 
-numba keys its cache on a function's own file, so editing a *callee* in another file would silently keep the
-stale machine code. Here the kernels of a file lie in a folder that carries a hash of this file, of the kernel sources
-that it imports, and of the numba version: an edit compiles anew what can call it, and nothing else.
+numba's own cache goes by a function's own file: editing a *callee* in another file would silently keep the stale
+machine code; and its index, which is read, changed and written back, is not safe where processes share a folder.
 """
 
 from __future__ import annotations
 
-import atexit
 import hashlib
-import os
-import re
-import shutil
-import tempfile
+import pickle
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from types import CodeType
 from typing import Any, TypeVar, cast
 
+import llvmlite
 import numba
+from llvmlite.binding import parse_assembly, parse_bitcode
 from numba.core import config as numba_config
-from numba.core import event
+from numba.core import types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompileResult, Flags, compile_extra
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import CPUDispatcher
+from numba.core.serialize import dumps
+from numba.core.sigutils import normalize_signature
+from numba.core.typing import make_concrete_template
 
 from ethbrake_marl.errors import check_whole_number
+from ethbrake_marl.kernel_store import (
+    alone,
+    digest_of_sources,
+    keep_kernel,
+    load_kernel,
+    place_of,
+    tell_compilation,
+)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-_PACKAGE = Path(__file__).resolve().parents[1]
-_MARK = b"@compiled"
-_IMPORT = re.compile(r"^from (ethbrake_marl[.\w]*) import (\([^)]*\)|.*)$", re.MULTILINE)
-_CONSTANT = re.compile(r"\b[A-Z][A-Z0-9_]*\b")
-_TEMPORARY = "ethbrake_marl-"
+_OPTIONS = {"nopython": True, "boundscheck": None, "fastmath": False, "nogil": True, "error_model": "numpy"}
+_KNOWN = (0, 61) <= tuple(map(int, numba.__version__.split(".")[:2])) <= (0, 68)
+_SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")  # numba's, of the code made
+# Instructions of the levels of x86-64 for which kernels are built ahead, the better one first.
+_V2 = {"+cx16", "+popcnt", "+sse4.2", "+ssse3"}
+_LEVELS = {"x86-64-v3": _V2 | {"+avx2", "+bmi", "+bmi2", "+f16c", "+fma", "+lzcnt", "+movbe"}, "x86-64-v2": _V2}
 
 
-@cache
-def cache_folder() -> Path:
-    """Folder of the compiled kernels: the user's cache, or where that cannot be written one for this process alone."""
-    home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home) / "ethbrake_marl"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError:
-        temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY))
-        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-        return temporary
+class _Linkable(JITCodeLibrary):  # type: ignore[misc]
+    """The code of a kernel for those that call it, which make it a part of theirs: no machine code is made of it."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
 
 
-@cache
-def kernel_folder(source: Path) -> Path:
-    """Folder of the kernels of one file, below ``cache_folder``: another one after every edit that can change them.
+class Kernel(CPUDispatcher):  # type: ignore[misc]
+    """A compiled function as numba's ``njit`` makes it, but for where its code is kept, and for what is not compiled.
 
-    Code that is in no file (a shell, a test) has one folder for all of it.
+    numba makes machine code, and two wrappers, of whatever one compiled function calls of others, though the caller
+    holds all of that code already; and it compiles once for each whole number that stands as an argument in a source.
     """
-    digest = hashlib.sha256(numba.__version__.encode())
-    for needed in kernel_sources(source) if source.is_file() else ():
-        digest.update(needed.read_bytes())
-    return cache_folder() / digest.hexdigest()[:16]
+
+    def __init__(self, *given: Any, **options: Any) -> None:
+        super().__init__(*given, **options)
+        self._compiler._customize_flags = _without_c_wrapper
+        self._linked: dict[tuple[Any, ...], Any] = {}  # types of the arguments -> signature, library, environments
+
+    def compile(self, sig: Any) -> Any:
+        """The machine code for one signature: at hand, loaded, or compiled and kept."""
+        with global_compiler_lock:
+            arguments, returned = normalize_signature(sig)
+            if tuple(arguments) not in self.overloads:
+                self._obtain("entry", (*arguments, returned), lambda: self._compile(sig), self._load)
+            return self.overloads[tuple(arguments)].entry_point
+
+    def _compile(self, sig: Any) -> Any:
+        tell_compilation()
+        super().compile(sig)
+        made = self.overloads[tuple(normalize_signature(sig)[0])]
+        if not _KNOWN:
+            return made.library.has_dynamic_globals, made._reduce()
+        library = made.library
+        for environment in made._find_referenced_environments():  # of what it has linked: its own is set
+            library.codegen.set_env(environment.env_name, environment)
+        parts = list(made._replace(type_annotation="")._reduce())
+        stub = "".join(f'define void @"{name}"() {{ ret void }}\n' for name in _symbols(library))
+        parts[0] = (library.name, "object", (parts[0][2][0], parse_assembly(stub).as_bitcode()))
+        return library.has_dynamic_globals, parts
+
+    def _load(self, *parts: Any) -> None:
+        self.targetctx.refresh()
+        made = CompileResult._rebuild(self.targetctx, *parts)
+        self.targetctx.insert_user_function(made.entry_point, made.fndesc, [made.library])
+        self.add_overload(made)
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """What another kernel that calls this one needs to know of it."""
+        if not _KNOWN:
+            return super().get_call_template(args, kws)
+        pysig, folded = self._compiler.fold_argument_types(args, kws)
+        arguments = tuple(types.unliteral(kind) for kind in folded)
+        if arguments not in self._linked:
+            self._obtain("linked", arguments, lambda: self._compile_linked(arguments), self._load_linked)
+        signatures = [signature for signature, *_ in self._linked.values()]
+        return make_concrete_template(self.__name__, self.__name__, signatures), pysig, arguments, {}
+
+    def get_overload(self, sig: Any) -> Any:
+        """By what the code for a signature is known to numba."""
+        return self._linked[tuple(normalize_signature(sig)[0])][1] if _KNOWN else super().get_overload(sig)
+
+    def _compile_linked(self, arguments: tuple[Any, ...]) -> Any:
+        flags = Flags()
+        self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
+        flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        library = _Linkable(self.targetctx.codegen(), self.__qualname__)
+        with self._compiling_counter:
+            made = compile_extra(
+                self.typingctx, self.targetctx, self.py_func, arguments, None, flags, self.locals, library=library
+            )
+        self._link(made.signature, made.fndesc, library, made.environment)
+        made.fndesc.typemap = made.fndesc.calltypes = None
+        library._ensure_finalized()
+        bitcode = library._final_module.as_bitcode()
+        environments = [made.environment, *made._find_referenced_environments()]
+        return library.has_dynamic_globals, (made.signature, made.fndesc, library.name, bitcode, environments)
+
+    def _load_linked(self, signature: Any, fndesc: Any, name: str, bitcode: bytes, environments: Any) -> None:
+        self.targetctx.refresh()
+        library = _Linkable(self.targetctx.codegen(), name)
+        library._final_module, library._finalized = parse_bitcode(bitcode), True
+        self._link(signature, fndesc, library, environments)
+
+    def _link(self, signature: Any, fndesc: Any, library: _Linkable, environments: Any) -> None:
+        self.targetctx.insert_user_function(library, fndesc, [library])
+        self._linked[signature.args] = signature, library, environments
+
+    def _obtain(self, way: str, kinds: tuple[Any, ...], make: Callable[[], Any], load: Callable[..., None]) -> None:
+        """Load what is kept under this name, or make and keep it, while no other process does."""
+        name = self._name(way, kinds)
+        kept = load_kernel(name) or (self._ready_made(kinds) if way == "entry" else None)
+        if kept is None:
+            with alone(name):
+                kept = load_kernel(name)  # another process may have made it meanwhile
+                if kept is None:
+                    unkept, made = make()
+                    if name and not unkept:
+                        keep_kernel(name, dumps(made))
+                    return
+        load(*pickle.loads(kept))
+
+    def _ready_made(self, kinds: tuple[Any, ...]) -> bytes | None:
+        """What was installed for a processor like this one, unless the user named another."""
+        triple, _, features = self.targetctx.codegen().magic_tuple()
+        for level, needed in _LEVELS.items() if numba_config.CPU_NAME is None else ():
+            if needed <= set(features.split(",")):
+                kept = load_kernel(self._name("entry", kinds, (triple, level, "")), ready_made=True)
+                if kept is not None:
+                    return kept
+        return None
+
+    def _name(self, way: str, kinds: tuple[Any, ...], processor: tuple[str, ...] = ()) -> str:
+        """Name of a signature's file in the store; empty where not all that makes the code is known."""
+        code, source = self.py_func.__code__, Path(self.py_func.__code__.co_filename)
+        digest, own = digest_of_sources(source), digest_of_sources(Path(__file__))
+        if not digest or not own or self.py_func.__closure__:
+            return ""
+        made_of = (
+            (way, sys.implementation.cache_tag, sys.flags.optimize, numba.__version__, llvmlite.__version__),
+            [str(getattr(numba_config, setting)) for setting in _SETTINGS],
+            processor or self.targetctx.codegen().magic_tuple(),
+            (own, digest, place_of(source), self.__module__, self.__qualname__, code.co_firstlineno, code.co_code),
+            [constant for constant in code.co_consts if not isinstance(constant, CodeType)],
+            sorted(self.targetoptions.items()),
+            [_described(kind) for kind in kinds],
+        )
+        return f"{self.__name__.strip('<>')}-{hashlib.sha256(repr(made_of).encode()).hexdigest()[:40]}.{way}"
 
 
-def kernel_sources(source: Path) -> list[Path]:
-    """The file, and all of this package that its kernels may be made of, sorted by name.
-
-    These are the files with kernels that it imports, theirs, and so on; and files from which any of them imports a
-    constant (a name in capitals).
-    """
-    found, follow = {source}, [source]
-    while follow:
-        for module, names in _IMPORT.findall(follow.pop().read_text("utf-8")):
-            for imported in _files(module, names):
-                has_kernels = _MARK in imported.read_bytes()
-                if imported not in found and (has_kernels or _CONSTANT.search(names)):
-                    found.add(imported)
-                    follow += [imported] * has_kernels
-    return sorted(found)
+def _without_c_wrapper(flags: Any) -> Any:
+    """Python calls these functions, other kernels do, and nothing written in C."""
+    flags.no_cfunc_wrapper = _KNOWN
+    return flags
 
 
-def _files(module: str, names: str) -> list[Path]:
-    """The files of a module of this package; of a package its own, and those of the names that are modules."""
-    place = _PACKAGE.joinpath(*module.split(".")[1:])
-    if place.with_suffix(".py").is_file():
-        return [place.with_suffix(".py")]
-    within = [place / f"{name}.py" for name in re.findall(r"\w+", names)]
-    return [place / "__init__.py", *(file for file in within if file.is_file())]
+def _symbols(library: Any) -> list[str]:
+    """Names of what a library defines for callers from outside."""
+    return [function.name for function in library._final_module.functions if function.name.startswith("_ZN7cpython")]
 
 
-def is_temporary(folder: Path) -> bool:
-    """Whether a ``cache_folder`` goes when this process ends."""
-    return folder.name.startswith(_TEMPORARY)
-
-
-def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
-    """Call ``tell`` once, when this process begins to compile: the folder of the kernels, and whether it was empty.
-
-    Kernels that are loaded from the folder are not compiled. Empty means: not even the physics of today is there.
-    """
-    events: Any = event  # numba's own types end here
-
-    class Once(event.Listener):
-        def on_start(self, event_: event.Event) -> None:
-            events.unregister("numba:compile", self)
-            physics = kernel_folder(Path(__file__).with_name("advance.py"))
-            tell(cache_folder(), not any(physics.rglob("*.nbi")))
-
-        def on_end(self, event_: event.Event) -> None:
-            """Nothing: it does not listen any more."""
-
-    events.register("numba:compile", Once())
+def _described(kind: Any) -> str:
+    """A type with the names of the fields that it and its parts have: of a named tuple numba's own name has none."""
+    parts = [_described(part) for part in getattr(kind, "types", ())]
+    return f"{kind} {getattr(kind, 'fields', '')} {parts}"
 
 
 def compiled(function: Function) -> Function:
@@ -151,16 +236,12 @@ def compiled_bare_apart(function: Function) -> Function:
 
 def _compile(function: Function, *, inline: bool, within: bool = False, bare: bool = False) -> Function:
     config: Any = numba_config  # its settings are made at run time
-    before = config.CACHE_DIR
-    config.CACHE_DIR = str(kernel_folder(Path(function.__code__.co_filename)))
-    try:
-        how: dict[str, Any] = {"inline": "always"} if within else {"forceinline": inline}
-        if bare:
-            how["_nrt"] = False
-        compiler: Any = numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy", **how)
-        return cast(Function, compiler(function))
-    finally:
-        config.CACHE_DIR = before
+    if config.DISABLE_JIT:
+        return function
+    how: dict[str, Any] = {"inline": "always"} if within else {"forceinline": inline}
+    if bare:
+        how["_nrt"] = False
+    return cast(Function, Kernel(function, targetoptions=_OPTIONS | how))
 
 
 Result = TypeVar("Result")
