@@ -20,13 +20,13 @@ import llvmlite
 import numba
 from llvmlite.binding import parse_assembly, parse_bitcode
 from numba.core import config as numba_config
-from numba.core import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult, Flags, compile_extra
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
+from numba.core.types.misc import unliteral
 from numba.core.typing import make_concrete_template
 
 from ethbrake_marl.errors import check_whole_number
@@ -41,7 +41,7 @@ from ethbrake_marl.kernel_store import (
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _OPTIONS = {"nopython": True, "boundscheck": None, "fastmath": False, "nogil": True, "error_model": "numpy"}
-_KNOWN = (0, 61) <= tuple(map(int, numba.__version__.split(".")[:2])) <= (0, 68)
+_KNOWN = numba.__version__.startswith("0.68.")  # of others these inner parts were not tried: numba goes its own way
 _SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")  # numba's, of the code made
 # Instructions of the levels of x86-64 for which kernels are built ahead, the better one first.
 _V2 = {"+cx16", "+popcnt", "+sse4.2", "+ssse3"}
@@ -101,7 +101,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         if not _KNOWN:
             return super().get_call_template(args, kws)
         pysig, folded = self._compiler.fold_argument_types(args, kws)
-        arguments = tuple(types.unliteral(kind) for kind in folded)
+        arguments = tuple(unliteral(kind) for kind in folded)
         if arguments not in self._linked:
             self._obtain("linked", arguments, lambda: self._compile_linked(arguments), self._load_linked)
         signatures = [signature for signature, *_ in self._linked.values()]
