@@ -250,12 +250,15 @@ def find_entry(written: AgentSpec) -> Entry:
     if written.file is not None:
         return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", (Source.UNSTATED,), _FROM_FILE)
     if written.name not in _ENTRIES:
+        if written.name == "ladder":
+            raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
         raise unknown_name("agent", written.name, {*_ENTRIES, "ladder"}, may_be_own=True)
     entry = _ENTRIES[written.name]
     if written.argument is not None and ":" not in entry.form:
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
     if written.policy is not None and "@" not in entry.form:
-        raise InvalidInput(f"agent {written.core!r}: {written.name} takes no policy")
+        own = "" if isinstance(entry.make, str) else "; register_agent(..., takes_policy=True) says that it does"
+        raise InvalidInput(f"agent {written.core!r}: {written.name} takes no policy{own}")
     return entry
 
 
@@ -270,23 +273,29 @@ def agent_entries() -> tuple[Entry, ...]:
 
 
 def register_agent(
-    name: str, factory: Factory, *, about: str = "an agent of your own", knows: Knowledge = (Source.UNSTATED,)
+    name: str,
+    factory: Factory,
+    *,
+    about: str = "an agent of your own",
+    knows: Knowledge = (Source.UNSTATED,),
+    takes_policy: bool = False,
 ) -> None:
-    """Make ``name``, ``name:argument`` and ``name@policy`` known to ``make_agent``, and so to every command.
+    """Make ``name`` and ``name:argument`` known to ``make_agent``, and so to every command.
 
     Args:
         name: plain, without argument.
-        factory: makes the agent, from what stands after the colon (or None) and ``AgentSettings``, whose ``policy`` is
-            what stands after the ``@``. The same one again changes nothing.
+        factory: makes the agent, from what stands after the colon (or None) and ``AgentSettings``. The same one again
+            changes nothing.
         about: one line for ``ethbrake agents``.
         knows: of the line while it drives, for ``ethbrake agents`` too.
+        takes_policy: whether ``name@policy`` is known, too; the factory finds it in ``AgentSettings.policy``.
 
     Raises ``AlreadyExists`` for a name that another factory has, ``InvalidInput`` for one that is not plain.
 
     """
     if parse_spec(name) != AgentSpec(name, None, None, ()):
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
-    entry = Entry(f"{name}[:ARGUMENT][@POLICY]", about, knows, factory)
+    entry = Entry(f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}", about, knows, factory)
     if name in OLD_NAMES or _ENTRIES.setdefault(name, entry).make is not factory:
         raise AlreadyExists(f"agent {name!r} is registered already")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
@@ -27,16 +27,15 @@ from ethbrake_marl.envs.setup import (
     restart_from,
     warn_of_unknown,
 )
-from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Feature, Observation, Observations
+from ethbrake_marl.observations import Observation, Observations
+from ethbrake_marl.observations.state import Appended, full_state, row_features
 from ethbrake_marl.physics import Bools, Ints, Worlds, concatenate
 from ethbrake_marl.physics.rows import Packed, unpack
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import initial_state_worlds
 
 Rewards = NDArray[np.float32]
-Appended = Literal["number", "state"]
 
 
 def make_sb3_vec_env(
@@ -62,7 +61,8 @@ def make_sb3_vec_env(
             horizon. Harm is counted to the horizon: nothing lies beyond it, and what is imagined there can grow without
             limit.
         appended: numbers of a row behind the vehicle's own observation. ``number``: the learner's place among the
-            learners (0 = the foremost); ``state``: the full state of the line (``envs.state``), for a central critic.
+            learners (0 = the foremost); ``state``: the full state of the line (``observations.state``), for a central
+            critic.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
@@ -107,8 +107,7 @@ class EthBrakeVecEnv(VecEnv):
     def __init__(
         self, engine: Engine, seed: int, *, horizon_is_end: bool = False, appended: Appended | None = None
     ) -> None:
-        if appended not in (None, *get_args(Appended)):
-            raise InvalidInput(f"appended = {appended!r}: must be {' or '.join(get_args(Appended))}, or None")
+        features = row_features(engine.observation.features, appended, engine.scenario)
         if not engine.learners:
             raise InvalidInput(f"scenario {engine.scenario.name!r} has no learner; pass learners=['vehicle_2']")
         self.engine = engine
@@ -122,7 +121,7 @@ class EthBrakeVecEnv(VecEnv):
         self._steps = np.zeros(rows, np.int64)
         self._begun = np.zeros(0)  # values of the report at each episode's beginning
         self._started = False
-        super().__init__(rows, feature_box(_row_features(engine, appended)), action_box())
+        super().__init__(rows, feature_box(features), action_box())
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Start the stream of ``seed`` at the next reset (None: fresh entropy); one stream serves all rows."""
@@ -281,14 +280,3 @@ class EthBrakeVecEnv(VecEnv):
     def _refuse_some_rows(self, what: str, indices: VecEnvIndices) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):
             raise InvalidInput(f"{what}: indices {indices!r}; rows share one batch, so leave indices out")
-
-
-def _row_features(engine: Engine, appended: Appended | None) -> tuple[Feature, ...]:
-    """Every number of a row in order."""
-    own = engine.observation.features
-    if appended is None:
-        return own
-    if appended == "state":
-        return (*own, *state_features(engine.scenario))
-    last = len(engine.learners) - 1
-    return (*own, Feature("learner", "1", 1.0, 0.0, float(max(last, 1)), "the learner's place among the learners"))
