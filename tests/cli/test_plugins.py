@@ -95,6 +95,7 @@ def recipe(tmp_path: Path) -> Path:
     return write_recipe(tmp_path, reward={"harm": 1.0, "calm": 0.01}, observation=seen)
 
 
+@pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.IncompleteTable")  # a list that shares worlds with a table
 def test_one_file__adds_agent_term_feature_and_preset_and_is_seen_in_the_report(
     ethbrake, tmp_path, parts, scenario, recipe, again
 ):
