@@ -35,7 +35,8 @@ class Watch(Protocol):
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """``before`` moved to the times ``until_s`` [n] under ``command_mps2`` [n, N]; ended worlds stay at theirs.
 
-        The first step is from the alert to the first decision. Nothing of what is given may be changed.
+        The first step is from the alert to the first decision; where a script decides on the way, a step is seen in
+        parts. Nothing of what is given may be changed.
         """
         ...
 
@@ -110,6 +111,7 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
     if not watched_by:
         return before
     now = unpack(engine.packed, before.vehicles)  # the episodes are the same, and so are their vehicles
-    for watch in watched_by:
-        watch.see(before, command_mps2, now.time_s)
+    for part in engine.segments(before, command_mps2):
+        for watch in watched_by:
+            watch.see(*part)
     return now

@@ -7,6 +7,7 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive, script_agents
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.setup import make_engine
 from ethbrake_marl.errors import InvalidInput
@@ -127,3 +128,21 @@ def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
     for seen in agent.seen[:3]:
         assert engine.observe(1).tobytes() == seen.tobytes()
         engine.step(np.full((20, 1), -0.5))
+
+
+def test_drive__a_policy_as_a_role_does_what_it_does_when_it_is_driven():
+    def with_roles(**roles):
+        return PAPER.replace(early_impacts="keep", roles={"vehicle_1": "full_brake", **roles})
+
+    universal, braking = make_agent("universal@shipped"), make_agent("full_brake")
+    driven = with_roles(vehicle_2="learner", vehicle_3="full_brake")
+    role = with_roles(vehicle_2="universal@shipped", vehicle_3="learner")
+    both = with_roles(vehicle_2="learner", vehicle_3="learner")
+    worlds = driven.sample(20, 7).worlds
+    harm = drive(worlds, universal, driven, 1).ledger.world_harm("first")
+    for episodes in (
+        drive(worlds, braking, role, 2),
+        drive(worlds, Team({1: universal, 2: braking}, "both"), both),
+    ):
+        assert np.abs(episodes.ledger.world_harm("first") - harm).max() < 1e-9
+    assert 0.0 < harm.mean() < drive(worlds, braking, driven, 1).ledger.world_harm("first").mean()
