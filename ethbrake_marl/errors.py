@@ -201,6 +201,10 @@ class FailedWorld(UserWarning):
     """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
 
 
+class IncompleteTable(UserWarning):
+    """A table of best known harm holds some of the worlds asked about, and not the others."""
+
+
 @contextmanager
 def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
     """Worlds that fail inside are told by the rows of the batch from which they were taken."""

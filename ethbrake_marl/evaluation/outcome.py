@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source
-from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of
+from ethbrake_marl.errors import IncompleteTable, InvalidInput, PhysicsError, count_of
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.files.html import html_table
 from ethbrake_marl.harm import HarmCount, Ledger
@@ -162,8 +163,14 @@ class Evaluation:
 
     @cached_property
     def limits(self) -> Limits | Unproven:
-        """What is known of each world whoever drives: found once, for everything that tells of this evaluation."""
-        return known_limits(self.worlds, self.task)
+        """What is known of each world whoever drives: found once, for everything that tells of this evaluation.
+
+        Warns (``IncompleteTable``) where a table of best known harm holds some of the worlds, and not the others.
+        """
+        found = known_limits(self.worlds, self.task)
+        if isinstance(found, Limits) and found.warning:
+            warnings.warn(found.warning, IncompleteTable, stacklevel=2)
+        return found
 
     def take(self, rows: Ints | Bools) -> Evaluation:
         """That of some of the worlds; nobody is left out of them."""

@@ -75,6 +75,7 @@ class Distance:
     realised_total: Estimate | None = None
     known_best_share: float | None = None  # worlds whose best is known without the agents of this evaluation
     below_best_known: int | None = None  # worlds in which the agent is below it
+    warning: str = ""  # a table holds some of the worlds, and not the others
 
     def estimates(self) -> dict[str, Estimate | None]:
         """The estimates by their names in JSON; ``mean_regret`` and ``realised_share`` are of first-impact harm."""
@@ -153,4 +154,5 @@ def distance(regrets: Regrets | None, outcome: Outcome, full_brake: Outcome | No
         realised_total=relative_decrease(total, regrets.regret(reference, "total")) if reference else None,
         known_best_share=float(known.mean()),
         below_best_known=int(regrets.below(outcome).sum()),
+        warning=limits.warning,
     )

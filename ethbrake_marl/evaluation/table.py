@@ -183,6 +183,7 @@ class SummaryRow:
         return {
             **estimates_to_json(self.distance.estimates()),
             "known_best_share": self.distance.known_best_share,
+            "best_known_warning": self.distance.warning or None,
             "below_best_known": self.distance.below_best_known,
             "impact_unproven": None if self.distance.between is None else asdict(self.distance.between),
         }
@@ -209,6 +210,7 @@ class SummaryTable(list[SummaryRow]):
             rates = [NO_VALUE if each is None else each.in_words(digits=1, scale=100.0, unit=" %") for each in shares]
             rows.append((row.agent, knowledge_text(row.knows), *rates[:1], *cells, *rates[1:]))
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
+        note += f" WARNING: {self[0].distance.warning}." if self and self[0].distance.warning else ""
         worlds = f"{self[0].parameters['scenario']}, {count_of(self[0].episodes, 'world')}" if self else "no agent"
         return html_table(_HEAD, rows, caption=worlds, note=note)
 

@@ -124,7 +124,7 @@ def _conditions(rows: Sequence[SummaryRow]) -> str:
         f"Ours: {parameter_line(rows[0].parameters)}. Harms are means per world in m²/s²; in brackets or"
         " below a value: its 95 % interval; decreases are relative to full braking."
     ]
-    texts += left_out_lines(rows) + limit_lines(rows) + knowledge_lines(rows)
+    texts += left_out_lines(rows) + warning_lines(rows) + limit_lines(rows) + knowledge_lines(rows)
     blocks = paper_blocks(rows)
     texts += [f"Paper, {name}: {PAPER_PARAMETERS[name]}." for name, _ in blocks]
     return "\n\n".join([*texts, *([PAPER_NOTE] if blocks else [])])
@@ -146,6 +146,11 @@ def left_out_line(worlds: Sequence[str], whole: int) -> str:
         f"LEFT OUT for every agent: {len(worlds):,} of {whole:,} worlds, which the physics could not advance"
         f" (please report them): {'; '.join(named)}."
     )
+
+
+def warning_lines(rows: Sequence[SummaryRow]) -> list[str]:
+    """That a table of best known harm does not hold some of these worlds, as a sentence; none where it is complete."""
+    return [f"WARNING: {rows[0].distance.warning}."] if rows and rows[0].distance.warning else []
 
 
 def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:

@@ -12,7 +12,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.team import Driver, Team
-from ethbrake_marl.evaluation import evaluate, summarise
+from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.learning.algorithms.protocol import Algorithm
 from ethbrake_marl.learning.model_state import Model
 from ethbrake_marl.learning.progress import (
@@ -208,20 +209,23 @@ class BetweenUpdates(BaseCallback):
         self.tell()
 
 
-METRICS = ("first_impact_harm", "total_harm", "collision_rate")
-
-
 def measure_on_list(training: Training) -> Evaluate:
-    """What measures the learners' policies on the recipe's fixed list: the means that ``evaluate`` gives on it."""
+    """What measures the learners' policies on the recipe's fixed list: the means that ``evaluate`` gives on it.
+
+    These alone: no bound is proven and no best known harm is looked up, as nobody is shown them.
+    """
     recipe, scenario = training.recipe, training.scenario
     worlds = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
 
     def measure(trained: Trained) -> dict[str, float]:
-        row = summarise(evaluate(worlds, {"policy": driver_of(trained, scenario)}, scenario=scenario, aftermath=False))[
-            0
-        ]
-        found = {name: getattr(row, name).value for name in METRICS}
-        return found | {AT_HORIZON: row.horizon_ends / row.episodes}
+        agents = {"policy": driver_of(trained, scenario)}
+        outcome = evaluate(worlds, agents, scenario=scenario, aftermath=False).outcome("policy")
+        return {
+            "first_impact_harm": mean(outcome.first_impact_harm).value,
+            "total_harm": mean(outcome.total_harm).value,
+            "collision_rate": float(outcome.collided.mean()),
+            AT_HORIZON: float((~outcome.at_rest).mean()),
+        }
 
     return measure
 

@@ -69,6 +69,22 @@ class Limits:
         """Worlds whose best is known for both counts, without looking at any agent."""
         return np.isfinite(self.first_impact_harm) & np.isfinite(self.total_harm)
 
+    @property
+    def warning(self) -> str:
+        """That a table holds some of the worlds and not the others, a clause; empty where it is all or none of them."""
+        known, avoidable = self.known, self.proof.avoidable
+        listed = known if avoidable is None else known & ~avoidable
+        missing = int((~known).sum())
+        if not (missing and listed.any()):
+            return ""
+        return (
+            f"the table of best known harm holds {listed.sum():,} of these {len(known):,} worlds, and not"
+            f" {missing:,} others ({100.0 * missing / len(known):.1f} %), whose best is not proven either. There the"
+            " best agent of this evaluation stands in: regrets are lower bounds, and no realised share is stated. A"
+            " table is made for one list; a longer list, or one of another version, has other worlds (ethbrake"
+            " best-harm)"
+        )
+
 
 def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
     """The limits of worlds at the alert; ``Unproven`` where the proofs do not cover the task."""

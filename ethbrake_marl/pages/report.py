@@ -14,7 +14,7 @@ from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.table import SummaryRow
-from ethbrake_marl.evaluation.text import identity_lines, knowledge_lines, left_out_lines, limit_lines
+from ethbrake_marl.evaluation.text import identity_lines, knowledge_lines, left_out_lines, limit_lines, warning_lines
 from ethbrake_marl.figures.report import harm_by_agent
 from ethbrake_marl.figures.style import Figure
 from ethbrake_marl.harm import HarmCount
@@ -128,7 +128,7 @@ def _results(report: Report) -> Section:
     if rows:
         body.append(paragraph(f"{parameter_line(rows[0].parameters)}. Harm in m²/s².", "quiet"))
     body += [paragraph(text, "quiet") for text in _empty_lines(report)]
-    body += [paragraph(text, "note") for text in left_out_lines(rows)]
+    body += [paragraph(text, "note") for text in (*left_out_lines(rows), *warning_lines(rows))]
     body += [paragraph(f"The limit: {text}", "quiet") for text in limit_lines(rows)]
     body += [paragraph(f"Who knows what: {text}", "note") for text in knowledge_lines(rows)]
     body += [paragraph(f"The paper's {name}: {PAPER_PARAMETERS[name]}.", "quiet") for name, _ in blocks]
@@ -210,6 +210,7 @@ def _other_test(test: ReportTest) -> Section:
         body.append(paragraph(f"Columns without a value in any row are left out: {'; '.join(empty)}.", "quiet"))
     if test.rows:
         told = [f"{parameter_line(test.rows[0].parameters)}.", *limit_lines(test.rows), *identity_lines(test.rows)]
+        body += [paragraph(text, "note") for text in warning_lines(test.rows)]
         body += [paragraph(text, "quiet") for text in told]
     return Section(test.title, body)
 

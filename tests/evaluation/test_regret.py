@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.errors import IncompleteTable
 from ethbrake_marl.evaluation import (
     Evaluation,
     Outcome,
@@ -19,9 +21,11 @@ from ethbrake_marl.evaluation import (
     write_per_world_csv,
 )
 from ethbrake_marl.evaluation.regret import assess, distance
+from ethbrake_marl.evaluation.table import SummaryTable
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.limits import limits as limits_module
 from ethbrake_marl.limits.limits import Unproven, known_limits, unproven_because
+from ethbrake_marl.physics import concatenate
 from ethbrake_marl.physics.advance import no_obstacle_harm
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 
@@ -75,6 +79,7 @@ def first_worlds(evaluation: Evaluation, n: int) -> Evaluation:
     return Evaluation(evaluation.scenario, (1,), evaluation.worlds.take(rows), rows, 7, outcomes)
 
 
+@pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.IncompleteTable")
 def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation) -> None:
     found = assess(four)
     assert found is not None
@@ -87,6 +92,7 @@ def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation) -> N
     assert found.below(four.outcome("a")).tolist() == [False, False, True, False]
 
 
+@pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.IncompleteTable")
 def test_best_known__rounding_below_the_table_is_not_below_it(four: Evaluation) -> None:
     close = outcome(four, ([1.0, 2.0 - 9e-7, 4.0 - 2e-6, 6.0], [1.0, 4.0, 6.0, 7.0]))
     found = assess(Evaluation(four.scenario, (1,), four.worlds, four.index, 7, {"a": close}))
@@ -115,7 +121,9 @@ def test_distance__by_hand(four: Evaluation, evaluation: Evaluation) -> None:
 
 
 def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Evaluation) -> None:
-    full, agent = (row.to_json() for row in summarise(four))
+    with pytest.warns(IncompleteTable, match=r"holds 2 of these 4 worlds, and not 1 others \(25.0 %\)"):
+        full, agent = (row.to_json() for row in summarise(four))
+    assert "(25.0 %)" in agent["best_known_warning"] and agent["best_known_warning"] == full["best_known_warning"]
     assert agent["known_best_share"] == full["known_best_share"] == 0.75
     assert agent["realised_share"] is agent["realised_share_total"] is None
     assert agent["mean_regret"] == agent["mean_regret_first"] == 0.75
@@ -123,9 +131,26 @@ def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Ev
     assert full["mean_regret"] == (10.0 + 8.0 + 7.0 + 4.0) / 4.0
     assert (full["below_best_known"], agent["below_best_known"]) == (0, 1)
     table = markdown_table(summarise(four))
+    assert "WARNING: the table of best known harm holds 2 of these 4 worlds" in table
     assert "≥ 0.75" in table
     assert "Found beforehand in 75.0 % of the worlds" in table
     assert "Below what was known: a in 1 world." in table
+
+
+def test_limits__of_a_list_longer_than_its_table_are_told_in_a_warning_and_of_no_table_are_not(
+    paper_random: Scenario,
+) -> None:
+    agents = {"full_brake": make_agent("full_brake")}
+    listed, unlisted = (paper_random.sample(8, seed).worlds for seed in (7, 4711))
+    for worlds, holds in ((listed, True), (unlisted, False), (concatenate([listed, unlisted]), None)):
+        found = evaluate(worlds, agents, scenario=paper_random, aftermath=False)
+        with nullcontext() if holds is not None else pytest.warns(IncompleteTable):
+            (row,) = summarise(found)
+        known = row.distance.known_best_share
+        assert known is not None and (known == 1.0) == bool(holds)
+        assert (row.to_json()["best_known_warning"] is None) == ("WARNING" not in markdown_table([row]))
+        assert (row.distance.warning == "") == (holds is not None)
+        assert ("WARNING" in SummaryTable([row])._repr_html_()) == (holds is None)
 
 
 def test_distance__without_full_braking_nothing_is_realised(four: Evaluation, evaluation: Evaluation) -> None:
@@ -215,6 +240,7 @@ def test_limits__of_another_line_up_are_null_with_the_reason(pair: Scenario, tmp
     assert "proven" not in markdown_table(summarise(result))
 
 
+@pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.IncompleteTable")
 def test_per_world__shows_the_limit_of_each_world(four: Evaluation, tmp_path: Path) -> None:
     write_per_world_csv(tmp_path / "out.csv", four)
     with (tmp_path / "out.csv").open(newline="") as stream:

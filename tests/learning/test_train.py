@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 import torch
 
+from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.evaluation import evaluate, summarise
+from ethbrake_marl.evaluation import outcome as outcome_module
 from ethbrake_marl.learning import train as train_module
 from ethbrake_marl.learning.progress import TrainingDiverged
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of, shipped_recipes
@@ -236,9 +239,21 @@ def test_train__stops_at_an_evaluation_that_is_not_good_enough_and_goes_on_to_th
     assert _bytes(tmp_path / "run" / "policy") == _bytes(tmp_path / "whole" / "policy")
 
 
-def test_train__measures_how_many_episodes_the_horizon_cuts_off(recipe: TrainingRecipe, tmp_path: Path) -> None:
+def test_train__measures_what_an_evaluation_of_the_kept_policy_tells_and_proves_nothing(
+    recipe: TrainingRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    prove = outcome_module.known_limits
+    monkeypatch.setattr(outcome_module, "known_limits", lambda *given: asked.append("limits") or prove(*given))
     result = train_module.train(recipe, SCENARIO, tmp_path / "run", steps=ROLLOUT, on_progress=None)
-    assert all(0.0 <= entry["horizon_rate"] <= 1.0 for entry in result.evaluations)
+    assert asked == []
+    worlds = result.training.scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
+    agents = {"policy": LearnedAgent(result.last_policy, "policy")}
+    (row,) = summarise(evaluate(worlds, agents, scenario=result.training.scenario))
+    assert asked == ["limits"]
+    names = ("first_impact_harm", "total_harm", "collision_rate")
+    told = {name: getattr(row, name).value for name in names} | {"horizon_rate": row.horizon_ends / row.episodes}
+    assert {name: result.evaluations[-1][name] for name in told} == told
 
 
 def test_train__second_ctrl_c_stops_at_once_and_keeps_the_last_policy(

@@ -62,9 +62,8 @@ def test_run__finds_the_limits_once_per_evaluation(calls: Counter[str], tmp_path
     assert run_command(["run", "--recipe", str(tmp_path / "tiny.yaml"), *lines]) == 0
     told = json.loads((tmp_path / "run" / "results.json").read_text())
     assert told[0]["unavoidable_rate"] is not None
-    assert calls["evaluation"] >= 4  # the three tests, and the policy while it learns
-    assert calls["limits"] == calls["avoidability"] == calls["evaluation"]
-    assert calls["best known"] == calls["evaluation"]
+    assert calls["evaluation"] >= 4  # the three tests, and the policy while it learns, of which nothing is proven
+    assert calls["limits"] == calls["avoidability"] == calls["best known"] == 3
 
 
 def test_evaluation__whose_limits_nobody_asks_for_finds_none(
