@@ -12,7 +12,7 @@ from pathlib import Path
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.durable import remove_folder
 from ethbrake_marl.learning.loop import StopAt
-from ethbrake_marl.learning.progress import HARM_METRIC
+from ethbrake_marl.learning.progress import chosen_by
 from ethbrake_marl.learning.run_folder import RunDirectory, is_finished, progress_rows, wait_for_others
 from ethbrake_marl.learning.training import Training, check_same
 from ethbrake_marl.policies.policy import Policy, has_bundle
@@ -67,7 +67,7 @@ def read_results(training: Training, folder: Path) -> tuple[str, ...]:
     table = [row for row in progress_rows(folder) if row.get(f"eval/{_MEASURED[0]}")]
     if not table:
         raise InvalidInput(f"{RunDirectory(folder).progress}: holds no evaluation; delete its folder to train anew")
-    harm = f"eval/{HARM_METRIC[training.recipe.reward.harm_count]}"
+    harm = chosen_by(table, training.recipe.reward.harm_count, "eval/")
     kept, last = min(table, key=lambda row: float(row[harm])), table[-1]
     trained = read_trained(RunDirectory(folder).policy)
     if isinstance(trained, Policy):
