@@ -12,7 +12,7 @@ from pathlib import Path
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.durable import remove_folder
 from ethbrake_marl.learning.loop import StopAt
-from ethbrake_marl.learning.progress import chosen_by
+from ethbrake_marl.learning.progress import OBJECTIVE, chosen_by
 from ethbrake_marl.learning.run_folder import RunDirectory, is_finished, progress_rows, wait_for_others
 from ethbrake_marl.learning.training import Training, check_same
 from ethbrake_marl.policies.policy import Policy, has_bundle
@@ -22,8 +22,9 @@ from ethbrake_marl.studies.jobs.training import TrainingJob, finish_training
 _MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
 RESULTS = (
     "steps",  # decisions of learners in whole updates
-    "policy_steps",  # decisions after which the kept policy was taken: the one of least harm on the recipe's list
+    "policy_steps",  # decisions after which the kept policy was taken: the best one on the recipe's list
     *_MEASURED,  # of the kept policy on that list
+    OBJECTIVE,  # likewise, where a learner has another objective than total
     *(f"last_{name}" for name in _MEASURED),  # of the last one
     "policy_sha256",  # of the kept policy's manifest, of several vehicle_i=... each
 )
@@ -74,8 +75,8 @@ def read_results(training: Training, folder: Path) -> tuple[str, ...]:
         sha256 = trained.manifest.manifest_sha256
     else:
         sha256 = " ".join(f"{name}={policy.manifest.manifest_sha256}" for name, policy in trained.members.items())
-    measured = [row[f"eval/{name}"] for row in (kept, last) for name in _MEASURED]
-    return (last["steps"], kept["steps"], *measured, sha256)
+    measured, later = ([row[f"eval/{name}"] for name in _MEASURED] for row in (kept, last))
+    return (last["steps"], kept["steps"], *measured, kept.get(f"eval/{OBJECTIVE}", ""), *later, sha256)
 
 
 @contextmanager
