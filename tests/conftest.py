@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -18,12 +17,6 @@ os.environ["MPLBACKEND"] = "Agg"
 os.environ["SDL_VIDEODRIVER"] = "dummy"
 os.environ["SDL_AUDIODRIVER"] = "dummy"
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
-
-# In a parallel run each process compiles for itself, once: where two compile one function for different arguments at
-# the same moment, numba may keep the code of the one under the name of the other.
-_worker = os.environ.get("PYTEST_XDIST_WORKER")
-if _worker is not None:
-    os.environ["NUMBA_CACHE_DIR"] = str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "numba" / _worker)
 
 pytest_plugins = ["tests.fixtures.evaluation", "tests.fixtures.policies"]
 

@@ -25,8 +25,8 @@ from ethbrake_marl.cli.terminal import show, write_json
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import LIST_SEED, make_lineup, make_proposers
 from ethbrake_marl.evaluation.shield_modes import compare_modes
+from ethbrake_marl.kernel_store import cache_folder, is_temporary
 from ethbrake_marl.physics import Worlds, advance, make_worlds
-from ethbrake_marl.physics.compiled import cache_folder, is_temporary
 from ethbrake_marl.scenario import Task, list_scenarios, load_scenario, scenario_folder
 from ethbrake_marl.scenario.catalogue import SHIPPED
 from ethbrake_marl.shield.uncertainty import parse_uncertainty

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.segment import Segment
 
 from ethbrake_marl.errors import IncompleteTable, OldSpelling, one_line, plain_text
-from ethbrake_marl.physics.compiled import is_temporary, on_first_compilation
+from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
 from ethbrake_marl.progress import Progress as PartProgress
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit

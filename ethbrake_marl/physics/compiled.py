@@ -1,114 +1,97 @@
-"""The one way in which this package compiles a kernel: strict floating point, cached safely.
+"""The one way in which this package compiles a kernel: strict floating point, kept safely by ``kernel_store``.
 
-numba keys its cache on a function's own file, so editing a *callee* in another file would silently keep the
-stale machine code. Here the kernels of a file lie in a folder that carries a hash of this file, of the kernel sources
-that it imports, and of the numba version: an edit compiles anew what can call it, and nothing else.
+numba's own cache goes by a function's own file: editing a *callee* in another file would silently keep the stale
+machine code; and its index, which is read, changed and written back, is not safe where processes share a folder.
 """
 
 from __future__ import annotations
 
-import atexit
 import hashlib
-import os
-import re
-import shutil
-import tempfile
+import pickle
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from types import CodeType
 from typing import Any, TypeVar, cast
 
+import llvmlite
 import numba
 from numba.core import config as numba_config
-from numba.core import event
+from numba.core.compiler import CompileResult
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import CPUDispatcher
+from numba.core.serialize import dumps
+from numba.core.sigutils import normalize_signature
 
 from ethbrake_marl.errors import check_whole_number
+from ethbrake_marl.kernel_store import (
+    alone,
+    digest_of_sources,
+    keep_kernel,
+    load_kernel,
+    place_of,
+    tell_compilation,
+)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-_PACKAGE = Path(__file__).resolve().parents[1]
-_MARK = b"@compiled"
-_IMPORT = re.compile(r"^from (ethbrake_marl[.\w]*) import (\([^)]*\)|.*)$", re.MULTILINE)
-_CONSTANT = re.compile(r"\b[A-Z][A-Z0-9_]*\b")
-_TEMPORARY = "ethbrake_marl-"
+_OPTIONS = {"nopython": True, "boundscheck": None, "fastmath": False, "nogil": True, "error_model": "numpy"}
+_SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")  # numba's, of the code made
 
 
-@cache
-def cache_folder() -> Path:
-    """Folder of the compiled kernels: the user's cache, or where that cannot be written one for this process alone."""
-    home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home) / "ethbrake_marl"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError:
-        temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY))
-        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-        return temporary
+class Kernel(CPUDispatcher):  # type: ignore[misc]
+    """A compiled function as numba's ``njit`` makes it, but for where its code is kept."""
+
+    def compile(self, sig: Any) -> Any:
+        """The code for one signature: at hand, loaded, or compiled and kept."""
+        with global_compiler_lock:
+            arguments, returned = normalize_signature(sig)
+            name = "" if tuple(arguments) in self.overloads else self._name(*arguments, returned)
+            if not name:
+                return super().compile(sig)
+            if not self._load(name):
+                tell_compilation()
+                with alone(name):
+                    if not self._load(name):  # another process may have compiled it meanwhile
+                        super().compile(sig)
+                        made = self.overloads[tuple(arguments)]
+                        if not made.library.has_dynamic_globals:
+                            keep_kernel(name, dumps(made._reduce()))
+            return self.overloads[tuple(arguments)].entry_point
+
+    def _name(self, *types: Any) -> str:
+        """Name of a signature's file in the store; empty where not all that makes the code is known."""
+        code, source = self.py_func.__code__, Path(self.py_func.__code__.co_filename)
+        digest = digest_of_sources(source)
+        if not digest or self.py_func.__closure__:
+            return ""
+        made_of = (
+            (sys.implementation.cache_tag, sys.flags.optimize, numba.__version__, llvmlite.__version__),
+            [str(getattr(numba_config, setting)) for setting in _SETTINGS],
+            self.targetctx.codegen().magic_tuple(),
+            (digest, place_of(source), self.__module__, self.__qualname__, code.co_firstlineno, code.co_code),
+            [constant for constant in code.co_consts if not isinstance(constant, CodeType)],
+            sorted(self.targetoptions.items()),
+            [_described(kind) for kind in types],
+        )
+        return f"{self.__name__.strip('<>')}-{hashlib.sha256(repr(made_of).encode()).hexdigest()[:40]}"
+
+    def _load(self, name: str) -> bool:
+        """Whether the store had it."""
+        kept = load_kernel(name)
+        if kept is not None:
+            self.targetctx.refresh()
+            made = CompileResult._rebuild(self.targetctx, *pickle.loads(kept))
+            self.targetctx.insert_user_function(made.entry_point, made.fndesc, [made.library])
+            self.add_overload(made)
+        return kept is not None
 
 
-@cache
-def kernel_folder(source: Path) -> Path:
-    """Folder of the kernels of one file, below ``cache_folder``: another one after every edit that can change them.
-
-    Code that is in no file (a shell, a test) has one folder for all of it.
-    """
-    digest = hashlib.sha256(numba.__version__.encode())
-    for needed in kernel_sources(source) if source.is_file() else ():
-        digest.update(needed.read_bytes())
-    return cache_folder() / digest.hexdigest()[:16]
-
-
-def kernel_sources(source: Path) -> list[Path]:
-    """The file, and all of this package that its kernels may be made of, sorted by name.
-
-    These are the files with kernels that it imports, theirs, and so on; and files from which any of them imports a
-    constant (a name in capitals).
-    """
-    found, follow = {source}, [source]
-    while follow:
-        for module, names in _IMPORT.findall(follow.pop().read_text("utf-8")):
-            for imported in _files(module, names):
-                has_kernels = _MARK in imported.read_bytes()
-                if imported not in found and (has_kernels or _CONSTANT.search(names)):
-                    found.add(imported)
-                    follow += [imported] * has_kernels
-    return sorted(found)
-
-
-def _files(module: str, names: str) -> list[Path]:
-    """The files of a module of this package; of a package its own, and those of the names that are modules."""
-    place = _PACKAGE.joinpath(*module.split(".")[1:])
-    if place.with_suffix(".py").is_file():
-        return [place.with_suffix(".py")]
-    within = [place / f"{name}.py" for name in re.findall(r"\w+", names)]
-    return [place / "__init__.py", *(file for file in within if file.is_file())]
-
-
-def is_temporary(folder: Path) -> bool:
-    """Whether a ``cache_folder`` goes when this process ends."""
-    return folder.name.startswith(_TEMPORARY)
-
-
-def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
-    """Call ``tell`` once, when this process begins to compile: the folder of the kernels, and whether it was empty.
-
-    Kernels that are loaded from the folder are not compiled. Empty means: not even the physics of today is there.
-    """
-    events: Any = event  # numba's own types end here
-
-    class Once(event.Listener):
-        def on_start(self, event_: event.Event) -> None:
-            events.unregister("numba:compile", self)
-            physics = kernel_folder(Path(__file__).with_name("advance.py"))
-            tell(cache_folder(), not any(physics.rglob("*.nbi")))
-
-        def on_end(self, event_: event.Event) -> None:
-            """Nothing: it does not listen any more."""
-
-    events.register("numba:compile", Once())
+def _described(kind: Any) -> str:
+    """A type with the names of the fields that it and its parts have: of a named tuple numba's own name has none."""
+    parts = [_described(part) for part in getattr(kind, "types", ())]
+    return f"{kind} {getattr(kind, 'fields', '')} {parts}"
 
 
 def compiled(function: Function) -> Function:
@@ -151,16 +134,12 @@ def compiled_bare_apart(function: Function) -> Function:
 
 def _compile(function: Function, *, inline: bool, within: bool = False, bare: bool = False) -> Function:
     config: Any = numba_config  # its settings are made at run time
-    before = config.CACHE_DIR
-    config.CACHE_DIR = str(kernel_folder(Path(function.__code__.co_filename)))
-    try:
-        how: dict[str, Any] = {"inline": "always"} if within else {"forceinline": inline}
-        if bare:
-            how["_nrt"] = False
-        compiler: Any = numba.njit(cache=True, fastmath=False, nogil=True, error_model="numpy", **how)
-        return cast(Function, compiler(function))
-    finally:
-        config.CACHE_DIR = before
+    if config.DISABLE_JIT:
+        return function
+    how: dict[str, Any] = {"inline": "always"} if within else {"forceinline": inline}
+    if bare:
+        how["_nrt"] = False
+    return cast(Function, Kernel(function, targetoptions=_OPTIONS | how))
 
 
 Result = TypeVar("Result")

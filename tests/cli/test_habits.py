@@ -8,14 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numba
 import pytest
 from typer.main import get_command
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli import doctor, terminal
 from ethbrake_marl.cli.app import app, run_command
-from ethbrake_marl.physics.compiled import cache_folder
+from ethbrake_marl.kernel_store import cache_folder
+from ethbrake_marl.physics.compiled import compiled
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -77,25 +77,22 @@ def test_completion__a_variable_that_no_shell_set_changes_nothing(ethbrake, monk
 
 
 @pytest.mark.parametrize(
-    ("kernels", "temporary", "told"),
+    ("loaded", "temporary", "told"),
     [
         ([], False, f"compiling the physics, once, about {terminal.COMPILE_S} s\n"),
-        (["older/one.nbi"], False, f"compiling the physics, once, about {terminal.COMPILE_S} s\n"),
-        (["today/one.nbi"], False, "compiling a part of the physics that was not used before, once, some seconds\n"),
+        (["advance-1"], False, "compiling a part of the physics that was not used before, once, some seconds\n"),
         ([], True, "no folder can be written"),
     ],
 )
-def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, kernels, temporary, told):
+def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, temporary, told):
     folder = tmp_path / ("ethbrake_marl-x" if temporary else "kept")
     folder.mkdir()
-    for name in kernels:
-        (folder / name).parent.mkdir()
-        (folder / name).touch()
-    monkeypatch.setattr("ethbrake_marl.physics.compiled.cache_folder", lambda: folder)
-    monkeypatch.setattr("ethbrake_marl.physics.compiled.kernel_folder", lambda source: folder / "today")
+    monkeypatch.setattr("ethbrake_marl.kernel_store.cache_folder", lambda: folder)
+    monkeypatch.setattr("ethbrake_marl.kernel_store._loaded", loaded)
+    monkeypatch.setattr("ethbrake_marl.kernel_store._tellers", [])
     terminal.tell_compilation()
 
-    @numba.njit
+    @compiled
     def next_number(x: int) -> int:
         return x + 1
 
@@ -115,14 +112,14 @@ def test_doctor__warms_up_only_when_asked(ethbrake, monkeypatch):
 def test_doctor_warm_up__leaves_nothing_to_compile(ethbrake):
     answer = ethbrake("doctor", "--warm-up", "--json")
     assert answer.status == 0 and '"name": "warm-up",\n    "ok": true' in answer.out
-    kernels = set(cache_folder().rglob("*.nbc"))
+    kernels = set(cache_folder().iterdir())
     commands = [
         ("evaluate", "--agents", "full_brake,e_v2x_bm,ppo@shipped,ppo@shipped+episode", "--episodes", "3"),
         ("shield", "--agents", "full_brake", "--episodes", "3"),
         ("evaluate", "--agents", "planner,full_brake+step", "--episodes", "3"),
     ]
     assert [ethbrake(*command).status for command in commands] == [0, 0, 0]
-    assert set(cache_folder().rglob("*.nbc")) == kernels
+    assert set(cache_folder().iterdir()) == kernels
 
 
 def test_results__stand_alone_on_stdout_whatever_a_file_of_the_users_prints(ethbrake, tmp_path: Path) -> None:

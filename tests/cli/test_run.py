@@ -266,7 +266,7 @@ def test_command_line__exit_status_and_streams_of_the_program():
 
 def test_kernels__a_temporary_cache_is_removed_at_the_end(tmp_path):
     process = program(
-        "from ethbrake_marl.physics.compiled import cache_folder; print(cache_folder(), cache_folder().is_dir())",
+        "from ethbrake_marl.kernel_store import cache_folder; print(cache_folder(), cache_folder().is_dir())",
         NUMBA_CACHE_DIR="/dev/null/x",
         TMPDIR=str(tmp_path),
     )

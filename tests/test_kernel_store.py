@@ -1,0 +1,280 @@
+"""Compiled kernels are kept by content: found wherever the package lies, and never stale, damaged or another's."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numba
+import pytest
+
+import ethbrake_marl
+from ethbrake_marl import kernel_store
+from ethbrake_marl.kernel_store import cache_folder, digest_of_sources, keep_kernel, kernel_sources, load_kernel
+
+needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
+PACKAGE = Path(ethbrake_marl.__file__).parent
+
+
+@pytest.fixture(autouse=True)
+def _own_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    forget()
+    yield
+    forget()
+
+
+def forget() -> None:
+    for remembered in (cache_folder, digest_of_sources, kernel_store._imports):
+        remembered.cache_clear()
+
+
+# ---------------------------------------------------------------- the folder
+
+
+def test_cache_folder__is_in_the_named_place(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "numba"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache_folder() == tmp_path / "numba" / "ethbrake_marl" and cache_folder().is_dir()
+    forget()
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    assert cache_folder() == tmp_path / "xdg" / "ethbrake_marl"
+    forget()
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    assert cache_folder() == tmp_path / ".cache" / "ethbrake_marl"
+
+
+def test_cache_folder__that_cannot_be_written_is_replaced_by_a_temporary_one(monkeypatch, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder", "utf-8")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(blocked))
+    folder = cache_folder()
+    assert folder.is_dir() and folder.name.startswith("ethbrake_marl-") and tmp_path not in folder.parents
+    folder.rmdir()
+
+
+def test_cache_folder__that_is_temporary_goes_at_the_end_of_the_process(monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("not a folder", "utf-8")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    at_the_end = []
+    monkeypatch.setattr(kernel_store.atexit, "register", lambda *call, **options: at_the_end.append((call, options)))
+    folder = cache_folder()
+    (folder / "kernel").write_text("machine code", "utf-8")
+    [((act, *given), options)] = at_the_end
+    act(*given, **options)
+    assert not folder.exists()
+    act(*given, **options)  # also when somebody else has removed it
+
+
+# ---------------------------------------------------------------- one file
+
+
+def test_keep_kernel__is_loaded_again():
+    assert load_kernel("one-1") is None
+    keep_kernel("one-1", b"machine code")
+    assert load_kernel("one-1") == b"machine code"
+    keep_kernel("one-1", b"other code")
+    assert load_kernel("one-1") == b"other code"
+    assert [file.name for file in cache_folder().iterdir()] == ["one-1"]
+
+
+@pytest.mark.parametrize("harm", ["flipped", "truncated", "emptied", "under another name"])
+def test_load_kernel__of_a_damaged_file_is_nothing(harm):
+    keep_kernel("one-1", b"machine code")
+    file = cache_folder() / "one-1"
+    content = file.read_bytes()
+    if harm == "under another name":
+        (cache_folder() / "two-2").write_bytes(content)
+    else:
+        file.write_bytes({"flipped": content[:-1] + b"!", "truncated": content[:-1], "emptied": b""}[harm])
+    assert load_kernel("two-2" if harm == "under another name" else "one-1") is None
+    keep_kernel("one-1", b"machine code")
+    assert load_kernel("one-1") == b"machine code"
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+@pytest.mark.parametrize(("user", "loaded"), [(0, True), (1000, False)])
+def test_load_kernel__of_another_users_file_is_nothing(monkeypatch, user, loaded):
+    keep_kernel("one-1", b"machine code")
+    stat = os.fstat
+
+    def owned(handle):
+        found = list(stat(handle))
+        found[4] = user
+        return os.stat_result(found)
+
+    monkeypatch.setattr(kernel_store.os, "fstat", owned)
+    monkeypatch.setattr(kernel_store.os, "getuid", lambda: 1001)
+    assert (load_kernel("one-1") is not None) == loaded
+
+
+def test_keep_kernel__on_a_full_disk_costs_a_warning(monkeypatch):
+    def full(*paths):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(kernel_store.os, "replace", full)
+    with pytest.warns(UserWarning, match="could not be kept: No space left"):
+        keep_kernel("one-1", b"machine code")
+    assert list(cache_folder().iterdir()) == []
+
+
+# ---------------------------------------------------------------- what a kernel is made of
+
+
+@pytest.fixture
+def copied(monkeypatch, tmp_path) -> Path:
+    package = tmp_path / "ethbrake_marl"
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(kernel_store, "_PACKAGE", package)
+    return package
+
+
+def digest_in(package: Path, name: str) -> str:
+    forget()
+    return digest_of_sources(package / name)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "edited", "moves"),
+    [
+        ("physics/advance.py", "physics/advance.py", True),  # its own file
+        ("physics/advance.py", "physics/events.py", True),  # what it calls
+        ("shield/certify_kernel.py", "physics/impact.py", True),  # through several files
+        ("observations/observe.py", "scenario/features.py", True),  # constants, from a file without kernels
+        ("physics/advance.py", "search/moves.py", False),  # kernels that it does not call
+        ("physics/events.py", "physics/advance.py", False),  # its callers
+        ("physics/advance.py", "physics/worlds.py", False),  # types
+    ],
+)
+def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, monkeypatch, kernel, edited, moves):
+    monkeypatch.setattr(kernel_store, "_IMPORTED_S", float("inf"))
+    before = digest_in(copied, kernel)
+    assert digest_in(copied, kernel) == before and len(before) == 64
+    source = copied / edited
+    source.write_text(source.read_text("utf-8") + "\n# a change\n", "utf-8")
+    assert (digest_in(copied, kernel) != before) == moves
+
+
+def test_digest_of_sources__is_not_known_of_code_in_no_file_or_edited_since(copied):
+    assert digest_of_sources(Path("<stdin>")) == ""
+    assert digest_in(copied, "physics/advance.py")
+    now = kernel_store.time.time() + 1.0
+    os.utime(copied / "physics" / "events.py", (now, now))
+    assert digest_in(copied, "physics/advance.py") == ""
+
+
+@needs_compiler
+def test_kernel_sources__hold_every_kernel_that_a_kernel_names():
+    checked = 0
+    for source in sorted(Path(ethbrake_marl.__file__).parent.rglob("*.py")):
+        if "@compiled" not in source.read_text("utf-8") or source.name == "compiled.py":
+            continue
+        place = source.relative_to(Path(ethbrake_marl.__file__).parents[1]).with_suffix("")
+        sources = kernel_sources(source)
+        for kernel in vars(importlib.import_module(".".join(place.parts))).values():
+            if hasattr(kernel, "py_func") and kernel.py_func.__code__.co_filename == str(source):
+                for name in kernel.py_func.__code__.co_names:
+                    called = kernel.py_func.__globals__.get(name)
+                    if hasattr(called, "py_func"):
+                        assert Path(called.py_func.__code__.co_filename) in sources, f"{source.name}: {name}"
+                        checked += 1
+    assert checked > 300
+
+
+def test_kernel_sources__find_every_import(copied):
+    """Kernels import from this package by ``from ethbrake_marl... import`` alone: no other way would be seen."""
+    for source in copied.rglob("*.py"):
+        if "@compiled" in source.read_text("utf-8"):
+            tree = ast.parse(source.read_text("utf-8"))
+            found = {module.decode() for module, _ in kernel_store._IMPORT.findall(source.read_bytes())}
+            asked = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
+            assert {module for module in asked if module.startswith("ethbrake_marl")} == found, source
+            assert not [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level], source
+            names = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+            assert not {name for name in names if name.startswith("ethbrake_marl.")}, source
+
+
+# ---------------------------------------------------------------- processes
+
+PROGRAM = """
+import sys, time
+import numpy as np
+from pathlib import Path
+from numba.core import event
+from ethbrake_marl.physics.impact import GAP, IMPACT_ROWS, MASS, SPEED, pool
+
+class Count(event.Listener):
+    names = []
+    def on_start(self, happened):
+        self.names.append(happened.data["dispatcher"].__name__)
+    def on_end(self, happened):
+        pass
+
+ready, go = map(Path, sys.argv[1:])
+ready.touch()
+while not go.exists():
+    time.sleep(0.001)
+event.register("numba:compile", Count())
+table = np.zeros((IMPACT_ROWS, 2))
+table[MASS] = 1.0
+table[SPEED] = 2.0, 4.0
+print(pool(table, SPEED, SPEED, 0, 1, GAP), *table[GAP], *sorted(set(Count.names)))
+"""
+SAME = "1 3.0 3.0"  # two of one mass, the one behind faster: one block, at the mean of both speeds
+COMPILED = f"{SAME} pool settle"
+
+
+def begin(package: Path, folder: Path, name: str) -> subprocess.Popen:
+    environment = {**os.environ, "PYTHONPATH": str(package.parent), "TMPDIR": str(folder)}
+    environment["NUMBA_DISABLE_JIT"] = "0"
+    command = [sys.executable, "-c", PROGRAM, str(folder / name), str(folder / "go")]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(command, env=environment, cwd=folder, text=True, **pipes)
+    while not (folder / name).exists() and process.poll() is None:
+        time.sleep(0.001)
+    return process
+
+
+def run(package: Path, folder: Path) -> str:
+    (folder / "go").touch()
+    out, errors = begin(package, folder, "alone").communicate(timeout=120)
+    assert errors == ""
+    return out.strip()
+
+
+def test_kernels__of_a_moved_package_are_at_hand_and_an_edited_callee_compiles_anew(copied, tmp_path):
+    assert run(PACKAGE, tmp_path) == COMPILED
+    assert run(copied, tmp_path) == SAME
+    with (copied / "physics" / "events.py").open("a") as file:
+        file.write("# a change\n")
+    assert run(copied, tmp_path) == COMPILED
+    assert run(PACKAGE, tmp_path) == SAME
+
+
+def test_kernels__that_two_processes_need_at_once_are_compiled_by_one(tmp_path):
+    both = [begin(PACKAGE, tmp_path, name) for name in ("one", "two")]
+    (tmp_path / "go").touch()
+    ends = [process.communicate(timeout=120) for process in both]
+    assert sorted(out.strip() for out, _ in ends) == [SAME, COMPILED] and [errors for _, errors in ends] == ["", ""]
+    assert not list(cache_folder().glob("*.lock"))
+
+
+def test_kernels__that_are_damaged_are_compiled_anew_and_replaced(tmp_path):
+    assert run(PACKAGE, tmp_path) == COMPILED
+    for file in cache_folder().iterdir():
+        file.write_bytes(file.read_bytes()[:-1])
+    assert run(PACKAGE, tmp_path) == COMPILED
+    assert run(PACKAGE, tmp_path) == SAME
+
+
+def test_kernels__without_a_folder_to_write_to_are_compiled_in_each_process(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/x")
+    assert [run(PACKAGE, tmp_path), run(PACKAGE, tmp_path)] == [COMPILED, COMPILED]
+    assert not list(tmp_path.glob("ethbrake_marl-*"))
