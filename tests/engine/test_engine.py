@@ -225,6 +225,6 @@ def test_jerk__of_a_learner_is_counted_over_the_step_though_a_script_decides_wit
     runs = []
     for first in (Counting(3), make_agent("full_brake")):
         scripts = {0: first, 2: make_agent("full_brake")}
-        running = Engine(OWN_GRID, 3, learners=(1,), scripts=scripts, reward={"jerk": 1.0}, seed=5)
+        running = Engine(OWN_GRID, 3, learners=(1,), scripts=scripts, reward={"harm": 0.0, "jerk": 1.0}, seed=5)
         runs.append([running.step(np.full((3, 1), action)).further["jerk"][:, 1] for action in (-1.0, 0.5, -0.3, 1.0)])
     assert np.array_equal(*runs) and np.any(runs[0])
