@@ -23,6 +23,7 @@ from ethbrake_marl.scenario import (
     scenario_json_schema,
     scenario_path,
 )
+from ethbrake_marl.scenario.roles import LEARNER, is_state_free
 from ethbrake_marl.scenario.catalogue import SHIPPED
 from ethbrake_marl.scenario.sample import count_kinds
 
@@ -60,7 +61,8 @@ def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")],
     scenario = load_runnable(path)
     sample = scenario.sample(CHECKED_DRAWS, LIST_SEED)
     names = [scenario.vehicle_names[i] for i in scenario.learners]
-    braking = Team.copies(make_single_agent("full_brake"), scenario.learners)
+    deciding = [i for i in range(scenario.vehicles) if not is_state_free(scenario.scripts.get(i, LEARNER))]
+    braking = Team.copies(make_single_agent("full_brake"), deciding)
     moving = int((~drive(sample.worlds, braking, scenario).at_rest).sum())
     late = int((sample.worlds.vehicles.latency_s[:, 0] > 0.0).sum())
     if as_json:
@@ -72,8 +74,8 @@ def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")],
     show(f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}{count_kinds(sample)}")
     if moving:
         show(
-            f"note: at the horizon ({scenario.horizon_s:g} s) something still moves in {moving:,} of them, though every"
-            " learner brakes fully; what comes after counts nowhere. A longer horizon_s sees more"
+            f"note: at the horizon ({scenario.horizon_s:g} s) something still moves in {moving:,} of them, though whoever"
+            " decides brakes fully; what comes after counts nowhere. A longer horizon_s sees more"
         )
     if late:
         show(f"note: Vehicle 1, whose braking is the alert, has a latency above 0 in {late:,} of them")
