@@ -23,8 +23,8 @@ from ethbrake_marl.scenario import (
     scenario_json_schema,
     scenario_path,
 )
-from ethbrake_marl.scenario.roles import LEARNER, is_state_free
 from ethbrake_marl.scenario.catalogue import SHIPPED
+from ethbrake_marl.scenario.roles import LEARNER, is_state_free
 from ethbrake_marl.scenario.sample import count_kinds
 
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
@@ -74,8 +74,8 @@ def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")],
     show(f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}{count_kinds(sample)}")
     if moving:
         show(
-            f"note: at the horizon ({scenario.horizon_s:g} s) something still moves in {moving:,} of them, though whoever"
-            " decides brakes fully; what comes after counts nowhere. A longer horizon_s sees more"
+            f"note: at the horizon ({scenario.horizon_s:g} s) something still moves in {moving:,} of them, though"
+            " whoever decides brakes fully; what comes after counts nowhere. A longer horizon_s sees more"
         )
     if late:
         show(f"note: Vehicle 1, whose braking is the alert, has a latency above 0 in {late:,} of them")

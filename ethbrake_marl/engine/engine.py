@@ -206,6 +206,7 @@ class Engine(Running):
         new._state, new._params = (array.copy() for array in new._kept(start.packed))
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
         new._potential = np.zeros(start.wanted.shape)
+        new._stops = []
         new._begin(np.arange(self.n), start)
         self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
 
@@ -319,7 +320,6 @@ class Engine(Running):
                 self._memories = {w: w.begun(memory, alert, rows) for w, memory in self._memories.items()}
                 for vehicle, script in self._remembering.items():
                     begin_script(script, alert, vehicle, rows)
-        self._stops = []
         if self._on_own_grid:
             self._begin_on_own_grid(rows, start.alert, start.clock[:, START])
         elif has_messages(self._state, self._params):
@@ -415,7 +415,10 @@ class Engine(Running):
 
         Deciders do not: like a learner they coast, and are seen to coast, until their first decision.
         """
-        self._state[rows] = self._kept(pack(alert)).state
+        began = self._kept(pack(alert)).state
+        self._stops = [(state.copy(), wanted) for state, wanted in self._stops]  # of who goes on; the others did not
+        for state in (self._state, *(state for state, _ in self._stops)):
+            state[rows] = began
         running, until_s, none = np.zeros(self.n, np.bool_), self._state[:, TIME].copy(), np.empty((self.n, 0))
         running[rows], until_s[rows] = True, start_s
         way = self._decide_on_the_way(running, until_s, none)

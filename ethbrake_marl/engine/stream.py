@@ -272,7 +272,7 @@ def memory_of(owner: object) -> dict[str, Any]:
     elif isinstance(owner, Mapping):
         parts = dict(owner)
     elif isinstance(owner, tuple | list):
-        parts = owner._asdict() if hasattr(owner, "_asdict") else dict(enumerate(owner))
+        parts = {str(at): value for at, value in enumerate(owner)}
     else:
         return {}
     arrays: dict[str, Any] = {}

@@ -84,8 +84,8 @@ class EthBrakeVecEnv(VecEnv):
     With several learners all rows share one policy, and the rows of a world end together. All worlds take their
     episodes from one stream, as in ``EthBrakeVectorEnv``. At the end of an episode its rows' infos hold
     ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, steps ``l``; ``t`` is always 0, no
-    clock is read), and harm under both counts; all other infos are empty, unless ``step_infos``. Attributes and methods belong to the whole
-    batch: there are no environments inside.
+    clock is read), and harm under both counts; all other infos are empty, unless ``step_infos``. Attributes and
+    methods belong to the whole batch: there are no environments inside.
 
     Args:
         engine: the running worlds; ``make_sb3_vec_env`` makes them.
