@@ -45,7 +45,10 @@ def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | Non
     """Fresh agents for the scenario's scripts, by vehicle; those that look ahead know the others."""
     left_out = () if except_for is None else (except_for,) if isinstance(except_for, int) else except_for
     specs = {i: spec for i, spec in scenario.scripts.items() if i not in left_out}
-    scripts = {i: make_single_agent(spec, horizon_s=scenario.horizon_s) for i, spec in specs.items()}
+    scripts = {
+        i: make_single_agent(spec, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
+        for i, spec in specs.items()
+    }
     for vehicle, script in scripts.items():
         set_others(script, vehicle, scripts)
     return scripts
