@@ -1,9 +1,9 @@
-# Everything runs in the project's own environment, .venv, made from Python >= 3.11 and this file alone.
+# Everything runs in the project's own environment, .venv, made from Python >= 3.11, this file and .ci/install.
 # TORCH_INDEX: index to take torch from, e.g. make run TORCH_INDEX=ADDRESS; without it uv picks the build (see below)
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # PEERS:       the environment of `make bench-peers`, apart from the project's own.
 # ARGS:        passed on by `make run` (to `ethbrake run`), `make test` (to pytest) and the long programmes.
-# WORKERS:     processes of `make test`; each compiles the kernels for itself, once. 0: one process, as a debugger needs.
+# WORKERS:     processes of `make test`. 0: one process, as a debugger needs.
 
 SHELL := /bin/sh
 VENV := .venv
@@ -15,29 +15,22 @@ TORCH_INDEX ?=
 PYTHON ?=
 ARGS ?=
 WORKERS ?= 2
-PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
-
-# The plain index has torch for NVIDIA's GPUs alone, with gigabytes of their libraries. uv looks what the machine has,
-# and takes the build for it (CPU where there is no GPU) from where torch publishes them, if that can be reached.
-define TORCH_FOR_THIS_MACHINE
-if $(PIP_INSTALL) uv && echo "== Installing torch: uv looks for the build for this machine" \
-  && UV_HTTP_TIMEOUT=30 UV_HTTP_RETRIES=1 $(BIN)/uv pip install --quiet --python $(BIN)/python --torch-backend auto \
-    --no-deps -c constraints.txt torch; then :; else \
-  echo "== uv cannot reach it (above): torch from pip's own index, which may be the large build for GPUs"; \
-  $(PIP_INSTALL) --no-deps torch; fi
-endef
+INSTALL := sh .ci/install $(VENV)
+# uv compiles nothing (all of it would take 48 CPU-s). Python compiles what it imports, once, unless this is passed on.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds proofs test-cluster docs dist benchmark audit figures
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds test-machines proofs test-cluster docs dist kernels benchmark audit figures
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
-	@echo "make test [ARGS=...]  the test suite, without the tests marked long"
+	@echo "make test [ARGS=...]  the test suite, without the tests marked slow or long (.ci/run runs the slow ones, too)"
 	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make check            lint and test"
 	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"
 	@echo "make figures          the printed blocks, tables and pictures of README and docs made again and compared (minutes)"
 	@echo "make dist             wheel and sdist in dist/, built twice with the same SHA-256"
+	@echo "make kernels          a wheel of ready-made kernels for this Python in dist/ (Linux, x86-64)"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
@@ -49,11 +42,12 @@ help:
 	@echo "make test-cluster     a sweep on a Ray cluster of two nodes on this machine, whose workers are killed at random, its driver once"
 	@echo "make shield-bugs      plant 36 bugs in copies of the shield; each must turn a test red"
 	@echo "make test-bounds      the tests at the lowest versions that pyproject.toml allows, and at the newest"
+	@echo "make test-machines    recorded results again, as on nine older processors: the same bits"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
 	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of the physics (ARGS='--modules rewards,v2x --sample 40': of others)"
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
-	@echo "make benchmark        drive suite v1 with the agents of docs/benchmark.md and make its tables (ARGS: some agents)"
+	@echo "make benchmark        drive suite v2 with the agents of docs/benchmark.md and make its tables (ARGS: some agents)"
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make clean            remove $(VENV), $(PEERS), .venvs, caches and builds (runs/ stays)"
 	@echo "TORCH_INDEX=URL       take torch from this index; else uv picks the build for this machine"
@@ -87,11 +81,14 @@ $(STAMP): pyproject.toml constraints.txt
 	  echo "error: $$found cannot make a virtual environment (on Debian: apt install python3-venv)" >&2; \
 	  exit 1; \
 	fi
-	@$(if $(TORCH_INDEX),echo "== Installing torch from $(TORCH_INDEX)"; \
-	$(PIP_INSTALL) --no-deps --index-url "$(TORCH_INDEX)" torch,$(TORCH_FOR_THIS_MACHINE))
-	@echo "== Installing ethbrake_marl with what it needs to train and to be tested, at the versions of constraints.txt"
-	@$(PIP_INSTALL) -e ".[train,dev]"
+	@echo "== Installing ethbrake_marl"
+	@$(INSTALL) -e .
+	@echo "== Installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX),: uv looks for the build for this machine)"
+	@$(INSTALL) --torch "$(TORCH_INDEX)"
+	@echo "== Installing what it needs to train and to be tested, at the versions of constraints.txt"
+	@$(INSTALL) -e ".[train,dev]"
 	@echo "== torch $$($(BIN)/python -c 'from importlib.metadata import version; print(version("torch"))')"
+	@$(BIN)/ethbrake evaluate --help >/dev/null
 	@echo "$(CURDIR)" > $@
 	@echo "== Environment ready"
 
@@ -120,7 +117,7 @@ check: lint
 
 $(DOCS_STAMP): $(STAMP)
 	@echo "== Installing what builds the site"
-	@$(PIP_INSTALL) -e ".[docs]"
+	@$(INSTALL) -e ".[docs]"
 	@touch $@
 
 docs: $(DOCS_STAMP)
@@ -135,6 +132,10 @@ figures: $(STAMP)
 dist: $(STAMP)
 	@echo "== wheel and sdist, twice"
 	@$(BIN)/python -m tests.wheel.reproducible $(ARGS)
+
+kernels: $(STAMP)
+	@echo "== ready-made kernels, for two levels of x86-64"
+	@$(BIN)/python -m tests.wheel.kernels $(ARGS)
 
 test-physics: $(STAMP)
 	@echo "== long programme on the physics"
@@ -155,6 +156,10 @@ test-light: $(STAMP)
 test-bounds: $(STAMP)
 	@echo "== the lowest and the highest versions"
 	@$(BIN)/python -m tests.programme.bounds $(ARGS)
+
+test-machines: $(STAMP)
+	@echo "== the same bits on other processors"
+	@$(BIN)/python -m tests.programme.machines $(ARGS)
 
 test-order: $(STAMP)
 	@echo "== the suite in random orders"
@@ -177,7 +182,7 @@ proofs: $(STAMP)
 	@NUMBA_DISABLE_JIT=1 $(BIN)/python -m tests.proofs
 test-cluster: $(STAMP)
 	@echo "== a sweep on a Ray cluster, disturbed"
-	@$(PIP_INSTALL) -e ".[cluster]"
+	@$(INSTALL) -e ".[cluster]"
 	@$(BIN)/python -m tests.studies.sweep.cluster $(ARGS)
 
 shield-bugs: $(STAMP)

@@ -24,7 +24,7 @@ myst_enable_extensions = ["dollarmath"]
 # Notebooks are Markdown files with code cells, each run in an empty folder. Their outputs are kept from build to build
 # until a cell changes; `make clean` forgets them.
 nb_execution_mode = "cache"
-nb_execution_timeout = 600
+nb_execution_timeout = -1  # however busy the machine is
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True

@@ -10,6 +10,7 @@ read from this file, and each is made on first use.
 from __future__ import annotations
 
 import ast
+import sys
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.util import find_spec
@@ -141,6 +142,7 @@ def _import_public(name: str) -> Any:
         close = get_close_matches(name, _HOMES, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
+    register_environments()
     with naming_extras():
         value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value
@@ -155,4 +157,6 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *_usable(), "__all__"})
 
 
-register_environments()
+# The command `ethbrake` registers them when it calls a command: Gymnasium takes longer to import than --help may take.
+if Path(sys.argv[0] if sys.argv else "").name != "ethbrake":
+    register_environments()

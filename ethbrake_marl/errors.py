@@ -9,9 +9,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
+from numbers import Integral
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 _NAMED = 5  # failed worlds that a message names one by one
 LINE_LIMIT = 1_500  # characters of a message; of a longer one the beginning and the end are shown
@@ -236,7 +239,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
     """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no end)."""
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"
         raise InvalidInput(f"{what} = {value!r}: must be a whole number{right}")

@@ -13,17 +13,17 @@ The first can be gamed (a light early touch makes the later, harder impact free)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
+from ethbrake_marl.defaults import HARM_COUNTS as HARM_COUNTS
+from ethbrake_marl.defaults import HarmCount as HarmCount
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics.advance import Impacts, no_obstacle_harm
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.elementary import logistic
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
-
-HarmCount = Literal["first", "total"]
-HARM_COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
 
 _INJURY_SLOPE = 0.177  # per m/s of speed change
 _INJURY_OFFSET = {"front": -4.457, "rear": -4.888}  # side of the car that is hit
@@ -146,5 +146,4 @@ def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"])
     (the striking car), -4.888 at its rear (the struck car). Source: Geisslinger et al. 2023.
     """
     dv = np.abs(speed_change_mps)
-    probability: Floats = 1.0 / (1.0 + np.exp(-_INJURY_OFFSET[side] - _INJURY_SLOPE * dv))
-    return probability
+    return logistic(_INJURY_OFFSET[side] + _INJURY_SLOPE * dv)

@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -67,13 +68,14 @@ def tell_compilation() -> None:
         _tellers.pop()(cache_folder(), not _loaded)
 
 
-def load_kernel(name: str) -> bytes | None:
-    """What was kept under a name; nothing where it is missing, damaged, or neither this user's nor root's.
+def load_kernel(name: str, *, ready_made: bool = False) -> bytes | None:
+    """What was kept, or installed, under a name; nothing where it is missing, damaged, or not this user's or root's.
 
     Who else could write there could have us run anything.
     """
+    folder = _ready_made_folder() if ready_made else cache_folder()
     try:
-        with (cache_folder() / name).open("rb") as file:
+        with (folder / name).open("rb") as file:
             about, content = os.fstat(file.fileno()), file.read()
     except OSError:
         return None
@@ -108,6 +110,9 @@ def _digest_of(name: str, content: bytes) -> bytes:
 @contextmanager
 def alone(name: str) -> Iterator[None]:
     """No other process that asks for the same name is inside meanwhile, unless the folder's disk knows no locks."""
+    if not name:
+        yield
+        return
     from filelock import FileLock, Timeout  # needed by who compiles only
 
     lock = FileLock(cache_folder() / f".{name}.lock", timeout=_LONGEST_WAIT_S)
@@ -119,6 +124,13 @@ def alone(name: str) -> Iterator[None]:
         if lock.is_locked:
             Path(lock.lock_file).unlink(missing_ok=True)
             lock.release()
+
+
+@cache
+def _ready_made_folder() -> Path:
+    """Folder of the kernels that the distribution ethbrake-marl-kernels brings, or one that does not exist."""
+    found = find_spec("ethbrake_marl_kernels")
+    return Path(found.origin).parent if found and found.origin else Path(os.devnull)
 
 
 @cache

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from functools import lru_cache
 from typing import Annotated, NamedTuple
 
@@ -221,10 +222,19 @@ def _weighted_by_list(objective: Objective, harm: HarmSoFar, vehicle: int) -> Fl
     return _weighted(harm.borne, np.full(harm.borne.shape, objective.weights))
 
 
+@lru_cache
 def _social_weights(angle_deg: float) -> tuple[float, float]:
-    """Weights of the own harm and of the others'; exactly 0 and 1 at 90 degrees too."""
-    angle = math.radians(angle_deg)
-    return (0.0, 1.0) if angle_deg == 90.0 else (math.cos(angle), math.sin(angle))
+    """Weights of the own harm and of the others': cosine and sine; exactly 0 and 1 at 90 degrees too.
+
+    By their series in exact fractions, rounded once: the C library's have other last bits on other processors.
+    """
+    if angle_deg == 90.0:
+        return 0.0, 1.0
+    angle, term, sums = Fraction(math.radians(angle_deg)), Fraction(1), [Fraction(0), Fraction(0)]
+    for k in range(28):
+        sums[k % 2] += -term if k % 4 >= 2 else term
+        term = term * angle / (k + 1)
+    return float(sums[0]), float(sums[1])
 
 
 def _weighted(borne: Floats, weights: Floats) -> Floats:

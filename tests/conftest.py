@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import sys
 from collections.abc import Iterator
 
 import pytest
+import typer.main
 from hypothesis import settings
 
 # Before the first numerical import: each pool reads its variable once.
@@ -19,6 +21,9 @@ os.environ["SDL_AUDIODRIVER"] = "dummy"
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 
 pytest_plugins = ["tests.fixtures.evaluation", "tests.fixtures.policies"]
+
+# Typer reads the signatures of all commands for each command line, 70 ms; the suite has a thousand in one process.
+typer.main.get_params_from_function = functools.cache(typer.main.get_params_from_function)
 
 # A shell's background job ignores Ctrl-C, and so would all processes that it starts; the tests send it.
 signal.signal(signal.SIGINT, signal.default_int_handler)

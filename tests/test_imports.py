@@ -163,7 +163,65 @@ def test_import__loads_nothing_heavy_and_says_nothing(module: str, heavy: tuple[
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+
+
+def ended(program: str) -> tuple[int, str, str]:
+    """Exit status, stdout and stderr of a Python program that begins as the script `ethbrake` does."""
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", f"import sys; sys.argv[0] = '/somewhere/bin/ethbrake'\n{program}"],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    return result.returncode, result.stdout, result.stderr
+
+
+HEAVY = ("numba", "numpy", "scipy", "gymnasium", "torch", "matplotlib")
+STARTS = f"""
+import os
+from typer.main import get_command
+from ethbrake_marl.cli.app import app, run_command
+
+def ask(*words):
+    status = run_command(words)
+    if status or (found := set(sys.modules) & set({HEAVY!r})):
+        sys.exit(f"{{words}}, {{dict(os.environ).get('COMP_WORDS')}}: status {{status}}, imported {{found}}")
+
+def ask_each(command, *words):
+    ask(*words, "--help")
+    for name, inner in getattr(command, "commands", {{}}).items():
+        ask_each(inner, *words, name)
+
+ask("--version")
+ask_each(get_command(app))
+os.environ |= {{"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake evaluate --sce", "COMP_CWORD": "2"}}
+try:
+    ask()
+except SystemExit as end:
+    sys.exit(end.code or ", ".join(set(sys.modules) & set({HEAVY!r})) or None)
+"""
+
+
+def test_start__version_every_help_and_completion_import_nothing_heavy() -> None:
+    status, out, err = ended(STARTS)
+    assert (status, err) == (0, "")
+    assert out.endswith("\n--scenario\n")
+    assert "Train a policy, or the policies of several learners, into a run's folder." in out
+
+
+@pytest.mark.parametrize("use", ["ethbrake_marl.Scenario", "run_command(['scenario', 'list'])"])
+def test_start__environments_are_registered_by_what_is_more_than_help(use: str) -> None:
+    program = f"""
+import ethbrake_marl
+from ethbrake_marl.cli.app import run_command
+assert "gymnasium" not in sys.modules
+{use}
+assert "EthBrake-v0" in sys.modules["gymnasium"].registry
+"""
+    status, _, err = ended(program)
+    assert (status, err) == (0, "")

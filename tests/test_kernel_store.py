@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,8 @@ import pytest
 import ethbrake_marl
 from ethbrake_marl import kernel_store
 from ethbrake_marl.kernel_store import cache_folder, digest_of_sources, keep_kernel, kernel_sources, load_kernel
+from ethbrake_marl.physics import compiled
+from tests.wheel.kernels import pack
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
 PACKAGE = Path(ethbrake_marl.__file__).parent
@@ -228,7 +231,7 @@ table[SPEED] = 2.0, 4.0
 print(pool(table, SPEED, SPEED, 0, 1, GAP), *table[GAP], *sorted(set(Count.names)))
 """
 SAME = "1 3.0 3.0"  # two of one mass, the one behind faster: one block, at the mean of both speeds
-COMPILED = f"{SAME} pool settle"
+COMPILED = f"{SAME} pool"
 
 
 def begin(package: Path, folder: Path, name: str) -> subprocess.Popen:
@@ -278,3 +281,90 @@ def test_kernels__without_a_folder_to_write_to_are_compiled_in_each_process(monk
     monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/x")
     assert [run(PACKAGE, tmp_path), run(PACKAGE, tmp_path)] == [COMPILED, COMPILED]
     assert not list(tmp_path.glob("ethbrake_marl-*"))
+
+
+INNER = """
+import sys
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
+
+@compiled_apart
+def checked(x):
+    if x < 0.0:
+        raise ValueError("negative", x)
+    print("seen", x)
+    return x
+
+@compiled
+def inner(x):
+    return checked(x) + checked(1.0)
+
+@compiled_apart
+def other(x):
+    return inner(x)
+
+for function, value in ((inner, 2.0), (inner, -1.0), (other, 3.0), (other, -1.0)):
+    try:
+        print(function(value), flush=True)
+    except ValueError as error:
+        print(error.args, flush=True)
+"""
+TOLD = "seen 2.0\nseen 1.0\n3.0\n('negative', -1.0)\nseen 3.0\nseen 1.0\n4.0\n('negative', -1.0)\n"
+
+
+def test_kernels__raise_and_print_inside_of_what_they_call_also_when_they_were_loaded(tmp_path):
+    (tmp_path / "program.py").write_text(INNER)
+    environment = {**os.environ, "PYTHONPATH": str(PACKAGE.parent), "NUMBA_DISABLE_JIT": "0"}
+    command = [sys.executable, "program.py"]
+    for loaded in ([], [".entry"], [".linked"]):
+        for file in cache_folder().iterdir():
+            if loaded and file.suffix not in loaded:
+                file.unlink()
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        assert (done.stdout, done.stderr) == (TOLD, "")
+    assert {file.suffix for file in cache_folder().iterdir()} == {".entry", ".linked"}
+
+
+def test_kernels__of_a_numba_that_is_not_known_are_compiled_as_numba_does(monkeypatch):
+    monkeypatch.setattr(compiled, "_KNOWN", False)
+
+    @compiled.compiled_apart
+    def twice(x: float) -> float:
+        return 2.0 * x
+
+    @compiled.compiled_apart
+    def outer(x: float) -> float:
+        return twice(x) + 1.0
+
+    assert outer(3.0) == 7.0
+    assert len(twice.overloads) == 1 and not twice._linked
+
+
+def test_kernels__are_not_compiled_once_for_each_number_that_stands_in_a_source():
+    @compiled.compiled_apart
+    def twice(k: int) -> int:
+        return 2 * k
+
+    @compiled.compiled_apart
+    def outer(k: int) -> int:
+        return twice(1) + twice(2) + twice(k)
+
+    assert outer(3) == 12
+    assert len(twice._linked) == 1 and not twice.overloads
+
+
+@pytest.mark.skipif((sys.platform, platform.machine()) != ("linux", "x86_64"), reason="none are built for this machine")
+def test_ready_made_kernels__are_taken_where_the_own_store_has_none_unless_they_are_damaged(monkeypatch, tmp_path):
+    with monkeypatch.context() as chosen:
+        chosen.setenv("NUMBA_CPU_NAME", "x86-64-v2")
+        chosen.setenv("NUMBA_CPU_FEATURES", "")
+        assert run(PACKAGE, tmp_path) == COMPILED
+    wheel = pack({file.name: file.read_bytes() for file in cache_folder().glob("*.entry")}, tmp_path)
+    site = tmp_path / "site"
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
+    subprocess.run([*pip, str(wheel)], check=True, timeout=120)
+    shutil.copytree(PACKAGE, site / "ethbrake_marl", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "another"))
+    assert run(site / "ethbrake_marl", tmp_path) == SAME
+    (kernel,) = (site / "ethbrake_marl_kernels").glob("*.entry")
+    kernel.write_bytes(kernel.read_bytes()[:-1])
+    assert run(site / "ethbrake_marl", tmp_path) == COMPILED

@@ -29,8 +29,8 @@ class BestHarm:
 
     ``recall`` gives the kept profiles; a world without one is searched at the alert with ``budget`` candidates.
     Decisions fall every ``time_step_s`` from the vehicle's latency on. ``predicted_harm`` [n] is what the engine will
-    count (m2/s2), to the same bits, if the engine's time step is that. Raises ``InvalidInput`` for a budget below 1 or an
-    unknown count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
+    count (m2/s2), to the same bits, if the engine's time step is that. Raises ``InvalidInput`` for a budget below 1 or
+    an unknown count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
     """
 
     knows = Source.MODEL

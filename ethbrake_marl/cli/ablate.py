@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import JobsOption, JsonOption, ScenarioOption, SetOption
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, show, write_json
+from ethbrake_marl.defaults import LIST_SEED, HarmCount
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.inputs import LIST_SEED, load_runnable
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.settings import read_settings
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.evaluation.inputs import load_runnable
+    from ethbrake_marl.learning.settings import read_settings
 
 if TYPE_CHECKING:
     from ethbrake_marl.studies.ablation.plan import Plan

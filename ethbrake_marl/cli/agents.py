@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from rich import box
 from rich.table import Table
 
-from ethbrake_marl.agents.knowledge import knowledge_text, sees_through
-from ethbrake_marl.agents.registry import agent_entries
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import JsonOption
 from ethbrake_marl.cli.terminal import result_console, show, write_json
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.agents.knowledge import knowledge_text, sees_through
+    from ethbrake_marl.agents.registry import agent_entries
 
 
 def agents_command(as_json: JsonOption = False) -> None:

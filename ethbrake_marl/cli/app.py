@@ -25,7 +25,7 @@ from ethbrake_marl.cli.falsify import falsify_command
 from ethbrake_marl.cli.options import VersionOption, rename_old_options
 from ethbrake_marl.cli.parts import CommandWithParts
 from ethbrake_marl.cli.picture import picture_app
-from ethbrake_marl.cli.plugins import accept_plugins, check_commands, keep_results_alone
+from ethbrake_marl.cli.plugins import accept_plugins, check_commands, prepare_commands
 from ethbrake_marl.cli.recipe import recipe_app
 from ethbrake_marl.cli.record import record_command
 from ethbrake_marl.cli.replay import replay_command
@@ -110,7 +110,7 @@ app.command("dataset", epilog="Example: ethbrake dataset --agents best_harm --ep
 )
 app.command("replay", epilog="Example: ethbrake replay PASSPORT --output again.html")(replay_command)
 app.command("explore", epilog="Example: ethbrake explore --agents full_brake,ppo@shipped")(explore_command)
-app.command("benchmark", epilog="Example: ethbrake benchmark v1 --agent ppo@shipped --output mine.json")(
+app.command("benchmark", epilog="Example: ethbrake benchmark v2 --agent ppo@shipped --output mine.json")(
     benchmark_command
 )
 app.command("leaderboard", epilog="Example: ethbrake leaderboard mine.json theirs.json --output table.html")(
@@ -137,7 +137,7 @@ def run_command(arguments: Sequence[str]) -> int:
     try:
         check_commands(app)
         variable = None if shell_asks(os.environ) else _NO_VARIABLE  # None: the usual one
-        command = keep_results_alone(accept_plugins(get_command(app)))
+        command = prepare_commands(accept_plugins(get_command(app)))
         arguments = rename_old_options(arguments, command)
         with naming_extras():
             status = command(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)

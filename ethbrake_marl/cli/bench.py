@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 from rich.table import Table
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import ForceOption, JsonOption
-from ethbrake_marl.cli.picture import picture_target
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
 from ethbrake_marl.errors import need
-from ethbrake_marl.studies.speed import BENCHMARKS, FULL, QUICK, WORLD_STEPS, Speed, measure
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.cli.results import picture_target
+    from ethbrake_marl.studies.speed import BENCHMARKS, FULL, QUICK, WORLD_STEPS, Speed, measure
 
 Measured = TypeVar("Measured")
 

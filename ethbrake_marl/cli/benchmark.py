@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import ForceOption, JsonOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import check_target
-from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
-from ethbrake_marl.studies.benchmark.leaderboard import Leaderboard, read_leaderboard, verify
-from ethbrake_marl.studies.benchmark.suite import load_suite
-from ethbrake_marl.studies.benchmark.table import (
-    RANK,
-    SCORE,
-    leaderboard_markdown,
-    leaderboard_table,
-    list_table,
-)
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.evaluation import check_target
+    from ethbrake_marl.evaluation.per_world import write_output
+    from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
+    from ethbrake_marl.studies.benchmark.leaderboard import Leaderboard, read_leaderboard, verify
+    from ethbrake_marl.studies.benchmark.suite import load_suite
+    from ethbrake_marl.studies.benchmark.table import RANK, SCORE, leaderboard_markdown, leaderboard_table, list_table
 
 _PAGES = (".html", ".htm")
 _MARKDOWN = ".md"
 
 
 def benchmark_command(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite that ships, such as v1.")],
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite that ships, such as v2.")],
     agent: Annotated[str, typer.Option(metavar="SPEC", help="Who drives; any agent of `ethbrake evaluate`.")],
     output: Annotated[
         Path | None, typer.Option(metavar="ENTRY.json", help="Also write the entry to this file.")

@@ -7,26 +7,30 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
-from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, say, show, write_json
+from ethbrake_marl.defaults import EPISODES, HARM_COUNTS, LIST_SEED, SEARCH_BUDGET, HarmCount
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import check_target
-from ethbrake_marl.evaluation.bounds import proven_of_table, shipped_bounds, shipped_lines
-from ethbrake_marl.evaluation.identity import result_identity
-from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, load_runnable, make_agents
-from ethbrake_marl.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.learning.settings import read_settings
-from ethbrake_marl.limits.best_harm import BUDGET, LEFT_OUT, search_list
-from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table, save_table
-from ethbrake_marl.limits.driven_profiles import fold_agent
-from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Sample, Scenario, Task
+
+if TYPE_CHECKING or LATE:
+    import numpy as np
+
+    from ethbrake_marl.agents.protocol import Agent
+    from ethbrake_marl.evaluation import check_target
+    from ethbrake_marl.evaluation.bounds import proven_of_table, shipped_bounds, shipped_lines
+    from ethbrake_marl.evaluation.identity import result_identity
+    from ethbrake_marl.evaluation.inputs import load_runnable, make_agents
+    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.limits.best_harm import LEFT_OUT, search_list
+    from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table, save_table
+    from ethbrake_marl.limits.driven_profiles import fold_agent
+    from ethbrake_marl.physics import Worlds
+    from ethbrake_marl.scenario import Sample, Scenario, Task
 
 TABLE_ENDING = ".npz"
 
@@ -42,7 +46,7 @@ def best_harm_command(
         str | None,
         typer.Option(metavar="A,B,...", help="Who is controlled, together.", show_default="the learners"),
     ] = None,
-    budget: Annotated[int, typer.Option(help="Candidate profiles per world and count.")] = BUDGET,
+    budget: Annotated[int, typer.Option(help="Candidate profiles per world and count.")] = SEARCH_BUDGET,
     search_seed: Annotated[int, typer.Option(help="Seed of the search.")] = 0,
     threads: Annotated[
         int | None, typer.Option(help="Worlds searched at once; changes no result.", show_default="every core")

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import JsonOption
 from ethbrake_marl.cli.terminal import result_console, say, write_json
-from ethbrake_marl.evaluation.compare import Comparison, compare_results
-from ethbrake_marl.evaluation.results_file import read_result
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.evaluation.compare import Comparison, compare_results
+    from ethbrake_marl.evaluation.results_file import read_result
 
 _FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield, equal-time (--json) or run.")
 _HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", "harm": "Harm"}

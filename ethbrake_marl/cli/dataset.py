@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import ForceOption, ScenarioOption, SetOption, UncertaintyOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, say
+from ethbrake_marl.defaults import LIST_SEED, DatasetFormat, HarmCount
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.dataset.write import (
-    DatasetFormat,
-    DatasetSummary,
-    check_dataset,
-    write_dataset,
-)
-from ethbrake_marl.evaluation.inputs import LIST_SEED, check_agents, load_evaluated, make_lineup
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.settings import read_settings
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.evaluation.dataset.write import DatasetSummary, check_dataset, write_dataset
+    from ethbrake_marl.evaluation.inputs import check_agents, load_evaluated, make_lineup
+    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 
 def dataset_command(

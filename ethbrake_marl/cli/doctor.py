@@ -4,36 +4,54 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
 import sys
+import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
-from packaging.requirements import Requirement
-from packaging.version import Version
 
 from ethbrake_marl import __version__
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import JsonOption
-from ethbrake_marl.cli.terminal import show, write_json
-from ethbrake_marl.evaluation import evaluate, summarise
-from ethbrake_marl.evaluation.inputs import LIST_SEED, make_lineup, make_proposers
-from ethbrake_marl.evaluation.shield_modes import compare_modes
+from ethbrake_marl.cli.terminal import say, show, write_json
 from ethbrake_marl.kernel_store import cache_folder, is_temporary
-from ethbrake_marl.physics import Worlds, advance, make_worlds
-from ethbrake_marl.scenario import Task, list_scenarios, load_scenario, scenario_folder
-from ethbrake_marl.scenario.catalogue import SHIPPED
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+
+if TYPE_CHECKING or LATE:
+    import numpy as np
+    from packaging.requirements import Requirement
+    from packaging.version import Version
+
+    from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+    from ethbrake_marl.physics import Worlds, advance, make_worlds
+    from ethbrake_marl.scenario import list_scenarios, scenario_folder
+    from ethbrake_marl.scenario.catalogue import SHIPPED
 
 DISTRIBUTION = "ethbrake-marl"
 EXTRAS = ("train", "marl", "export", "data", "render", "explore", "cluster", "tune")
-_WARM_UP = ("ladder", "ppo@shipped", "ppo@shipped+refined+episode", "full_brake+step", "full_brake+robust")
+_TINY = ("n_envs=16", "n_steps=8", "counterfactuals=16", "evaluation.worlds=10")
+_LINEUP = "ladder,ppo@shipped,ppo@shipped+refined+episode,full_brake+step,full_brake+robust"
+# Small calls of what people call first: what they use is what is compiled. One world alone lies otherwise in memory.
+_DOORS = (
+    ("run", "--steps", "128", "--episodes", "20", "--output", "run", *(f"--set={value}" for value in _TINY)),
+    ("evaluate", "--agents", _LINEUP, "--episodes", "20"),
+    ("evaluate", "--agents", "full_brake,ppo@shipped+episode,full_brake+step", "--episodes", "1"),
+    ("shield", "--agents", "full_brake", "--episodes", "3"),
+)
+_FIRST_STEP = """
+import ethbrake_marl as eb
+env = eb.parallel_env()
+env.reset(seed=0)
+env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+"""
 OLDEST_PYTHON = (3, 11)
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent  # or the folder of installed packages, where there is no pyproject.toml
@@ -48,10 +66,10 @@ class Check:
     detail: str
 
 
-def diagnose(*, warm_up: bool = False) -> list[Check]:
+def diagnose(*, compile_all: bool = False) -> list[Check]:
     """All checks, in the order in which they should be repaired; none of them raises.
 
-    ``warm_up``: run every kernel that the usual commands use first, so that all are compiled and kept.
+    ``compile_all``: call the usual commands on a few worlds first, so that all they use is compiled and kept.
     """
     return [
         Check("ethbrake_marl", True, f"{__version__} in {_PACKAGE}"),
@@ -62,7 +80,7 @@ def diagnose(*, warm_up: bool = False) -> list[Check]:
         _check("scenarios", _scenarios),
         _check("physics", _golden_impact),
         _check("baseline", _golden_baseline),
-        *([_check("warm-up", _warm_up)] if warm_up else []),
+        *([_check("compile", _compile)] if compile_all else []),
     ]
 
 
@@ -157,18 +175,25 @@ def _golden_baseline() -> tuple[bool, str]:
     return found == wanted, f"E-V2X-BM at gaps 7 and 7 m: {found} (known: {wanted})"
 
 
-def _warm_up() -> tuple[bool, str]:
-    """A few worlds through what evaluations, shields and searches run; all other commands use parts of it."""
-    begun = perf_counter()
-    scenario = load_scenario("paper-random")
-    for n in (20, 1):  # some in which a shield steps in; and one alone, whose arrays lie differently in memory
-        sample = scenario.sample(n, LIST_SEED)
-        lineup = make_lineup(_WARM_UP, scenario, uncertainty=parse_uncertainty("latency_s=0.1"))
-        summarise(evaluate(sample, lineup, scenario=scenario))
-        compare_modes(
-            make_proposers(["full_brake"], scenario), sample.worlds, Task(scenario, scenario.learners, "first")
-        )
-    return True, f"what these commands use is compiled, after {perf_counter() - begun:.0f} s"
+def _compile() -> tuple[bool, str]:
+    """The commands of ``_DOORS`` on a few worlds, side by side on all cores; a line for each that ended."""
+    begun, failed = perf_counter(), []
+    doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if door[0] != "run" or find_spec("torch")]
+    doors.append(("-c", _FIRST_STEP))
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        called = {pool.submit(_call, door, folder): door for door in doors}
+        for done, future in enumerate(as_completed(called), start=1):
+            door, error = (called[future] + ("first step",))[2], future.result()
+            say(f"compile: {done} of {len(called)}: {door}{f' failed: {error}' if error else ''}")
+            failed += [f"{door}: {error}"] if error else []
+    return not failed, "; ".join(failed) or f"what these commands use is compiled, after {perf_counter() - begun:.0f} s"
+
+
+def _call(arguments: tuple[str, ...], folder: str) -> str:
+    """The last line of what a command says on stderr where it fails."""
+    command = [sys.executable, *arguments]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 
 
 def _world(
@@ -186,8 +211,8 @@ def _world(
 
 
 def doctor_command(
-    warm_up: Annotated[
-        bool, typer.Option("--warm-up", help="Compile all of the physics now, so that no later command waits for it.")
+    compile_all: Annotated[
+        bool, typer.Option("--compile", help="Compile the physics now, on all cores, so that no later command waits.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -195,7 +220,7 @@ def doctor_command(
 
     One line per check, OK or FAIL; exit status 1 when any failed.
     """
-    checks = diagnose(warm_up=warm_up)
+    checks = diagnose(compile_all=compile_all)
     if as_json:
         write_json([asdict(check) for check in checks])
     else:

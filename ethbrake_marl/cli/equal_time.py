@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import JsonOption, ScenarioOption, SetOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, show, write_json
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.evaluation.identity import result_identity
-from ethbrake_marl.evaluation.inputs import check_agents, load_driven, make_lineup
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.settings import read_settings
-from ethbrake_marl.limits.shipped import best_known
-from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Scenario, Task
-from ethbrake_marl.studies.equal_time import equal_time, timed_table
+
+if TYPE_CHECKING or LATE:
+    import numpy as np
+
+    from ethbrake_marl.evaluation.identity import result_identity
+    from ethbrake_marl.evaluation.inputs import check_agents, load_driven, make_lineup
+    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.limits.shipped import best_known
+    from ethbrake_marl.physics import Worlds
+    from ethbrake_marl.scenario import Scenario, Task
+    from ethbrake_marl.studies.equal_time import equal_time, timed_table
 
 REFINED = "ppo@shipped+refined+episode"
 SEARCHES = (  # without a policy, from a millisecond per world to what refining takes and more

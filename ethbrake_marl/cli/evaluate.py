@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.team import Team
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import (
     AgentsOption,
     ForceOption,
@@ -27,47 +26,63 @@ from ethbrake_marl.cli.options import (
     UncertaintyOption,
     VehicleOption,
 )
-from ethbrake_marl.cli.picture import PictureOption, counted_without, picture_app, picture_target, tell_left_out
-from ethbrake_marl.cli.report import ReportOption, check_page, write_evaluation_report
-from ethbrake_marl.cli.results import results_beside, tell_results
-from ethbrake_marl.cli.shards import (
-    JobsOption,
-    KeptOption,
-    RayOption,
-    RowsOption,
-    ShardsOption,
-    check_shards,
-    evaluate_in_shards,
-)
+from ethbrake_marl.cli.picture import PictureOption, picture_app
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
+from ethbrake_marl.defaults import EPISODES, LIST_SEED, HarmCount
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.evaluation import (
-    Evaluation,
-    SummaryRow,
-    check_target,
-    declared_objectives,
-    evaluate,
-    horizon_note,
-    summarise,
-)
-from ethbrake_marl.evaluation.frame import check_per_world
-from ethbrake_marl.evaluation.groups import check_group, summarise_by
-from ethbrake_marl.evaluation.inputs import (
-    EPISODES,
-    LIST_SEED,
-    PROGRESS_EVERY,
-    check_agents,
-    choose_worlds,
-    load_evaluated,
-    make_lineup,
-    make_proposers,
-)
-from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_tables, modes_to_json
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.settings import read_settings
-from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.scenario.sample import kind_columns
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.agents.protocol import Agent
+    from ethbrake_marl.agents.team import Team
+    from ethbrake_marl.cli.report import check_page, write_evaluation_report
+    from ethbrake_marl.cli.results import counted_without, picture_target, results_beside, tell_left_out, tell_results
+    from ethbrake_marl.cli.shards import check_shards, evaluate_in_shards
+    from ethbrake_marl.evaluation import (
+        Evaluation,
+        SummaryRow,
+        check_target,
+        declared_objectives,
+        evaluate,
+        horizon_note,
+        summarise,
+    )
+    from ethbrake_marl.evaluation.frame import check_per_world
+    from ethbrake_marl.evaluation.groups import check_group, summarise_by
+    from ethbrake_marl.evaluation.inputs import (
+        PROGRESS_EVERY,
+        check_agents,
+        choose_worlds,
+        load_evaluated,
+        make_lineup,
+        make_proposers,
+    )
+    from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_tables, modes_to_json
+    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.scenario import Sample, Scenario, Task
+    from ethbrake_marl.scenario.sample import kind_columns
+    from ethbrake_marl.shield.uncertainty import parse_uncertainty
+
+ReportOption = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FILE.html", help="Also write a page with tables, figures and episodes to watch."),
+]
+ShardsOption = Annotated[
+    int | None, typer.Option(metavar="K", help="Evaluate the list in K parts, in flat memory; changes no figure.")
+]
+JobsOption = Annotated[int, typer.Option(metavar="N", help="With --shards: processes; changes no figure.")]
+RayOption = Annotated[
+    str | None,
+    typer.Option(
+        "--ray", metavar="local|ADDRESS", help="With --shards: on Ray, on all its cores or on --jobs of them."
+    ),
+]
+KeptOption = Annotated[
+    Path | None,
+    typer.Option("--output", metavar="FOLDER", help="With --shards: keeps finished ones; the same command goes on."),
+]
+RowsOption = Annotated[
+    bool, typer.Option("--rows", help="With --output: also one row per world and agent, as Parquet files in it.")
+]
 
 
 def evaluate_command(

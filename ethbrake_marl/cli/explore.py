@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import ScenarioOption, SetOption, VehicleOption
 from ethbrake_marl.cli.terminal import say, show
+from ethbrake_marl.defaults import LIST_SEED
 from ethbrake_marl.errors import need
-from ethbrake_marl.evaluation.inputs import LIST_SEED, load_driven, make_lineup
-from ethbrake_marl.learning.settings import read_settings
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.evaluation.inputs import load_driven, make_lineup
+    from ethbrake_marl.learning.settings import read_settings
 
 AGENTS = "full_brake,copy_leader,e_v2x_bm,ppo@shipped,ppo@shipped+step"
 

@@ -6,38 +6,41 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from rich import box
 from rich.table import Table
 
-from ethbrake_marl.agents.spelling import parse_spec
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
+from ethbrake_marl.defaults import HINDSIGHT, MEASURES, MOST_NAMED_WORLDS, HarmCount, MeasureName
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.evaluation import check_target
-from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256
-from ethbrake_marl.evaluation.inputs import check_agents, load_evaluated
-from ethbrake_marl.evaluation.named_worlds import (
-    FORMAT,
-    MOST,
-    VERSION,
-    NamedWorld,
-    NamedWorlds,
-    named_worlds_text,
-    read_named_worlds,
-    states_of,
-)
-from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.settings import read_settings
-from ethbrake_marl.physics import Floats
-from ethbrake_marl.scenario import Sample, Scenario
-from ethbrake_marl.studies.falsification.falsify import Falsified, falsify
-from ethbrake_marl.studies.falsification.measures import HINDSIGHT, MEASURES, Measure, MeasureName, make_measure
+
+if TYPE_CHECKING or LATE:
+    import numpy as np
+
+    from ethbrake_marl.agents.spelling import parse_spec
+    from ethbrake_marl.evaluation import check_target
+    from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256
+    from ethbrake_marl.evaluation.inputs import check_agents, load_evaluated
+    from ethbrake_marl.evaluation.named_worlds import (
+        FORMAT,
+        VERSION,
+        NamedWorld,
+        NamedWorlds,
+        named_worlds_text,
+        read_named_worlds,
+        states_of,
+    )
+    from ethbrake_marl.evaluation.per_world import write_output
+    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.physics import Floats
+    from ethbrake_marl.scenario import Sample, Scenario
+    from ethbrake_marl.studies.falsification.falsify import Falsified, falsify
+    from ethbrake_marl.studies.falsification.measures import Measure, make_measure
 
 WORSE = 1  # exit status when a kept world is worse than it was
 ROUNDING = 1e-6  # m2/s2
@@ -73,7 +76,9 @@ def falsify_command(
     scenario: ScenarioOption = "paper-random",
     budget: Annotated[int, typer.Option(help="Worlds that are tried.", min=1)] = 4000,
     seed: Annotated[int, typer.Option(help="Seed of the search.", min=0)] = 0,
-    most: Annotated[int, typer.Option("--keep", help="Worlds that are kept, at most.", min=1, max=MOST)] = 20,
+    most: Annotated[
+        int, typer.Option("--keep", help="Worlds that are kept, at most.", min=1, max=MOST_NAMED_WORLDS)
+    ] = 20,
     at_random: AtRandomOption = False,
     harm_count: Annotated[HarmCount, typer.Option(help="Harm that is measured, and that agents minimise.")] = "first",
     vehicle: VehicleOption = None,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 from ethbrake_marl import __version__
@@ -34,6 +33,8 @@ class Machine:
 
 def this_machine() -> Machine:
     """The machine on which this runs."""
+    from importlib.metadata import version  # takes as long as half of the command line
+
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return Machine(
         _processor(),

@@ -11,10 +11,8 @@ import typer
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli.terminal import show, write_json
+from ethbrake_marl.defaults import EPISODES, LIST_SEED, OLD_SHIELDS, UNCERTAINTY_EXAMPLE, HarmCount
 from ethbrake_marl.errors import OldSpelling
-from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, OLD_SHIELDS
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.shield.uncertainty import EXAMPLE
 
 ScenarioOption = Annotated[
     str,
@@ -45,7 +43,9 @@ OutputOption = Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folde
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what is already there.")]
 UncertaintyOption = Annotated[
     str | None,
-    typer.Option(metavar="QUANTITY=WIDTH,...", help=f"What the robust shield does not know, such as {EXAMPLE}."),
+    typer.Option(
+        metavar="QUANTITY=WIDTH,...", help=f"What the robust shield does not know, such as {UNCERTAINTY_EXAMPLE}."
+    ),
 ]
 AgentsOption = Annotated[str, typer.Option(metavar="A,B,...", help="Who drives, with commas between them.")]
 ListEpisodesOption = Annotated[int | None, typer.Option(help="Worlds of the list.", show_default=str(EPISODES))]

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ethbrake_marl.agents.team import Team
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
+from ethbrake_marl.defaults import LIST_SEED, PRICE_CHANNELS, HarmCount
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation import check_target
-from ethbrake_marl.evaluation.criticality import CELLS, criticality_map
-from ethbrake_marl.evaluation.deceleration import deceleration_curve
-from ethbrake_marl.evaluation.identity import result_identity
-from ethbrake_marl.evaluation.inputs import LIST_SEED, load_driven, load_evaluated, make_agents, make_proposers
-from ethbrake_marl.evaluation.text import left_out_line
-from ethbrake_marl.figures import picture_ending
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.settings import read_settings
-from ethbrake_marl.physics import LeftOutRows
-from ethbrake_marl.scenario import Task
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
-from ethbrake_marl.studies.price import AGENTS, CHANNELS, price_figure, price_of_not_knowing, price_tables
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.agents.team import Team
+    from ethbrake_marl.cli.results import counted_without, picture_target, tell_left_out
+    from ethbrake_marl.evaluation.criticality import CELLS, criticality_map
+    from ethbrake_marl.evaluation.deceleration import deceleration_curve
+    from ethbrake_marl.evaluation.identity import result_identity
+    from ethbrake_marl.evaluation.inputs import load_driven, load_evaluated, make_agents, make_proposers
+    from ethbrake_marl.evaluation.text import left_out_line
+    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.scenario import Task
+    from ethbrake_marl.shield.uncertainty import parse_uncertainty
+    from ethbrake_marl.studies.price import AGENTS, price_figure, price_of_not_knowing, price_tables
 
 picture_app = typer.Typer(
     rich_markup_mode=None,
@@ -202,16 +203,16 @@ def picture_robustness(
 def picture_price(
     output: PictureOption,
     agents: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="A,B,...",
             help="Who drives. Who says believed is compared with the same that knows.",
             show_default="a ladder of six",
         ),
-    ] = ",".join(AGENTS),
+    ] = None,
     channels: Annotated[
         str, typer.Option(metavar="A,B,...", help="Presets of v2x; those that send messages also periodically.")
-    ] = ",".join(CHANNELS),
+    ] = ",".join(PRICE_CHANNELS),
     scenario: ScenarioOption = "cooperation-2-paper",
     episodes: Annotated[int, typer.Option(help="Worlds of the list.", min=1)] = 100,
     seed: Annotated[int, typer.Option(help="Seed of the list.")] = LIST_SEED,
@@ -231,8 +232,8 @@ def picture_price(
     chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
     with interruptible("nothing was written"), progress_bars() as bars:
         found = price_of_not_knowing(
-            chosen, channels=channels.split(","), agents=agents.split(","), n=episodes, seed=seed,
-            harm_count=harm_count, on_progress=lambda what, done: bars.show(what, done, episodes),
+            chosen, channels=channels.split(","), agents=AGENTS if agents is None else agents.split(","), n=episodes,
+            seed=seed, harm_count=harm_count, on_progress=lambda what, done: bars.show(what, done, episodes),
         )  # fmt: skip
     caption = (
         f"{chosen.name} over each channel: {count_of(episodes, 'world')} of the list of seed {seed}. Harm on what was"
@@ -246,20 +247,3 @@ def picture_price(
     if found.left_out:
         say(left_out_line(list(map(str, found.left_out)), episodes * len(found.identities)))
     say(f"picture: {target}")
-
-
-def counted_without(left_out: LeftOutRows) -> str:
-    """What a caption says of worlds that count in no figure; nothing where there are none."""
-    return f" Left out: {len(left_out):,}, which the physics could not advance." if left_out else ""
-
-
-def tell_left_out(left_out: LeftOutRows, whole: int) -> None:
-    """Name the worlds that count in no figure, of ``whole``, in a line on stderr; none where every world counts."""
-    if left_out:
-        say(left_out_line([f"world {world} of seed {LIST_SEED} ({reason})" for world, reason in left_out], whole))
-
-
-def picture_target(output: Path, *, force: bool) -> Path:
-    """The file to write, checked before any work."""
-    picture_ending(output)
-    return check_target(output, force=force)

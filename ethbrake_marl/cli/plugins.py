@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
 from typer.main import get_command
 
+from ethbrake_marl.cli.late import import_late
 from ethbrake_marl.cli.terminal import results_alone
+from ethbrake_marl.envs.registration import register_environments
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.files.plugins import load_plugin
 
@@ -15,6 +18,7 @@ from ethbrake_marl.files.plugins import load_plugin
 def _load_all(sources: list[str] | None) -> None:
     with results_alone():
         for source in sources or ():
+            register_environments()
             load_plugin(source)
 
 
@@ -47,18 +51,29 @@ def accept_plugins(command: Any) -> Any:
     return command
 
 
-def keep_results_alone(command: Any) -> Any:
+def prepare_commands(command: Any) -> Any:
     """The command, or group of them, of which those of this package leave stdout to their results.
 
-    A command of somebody's plug-in prints where it likes.
+    Each of these registers the environments and makes its late imports first. A command of somebody's plug-in prints
+    where it likes.
     """
     waiting = [command]
     for each in waiting:
         inner = getattr(each, "commands", None)
         waiting += (inner or {}).values()
         if inner is None and each.callback.__module__.startswith("ethbrake_marl."):
-            each.callback = results_alone()(each.callback)
+            each.callback = _prepared(each.callback)
     return command
+
+
+def _prepared(callback: Callable[..., Any]) -> Callable[..., Any]:
+    @results_alone()
+    def call(*arguments: Any, **options: Any) -> Any:
+        register_environments()
+        import_late(callback.__module__)
+        return callback(*arguments, **options)
+
+    return call
 
 
 def check_commands(app: typer.Typer) -> None:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import ForceOption, JsonOption
 from ethbrake_marl.cli.terminal import say, show, write_json
-from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.files.plain import read_plain
-from ethbrake_marl.files.yaml import SIZE_LIMIT
-from ethbrake_marl.learning.recipe import load_recipe, recipe_path, shipped_recipes
-from ethbrake_marl.learning.recipe_schema import recipe_json_schema
-from ethbrake_marl.learning.recipe_text import new_recipe_text
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.evaluation.per_world import write_output
+    from ethbrake_marl.files.plain import read_plain
+    from ethbrake_marl.files.yaml import SIZE_LIMIT
+    from ethbrake_marl.learning.recipe import load_recipe, recipe_path, shipped_recipes
+    from ethbrake_marl.learning.recipe_schema import recipe_json_schema
+    from ethbrake_marl.learning.recipe_text import new_recipe_text
 
 recipe_app = typer.Typer(
     rich_markup_mode=None,

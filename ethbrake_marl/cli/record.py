@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import ForceOption, ScenarioOption, UncertaintyOption, VehicleOption
 from ethbrake_marl.cli.terminal import interruptible, say
-from ethbrake_marl.evaluation import check_target
-from ethbrake_marl.evaluation.film import check_ending, check_number_of_films, film_bytes, film_scenes
-from ethbrake_marl.evaluation.inputs import LIST_SEED, load_evaluated, make_lineup
-from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.defaults import LIST_SEED
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.evaluation import check_target
+    from ethbrake_marl.evaluation.film import check_ending, check_number_of_films, film_bytes, film_scenes
+    from ethbrake_marl.evaluation.inputs import load_evaluated, make_lineup
+    from ethbrake_marl.evaluation.per_world import write_output
+    from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 
 def record_command(

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import ForceOption, JsonOption, SetOption
-from ethbrake_marl.cli.report import check_page
 from ethbrake_marl.cli.terminal import interruptible, say, show, write_json
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation import check_target
-from ethbrake_marl.evaluation.film import check_ending, film_bytes, film_scenes
-from ethbrake_marl.evaluation.passport import parse_passport
-from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.evaluation.replay import Given, Replay, replay
-from ethbrake_marl.learning.settings import read_settings
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.cli.report import check_page
+    from ethbrake_marl.evaluation import check_target
+    from ethbrake_marl.evaluation.film import check_ending, film_bytes, film_scenes
+    from ethbrake_marl.evaluation.passport import parse_passport
+    from ethbrake_marl.evaluation.per_world import write_output
+    from ethbrake_marl.evaluation.replay import Given, Replay, replay
+    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 DIFFERS = 1  # exit status
 _PAGE = (".html", ".htm")

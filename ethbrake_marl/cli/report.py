@@ -5,9 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from ethbrake_marl.agents.team import Driver
 from ethbrake_marl.cli.terminal import Bars, say
@@ -15,11 +13,6 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, check_target
 from ethbrake_marl.evaluation.conditions import parameter_line
 from ethbrake_marl.harm import HarmCount
-
-ReportOption = Annotated[
-    Path | None,
-    typer.Option("--report", metavar="FILE.html", help="Also write a page with tables, figures and episodes to watch."),
-]
 
 
 def check_page(path: Path, *, force: bool = False) -> Path:

@@ -1,4 +1,4 @@
-"""The results of ``evaluate`` and ``run``: printed, and written beside the rows of every world."""
+"""The results of ``evaluate`` and ``run``: printed, and written beside the rows of every world; what pictures share."""
 
 from __future__ import annotations
 
@@ -7,14 +7,25 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ethbrake_marl.cli.terminal import result_console, say, write_json
+from ethbrake_marl.defaults import LIST_SEED
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation import Evaluation, SummaryRow, horizon_note, rescore, rescored_table, rich_table
+from ethbrake_marl.evaluation import (
+    Evaluation,
+    SummaryRow,
+    check_target,
+    horizon_note,
+    rescore,
+    rescored_table,
+    rich_table,
+)
 from ethbrake_marl.evaluation.frame import write_per_world
 from ethbrake_marl.evaluation.paper import TESTS
 from ethbrake_marl.evaluation.per_world import write_output
 from ethbrake_marl.evaluation.results_file import results_to_json
-from ethbrake_marl.evaluation.text import metrics_table
+from ethbrake_marl.evaluation.text import left_out_line, metrics_table
+from ethbrake_marl.figures import picture_ending
 from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.physics import LeftOutRows
 
 Groups = Mapping[str, Sequence[SummaryRow]]
 
@@ -95,3 +106,20 @@ def show_beside(beside: Mapping[str, Sequence[SummaryRow]]) -> None:
     for test, rows in beside.items():
         result_console().print(f"\n{TESTS[test]}\n", highlight=False, markup=False)
         result_console().print(rich_table(rows))
+
+
+def counted_without(left_out: LeftOutRows) -> str:
+    """What a caption says of worlds that count in no figure; nothing where there are none."""
+    return f" Left out: {len(left_out):,}, which the physics could not advance." if left_out else ""
+
+
+def tell_left_out(left_out: LeftOutRows, whole: int) -> None:
+    """Name the worlds that count in no figure, of ``whole``, in a line on stderr; none where every world counts."""
+    if left_out:
+        say(left_out_line([f"world {world} of seed {LIST_SEED} ({reason})" for world, reason in left_out], whole))
+
+
+def picture_target(output: Path, *, force: bool) -> Path:
+    """The file to write, checked before any work."""
+    picture_ending(output)
+    return check_target(output, force=force)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import (
     ForceOption,
     JsonOption,
@@ -19,14 +20,17 @@ from ethbrake_marl.cli.options import (
     TrainingSeedOption,
     VehicleOption,
 )
-from ethbrake_marl.cli.results import show_beside, show_rows
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, say, write_json
 from ethbrake_marl.cli.train import KEPT, end_of_training
-from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, load_driven
-from ethbrake_marl.evaluation.per_world import PER_WORLD
-from ethbrake_marl.evaluation.results_file import results_to_json
-from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.settings import read_settings
+from ethbrake_marl.defaults import EPISODES, LIST_SEED
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.cli.results import show_beside, show_rows
+    from ethbrake_marl.evaluation.inputs import load_driven
+    from ethbrake_marl.evaluation.per_world import PER_WORLD
+    from ethbrake_marl.evaluation.results_file import results_to_json
+    from ethbrake_marl.learning.recipe import load_recipe
+    from ethbrake_marl.learning.settings import read_settings
 
 
 def run_experiment_command(

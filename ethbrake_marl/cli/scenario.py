@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ethbrake_marl.agents.registry import make_single_agent
-from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.agents.team import Team
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import ForceOption, JsonOption
 from ethbrake_marl.cli.terminal import say, show, write_json
-from ethbrake_marl.evaluation.inputs import LIST_SEED, load_runnable
-from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.files.plain import read_plain
-from ethbrake_marl.files.yaml import SIZE_LIMIT
-from ethbrake_marl.scenario import (
-    list_scenarios,
-    load_scenario,
-    new_scenario_text,
-    scenario_json_schema,
-    scenario_path,
-)
-from ethbrake_marl.scenario.catalogue import SHIPPED
-from ethbrake_marl.scenario.roles import LEARNER, is_state_free
-from ethbrake_marl.scenario.sample import count_kinds
+from ethbrake_marl.defaults import LIST_SEED
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.agents.registry import make_single_agent
+    from ethbrake_marl.agents.rollout import drive
+    from ethbrake_marl.agents.team import Team
+    from ethbrake_marl.evaluation.inputs import load_runnable
+    from ethbrake_marl.evaluation.per_world import write_output
+    from ethbrake_marl.files.plain import read_plain
+    from ethbrake_marl.files.yaml import SIZE_LIMIT
+    from ethbrake_marl.scenario import (
+        list_scenarios,
+        load_scenario,
+        new_scenario_text,
+        scenario_json_schema,
+        scenario_path,
+    )
+    from ethbrake_marl.scenario.catalogue import SHIPPED
+    from ethbrake_marl.scenario.roles import LEARNER, is_state_free
+    from ethbrake_marl.scenario.sample import count_kinds
 
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
 

@@ -7,9 +7,6 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from ethbrake_marl.cli.results import show_rows
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
@@ -26,23 +23,6 @@ from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from ethbrake_marl.studies.jobs.work import Workers
 from ethbrake_marl.studies.shards import MOST_JOBS, ShardFolder, evaluate_shards
 
-ShardsOption = Annotated[
-    int | None, typer.Option(metavar="K", help="Evaluate the list in K parts, in flat memory; changes no figure.")
-]
-JobsOption = Annotated[int, typer.Option(metavar="N", help="With --shards: processes; changes no figure.")]
-RayOption = Annotated[
-    str | None,
-    typer.Option(
-        "--ray", metavar="local|ADDRESS", help="With --shards: on Ray, on all its cores or on --jobs of them."
-    ),
-]
-KeptOption = Annotated[
-    Path | None,
-    typer.Option("--output", metavar="FOLDER", help="With --shards: keeps finished ones; the same command goes on."),
-]
-RowsOption = Annotated[
-    bool, typer.Option("--rows", help="With --output: also one row per world and agent, as Parquet files in it.")
-]
 RESULTS = "results.json"
 _INTERVALS = (
     "Intervals: rates exact (Clopper-Pearson), means by Student's t; all from exact sums, the same bits in any"

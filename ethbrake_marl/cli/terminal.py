@@ -6,6 +6,7 @@ import io
 import json
 import os
 import sys
+import time
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
@@ -22,7 +23,7 @@ from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
 from ethbrake_marl.progress import Progress as PartProgress
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
-COMPILE_S = 20  # processor seconds of a first `ethbrake evaluate`
+EVERY_S = 10.0  # between two signs of life where stderr is no terminal
 INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
 
@@ -85,11 +86,33 @@ def tell_compilation() -> None:
         if is_temporary(folder):
             say("compiling the physics; no folder can be written to keep it, so every command does (ethbrake doctor)")
         elif empty:
-            say(f"compiling the physics, once, about {COMPILE_S} s")
+            say("compiling the physics, once: minutes of one core, then it is kept")
         else:
-            say("compiling a part of the physics that was not used before, once, some seconds")
+            say("compiling what was not used before, once, then it is kept")
+        _count_kernels()
 
     on_first_compilation(tell)
+
+
+def _count_kernels() -> None:
+    """Say every ten seconds how many kernels this process has compiled, as long as it does."""
+    from numba.core import event  # loaded by whatever compiles, and by nothing that does not
+
+    events: Any = event  # numba's own types end here
+    begun, said, count = time.monotonic(), time.monotonic(), 0
+
+    class Count(event.Listener):  # type: ignore[misc]  # numba has no types
+        def on_start(self, event_: event.Event) -> None:
+            """Nothing: it counts what is done."""
+
+        def on_end(self, event_: event.Event) -> None:
+            nonlocal said, count
+            count, now = count + 1, time.monotonic()
+            if now - said >= EVERY_S:
+                said = now
+                say(f"compiling: {count} kernels in {now - begun:.0f} s so far")
+
+    events.register("numba:compile", Count())
 
 
 def shell_asks(environment: Mapping[str, str]) -> bool:
@@ -122,12 +145,13 @@ def interruptible(kept: str) -> Iterator[None]:
 
 
 class Bars:
-    """One progress bar per part of the work when stderr is a terminal, else a line when a part begins or has news."""
+    """One progress bar per part of the work when stderr is a terminal, else a line: news, and every ten seconds."""
 
     def __init__(self, bars: Progress | None) -> None:
         self._bars = bars
         self._tasks: dict[str, TaskID] = {}
-        self._last_label, self._last_done = "", False
+        self._last_label, self._last_done, self._said_s = "", False, 0.0
+        self._begun: dict[str, tuple[float, int]] = {}  # when each part was first heard of, and how far it was
 
     def show(
         self,
@@ -147,8 +171,13 @@ class Bars:
         if note:
             self.tell(note)
         if self._bars is None:
-            if label != self._last_label or (done >= total and not self._last_done):
-                say(f"{label}: {done:,} of {total:,}")
+            now = time.monotonic()
+            news = label != self._last_label or (done >= total and not self._last_done)
+            begun_s, first = self._begun.setdefault(name, (now, done))
+            if news or now - self._said_s >= EVERY_S:
+                left_s = (now - begun_s) * (total - done) / (done - first) if done > first else 0.0
+                say(f"{label}: {done:,} of {total:,}{f', about {left_s:.0f} s left' if left_s >= 1.0 else ''}")
+                self._said_s = now
             self._last_label, self._last_done = label, done >= total
             return
         if name not in self._tasks:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import (
     ForceOption,
     JobsOption,
@@ -24,15 +25,17 @@ from ethbrake_marl.cli.options import (
 )
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, write_json
 from ethbrake_marl.errors import AlreadyExists, check_one_learner
-from ethbrake_marl.evaluation.inputs import load_runnable
-from ethbrake_marl.evaluation.per_world import check_target, write_output
-from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.schemes import check_scheme, who_drives_what
-from ethbrake_marl.learning.settings import read_settings
-from ethbrake_marl.policies.onnx import onnx_model
-from ethbrake_marl.policies.policy import save_policy
-from ethbrake_marl.policies.shipped import load_named_policy
 from ethbrake_marl.progress import Progress
+
+if TYPE_CHECKING or LATE:
+    from ethbrake_marl.evaluation.inputs import load_runnable
+    from ethbrake_marl.evaluation.per_world import check_target, write_output
+    from ethbrake_marl.learning.recipe import load_recipe
+    from ethbrake_marl.learning.schemes import check_scheme, who_drives_what
+    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.policies.onnx import onnx_model
+    from ethbrake_marl.policies.policy import save_policy
+    from ethbrake_marl.policies.shipped import load_named_policy
 
 if TYPE_CHECKING:
     from ethbrake_marl.learning.train import TrainResult

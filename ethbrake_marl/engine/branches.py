@@ -18,6 +18,7 @@ from ethbrake_marl.engine.stream import Roster
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.messages import hear_rows
 from ethbrake_marl.physics.rows import (
     TIME,
@@ -30,6 +31,7 @@ from ethbrake_marl.physics.rows import (
     params_at,
     previous_at,
     speed_at,
+    vehicles_in,
 )
 
 ROUNDING_MPS2 = 1e-5  # a command that differs by less is the same: networks round by the size of their batch
@@ -180,22 +182,30 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
 
     A policy that sees the same does the same, and no latency or news is left that could change what it sees.
     """
-    N = engine.scenario.vehicles
     if has_messages(engine._state, engine._params):
         return np.zeros(len(rows), np.bool_)  # what is still on its way may change what it sees
-    stands: Bools = (before[:, speed_at(N) : command_at(N)] == 0.0).all(axis=1)
-    some = np.flatnonzero(stands)
-    now, then, params = engine._state[rows[some]], before[some], engine._params[rows[some]]
-    same = (now[:, speed_at(N) : command_at(N)] == 0.0).all(axis=1)
-    same &= (now[:, gap_at(N) : harm_at(N)] == then[:, gap_at(N) : harm_at(N)]).all(axis=1)
-    commands = slice(command_at(N), previous_at(N))
-    same &= (np.abs(now[:, commands] - then[:, commands]) < ROUNDING_MPS2).all(axis=1)
-    latency = params[:, params_at(2, N) : params_at(3, N)]
-    news = params[:, params_at(6, N) :] if has_news(params, N) else latency
-    for known in (latency, news):
-        same &= ((known < then[:, :1]) | np.isinf(known)).all(axis=1)
-    stands[some] = same
+    stands = np.empty(len(rows), np.bool_)
+    find_standing(engine._state, before, engine._params, rows, stands)
     return stands
+
+
+@compiled
+def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
+    """Fill ``stands`` [m] for ``rows`` [m] of ``state``, which stood as ``before`` [m]."""
+    N = vehicles_in(state)
+    for m in range(rows.shape[0]):
+        k, same = rows[m], True
+        for c in range(speed_at(N), command_at(N)):
+            same = same and before[m, c] == 0.0 and state[k, c] == 0.0
+        if same:
+            for c in range(gap_at(N), harm_at(N)):
+                same = same and state[k, c] == before[m, c]
+            for c in range(command_at(N), previous_at(N)):
+                same = same and abs(state[k, c] - before[m, c]) < ROUNDING_MPS2
+            for c in range(params_at(2, N), params.shape[1]):
+                known = params_at(2, N) <= c < params_at(3, N) or (has_news(params, N) and c >= params_at(6, N))
+                same = same and (not known or params[k, c] < before[m, TIME] or np.isinf(params[k, c]))
+        stands[m] = same
 
 
 def _add(wanted: Floats, offsets: Offsets, running: Ints, number: int, moved: Floats) -> None:

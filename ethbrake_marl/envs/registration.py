@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import gymnasium
-import pettingzoo
-
 GYMNASIUM_ID = "EthBrake-v0"
 PETTINGZOO_ID = "ethbrake/ethbrake-v0"
 
 
 def register_environments() -> None:
     """Register every id that is not registered yet; calling it again changes nothing."""
+    import gymnasium  # takes longer than the command line may take for --help
+    import pettingzoo
+
     for id_ in (GYMNASIUM_ID, f"ethbrake/{GYMNASIUM_ID}"):
         if id_ in gymnasium.registry:
             continue

@@ -15,19 +15,17 @@ from ethbrake_marl.agents.registry import current_spelling, make_agent, make_sin
 from ethbrake_marl.agents.rollout import script_agents, set_others
 from ethbrake_marl.agents.spelling import AgentSpec, parse_spec
 from ethbrake_marl.agents.team import Driver, Team, team_of
+from ethbrake_marl.defaults import EPISODES, LIST_SEED, OLD_SHIELDS, HarmCount
 from ethbrake_marl.engine.stream import ask_script, begin_script
 from ethbrake_marl.errors import InvalidInput, OldSpelling, check_one_learner, naming_agent, unknown_name
 from ethbrake_marl.evaluation.named_worlds import read_named_worlds
 from ethbrake_marl.files.overrides import Override, changed_parts
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
-EPISODES = 10_000
-PROGRESS_EVERY = 500  # worlds between two signs of life
+PROGRESS_EVERY = 2_500  # worlds between two signs of life
 TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only checked
-LIST_SEED = 7  # of the worlds on which everything is measured; has nothing to do with the seed of a training
 
 LADDER = (  # from no decision at all up to the best that is known
     "coast",
@@ -41,7 +39,6 @@ LADDER = (  # from no decision at all up to the best that is known
 )
 _LADDER_SPEC = "ladder"
 _LEARNED = ("ppo", "sac", "counterfactual", "universal", "team")  # around whom ``--shield`` puts a shield
-OLD_SHIELDS = ("none", "episode", "step", "robust")  # of ``--shield``, the old spelling of ``+episode`` and so on
 
 
 def load_runnable(name_or_path: str, settings: Sequence[Override] = ()) -> Scenario:

@@ -74,12 +74,15 @@ class _Follower:
         """Keep the pieces and impacts of one step."""
         moving = until_s > before.time_s
         moving |= before.time_s == self._worlds.time_s  # an impact at the very alert
-        for k in np.flatnonzero(moving).tolist():
+        some = np.flatnonzero(moving)
+        rows = advance(before.take(some), command_mps2[some], until_s=until_s[some], record=True)[1].rows
+        assert rows is not None  # they were asked for
+        columns = [np.zeros_like(rows.world), *(getattr(rows, f.name) for f in fields(ImpactRows)[1:])]
+        starts = np.searchsorted(rows.world, np.arange(some.size + 1)).tolist()  # they come world by world
+        for k, first, end in zip(some.tolist(), starts[:-1], starts[1:], strict=True):
+            self._impacts[k].append(ImpactRows(*(column[first:end] for column in columns)))
             world = before if before.n == 1 else before.take([k])
             command, until = command_mps2[k], float(until_s[k])
-            rows = advance(world, command, until_s=until, record=True)[1].rows
-            assert rows is not None  # they were asked for
-            self._impacts[k].append(rows)
             if until > float(world.time_s[0]):
                 pieces = segment_pieces(world, command, until)
                 way = _way(pieces, until)

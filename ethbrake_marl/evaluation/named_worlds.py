@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from ethbrake_marl.defaults import MOST_NAMED_WORLDS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import scenario_sha256
 from ethbrake_marl.files.yaml import flow_text, read_yaml
@@ -22,7 +23,6 @@ from ethbrake_marl.scenario.sample import quantity_columns
 
 FORMAT: Literal["ethbrake-worlds"] = "ethbrake-worlds"
 VERSION = 1
-MOST = 1000  # worlds of a file
 SIZE_LIMIT = 8 << 20  # bytes of it: so many worlds of a long line
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -55,7 +55,7 @@ class NamedWorlds(_Strict):
     against: str | None = None
     harm_count: HarmCount
     found_by: str  # the command
-    worlds: Annotated[list[NamedWorld], Field(min_length=1, max_length=MOST)]
+    worlds: Annotated[list[NamedWorld], Field(min_length=1, max_length=MOST_NAMED_WORLDS)]
 
     def worlds_of(self, scenario: Scenario, where: str) -> Worlds:
         """The worlds at the alert; raises ``InvalidInput`` for another scenario than theirs."""

@@ -12,6 +12,7 @@ import platform
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.metadata import version
 from urllib.parse import quote, unquote
 
@@ -204,6 +205,7 @@ def _around(agent: str) -> tuple[str, ...]:
         return ()
 
 
+@cache
 def _versions() -> tuple[str, ...]:
     own, *others = (version(name) for name in _PACKAGES)
     return (own, platform.python_version(), *others)

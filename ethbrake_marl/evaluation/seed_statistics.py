@@ -146,7 +146,9 @@ def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Float
         means = np.empty((size, len(sides)))
         for column, side in enumerate(sides):
             seeds = rng.integers(len(side), size=(size, len(side)))
-            means[:, column] = np.take_along_axis(weights @ side.T, seeds, axis=1).mean(axis=1)
+            # Not a matrix product: its order of adding depends on the machine.
+            of_seeds = np.stack([(weights * row).sum(axis=1) for row in side], axis=1)
+            means[:, column] = np.take_along_axis(of_seeds, seeds, axis=1).mean(axis=1)
         parts.append(means)
     return np.concatenate(parts)
 

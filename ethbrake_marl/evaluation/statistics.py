@@ -125,14 +125,15 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
     difference = value.value - baseline.value
     if value.interval is None or baseline.interval is None:
         return Estimate(difference, None)
-    shares = [
-        (0.5 * (high - low) / float(stdtrit(size - 1, 0.5 + 0.5 * CONFIDENCE))) ** 2
+    errors = [
+        0.5 * (high - low) / float(stdtrit(size - 1, 0.5 + 0.5 * CONFIDENCE))
         for (low, high), size in ((value.interval, n), (baseline.interval, m))
     ]
+    shares = [error * error for error in errors]
     variance = sum(shares)
     if variance == 0.0:
         return Estimate(difference, (difference, difference))
-    freedom = variance**2 / (shares[0] ** 2 / (n - 1) + shares[1] ** 2 / (m - 1))
+    freedom = variance * variance / (shares[0] * shares[0] / (n - 1) + shares[1] * shares[1] / (m - 1))
     half = float(stdtrit(freedom, 0.5 + 0.5 * CONFIDENCE)) * math.sqrt(variance)
     return Estimate(difference, (difference - half, difference + half))
 

@@ -18,6 +18,7 @@ import numpy as np
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.protocol import fixed_commands
 from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.defaults import SEARCH_BUDGET
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, BestKnown, join_tables, load_table, save_table
@@ -38,7 +39,6 @@ from ethbrake_marl.search.profiles import (
     search_profiles,
 )
 
-BUDGET = 100_000  # candidates per world and count
 CHUNK = 200  # worlds between two reports of progress
 LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is in no row
 CONSTANTS = 29  # even grid of constant commands from which every search also starts
@@ -52,7 +52,7 @@ def best_harm(
     *,
     counts: Sequence[HarmCount] = HARM_COUNTS,
     vehicles: Sequence[int] | None = None,
-    budget: int = BUDGET,
+    budget: int = SEARCH_BUDGET,
     seed: int = 0,
     threads: int | None = None,
     known: BestHarmTable | None = None,
@@ -110,7 +110,7 @@ def search_list(
     *,
     counts: Sequence[HarmCount] = HARM_COUNTS,
     vehicles: Sequence[int] | None = None,
-    budget: int = BUDGET,
+    budget: int = SEARCH_BUDGET,
     seed: int = 0,
     threads: int | None = None,
     known: BestHarmTable | None = None,

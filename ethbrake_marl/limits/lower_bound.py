@@ -16,9 +16,11 @@ part is rounded outward: lowered by ``rounding``, more than both can be off toge
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
+from typing import Any
 
 import numpy as np
 
@@ -46,6 +48,7 @@ from ethbrake_marl.limits.meetings import (
     WIDTH,
 )
 from ethbrake_marl.physics import Bools, Floats, Worlds, advance
+from ethbrake_marl.physics.compiled import by_parts
 
 EPS = 2.0**-52  # the spacing of doubles at 1
 # Bounds are lowered by so many eps of the squared speeds that a world can hold: a segment or a round of impacts moves a
@@ -110,7 +113,15 @@ def lower_bound(
     struck = at_onset.obstacle_hit & (harm_count == "first")  # whoever is pushed there is not charged for it again
     unavoidable = has_front & has_rear & (verdict.reason >= 2) & ~struck
     out = np.empty((worlds.n, BOUNDS))
-    bound_worlds(onset_states(at_onset, vehicle, time_step_s), horizon_s - start, has_front, has_rear, unavoidable, out)
+    given: tuple[Any, ...] = (
+        onset_states(at_onset, vehicle, time_step_s),
+        horizon_s - start,
+        has_front,
+        has_rear,
+        unavoidable,
+        out,
+    )
+    by_parts(lambda part: bound_worlds(*(array[part] for array in given)), worlds.n, os.cpu_count() or 1)
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
     early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)

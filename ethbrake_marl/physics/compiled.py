@@ -18,12 +18,16 @@ from typing import Any, TypeVar, cast
 
 import llvmlite
 import numba
+from llvmlite.binding import parse_assembly, parse_bitcode
 from numba.core import config as numba_config
-from numba.core.compiler import CompileResult
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompileResult, Flags, compile_extra
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
+from numba.core.types.misc import unliteral
+from numba.core.typing import make_concrete_template
 
 from ethbrake_marl.errors import check_whole_number
 from ethbrake_marl.kernel_store import (
@@ -37,55 +41,153 @@ from ethbrake_marl.kernel_store import (
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _OPTIONS = {"nopython": True, "boundscheck": None, "fastmath": False, "nogil": True, "error_model": "numpy"}
+_KNOWN = numba.__version__.startswith("0.68.")  # of others these inner parts were not tried: numba goes its own way
 _SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")  # numba's, of the code made
+# Instructions of the levels of x86-64 for which kernels are built ahead, the better one first.
+_V2 = {"+cx16", "+popcnt", "+sse4.2", "+ssse3"}
+_LEVELS = {"x86-64-v3": _V2 | {"+avx2", "+bmi", "+bmi2", "+f16c", "+fma", "+lzcnt", "+movbe"}, "x86-64-v2": _V2}
+
+
+class _Linkable(JITCodeLibrary):  # type: ignore[misc]
+    """The code of a kernel for those that call it, which make it a part of theirs: no machine code is made of it."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
 
 
 class Kernel(CPUDispatcher):  # type: ignore[misc]
-    """A compiled function as numba's ``njit`` makes it, but for where its code is kept."""
+    """A compiled function as numba's ``njit`` makes it, but for where its code is kept, and for what is not compiled.
+
+    numba makes machine code, and two wrappers, of whatever one compiled function calls of others, though the caller
+    holds all of that code already; and it compiles once for each whole number that stands as an argument in a source.
+    """
+
+    def __init__(self, *given: Any, **options: Any) -> None:
+        super().__init__(*given, **options)
+        self._compiler._customize_flags = _without_c_wrapper
+        self._linked: dict[tuple[Any, ...], Any] = {}  # types of the arguments -> signature, library, environments
 
     def compile(self, sig: Any) -> Any:
-        """The code for one signature: at hand, loaded, or compiled and kept."""
+        """The machine code for one signature: at hand, loaded, or compiled and kept."""
         with global_compiler_lock:
             arguments, returned = normalize_signature(sig)
-            name = "" if tuple(arguments) in self.overloads else self._name(*arguments, returned)
-            if not name:
-                return super().compile(sig)
-            if not self._load(name):
-                tell_compilation()
-                with alone(name):
-                    if not self._load(name):  # another process may have compiled it meanwhile
-                        super().compile(sig)
-                        made = self.overloads[tuple(arguments)]
-                        if not made.library.has_dynamic_globals:
-                            keep_kernel(name, dumps(made._reduce()))
+            if tuple(arguments) not in self.overloads:
+                self._obtain("entry", (*arguments, returned), lambda: self._compile(sig), self._load)
             return self.overloads[tuple(arguments)].entry_point
 
-    def _name(self, *types: Any) -> str:
+    def _compile(self, sig: Any) -> Any:
+        tell_compilation()
+        super().compile(sig)
+        made = self.overloads[tuple(normalize_signature(sig)[0])]
+        if not _KNOWN:
+            return made.library.has_dynamic_globals, made._reduce()
+        library = made.library
+        for environment in made._find_referenced_environments():  # of what it has linked: its own is set
+            library.codegen.set_env(environment.env_name, environment)
+        parts = list(made._replace(type_annotation="")._reduce())
+        stub = "".join(f'define void @"{name}"() {{ ret void }}\n' for name in _symbols(library))
+        parts[0] = (library.name, "object", (parts[0][2][0], parse_assembly(stub).as_bitcode()))
+        return library.has_dynamic_globals, parts
+
+    def _load(self, *parts: Any) -> None:
+        self.targetctx.refresh()
+        made = CompileResult._rebuild(self.targetctx, *parts)
+        self.targetctx.insert_user_function(made.entry_point, made.fndesc, [made.library])
+        self.add_overload(made)
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """What another kernel that calls this one needs to know of it."""
+        if not _KNOWN:
+            return super().get_call_template(args, kws)
+        pysig, folded = self._compiler.fold_argument_types(args, kws)
+        arguments = tuple(unliteral(kind) for kind in folded)
+        if arguments not in self._linked:
+            self._obtain("linked", arguments, lambda: self._compile_linked(arguments), self._load_linked)
+        signatures = [signature for signature, *_ in self._linked.values()]
+        return make_concrete_template(self.__name__, self.__name__, signatures), pysig, arguments, {}
+
+    def get_overload(self, sig: Any) -> Any:
+        """By what the code for a signature is known to numba."""
+        return self._linked[tuple(normalize_signature(sig)[0])][1] if _KNOWN else super().get_overload(sig)
+
+    def _compile_linked(self, arguments: tuple[Any, ...]) -> Any:
+        flags = Flags()
+        self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
+        flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        library = _Linkable(self.targetctx.codegen(), self.__qualname__)
+        with self._compiling_counter:
+            made = compile_extra(
+                self.typingctx, self.targetctx, self.py_func, arguments, None, flags, self.locals, library=library
+            )
+        self._link(made.signature, made.fndesc, library, made.environment)
+        made.fndesc.typemap = made.fndesc.calltypes = None
+        library._ensure_finalized()
+        bitcode = library._final_module.as_bitcode()
+        environments = [made.environment, *made._find_referenced_environments()]
+        return library.has_dynamic_globals, (made.signature, made.fndesc, library.name, bitcode, environments)
+
+    def _load_linked(self, signature: Any, fndesc: Any, name: str, bitcode: bytes, environments: Any) -> None:
+        self.targetctx.refresh()
+        library = _Linkable(self.targetctx.codegen(), name)
+        library._final_module, library._finalized = parse_bitcode(bitcode), True
+        self._link(signature, fndesc, library, environments)
+
+    def _link(self, signature: Any, fndesc: Any, library: _Linkable, environments: Any) -> None:
+        self.targetctx.insert_user_function(library, fndesc, [library])
+        self._linked[signature.args] = signature, library, environments
+
+    def _obtain(self, way: str, kinds: tuple[Any, ...], make: Callable[[], Any], load: Callable[..., None]) -> None:
+        """Load what is kept under this name, or make and keep it, while no other process does."""
+        name = self._name(way, kinds)
+        kept = load_kernel(name) or (self._ready_made(kinds) if way == "entry" else None)
+        if kept is None:
+            with alone(name):
+                kept = load_kernel(name)  # another process may have made it meanwhile
+                if kept is None:
+                    unkept, made = make()
+                    if name and not unkept:
+                        keep_kernel(name, dumps(made))
+                    return
+        load(*pickle.loads(kept))
+
+    def _ready_made(self, kinds: tuple[Any, ...]) -> bytes | None:
+        """What was installed for a processor like this one, unless the user named another."""
+        triple, _, features = self.targetctx.codegen().magic_tuple()
+        for level, needed in _LEVELS.items() if numba_config.CPU_NAME is None else ():
+            if needed <= set(features.split(",")):
+                kept = load_kernel(self._name("entry", kinds, (triple, level, "")), ready_made=True)
+                if kept is not None:
+                    return kept
+        return None
+
+    def _name(self, way: str, kinds: tuple[Any, ...], processor: tuple[str, ...] = ()) -> str:
         """Name of a signature's file in the store; empty where not all that makes the code is known."""
         code, source = self.py_func.__code__, Path(self.py_func.__code__.co_filename)
-        digest = digest_of_sources(source)
-        if not digest or self.py_func.__closure__:
+        digest, own = digest_of_sources(source), digest_of_sources(Path(__file__))
+        if not digest or not own or self.py_func.__closure__:
             return ""
         made_of = (
-            (sys.implementation.cache_tag, sys.flags.optimize, numba.__version__, llvmlite.__version__),
+            (way, sys.implementation.cache_tag, sys.flags.optimize, numba.__version__, llvmlite.__version__),
             [str(getattr(numba_config, setting)) for setting in _SETTINGS],
-            self.targetctx.codegen().magic_tuple(),
-            (digest, place_of(source), self.__module__, self.__qualname__, code.co_firstlineno, code.co_code),
+            processor or self.targetctx.codegen().magic_tuple(),
+            (own, digest, place_of(source), self.__module__, self.__qualname__, code.co_firstlineno, code.co_code),
             [constant for constant in code.co_consts if not isinstance(constant, CodeType)],
             sorted(self.targetoptions.items()),
-            [_described(kind) for kind in types],
+            [_described(kind) for kind in kinds],
         )
-        return f"{self.__name__.strip('<>')}-{hashlib.sha256(repr(made_of).encode()).hexdigest()[:40]}"
+        return f"{self.__name__.strip('<>')}-{hashlib.sha256(repr(made_of).encode()).hexdigest()[:40]}.{way}"
 
-    def _load(self, name: str) -> bool:
-        """Whether the store had it."""
-        kept = load_kernel(name)
-        if kept is not None:
-            self.targetctx.refresh()
-            made = CompileResult._rebuild(self.targetctx, *pickle.loads(kept))
-            self.targetctx.insert_user_function(made.entry_point, made.fndesc, [made.library])
-            self.add_overload(made)
-        return kept is not None
+
+def _without_c_wrapper(flags: Any) -> Any:
+    """Python calls these functions, other kernels do, and nothing written in C."""
+    flags.no_cfunc_wrapper = _KNOWN
+    return flags
+
+
+def _symbols(library: Any) -> list[str]:
+    """Names of what a library defines for callers from outside."""
+    return [function.name for function in library._final_module.functions if function.name.startswith("_ZN7cpython")]
 
 
 def _described(kind: Any) -> str:

@@ -83,7 +83,7 @@ def _farthest(worlds: Worlds, duration_s: Floats) -> Floats:
     """
     vehicles = worlds.vehicles
     driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
-    energy = sum_rows(vehicles.mass_t * (worlds.speeds_mps**2 / 2.0 + driving))
+    energy = sum_rows(vehicles.mass_t * (worlds.speeds_mps * worlds.speeds_mps / 2.0 + driving))
     farthest: Floats = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
     return farthest
 

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
-from scipy.special import expit
 
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, forecast
+from ethbrake_marl.physics.elementary import logistic
 from ethbrake_marl.rewards.params import RewardParams
 from ethbrake_marl.rewards.registry import TERMS, StepOutcome, Term, checked_term
 
@@ -112,8 +112,8 @@ def _risk(params: RewardParams, step: StepOutcome) -> Floats:
     room = np.maximum(step.gaps_m - params.safety_buffer_m, 0.0)
     approaching = closing > 0.0
     time_to_collision = room / np.where(approaching, closing, 1.0)
-    urgency = np.where(approaching, expit(-time_to_collision / params.ttc_scale_s), 0.0)
-    nearness = expit(params.distance_slope_per_m * (params.target_gap_m - step.gaps_m))
+    urgency = np.where(approaching, logistic(-time_to_collision / params.ttc_scale_s), 0.0)
+    nearness = logistic(params.distance_slope_per_m * (params.target_gap_m - step.gaps_m))
     pair_risk = -(urgency + nearness)
     risk = np.zeros(step.speeds_mps.shape)
     risk[:, :-1] += pair_risk

@@ -12,9 +12,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 from pydantic_core import PydanticCustomError
-from scipy.special import ndtr, ndtri
 
 from ethbrake_marl.files.yaml import flow_text
+from ethbrake_marl.physics.elementary import exp_each, log, normal_probability, normal_quantile_each
 from ethbrake_marl.physics.worlds import Floats
 
 LEAST_MASS = 1e-6  # of a normal distribution inside its bounds; below it the inverse loses its digits
@@ -72,7 +72,7 @@ class LogUniform(_Distribution):
     def value(self, u: Floats) -> Floats:
         """``low (high / low)^u``, in the shape of ``u`` in [0, 1)."""
         low, high = self.loguniform
-        return np.clip(low * (high / low) ** u, low, high)
+        return np.clip(low * exp_each((u * log(high / low)).ravel()).reshape(u.shape), low, high)
 
 
 class NormalShape(_Distribution):
@@ -103,7 +103,8 @@ class Normal(_Distribution):
     def _bounds(self) -> tuple[float, float]:
         """Probability below low and below high."""
         shape = self.normal
-        return float(ndtr((shape.low - shape.mean) / shape.sd)), float(ndtr((shape.high - shape.mean) / shape.sd))
+        low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
+        return low, high
 
     @property
     def support(self) -> tuple[float, float]:
@@ -114,8 +115,8 @@ class Normal(_Distribution):
         """``mean + sd Q(p_low + (p_high - p_low) u)`` with the normal quantile Q; same shape as ``u`` in [0, 1)."""
         shape = self.normal
         below, above = self._bounds()
-        drawn: Floats = np.clip(shape.mean + shape.sd * ndtri(below + (above - below) * u), shape.low, shape.high)
-        return drawn
+        quantile = normal_quantile_each((below + (above - below) * u).ravel()).reshape(u.shape)
+        return np.clip(shape.mean + shape.sd * quantile, shape.low, shape.high)
 
 
 class Choice(_Distribution):

@@ -10,10 +10,11 @@ import numpy as np
 
 from ethbrake_marl.physics import Floats, Ints, UInt64s
 from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.elementary import exp
 
 RESOLUTION = 1048576.0  # commands are multiples of 1 / 2^20 m/s2: short to store, exact to repeat, and off any edge
 LONGEST_DRAWN = 25.0  # steps of a phase that is drawn
-DECADES = 6.0  # changes of a command range over as many decades below the whole range
+LN_SMALLEST = -13.815510557964275  # changes of a command range over six decades below the whole range
 
 # kinds of change
 COMMAND_CHANGE, TRADE, SET_COMMAND, MOVE_END = 0, 1, 2, 3
@@ -84,7 +85,7 @@ def draw_change(random: UInt64s, bounds: Floats, active: int, change: Floats) ->
     change[PHASE] = phase
     if u < 0.70:
         change[KIND] = COMMAND_CHANGE if u < 0.45 else TRADE
-        change[AMOUNT] = sign * (high - low) * 10.0 ** (-DECADES * size)
+        change[AMOUNT] = sign * (high - low) * exp(LN_SMALLEST * size)
     elif u < 0.78:
         change[KIND] = SET_COMMAND
         change[AMOUNT] = draw_command(random, low, high)

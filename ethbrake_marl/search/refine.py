@@ -15,6 +15,7 @@ import numpy as np
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.physics import Bools, Floats, Ints, UInt64s
 from ethbrake_marl.physics.compiled import compiled, compiled_apart
+from ethbrake_marl.physics.elementary import exp
 from ethbrake_marl.physics.episode import (
     GOES_ON,
     HARM_IS_TOTAL,
@@ -41,7 +42,7 @@ LONGEST_CHANGE_S = 0.6
 LONGEST_WHILE_S = 0.8  # of a template
 SET_SHARE = 0.1  # of the changes, which replace commands; the others add to them
 FULL_BRAKE_SHARE = 0.8  # of the templates, which begin with full braking
-DECADES = 3.0  # amounts that are added range over as many below the whole range of commands
+LN_SMALLEST = -6.907755278982138  # amounts that are added range over three decades below the whole range of commands
 WORSE = 5.0  # m2/s2: a template may be worse by so much before it is climbed from
 NO_HARM = 1e-9  # m2/s2
 
@@ -221,7 +222,7 @@ def change_steps(
 def draw_amount(random: UInt64s, whole: float) -> float:
     """An amount to add, of either sign; its logarithm is uniform over the decades below the ``whole`` range."""
     sign = 1.0 if draw(random) < 0.5 else -1.0
-    return float(sign * whole * 10.0 ** (-DECADES * draw(random)))
+    return float(sign * whole * exp(LN_SMALLEST * draw(random)))
 
 
 @compiled

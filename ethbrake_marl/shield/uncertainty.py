@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.defaults import UNCERTAINTY_EXAMPLE
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.physics import Floats, Worlds, concatenate
 from ethbrake_marl.physics.worlds import is_known_at_once, known_at_once
@@ -25,8 +26,7 @@ OF_VEHICLES = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "m
 QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m")
 POSITIVE = ("braking_capacity_mps2", "mass_t")  # must stay above 0
 MOST_CORNERS = 1024  # of one world: each costs as much as the world itself
-EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
-_FORM = f"must be quantity=half-width, for instance {EXAMPLE}"
+_FORM = f"must be quantity=half-width, for instance {UNCERTAINTY_EXAMPLE}"
 
 _ENTRY = re.compile(
     r"(?P<name>\w+)(?:\.(?P<what>vehicle|pair)_(?P<number>[1-9]\d*))?\s*=\s*(?P<width>[^=%\s]+)(?P<share>%?)",
@@ -84,7 +84,7 @@ class Uncertainty:
                 f"uncertainty: intervals = {self.intervals!r}: must be a tuple of Interval; parse_uncertainty reads it"
             )
         if not self.intervals:
-            raise InvalidInput(f"uncertainty: no interval; one is needed, for instance {EXAMPLE}")
+            raise InvalidInput(f"uncertainty: no interval; one is needed, for instance {UNCERTAINTY_EXAMPLE}")
         for k, one in enumerate(self.intervals):
             for other in self.intervals[:k]:
                 same = None in (one.place, other.place) or one.place == other.place
@@ -110,7 +110,7 @@ class Uncertainty:
         if corners > MOST_CORNERS:
             raise InvalidInput(
                 f"uncertainty: {len(sides)} uncertain numbers in each world make {corners} corners; at most"
-                f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {EXAMPLE}"
+                f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {UNCERTAINTY_EXAMPLE}"
             )
         parts = [worlds] + [_placed(worlds, sides, lambda k, c=c: c >> k & 1) for c in range(corners)]  # type: ignore[misc]
         order = np.arange(worlds.n * len(parts)).reshape(len(parts), worlds.n).T.ravel()
@@ -139,7 +139,7 @@ class Uncertainty:
 
 
 def parse_uncertainty(text: str) -> Uncertainty:
-    """Read ``quantity=half-width`` entries with commas between them, for instance ``EXAMPLE``.
+    """Read ``quantity=half-width`` entries with commas between them, for instance ``UNCERTAINTY_EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
     the quantity limits it to that one. Blanks around entries and ``=`` change nothing. Raises ``InvalidInput`` for
@@ -157,7 +157,7 @@ def checked_uncertainty(given: object) -> Uncertainty | None:
         return given
     if isinstance(given, str):
         return parse_uncertainty(given)
-    raise InvalidInput(f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {EXAMPLE!r}")
+    raise InvalidInput(f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {UNCERTAINTY_EXAMPLE!r}")
 
 
 def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
@@ -165,7 +165,7 @@ def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):
         what = "needs an uncertainty" if uncertainty is None else "takes no uncertainty; robust does"
-        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {EXAMPLE}")
+        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {UNCERTAINTY_EXAMPLE}")
     return uncertainty
 
 

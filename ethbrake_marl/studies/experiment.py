@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.defaults import EPISODES, LIST_SEED
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, evaluate, parameter_line, summarise
-from ethbrake_marl.evaluation.inputs import EPISODES, LIST_SEED, PROGRESS_EVERY, make_agents
+from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, make_agents
 from ethbrake_marl.evaluation.paper import TESTS, other_tests
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.learning.recipe import TrainingRecipe
@@ -118,20 +120,32 @@ def run_experiment(
     with _status(run, trained.status):
         agents = _agents(trained.policy, scenario)
         evaluation = _evaluate(sample, agents, scenario, vehicle, list_seed, trained, tell)
-        tell(Progress("figures", 0, 1))
+        begin = _stages(tell, 3 + len(other_tests(scenario)))
+        begin("what nobody can avoid in these worlds, proven world by world")
         rows = summarise(evaluation)
-        beside = _beside(trained.policy, scenario, min(episodes, BESIDE_EPISODES), list_seed)
+        beside = _beside(trained.policy, scenario, min(episodes, BESIDE_EPISODES), list_seed, begin)
+        begin("results and figures")
         write_results(run.path, evaluation, rows)
         write_beside(run.path, beside)
-        report = _show(run, evaluation, rows, beside, trained, agents, wall_s=time.monotonic() - started)
-        tell(Progress("figures", 1, 1))
+        wall_s = time.monotonic() - started
+        report = _show(run, evaluation, rows, beside, trained, agents, begin, wall_s=wall_s)
+        begin("")
     return ExperimentResult(run.path, trained.status, trained.steps, rows, report, beside)
 
 
-def _beside(policy: Policy, scenario: Scenario, episodes: int, list_seed: int) -> dict[str, list[SummaryRow]]:
+def _stages(tell: OnProgress, total: int) -> Callable[[str], None]:
+    """What is to be called when each of so many parts of the report begins, with a line about it, and at the end."""
+    done = count()
+    return lambda note: tell(Progress("report", next(done), total, note=note))
+
+
+def _beside(
+    policy: Policy, scenario: Scenario, episodes: int, list_seed: int, begin: Callable[[str], None]
+) -> dict[str, list[SummaryRow]]:
     """The same policy, trained on ``scenario`` alone, on the other two of the three tests, beside two baselines."""
     found: dict[str, list[SummaryRow]] = {}
     for other in other_tests(scenario):
+        begin(f"the same policy on {other.name}: {count_of(episodes, 'world')}")
         agents = _agents(policy, other, BESIDE)
         evaluation = evaluate(other.sample(episodes, list_seed), agents, scenario=other, seed=list_seed)
         found[other.name] = summarise(evaluation)
@@ -180,6 +194,7 @@ def _show(
     beside: Mapping[str, list[SummaryRow]],
     trained: TrainResult,
     agents: Mapping[str, Agent],
+    begin: Callable[[str], None],
     *,
     wall_s: float,
 ) -> Path:
@@ -208,6 +223,7 @@ def _show(
         summary += f" {TESTS[evaluation.scenario.name]} The other two tests stand below."
     if trained.status == "interrupted":
         summary += " The training was interrupted; this is the policy it had by then."
+    begin("the page, and the episodes to watch there")
     return write_page(
         run.path,
         evaluation,

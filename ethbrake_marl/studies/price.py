@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ethbrake_marl.agents.believing import SUFFIX, split_believed
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.spelling import parse_spec
+from ethbrake_marl.defaults import PRICE_CHANNELS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.identity import result_identity
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut
@@ -21,7 +22,6 @@ from ethbrake_marl.scenario.v2x import CHANNELS as PRESETS
 if TYPE_CHECKING:
     from ethbrake_marl.figures.style import Figure
 
-CHANNELS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
 POLICY = "ppo@shipped/ppo"
 AGENTS = (
     "full_brake",
@@ -77,7 +77,7 @@ class Price:
         return [self.identities[row.channel] | row.to_json() for row in self.rows]
 
 
-def channels_of(presets: Sequence[str] = CHANNELS) -> dict[str, dict[str, str]]:
+def channels_of(presets: Sequence[str] = PRICE_CHANNELS) -> dict[str, dict[str, str]]:
     """The channels by name: each preset, and where it sends messages one by one also periodic.
 
     Raises ``InvalidInput`` for no preset, and for a name that is none.
@@ -121,7 +121,7 @@ def limit_of(agent: str) -> str | None:
 def price_of_not_knowing(
     scenario: Scenario,
     *,
-    channels: Sequence[str] = CHANNELS,
+    channels: Sequence[str] = PRICE_CHANNELS,
     agents: Sequence[str] = AGENTS,
     n: int = 100,
     seed: int = 7,

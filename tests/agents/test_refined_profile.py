@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
@@ -128,13 +126,3 @@ def test_record__keeps_what_was_commanded():
     worlds = WORLDS.take(np.arange(5))
     commands = record_commands(eb.make_agent("constant:5"), worlds, SCENARIO, 1, 75)
     assert commands.shape == (5, 75) and (commands == -5.0).all()
-
-
-@pytest.mark.long
-def test_refined__takes_less_than_a_third_of_a_millisecond_a_world():
-    problem = problem_of(SCENARIO.sample(2000, 7).worlds)
-    given = np.repeat(-np.full((2000, 1), 5.0), int(problem.last_step.max()), axis=1)
-    refine_commands(problem, given, budget=10)
-    start = time.process_time()
-    refine_commands(problem, given, budget=500)
-    assert (time.process_time() - start) / 2000 < 1e-3

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from numba.core import event
 from typer.main import get_command
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli import doctor, terminal
+from ethbrake_marl.cli import doctor, parts, terminal
 from ethbrake_marl.cli.app import app, run_command
 from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.physics.compiled import compiled
@@ -27,7 +29,6 @@ def test_version__is_told_by_the_command_and_by_python_m(ethbrake):
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
     assert (result.returncode, result.stdout, result.stderr) == (0, f"ethbrake {__version__}\n", "")
@@ -43,10 +44,14 @@ def test_short_help__is_the_long_one_for_every_command(ethbrake):
         assert "-h, --help" in short.out
 
 
+def test_help__tells_the_parts_of_the_package_without_importing_them():
+    assert parts.part_names() == parts.OF_THE_PACKAGE
+
+
 COMPLETION = [
     ({"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake sce", "COMP_CWORD": "1"}, "scenario\n"),
     ({"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake scenario val", "COMP_CWORD": "2"}, "validate\n"),
-    ({"_ETHBRAKE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --warm"}, '"--warm-up"'),
+    ({"_ETHBRAKE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --comp"}, '"--compile"'),
 ]
 
 
@@ -79,8 +84,8 @@ def test_completion__a_variable_that_no_shell_set_changes_nothing(ethbrake, monk
 @pytest.mark.parametrize(
     ("loaded", "temporary", "told"),
     [
-        ([], False, f"compiling the physics, once, about {terminal.COMPILE_S} s\n"),
-        (["advance-1"], False, "compiling a part of the physics that was not used before, once, some seconds\n"),
+        ([], False, "compiling the physics, once: minutes of one core, then it is kept\n"),
+        (["advance-1"], False, "compiling what was not used before, once, then it is kept\n"),
         ([], True, "no folder can be written"),
     ],
 )
@@ -90,6 +95,7 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     monkeypatch.setattr("ethbrake_marl.kernel_store.cache_folder", lambda: folder)
     monkeypatch.setattr("ethbrake_marl.kernel_store._loaded", loaded)
     monkeypatch.setattr("ethbrake_marl.kernel_store._tellers", [])
+    monkeypatch.setitem(event._registered, "numba:compile", [])  # nobody listens any more after this test
     terminal.tell_compilation()
 
     @compiled
@@ -100,18 +106,21 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     assert next_number(1.5) == 2.5
     captured = capsys.readouterr()
     assert captured.out == "" and told in captured.err and captured.err.count("\n") == 1
+    monkeypatch.setattr(terminal, "EVERY_S", 0.0)
+    assert next_number(1j) == 1 + 1j
+    assert re.search(r"^compiling: \d+ kernels in \d+ s so far$", capsys.readouterr().err, re.MULTILINE)
 
 
-def test_doctor__warms_up_only_when_asked(ethbrake, monkeypatch):
-    monkeypatch.setattr(doctor, "_warm_up", lambda: (True, "9 kernels ready"))
-    assert "warm-up" not in ethbrake("doctor").out
-    assert "9 kernels ready" in ethbrake("doctor", "--warm-up").out
+def test_doctor__compiles_only_when_asked(ethbrake, monkeypatch):
+    monkeypatch.setattr(doctor, "_compile", lambda: (True, "9 kernels ready"))
+    assert "compile" not in ethbrake("doctor").out
+    assert "9 kernels ready" in ethbrake("doctor", "--compile").out
 
 
 @pytest.mark.long
-def test_doctor_warm_up__leaves_nothing_to_compile(ethbrake):
-    answer = ethbrake("doctor", "--warm-up", "--json")
-    assert answer.status == 0 and '"name": "warm-up",\n    "ok": true' in answer.out
+def test_doctor_compile__leaves_nothing_to_compile(ethbrake):
+    answer = ethbrake("doctor", "--compile", "--json")
+    assert answer.status == 0 and '"name": "compile",\n    "ok": true' in answer.out
     kernels = set(cache_folder().iterdir())
     commands = [
         ("evaluate", "--agents", "full_brake,e_v2x_bm,ppo@shipped,ppo@shipped+episode", "--episodes", "3"),

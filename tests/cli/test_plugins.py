@@ -229,6 +229,7 @@ def test_changed_file__is_refused_in_the_same_process(ethbrake, parts):
         plugins.load_the_same(plugins.loaded_plugins())
 
 
+@pytest.mark.slow
 def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, monkeypatch):
     from ethbrake_marl.learning.recipe import load_recipe
     from ethbrake_marl.scenario import load_scenario

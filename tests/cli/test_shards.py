@@ -73,6 +73,7 @@ def test_compare__takes_two_sharded_results_and_no_mixture(ethbrake, tmp_path: P
     assert refused.status == 2 and "another kind of results" in refused.err
 
 
+@pytest.mark.slow
 def test_killed__the_same_command_goes_on(ethbrake, tmp_path: Path) -> None:
     folder = tmp_path / "kept"
     command = [

@@ -24,6 +24,19 @@ def test_bars__without_a_terminal_news_are_lines(capsys):
     ]
 
 
+def test_bars__without_a_terminal_every_ten_seconds_bring_a_line_with_the_time_that_is_left(capsys, monkeypatch):
+    times = iter((100.0, 105.0, 110.5, 111.0, 121.0))
+    monkeypatch.setattr("ethbrake_marl.cli.terminal.time.monotonic", lambda: next(times))
+    bars = Bars(None)
+    for done in (0, 100, 210, 220, 420):
+        bars.show("ppo", done, 1000)
+    assert capsys.readouterr().err.splitlines() == [
+        "ppo: 0 of 1,000",
+        "ppo: 210 of 1,000, about 40 s left",
+        "ppo: 420 of 1,000, about 29 s left",
+    ]
+
+
 def test_bars__on_a_terminal_each_part_has_one_bar():
     screen = io.StringIO()
     with Progress(console=Console(file=screen, force_terminal=True, width=100)) as progress:

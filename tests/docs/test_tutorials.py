@@ -23,7 +23,7 @@ NOTEBOOKS = sorted(
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.long] if name in TRAIN else []) for name in NOTEBOOKS]
+    "name", [pytest.param(name, marks=pytest.mark.long if name in TRAIN else pytest.mark.slow) for name in NOTEBOOKS]
 )
 def test_notebook__runs_from_its_first_cell_to_its_last(name: str, tmp_path: Path) -> None:
     cells = CELL.findall((DOCS / "tutorials" / f"{name}.md").read_text("utf-8"))
@@ -34,7 +34,6 @@ def test_notebook__runs_from_its_first_cell_to_its_last(name: str, tmp_path: Pat
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=900,
         check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]

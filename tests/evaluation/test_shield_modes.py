@@ -91,7 +91,9 @@ def test_worlds_that_cannot_be_advanced__are_out_for_all_modes_and_named(
         compare_modes(agents, plant(WORLDS, list(range(60))), task)
 
 
-@pytest.mark.parametrize("spec", ["full_brake+robust", "full_brake+robust:interior"])
+@pytest.mark.parametrize(
+    "spec", ["full_brake+robust", pytest.param("full_brake+robust:interior", marks=pytest.mark.slow)]
+)
 def test_behind_shields__those_that_do_not_know_the_world_are_left_out(spec: str) -> None:
     agent = make_agent(spec, scenario=PAPER, uncertainty="gaps_m=0.5")
     assert compare_behind_shields({spec: agent}, WORLDS, Task(PAPER, (1,))) == []

@@ -36,7 +36,13 @@ def share(agents: dict[str, eb.Agent | eb.Team], worlds: int) -> dict[str, float
     return {name: (harm["full_brake"] - harm[name]) / (harm["full_brake"] - harm["best_harm"]) for name in agents}
 
 
-@pytest.mark.parametrize(("episodes", "least"), [(1000, 0.9), pytest.param(10_000, 0.98, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    ("episodes", "least"),
+    [
+        pytest.param(1000, 0.9, marks=pytest.mark.slow),
+        pytest.param(10_000, 0.98, marks=pytest.mark.long),
+    ],
+)
 def test_clone__of_ppo_reaches_its_share_in_other_worlds(
     script: ModuleType, tmp_path: Path, episodes: int, least: float
 ) -> None:

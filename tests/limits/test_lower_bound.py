@@ -138,7 +138,7 @@ def test_paper_lists__are_bounded_near_the_best_known_harm():
 
 @pytest.mark.parametrize(
     ("name", "n"),
-    [("paper-random", 10_000), ("paper-delay-low", 2000), ("paper-delay-middle", 2000), ("paper-delay-high", 2000)],
+    [("paper-random", 2000), ("paper-delay-low", 2000), ("paper-delay-middle", 2000), ("paper-delay-high", 2000)],
 )
 @pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_best_known_harm__is_never_below_the_bound_and_near_it(name, n, harm_count):
@@ -168,6 +168,7 @@ SHIPPED_GAPS = {  # list, worlds -> share of the best known first-impact harm th
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "n"), SHIPPED_GAPS)
 def test_decisions__the_bound_of_every_shipped_list_is_near_the_best_known_and_never_above(name, n):
     scenario = load_scenario(name)

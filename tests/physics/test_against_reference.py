@@ -1,4 +1,4 @@
-"""The event-exact kernel against the separately written tiny-step reference, on 2,025 random worlds.
+"""The event-exact kernel against the separately written tiny-step reference, on 540 random worlds.
 
 A world may differ only where a discontinuity decides (a graze, a bounce at the plastic threshold) and the reference,
 run again at half its step, disagrees with itself. Such worlds are counted, not skipped.
@@ -19,7 +19,7 @@ from tests.reference.tiny_steps import Outcome, simulate
 
 Floats = NDArray[np.float64]
 
-WORLDS = 225  # per case; nine cases
+WORLDS = 180  # per line, of three restitutions: a step of the reference costs much the same for one world
 STEP_S = 1e-4
 HARM_M2PS2 = 0.05  # per pair, each count
 STATE = 0.01  # m and m/s at the horizon
@@ -34,11 +34,11 @@ class Case(NamedTuple):
     horizon_s: Floats
 
 
-def random_case(seed: int, n: int, N: int, e: float, command_mps2: float = 7.0) -> Case:
+def random_case(seed: int, n: int, N: int, e: float | Floats, command_mps2: float = 7.0) -> Case:
     """Draw ``n`` worlds; commands are constant, uniform in [-command_mps2, command_mps2]."""
-    rng = np.random.default_rng([seed, N, round(100 * e)])
+    rng = np.random.default_rng([seed, N])
     worlds = make_worlds(
-        rng.uniform(1.0, 12.0, (n, N - 1)),
+        rng.uniform(1.0, 8.0, (n, N - 1)),
         rng.uniform(5.0, 25.0, (n, N)),
         braking_capacity_mps2=7.0,
         driving_capacity_mps2=7.0,
@@ -48,7 +48,7 @@ def random_case(seed: int, n: int, N: int, e: float, command_mps2: float = 7.0) 
         restitution=e,
     )
     command = rng.uniform(-1.0, 1.0, (n, N)) * command_mps2
-    return Case(worlds, command, rng.uniform(6.0, 8.0, n))
+    return Case(worlds, command, rng.uniform(4.0, 5.0, n))
 
 
 def refer(case: Case, rows: NDArray[np.int64], step_s: float) -> Outcome:
@@ -89,13 +89,12 @@ def refers_to_itself(coarse: Outcome, fine: Outcome) -> NDArray[np.bool_]:
     return same & np.all(np.abs(coarse.total_harm - fine.total_harm) <= HARM_M2PS2 / 5, axis=1)
 
 
-@pytest.mark.parametrize("e", [0.0, 0.1, 0.3])
 @pytest.mark.parametrize("N", [2, 3, 5])
-def test_advance__agrees_with_the_tiny_step_reference(N: int, e: float) -> None:
-    case = random_case(20, WORLDS, N, e)
+def test_advance__agrees_with_the_tiny_step_reference(N: int) -> None:
+    case = random_case(20, WORLDS, N, np.resize([0.0, 0.1, 0.3], WORLDS))
     end, impacts = advance(case.worlds, case.command_mps2, until_s=case.horizon_s)
     outcome = refer(case, np.arange(WORLDS), STEP_S)
-    assert np.mean(np.any(outcome.count > 0, axis=1)) > 0.5  # the worlds have something to say about impacts
+    assert np.mean(np.any(outcome.count > 0, axis=1)) > 0.4  # the worlds have something to say about impacts
 
     apart = np.flatnonzero(disagreements(outcome, end, impacts, case.horizon_s))
     certain = refers_to_itself(Outcome(*(column[apart] for column in outcome)), refer(case, apart, STEP_S / 2))

@@ -109,6 +109,7 @@ def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_sh
     assert (shielded <= result.outcome("ppo@shipped+episode").predicted_harm + 1e-9).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
 @pytest.mark.parametrize("test", list(TESTS))
 def test_policy_shipped__is_the_best_that_ships(test: str, harm_count: HarmCount) -> None:

@@ -18,7 +18,7 @@ from tests.programme.copies import KERNELS, copy_repository
 from tests.programme.suites import ROOT
 
 LIMIT_S = 900.0
-QUIETLY = ("-p", "no:cacheprovider", "-p", "no:randomly")  # in a fixed order, leaving nothing behind
+QUIETLY = ("-p", "no:cacheprovider", "-p", "no:randomly", "-m", "not long")  # in a fixed order, leaving nothing behind
 
 
 class Patch(NamedTuple):

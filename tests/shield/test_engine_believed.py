@@ -77,6 +77,7 @@ def test_step__in_the_middle_is_above_its_bound_where_the_world_is_not_the_middl
     assert any(harm > bound + 1.0 for bound, harm in first)
 
 
+@pytest.mark.slow
 def test_interior__bounds_every_world_of_the_ranges() -> None:
     inside = NEVER_HEARD.replace(
         gaps_m=[{"uniform": [5.13, 9.71]}, {"uniform": [7.37, 7.58]}], mass_t=[4.5, 5.5, {"uniform": [4.0, 5.0]}],

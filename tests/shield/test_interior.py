@@ -21,6 +21,9 @@ from tests.shield.enclosed import outside
 from tests.shield.lines import line
 from tests.shield.test_certify import STEPS, two
 
+# What bounds a box takes two minutes to compile; the tests in other files that need it are slow, too.
+pytestmark = pytest.mark.slow
+
 UNUSUAL = {
     "gaps": ({}, "gaps_m=1"),
     "capacities": ({"restitution": 0.0}, "braking_capacity_mps2=5%"),

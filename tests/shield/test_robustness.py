@@ -54,6 +54,7 @@ def test_step__breaks_its_bound_where_the_truth_differs_and_robust_pays_for_keep
     assert found["robust", "as told"].harm > told.harm
 
 
+@pytest.mark.slow
 def test_interior__keeps_its_bound_inside_and_is_refused_for_what_it_cannot_certify():
     found = of(
         robustness(

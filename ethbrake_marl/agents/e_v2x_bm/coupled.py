@@ -7,6 +7,8 @@ three baselines that may bound a shield. docs/baselines.md says how close to the
 
 from __future__ import annotations
 
+import hashlib
+import os
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,9 +20,13 @@ from ethbrake_marl.agents.e_v2x_bm.simulate import make_line
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import by_parts, compiled
 from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.segment import DONE
+
+_MANY = 200  # worlds to search: fewer are neither remembered nor shared between threads
+_REMEMBERED = 32  # searches: the baseline's, which a shield around another agent asks for in the same worlds
+_FOUND: dict[bytes, Floats] = {}  # by the SHA-256 of all that was asked
 
 
 class CoupledOptimum(NamedTuple):
@@ -90,15 +96,34 @@ def _minimise(
     horizon_s: float,
 ) -> Floats:
     """Best deceleration of worlds ``rows`` [m], its harm and that of the other count: [3, m]."""
-    v, found, status = worlds.vehicles, np.empty((3, rows.size)), np.empty(rows.size, np.int64)
-    _search_worlds(
+    v = worlds.vehicles
+    lines = (
         worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, worlds.obstacle_gap_m, worlds.obstacle_hit,
         command, told.vehicles.braking_capacity_mps2, onset_after_s(worlds), v.latency_s, v.mass_t, v.speed_limit_mps,
-        v.restitution, vehicle, rows, harm_count == "total", horizon_s, found, status,
+        v.restitution,
     )  # fmt: skip
+    question = hashlib.sha256(repr((vehicle, harm_count, horizon_s, worlds.speeds_mps.shape)).encode())
+    for column in (rows, *lines):
+        question.update(np.ascontiguousarray(column).tobytes())
+    key = question.digest()
+    if key in _FOUND:
+        return _FOUND[key].copy()
+
+    def search(part: slice) -> tuple[Floats, Ints]:
+        some = rows[part]
+        found, status = np.empty((3, some.size)), np.empty(some.size, np.int64)
+        _search_worlds(*lines, vehicle, some, harm_count == "total", horizon_s, found, status)
+        return found, status
+
+    parts = by_parts(search, rows.size, (os.cpu_count() or 1) if rows.size >= _MANY else 1)
+    found, status = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
     if (status != DONE).any():
         with renumbered(rows):
             raise failure(status, worlds.time_s[rows], np.full(rows.size, horizon_s))
+    if rows.size >= _MANY:
+        _FOUND[key] = found.copy()
+        for old in list(_FOUND)[:-_REMEMBERED]:
+            _FOUND.pop(old, None)
     return found
 
 

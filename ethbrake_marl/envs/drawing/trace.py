@@ -193,8 +193,8 @@ def _rows(worlds: Worlds, command: Floats, until_s: Floats) -> ImpactRows:
 def _harm_until(impacts: ImpactRows, times: Floats) -> Floats:
     """Harm of the impacts of one world up to these times [k, 2], by first impacts and in total."""
     by_then = impacts.time_s <= times[:, np.newaxis]
-    harm = impacts.closing_speed_mps**2
-    return np.stack([by_then @ (harm * impacts.first), by_then @ harm], axis=1)
+    harm = impacts.closing_speed_mps * impacts.closing_speed_mps
+    return np.stack([(by_then * (harm * impacts.first)).sum(axis=1), (by_then * harm).sum(axis=1)], axis=1)
 
 
 def _replaced(whole: Floats, rows: Ints, part: Floats) -> Floats:

@@ -6,18 +6,18 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from ethbrake_marl.agents.team import Driver, team_of
+from ethbrake_marl.defaults import LIST_SEED, DatasetFormat
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number, need, unknown_name
 from ethbrake_marl.evaluation.dataset.minari_folder import check_folder, env_spec, minari_folder
 from ethbrake_marl.evaluation.dataset.parquet import parquet_file
 from ethbrake_marl.evaluation.dataset.recording import Recording, Task, record_episodes
 from ethbrake_marl.evaluation.frame import PARQUET
 from ethbrake_marl.evaluation.identity import policy_sha256, result_versions, scenario_sha256
-from ethbrake_marl.evaluation.inputs import LIST_SEED
 from ethbrake_marl.evaluation.outcome import LeftOut
 from ethbrake_marl.evaluation.per_world import check_target
 from ethbrake_marl.observations import Observation, choose_observation, observation_for
@@ -25,7 +25,6 @@ from ethbrake_marl.physics import leaving_out_failed
 from ethbrake_marl.rewards import Reward, reward_params
 from ethbrake_marl.scenario import Sample, Scenario
 
-DatasetFormat = Literal["parquet", "minari"]
 BATCH = 500  # worlds recorded together: bounds memory, changes no episode
 
 _PACKAGES: dict[DatasetFormat, tuple[str, ...]] = {"parquet": ("pyarrow",), "minari": ("minari", "h5py")}

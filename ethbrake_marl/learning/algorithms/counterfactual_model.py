@@ -212,7 +212,7 @@ class CounterfactualModel(BaseAlgorithm):
             moments.append(moment_of(self.env.engine))
             new_obs, rewards, dones, infos = self.env.step(act(observations)[:, np.newaxis])
             self.num_timesteps += self.env.num_envs
-            self._update_info_buffer(infos, dones)
+            self._update_info_buffer([infos[row] for row in np.flatnonzero(dones)], dones[dones])  # others tell nothing
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
             told.update_locals(locals())
             told.on_step()

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 
 from ethbrake_marl.agents.team import Driver
+from ethbrake_marl.defaults import HINDSIGHT, MeasureName
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
@@ -16,10 +16,6 @@ from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Sample, Scenario
-
-MeasureName = Literal["harm", "regret", "difference", "bound"]
-MEASURES: tuple[MeasureName, ...] = get_args(MeasureName)
-HINDSIGHT = "best_harm"  # the reference of regret, unless another is given
 
 
 @dataclass(frozen=True, slots=True)

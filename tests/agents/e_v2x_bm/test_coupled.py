@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.errors import InvalidInput
@@ -97,6 +98,25 @@ def test_coupled__a_world_alone_gives_the_same_bits():
     for k in (0, 7, 29):
         alone = optimise_coupled(worlds.take([k]), 1)
         assert [column[0] for column in alone] == [column[k] for column in together]
+
+
+def test_coupled__threads_and_what_was_searched_before_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    worlds, searches = load_scenario("paper-random").sample(600, 7).worlds, []
+    search = coupled._search_worlds
+    monkeypatch.setattr(coupled, "_search_worlds", lambda *given: searches.append(1) or search(*given))
+    found = {}
+    for cores in (1, 3):
+        monkeypatch.setattr(coupled, "_FOUND", {})
+        monkeypatch.setattr("os.cpu_count", lambda cores=cores: cores)
+        found[cores] = optimise_coupled(worlds, 1)
+        assert len(searches) == cores
+        again = optimise_coupled(worlds, 1)
+        again.harm[:] = -1.0  # whoever changes what it was given changes nothing that is remembered
+        assert all((one == other).all() for one, other in zip(optimise_coupled(worlds, 1), found[1], strict=True))
+        assert len(searches) == cores
+        searches.clear()
+    total, other = optimise_coupled(worlds, 1, harm_count="total"), optimise_coupled(worlds, 1, horizon_s=4.0)
+    assert len(searches) == 6 and (total.harm != found[1].harm).any() and (other.harm != found[1].harm).any()
 
 
 def test_coupled__stays_off_the_edge_of_a_jump():

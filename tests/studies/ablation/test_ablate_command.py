@@ -253,6 +253,7 @@ def test_plan__the_recipes_own_scheme_holds_and_turns_are_for_several(tiny):
         planned(recipe.replace(scheme="independent", turns=5), "shared")
 
 
+@pytest.mark.slow
 def test_ablate__an_interruption_reaches_the_trainings_of_other_processes(tmp_path, tiny):
     folder = tmp_path / "stopped"
     command = [

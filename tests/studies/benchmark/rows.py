@@ -1,6 +1,6 @@
 """The first rows of the benchmark: `python -m tests.studies.benchmark.rows [AGENT ...]`.
 
-Makes the entries of these agents anew (by default: of all rows) in docs/benchmark/v1, and puts the tables into
+Makes the entries of these agents anew (by default: of all rows) in docs/benchmark/v2, and puts the tables into
 docs/benchmark.md. With --tables it drives nobody.
 """
 
@@ -21,7 +21,7 @@ ROWS = (
     "best_harm:2000",
 )  # fmt: skip
 DOCS = Path(__file__).resolve().parents[3] / "docs"
-PAGE, ENTRIES = DOCS / "benchmark.md", DOCS / "benchmark" / "v1"
+PAGE, ENTRIES = DOCS / "benchmark.md", DOCS / "benchmark" / "v2"
 
 
 def list_markdown(suite: Suite) -> str:
@@ -41,14 +41,14 @@ def list_markdown(suite: Suite) -> str:
 
 def page_tables() -> dict[str, str]:
     """Every table of docs/benchmark.md by its marker."""
-    suite = load_suite("v1")
+    suite = load_suite("v2")
     found = read_leaderboard(sorted(ENTRIES.glob("*.json")), suite)
     return {"lists": list_markdown(suite), "rows": leaderboard_markdown(found).rstrip("\n")}
 
 
 def main(arguments: list[str]) -> None:
     """Make entries, then the tables."""
-    suite = load_suite("v1")
+    suite = load_suite("v2")
     for agent in [] if arguments == ["--tables"] else arguments or ROWS:
         print(agent, flush=True)
         entry = make_entry(suite, agent, on_progress=ShownProgress())

@@ -1,4 +1,4 @@
-"""docs/benchmark.md shows the lists of suite v1, and the leaderboard of the entries that stand beside it."""
+"""docs/benchmark.md shows the lists of suite v2, and the leaderboard of the entries that stand beside it."""
 
 from __future__ import annotations
 

@@ -85,7 +85,6 @@ def test_items__need_no_torch_where_nothing_is_trained() -> None:
         env={**os.environ, "PYTHONPATH": str(PAPER.parents[1])},
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
     assert (result.returncode, result.stderr) == (0, "")

@@ -127,7 +127,7 @@ def test_local_ray__listens_on_loopback_alone_and_has_no_dashboard():
     pytest.importorskip("ray")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     told = subprocess.run(
-        [sys.executable, "-c", LISTENING], env=environment, capture_output=True, text=True, timeout=600, check=True
+        [sys.executable, "-c", LISTENING], env=environment, capture_output=True, text=True, check=True
     ).stdout.splitlines()
     listens = [line for line in told if line.startswith("listens")]
     assert listens and set(listens) <= {
