@@ -209,6 +209,10 @@ class FailedWorld(UserWarning):
     """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
 
 
+class WithoutEffect(UserWarning):
+    """Something that was given changes nothing here."""
+
+
 class IncompleteTable(UserWarning):
     """A table of best known harm holds some of the worlds asked about, and not the others."""
 

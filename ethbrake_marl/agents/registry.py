@@ -42,6 +42,7 @@ class AgentSettings:
     horizon_s: float = HORIZON_S  # until when it looks ahead
     most_candidates: int | None = None  # of a search, whatever its argument says; None: what that says
     uncertainty: object = None  # what a robust shield does not know, as ``shield.uncertainty`` reads it
+    time_step_s: float = 0.1  # between two decisions
 
     def needed_scenario(self) -> Scenario:
         """The scenario, for an agent that cannot do without. Raises ``InvalidInput`` if there is none."""
@@ -179,6 +180,7 @@ def make_agent(
     horizon_s: float | None = None,
     most_candidates: int | None = None,
     uncertainty: object = None,
+    time_step_s: float | None = None,
 ) -> Driver:
     """A fresh agent for one vehicle in one batch, or the team of a run.
 
@@ -191,6 +193,7 @@ def make_agent(
         horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: for trying an agent out: no search of it takes more.
         uncertainty: what a robust shield does not know, such as ``"gaps_m=0.5"``.
+        time_step_s: between two decisions of what searches; None: the scenario's, or 0.1 s.
 
     Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, harm count or
     horizon, and for a scenario that is missing.
@@ -209,8 +212,9 @@ def make_agent(
         raise InvalidInput(f"horizon_s {horizon_s!r}: must be a positive number of seconds")
     written = current_spelling(spec, scenario=scenario, harm_count=harm_count)
     settings = AgentSettings(
-        written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty
-    )
+        written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty,
+        time_step_s or (0.1 if scenario is None else scenario.time_step_s),
+    )  # fmt: skip
     driver = _make(find_entry(written), written.argument, settings)
     for each in written.around:
         settings = replace(settings, spec=f"{settings.spec}+{each}")

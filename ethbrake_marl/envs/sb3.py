@@ -47,6 +47,7 @@ def make_sb3_vec_env(
     observation: Observation | None = None,
     horizon_is_end: bool = False,
     appended: Appended | None = None,
+    step_infos: bool = False,
 ) -> EthBrakeVecEnv:
     """``n_envs`` worlds for Stable-Baselines3.
 
@@ -63,6 +64,8 @@ def make_sb3_vec_env(
         appended: numbers of a row behind the vehicle's own observation. ``number``: the learner's place among the
             learners (0 = the foremost); ``state``: the full state of the line (``observations.state``), for a central
             critic.
+        step_infos: infos tell what the other interfaces tell in every step, not at the end of an episode alone; that
+            costs time.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
@@ -72,7 +75,7 @@ def make_sb3_vec_env(
     check_seed(seed)
     engine = make_engine(scenario, n_envs, learners=learners, reward=reward, observation=observation)
     begin = fresh_seed() if seed is None else seed
-    return EthBrakeVecEnv(engine, begin, horizon_is_end=horizon_is_end, appended=appended)
+    return EthBrakeVecEnv(engine, begin, horizon_is_end=horizon_is_end, appended=appended, step_infos=step_infos)
 
 
 class EthBrakeVecEnv(VecEnv):
@@ -81,14 +84,15 @@ class EthBrakeVecEnv(VecEnv):
     With several learners all rows share one policy, and the rows of a world end together. All worlds take their
     episodes from one stream, as in ``EthBrakeVectorEnv``. At the end of an episode its rows' infos hold
     ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, steps ``l``; ``t`` is always 0, no
-    clock is read), and harm under both counts; all other infos are empty. Attributes and methods belong to the whole
-    batch: there are no environments inside.
+    clock is read), and harm under both counts; all other infos are empty, unless ``step_infos``. Attributes and
+    methods belong to the whole batch: there are no environments inside.
 
     Args:
         engine: the running worlds; ``make_sb3_vec_env`` makes them.
         seed: of the stream of worlds.
         horizon_is_end: as in ``make_sb3_vec_env``.
         appended: as in ``make_sb3_vec_env``.
+        step_infos: as in ``make_sb3_vec_env``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -105,7 +109,13 @@ class EthBrakeVecEnv(VecEnv):
     render_mode: str | None = None
 
     def __init__(
-        self, engine: Engine, seed: int, *, horizon_is_end: bool = False, appended: Appended | None = None
+        self,
+        engine: Engine,
+        seed: int,
+        *,
+        horizon_is_end: bool = False,
+        appended: Appended | None = None,
+        step_infos: bool = False,
     ) -> None:
         features = row_features(engine.observation.features, appended, engine.scenario)
         if not engine.learners:
@@ -113,6 +123,7 @@ class EthBrakeVecEnv(VecEnv):
         self.engine = engine
         self.horizon_is_end = horizon_is_end
         self.appended = appended
+        self.step_infos = step_infos
         self._next_seed: int | None = seed
         self._learners = np.array(engine.learners, np.int64)
         self._actions: NDArray[Any] | None = None
@@ -163,7 +174,7 @@ class EthBrakeVecEnv(VecEnv):
         reward = step.reward.take(learners, axis=1).reshape(-1)
         self._return += reward
         self._steps += 1
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos = plain_infos(report(engine, step), learners) if self.step_infos else [{} for _ in range(self.num_envs)]
         over = engine.ended  # all that have ended: an interrupted step may have left some that nobody renewed
         ended = np.flatnonzero(over)
         if len(ended):
