@@ -83,10 +83,16 @@ $(STAMP): pyproject.toml constraints.txt
 	fi
 	@echo "== Installing ethbrake_marl"
 	@$(INSTALL) -e .
-	@echo "== Installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX),: uv looks for the build for this machine)"
-	@$(INSTALL) --torch "$(TORCH_INDEX)"
-	@echo "== Installing what it needs to train and to be tested, at the versions of constraints.txt"
-	@$(INSTALL) -e ".[train,dev]"
+	@echo "== Compiling the physics, beside the rest of the installation"
+	@PYTHONPATH="$(CURDIR)" $(BIN)/python -c "from ethbrake_marl.cli import doctor; raise SystemExit(not doctor.compile_ahead(training=False)[0])" & \
+	compiling=$$!; \
+	trap "kill $$compiling" INT TERM; \
+	echo "== Installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX),: uv looks for the build for this machine)"; \
+	$(INSTALL) --torch "$(TORCH_INDEX)" || exit; \
+	echo "== Installing what it needs to train and to be tested, at the versions of constraints.txt"; \
+	$(INSTALL) -e ".[train,dev]" || exit; \
+	wait $$compiling || \
+	  echo "== not all could be compiled (above): the rest is compiled when it is needed" >&2
 	@echo "== torch $$($(BIN)/python -c 'from importlib.metadata import version; print(version("torch"))')"
 	@$(BIN)/ethbrake evaluate --help >/dev/null
 	@echo "$(CURDIR)" > $@

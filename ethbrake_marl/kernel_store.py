@@ -23,12 +23,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parent
-_MARK = b"@compiled"
+_MARK = b"\n@compiled"  # of a decorator, at the start of its line
 _IMPORT = re.compile(rb"^from (ethbrake_marl[.\w]*) import (\([^)]*\)|.*)$", re.MULTILINE)
 _CONSTANT = re.compile(r"\b[A-Z][A-Z0-9_]*\b")
 _TEMPORARY = "ethbrake_marl-"
 _DIGEST_BYTES = 32
 _LONGEST_WAIT_S = 600.0  # for another process that compiles the same kernel: it may have been stopped
+_UNKEPT = "each process compiles for itself; set the clock, or their dates (find FOLDER -exec touch {} +)"
 _IMPORTED_S = time.time()
 _tellers: list[Callable[[Path, bool], None]] = []
 _loaded: list[str] = []
@@ -138,11 +139,14 @@ def digest_of_sources(source: Path) -> str:
     """Hash of all files that the kernels of one file may be made of; empty where that is not known.
 
     That is so for code in no file (a shell), and for a file that was edited after this process began: its code may
-    have been read before.
+    have been read before. A date in the future cannot be told from that, and costs a warning.
     """
     digest = hashlib.sha256()
     for file in kernel_sources(source) if source.is_file() else ():
-        if file.stat().st_mtime > _IMPORTED_S:
+        written_s = file.stat().st_mtime
+        if written_s > time.time():
+            warnings.warn(f"{_PACKAGE}: dates of files lie in the future: {_UNKEPT}", stacklevel=2)
+        if written_s > _IMPORTED_S:
             return ""
         digest.update(f"{place_of(file)} {file.stat().st_size} ".encode() + file.read_bytes())
     return digest.hexdigest() if source.is_file() else ""

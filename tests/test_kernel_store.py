@@ -154,6 +154,7 @@ def digest_in(package: Path, name: str) -> str:
         ("physics/advance.py", "search/moves.py", False),  # kernels that it does not call
         ("physics/events.py", "physics/advance.py", False),  # its callers
         ("physics/advance.py", "physics/worlds.py", False),  # types
+        ("physics/compiled.py", "kernel_store.py", False),  # where kernels are kept
     ],
 )
 def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, monkeypatch, kernel, edited, moves):
@@ -168,9 +169,16 @@ def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, mo
 def test_digest_of_sources__is_not_known_of_code_in_no_file_or_edited_since(copied):
     assert digest_of_sources(Path("<stdin>")) == ""
     assert digest_in(copied, "physics/advance.py")
-    now = kernel_store.time.time() + 1.0
-    os.utime(copied / "physics" / "events.py", (now, now))
+    since = (kernel_store._IMPORTED_S + time.time()) / 2
+    os.utime(copied / "physics" / "events.py", (since, since))
     assert digest_in(copied, "physics/advance.py") == ""
+
+
+def test_digest_of_sources__is_not_known_of_files_from_the_future_which_is_told(copied):
+    ahead = time.time() + 3600.0
+    os.utime(copied / "physics" / "events.py", (ahead, ahead))
+    with pytest.warns(UserWarning, match=f"{copied}: dates of files lie in the future.* touch"):
+        assert digest_in(copied, "physics/advance.py") == ""
 
 
 @needs_compiler

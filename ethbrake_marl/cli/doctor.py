@@ -9,7 +9,7 @@ import sys
 import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.util import find_spec
@@ -22,7 +22,7 @@ import typer
 from ethbrake_marl import __version__
 from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import JsonOption
-from ethbrake_marl.cli.terminal import say, show, write_json
+from ethbrake_marl.cli.terminal import EVERY_S, say, show, write_json
 from ethbrake_marl.kernel_store import cache_folder, is_temporary
 
 if TYPE_CHECKING or LATE:
@@ -37,15 +37,17 @@ if TYPE_CHECKING or LATE:
 
 DISTRIBUTION = "ethbrake-marl"
 EXTRAS = ("train", "marl", "export", "data", "render", "explore", "cluster", "tune")
-_TINY = ("n_envs=16", "n_steps=8", "counterfactuals=16", "evaluation.worlds=10")
+_TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=evaluation.worlds=10")
 _LINEUP = "ladder,ppo@shipped,ppo@shipped+refined+episode,full_brake+step,full_brake+robust"
 # Small calls of what people call first: what they use is what is compiled. One world alone lies otherwise in memory.
 _DOORS = (
-    ("run", "--steps", "128", "--episodes", "20", "--output", "run", *(f"--set={value}" for value in _TINY)),
-    ("evaluate", "--agents", _LINEUP, "--episodes", "20"),
+    ("run", "--steps", "128", "--episodes", "20", "--output", "run", "--set=counterfactuals=16", *_TINY),
+    ("train", "--recipe", "ppo", "--steps", "128", "--output", "ppo", "--set=batch_size=64", *_TINY),
+    ("evaluate", "--agents", _LINEUP, "--episodes", "20", "--uncertainty", "gaps_m=0.5"),
     ("evaluate", "--agents", "full_brake,ppo@shipped+episode,full_brake+step", "--episodes", "1"),
     ("shield", "--agents", "full_brake", "--episodes", "3"),
 )
+_TRAINING = ("run", "train")  # what needs torch
 _FIRST_STEP = """
 import ethbrake_marl as eb
 env = eb.parallel_env()
@@ -71,16 +73,17 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
 
     ``compile_all``: call the usual commands on a few worlds first, so that all they use is compiled and kept.
     """
+    has_torch = find_spec("torch") is not None
     return [
         Check("ethbrake_marl", True, f"{__version__} in {_PACKAGE}"),
         _check("python", _python),
         *_dependencies(),
         _check("processor", _processor),
         _check("kernel cache", _kernel_cache),
+        *([_check("compile", lambda: compile_ahead(training=has_torch))] if compile_all else []),
         _check("scenarios", _scenarios),
         _check("physics", _golden_impact),
         _check("baseline", _golden_baseline),
-        *([_check("compile", _compile)] if compile_all else []),
     ]
 
 
@@ -175,17 +178,26 @@ def _golden_baseline() -> tuple[bool, str]:
     return found == wanted, f"E-V2X-BM at gaps 7 and 7 m: {found} (known: {wanted})"
 
 
-def _compile() -> tuple[bool, str]:
-    """The commands of ``_DOORS`` on a few worlds, side by side on all cores; a line for each that ended."""
+def compile_ahead(*, training: bool) -> tuple[bool, str]:
+    """Call the commands of ``_DOORS`` on a few worlds, side by side on all cores, and tell how far they are.
+
+    ``training``: those that need torch, too. Whether all ended well, and what there is to say.
+    """
+    if is_temporary(cache_folder()):
+        return False, "no folder can be written to keep what is compiled; set NUMBA_CACHE_DIR to a writable folder"
     begun, failed = perf_counter(), []
-    doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if door[0] != "run" or find_spec("torch")]
-    doors.append(("-c", _FIRST_STEP))
+    doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if training or door[0] not in _TRAINING]
+    doors.append(("-c", _FIRST_STEP, "first step"))
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        called = {pool.submit(_call, door, folder): door for door in doors}
-        for done, future in enumerate(as_completed(called), start=1):
-            door, error = (called[future] + ("first step",))[2], future.result()
-            say(f"compile: {done} of {len(called)}: {door}{f' failed: {error}' if error else ''}")
-            failed += [f"{door}: {error}"] if error else []
+        called = {pool.submit(_call, door, folder): door[2] for door in doors}
+        waiting = set(called)
+        while waiting:
+            done, waiting = wait(waiting, EVERY_S, FIRST_COMPLETED)
+            failed += [f"{called[future]} failed: {future.result()}" for future in done if future.result()]
+            kept = sum(1 for _ in cache_folder().iterdir())
+            say(f"compile: {len(called) - len(waiting)} of {len(called)} commands done, {kept} files in the cache")
+    for failure in failed:
+        say(f"compile: {failure}")
     return not failed, "; ".join(failed) or f"what these commands use is compiled, after {perf_counter() - begun:.0f} s"
 
 

@@ -56,6 +56,7 @@ EPS = 2.0**-52  # the spacing of doubles at 1
 BOUND_EPS = 2.0**12
 
 LEAST_TIME_STEP_S = 1e-3  # between decisions: work grows as they come closer
+_LEAST_PART = 100  # worlds of a thread: fewer are done before another one has begun
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +122,8 @@ def lower_bound(
         unavoidable,
         out,
     )
-    by_parts(lambda part: bound_worlds(*(array[part] for array in given)), worlds.n, os.cpu_count() or 1)
+    threads = min(os.cpu_count() or 1, worlds.n // _LEAST_PART + 1)
+    by_parts(lambda part: bound_worlds(*(array[part] for array in given)), worlds.n, threads)
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
     early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)

@@ -112,9 +112,25 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
 
 
 def test_doctor__compiles_only_when_asked(ethbrake, monkeypatch):
-    monkeypatch.setattr(doctor, "_compile", lambda: (True, "9 kernels ready"))
+    monkeypatch.setattr(doctor, "compile_ahead", lambda training: (True, "9 kernels ready"))
     assert "compile" not in ethbrake("doctor").out
     assert "9 kernels ready" in ethbrake("doctor", "--compile").out
+
+
+def test_doctor_compile__tells_how_far_it_is_and_what_failed(ethbrake, monkeypatch):
+    monkeypatch.setattr(doctor, "_call", lambda door, folder: "no luck" if "shield" in door else "")
+    answer = ethbrake("doctor", "--compile")
+    assert answer.status == 1 and re.search("FAIL +compile +shield failed: no luck", answer.out)
+    *far, failed = [line for line in answer.err.splitlines() if line.startswith("compile: ")]
+    assert re.fullmatch(r"compile: (\d+) of \1 commands done, \d+ files in the cache", far[-1])
+    assert failed == "compile: shield failed: no luck"
+
+
+def test_doctor_compile__where_nothing_can_be_kept_does_not_begin(ethbrake, monkeypatch):
+    monkeypatch.setattr(doctor, "is_temporary", lambda folder: True)
+    monkeypatch.setattr(doctor, "_call", None)
+    answer = ethbrake("doctor", "--compile")
+    assert answer.status == 1 and re.search("FAIL +compile +no folder .* NUMBA_CACHE_DIR", answer.out)
 
 
 @pytest.mark.long
