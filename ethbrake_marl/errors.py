@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
@@ -188,11 +188,16 @@ class AgentFailed(InvalidInput):
 
 
 @contextmanager
-def naming_agent(name: str) -> Iterator[None]:
-    """Name an agent that fails inside the block as the user does: on the command line, or in a mapping."""
+def naming_agent(name: str, others: Collection[str] = ()) -> Iterator[None]:
+    """Name an agent that fails inside the block as the user does: on the command line, or in a mapping.
+
+    ``others``: names of who drives the other vehicles, which stay.
+    """
     try:
         yield
     except AgentFailed as error:
+        if error.agent in others:
+            raise
         raise AgentFailed(name, error.row, error.reason) from error
 
 
@@ -202,6 +207,10 @@ class OldSpelling(FutureWarning):
 
 class FailedWorld(UserWarning):
     """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
+
+
+class WithoutEffect(UserWarning):
+    """Something that was given changes nothing here."""
 
 
 class IncompleteTable(UserWarning):

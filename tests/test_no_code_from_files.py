@@ -163,5 +163,6 @@ def test_leave__that_is_no_longer_needed_is_told(tmp_path: Path) -> None:
         "ethbrake_marl/files/plugins.py: may use compile, and does not",
         "ethbrake_marl/files/plugins.py: may use exec, and does not",
         "ethbrake_marl/learning/legacy.py: may use load, and does not",
+        "ethbrake_marl/physics/compiled.py: may use pickle, and does not",
         "ethbrake_marl/studies/jobs/work.py: may use pickle, and does not",
     ]

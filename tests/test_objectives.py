@@ -99,7 +99,7 @@ def test_reward__weight_and_other_terms_stay_what_they_are():
     safe = ~engine.ledger.collided
     assert safe.any()
     assert doubled == pytest.approx(2.0 * single + 3.0 * safe[:, np.newaxis])
-    without, _ = played({"objective": "own", "harm": 0.0, "terminal": 1.0})
+    without, _ = played({"harm": 0.0, "terminal": 1.0})
     assert without.tolist() == np.repeat(safe[:, np.newaxis] * 1.0, 3, axis=1).tolist()
 
 

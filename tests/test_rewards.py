@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.setup import make_engine
-from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.errors import InvalidInput, UnknownName, WithoutEffect
 from ethbrake_marl.physics import advance, forecast, make_worlds
 from ethbrake_marl.rewards import (
     REWARDS,
@@ -75,7 +75,9 @@ def test_collision__counts_every_impact_whatever_the_harm_counts():
     given = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t")
     facts |= dict.fromkeys(given, np.ones((2, 3)))
     for count, harm in (("first", [-100.0, 0.0]), ("total", [-130.0, -7.0])):
-        terms = reward_terms(RewardParams(harm_count=count, collision=1.0, k_energy=0.5), StepOutcome(**facts))
+        terms = reward_terms(
+            RewardParams(harm=1.0, harm_count=count, collision=1.0, k_energy=0.5), StepOutcome(**facts)
+        )
         assert terms["collision"][:, 0].tolist() == [-65.0, -3.5]
         assert terms["harm"][:, 0].tolist() == harm
 
@@ -273,9 +275,19 @@ def test_reward__may_be_given_as_settings():
         ({"hram": 1.0}, "unknown setting of a reward 'hram'; did you mean 'harm'"),
         ({"jerk": -1.0}, "reward: jerk = -1.0: must be greater than or equal to 0"),
         ({"jerk": "a"}, "reward: jerk = 'a': must be a number"),
+        ({"shaping": 1.0}, "reward: harm: is left out, and would weigh 1 beside shaping; say harm: 1, or 0 for none"),
+        ({"harm": 0.0, "objective": "own"}, "reward: objective: changes the term harm alone, whose weight is 0"),
     ],
 )
 def test_reward__that_cannot_be_one_is_refused_in_one_line(reward, message):
     with pytest.raises(InvalidInput, match=message) as caught:
         reward_params(reward)
     assert "\n" not in str(caught.value)
+
+
+def test_reward__without_harm_says_that_the_scenarios_objective_changes_nothing():
+    own = load_scenario("cooperation-3-pair").replace(objective="own")
+    with pytest.warns(WithoutEffect, match="the scenario's objective, own, changes nothing"):
+        paid = make_engine(own, 2, reward="paper", seed=1)
+    assert paid.reward.objective is None
+    make_engine(own, 2, reward={"harm": 1.0, "risk": 0.1}, seed=1)

@@ -28,15 +28,21 @@ class BestHarm:
     """Drives the profile of least harm known, while the ``others`` follow their scripts (without one: brake fully).
 
     ``recall`` gives the kept profiles; a world without one is searched at the alert with ``budget`` candidates.
-    Decisions fall every 0.1 s from the vehicle's latency on. ``predicted_harm`` [n] is what the engine will count
-    (m2/s2), to the same bits, if the engine's time step is that. Raises ``InvalidInput`` for a budget below 1 or an
-    unknown count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
+    Decisions fall every ``time_step_s`` from the vehicle's latency on. ``predicted_harm`` [n] is what the engine will
+    count (m2/s2), to the same bits, if the engine's time step is that. Raises ``InvalidInput`` for a budget below 1 or
+    an unknown count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
     """
 
     knows = Source.MODEL
 
     def __init__(
-        self, recall: Recall, *, harm_count: HarmCount = "first", horizon_s: float = 8.0, budget: int = SEARCH_BUDGET
+        self,
+        recall: Recall,
+        *,
+        harm_count: HarmCount = "first",
+        horizon_s: float = 8.0,
+        budget: int = SEARCH_BUDGET,
+        time_step_s: float = TIME_STEP_S,
     ) -> None:
         if not budget >= 1:
             raise InvalidInput(f"best_harm: budget = {budget}; at least 1 candidate is needed")
@@ -47,7 +53,7 @@ class BestHarm:
         self.searched: Floats = np.empty(0)  # [n] 1 where nothing was kept
         self._recall = recall
         self._harm_count: HarmCount = harm_count
-        self._horizon_s = horizon_s
+        self._horizon_s, self._time_step_s = horizon_s, time_step_s
         self._budget = budget
         self._start_s: Floats = np.empty(0)
         self._profiles = Profiles(np.zeros((0, 1), np.int64), np.zeros((0, 1, 1)))
@@ -72,13 +78,14 @@ class BestHarm:
             raise InvalidInput(
                 f"agent {self.name!r}: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
             )
-        step = np.maximum(decision_at(worlds.time_s, self._start_s[: worlds.n], TIME_STEP_S), 0)
+        step = np.maximum(decision_at(worlds.time_s, self._start_s[: worlds.n], self._time_step_s), 0)
         return self._profiles.take(slice(worlds.n)).at(step)[:, 0]
 
     def _problem(self, worlds: Worlds, vehicle: int, others: Floats) -> ProfileProblem:
         return profile_problem(
-            worlds, [vehicle], harm_count=self._harm_count, horizon_s=self._horizon_s, others_mps2=others
-        )
+            worlds, [vehicle], harm_count=self._harm_count, horizon_s=self._horizon_s, time_step_s=self._time_step_s,
+            others_mps2=others,
+        )  # fmt: skip
 
     def _search(self, worlds: Worlds, vehicle: int, others: Floats, profiles: Profiles, unknown: Ints) -> Profiles:
         """The given profiles with those of ``unknown`` worlds replaced by searched ones."""

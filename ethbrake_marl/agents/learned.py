@@ -37,6 +37,7 @@ class LearnedAgent:
     """
 
     knows = Source.MESSAGES
+    remembers = False
 
     def __init__(self, policy: LearnedPolicy, name: str = "learned") -> None:
         self.policy = policy

@@ -42,6 +42,7 @@ class Planner:
         harm_count: which harm it minimises, ``first`` or ``total``.
         horizon_s: until when it looks ahead, s.
         most_candidates: of a search, whatever the argument says.
+        time_step_s: between two decisions, s.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -61,6 +62,7 @@ class Planner:
         harm_count: HarmCount = "first",
         horizon_s: float = 8.0,
         most_candidates: int | None = None,
+        time_step_s: float = TIME_STEP_S,
     ) -> None:
         check_harm_count(harm_count)
         self.others: Mapping[int, Script] = {}
@@ -70,7 +72,7 @@ class Planner:
         if most_candidates is not None:
             self._candidates, self._milliseconds = min(self._candidates, most_candidates), 0.0
         self._harm_count: HarmCount = harm_count
-        self._horizon_s = horizon_s
+        self._horizon_s, self._time_step_s = horizon_s, time_step_s
         self._latency_s: Floats = np.empty(0)
         self._others_mps2: Floats = np.empty((0, 0))  # [n, N]
         self._plan = Profiles(np.zeros((0, MOST_PHASES), np.int64), np.zeros((0, MOST_PHASES, 1)))
@@ -112,12 +114,13 @@ class Planner:
 
     def _problem(self, worlds: Worlds, vehicle: int, others: Floats) -> ProfileProblem:
         return profile_problem(
-            worlds, [vehicle], harm_count=self._harm_count, horizon_s=self._horizon_s, others_mps2=others
-        )
+            worlds, [vehicle], harm_count=self._harm_count, horizon_s=self._horizon_s, time_step_s=self._time_step_s,
+            others_mps2=others,
+        )  # fmt: skip
 
     def _rest(self, rows: Ints, time_s: Floats, problem: ProfileProblem) -> Profiles:
         """What is left of the plans of ``rows`` from ``time_s`` on."""
-        passed = np.rint((time_s - self._planned_s[rows]) / TIME_STEP_S).astype(np.int64)[:, np.newaxis]
+        passed = np.rint((time_s - self._planned_s[rows]) / self._time_step_s).astype(np.int64)[:, np.newaxis]
         ends = np.maximum(self._plan.ends[rows] - passed, 0)
         ends = np.minimum(ends, problem.last_step[:, np.newaxis])
         ends[:, -1] = problem.last_step
@@ -170,6 +173,7 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
     """``planner``, ``planner:CANDIDATES`` or ``planner:20ms``; with ``:believed`` behind, in the believed world."""
     budget, believes = split_believed(argument)
     planner = Planner(
-        budget, harm_count=settings.harm_count, horizon_s=settings.horizon_s, most_candidates=settings.most_candidates
-    )
+        budget, harm_count=settings.harm_count, horizon_s=settings.horizon_s, most_candidates=settings.most_candidates,
+        time_step_s=settings.time_step_s,
+    )  # fmt: skip
     return Believing(planner, settings.needed_scenario(), shows=True) if believes else planner

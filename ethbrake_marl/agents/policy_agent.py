@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,7 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import LARGEST, action_to_command
-from ethbrake_marl.agents.foreign import Infer, State, adapt_policy, to_array, weights_sha256
+from ethbrake_marl.agents.foreign import (
+    Infer,
+    State,
+    adapt_policy,
+    map_state,
+    to_array,
+    training_environment,
+    weights_sha256,
+)
 from ethbrake_marl.agents.knowledge import Source
 from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, describe_error
 from ethbrake_marl.observations import (
@@ -26,6 +34,7 @@ from ethbrake_marl.observations import (
     observation_for,
     observe,
 )
+from ethbrake_marl.observations.state import Appended, appending, row_features
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 
@@ -38,21 +47,27 @@ def policy_agent(
     observation: Observation | None = None,
     initial_state: Callable[[int], State] | None = None,
     clip: bool = False,
+    appended: Appended | None = None,
 ) -> PolicyAgent:
     """An agent that drives by a policy of any library: observations [n, F] float32 -> actions [n, 1] in [-1, 1].
 
-    A policy with a memory is a function ``(observation, state) -> (action, state)`` with an ``initial_state``.
+    A policy with a memory is a function ``(observation, state) -> (action, state)`` with an ``initial_state``, or a
+    model whose ``predict`` gives a state.
 
     Args:
-        policy: a function, a model with ``predict`` (Stable-Baselines3; asked deterministically), a torch module
-            (called as it is, without gradients), an ONNX session, or the path of an ``.onnx`` file. Copies share it.
+        policy: a function, a model with ``predict`` (Stable-Baselines3; asked deterministically, its state kept world
+            by world, its observations normalised by its ``VecNormalize``), a torch module (called as it is, without
+            gradients), an ONNX session, or the path of an ``.onnx`` file. Copies share it.
         name: in tables and messages; None: the name of the function or class.
         scenario: the policy observes what learners of it do.
         observation: what it observes instead, as ``choose_observation`` reads it; None: that of the scenario, or of the
-            policy itself, or the usual one.
+            policy itself, or of the environment that a Stable-Baselines3 model has, or the usual one.
         initial_state: makes the memory of ``n`` episodes that begin: an array whose first axis is the world, or tuples
-            and mappings of such. None: the policy has no memory.
+            and mappings of such. None: a function has no memory.
         clip: actions beyond -1 and 1 mean -1 and 1; otherwise they are refused.
+        appended: ``number`` or ``state`` of ``make_sb3_vec_env``, where the policy was trained on such rows; needs the
+            scenario with its learners. None: as in the environment that the model has. Who sees the ``state`` knows
+            the true state of the line.
 
     Raises ``InvalidInput`` for what is no such policy, or one for another number of features.
 
@@ -64,23 +79,45 @@ def policy_agent(
 
     """
     named = name or _name_of(policy)
-    spec = _observation_of(policy, scenario, observation)
+    trained = training_environment(policy, named)
+    spec = _observation_of(policy, scenario, observation, trained)
+    if appended is None and (appended := getattr(trained, "appended", None)) is not None:
+        scenario = trained.engine.scenario if scenario is None else scenario
+    if appended is not None and scenario is None:
+        raise InvalidInput(f"agent {named!r}: appended = {appended!r} needs the scenario that it was trained in")
+    size = spec.size if scenario is None else len(row_features(spec.features, appended, scenario))
     shape = getattr(getattr(policy, "observation_space", None), "shape", None)
-    if shape not in (None, (spec.size,)):
+    if shape not in (None, (size,)):
         raise InvalidInput(
-            f"agent {named!r}: the policy takes observations of shape {shape}, here are {spec.size} features;"
-            " give what it was trained on: scenario or observation"
+            f"agent {named!r}: the policy takes observations of shape {shape}, here are {size} features;"
+            " give what it was trained on: scenario, observation, or appended (number or state, of make_sb3_vec_env)"
         )
-    infer = adapt_policy(policy, named, initial_state is not None)
-    return PolicyAgent(infer, named, spec, initial_state, clip, lambda: weights_sha256(policy))
+    if trained is not None and [f.name for f in spec.features] != [f.name for f in trained.engine.observation.features]:
+        raise InvalidInput(
+            f"agent {named!r}: the model is trained on other features than {spec}: {trained.engine.observation}; leave"
+            " observation out, and give the scenario it was trained in, or none"
+        )
+    actions = getattr(policy, "action_space", None)
+    ends = getattr(actions, "low", -1.0), getattr(actions, "high", 1.0)
+    if not (clip or (np.all(ends[0] == -1.0) and np.all(ends[1] == 1.0))):
+        raise InvalidInput(
+            f"agent {named!r}: the policy gives actions in {actions}, here they mean [-1, 1]; write a function around"
+            " it that says what they mean"
+        )
+    infer, begin = adapt_policy(policy, named, size, initial_state)
+    more = None if appended is None or scenario is None else appending(appended, scenario)
+    agent = PolicyAgent(infer, named, spec, begin, clip, lambda: weights_sha256(policy), more)
+    if appended == "state":
+        agent.knows = Source.STATE
+    return agent
 
 
-def _observation_of(policy: Any, scenario: Scenario | None, given: Observation | None) -> ObservationSpec:
+def _observation_of(policy: Any, scenario: Scenario | None, given: Observation | None, trained: Any) -> ObservationSpec:
     if given is not None:
         return choose_observation(given, None if scenario is None else scenario.time_step_s)
     if scenario is not None:
         return observation_for(scenario)
-    own = getattr(policy, "observation", None)
+    own = getattr(policy, "observation", None) if trained is None else trained.engine.observation
     return own if isinstance(own, ObservationSpec) else ObservationSpec()
 
 
@@ -104,11 +141,14 @@ class PolicyAgent:
         initial_state: Callable[[int], State] | None,
         clip: bool,
         weights_sha256: Callable[[], str | None],
+        more: Callable[[Worlds, int], Observations] | None = None,
     ) -> None:
         self.name = name
         self.weights_sha256 = weights_sha256  # of the policy as it is now; None where nobody can find its weights
         self.observation = observation
         self._infer, self._initial_state, self._clip = infer, initial_state, clip
+        self.remembers = initial_state is not None
+        self._more = more  # what stands behind the own observation
         self._steps: Ints = np.zeros(0, np.int64)  # [n] decisions of the running episodes
         self._rows: Ints = np.zeros(0, np.int64)  # [n] their rows in the batch that began
         self._state: State = None
@@ -144,6 +184,8 @@ class PolicyAgent:
         if len(self._steps) > worlds.n:  # a smaller batch has begun
             self.__dict__.update(self.take(np.arange(worlds.n)).__dict__)
         seen = observe(worlds, vehicle, self.observation).astype(np.float32, copy=False)
+        if self._more is not None:
+            seen = np.concatenate([seen, self._more(worlds, vehicle)], axis=1, dtype=np.float32)
         action, state = self._ask(seen, worlds)
         values = self._checked(action, seen, worlds)
         self._state, self._steps = state, self._steps + 1
@@ -226,19 +268,8 @@ class PolicyAgent:
         return f"step {self._steps[k] + 1} ({worlds.time_s[k]:.2f} s)"
 
 
-def _map(function: Callable[..., Any], state: State, *others: State) -> State:
-    """The function of every array of a memory, together with those in its place in the others."""
-    if state is None:
-        return None
-    if isinstance(state, Mapping):
-        return {key: _map(function, value, *(other[key] for other in others)) for key, value in state.items()}
-    if isinstance(state, tuple | list):
-        return tuple(_map(function, *parts) for parts in zip(state, *others, strict=True))
-    return function(state, *others)
-
-
 def _take(state: State, rows: Ints) -> State:
-    return _map(lambda array: array[rows], state)
+    return map_state(lambda array: array[rows], state)
 
 
 def _put(state: State, rows: Ints, part: State) -> State:
@@ -248,7 +279,7 @@ def _put(state: State, rows: Ints, part: State) -> State:
         array[rows] = new
         return array
 
-    return _map(put, state, part)
+    return map_state(put, state, part)
 
 
 def _checked_state(state: State, n: int) -> State:
@@ -258,4 +289,4 @@ def _checked_state(state: State, n: int) -> State:
             raise InvalidInput(f"state: {type(array).__name__} of shape {shape}; its first axis must be the {n} worlds")
         return array
 
-    return _map(check, state)
+    return map_state(check, state)

@@ -42,6 +42,7 @@ class AgentSettings:
     horizon_s: float = HORIZON_S  # until when it looks ahead
     most_candidates: int | None = None  # of a search, whatever its argument says; None: what that says
     uncertainty: object = None  # what a robust shield does not know, as ``shield.uncertainty`` reads it
+    time_step_s: float = 0.1  # between two decisions
 
     def needed_scenario(self) -> Scenario:
         """The scenario, for an agent that cannot do without. Raises ``InvalidInput`` if there is none."""
@@ -179,6 +180,7 @@ def make_agent(
     horizon_s: float | None = None,
     most_candidates: int | None = None,
     uncertainty: object = None,
+    time_step_s: float | None = None,
 ) -> Driver:
     """A fresh agent for one vehicle in one batch, or the team of a run.
 
@@ -191,6 +193,7 @@ def make_agent(
         horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: for trying an agent out: no search of it takes more.
         uncertainty: what a robust shield does not know, such as ``"gaps_m=0.5"``.
+        time_step_s: between two decisions of what searches; None: the scenario's, or 0.1 s.
 
     Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, harm count or
     horizon, and for a scenario that is missing.
@@ -209,8 +212,9 @@ def make_agent(
         raise InvalidInput(f"horizon_s {horizon_s!r}: must be a positive number of seconds")
     written = current_spelling(spec, scenario=scenario, harm_count=harm_count)
     settings = AgentSettings(
-        written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty
-    )
+        written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty,
+        time_step_s or (0.1 if scenario is None else scenario.time_step_s),
+    )  # fmt: skip
     driver = _make(find_entry(written), written.argument, settings)
     for each in written.around:
         settings = replace(settings, spec=f"{settings.spec}+{each}")
@@ -250,12 +254,15 @@ def find_entry(written: AgentSpec) -> Entry:
     if written.file is not None:
         return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", (Source.UNSTATED,), _FROM_FILE)
     if written.name not in _ENTRIES:
+        if written.name == "ladder":
+            raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
         raise unknown_name("agent", written.name, {*_ENTRIES, "ladder"}, may_be_own=True)
     entry = _ENTRIES[written.name]
     if written.argument is not None and ":" not in entry.form:
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
     if written.policy is not None and "@" not in entry.form:
-        raise InvalidInput(f"agent {written.core!r}: {written.name} takes no policy")
+        own = "" if isinstance(entry.make, str) else "; register_agent(..., takes_policy=True) says that it does"
+        raise InvalidInput(f"agent {written.core!r}: {written.name} takes no policy{own}")
     return entry
 
 
@@ -270,23 +277,29 @@ def agent_entries() -> tuple[Entry, ...]:
 
 
 def register_agent(
-    name: str, factory: Factory, *, about: str = "an agent of your own", knows: Knowledge = (Source.UNSTATED,)
+    name: str,
+    factory: Factory,
+    *,
+    about: str = "an agent of your own",
+    knows: Knowledge = (Source.UNSTATED,),
+    takes_policy: bool = False,
 ) -> None:
-    """Make ``name``, ``name:argument`` and ``name@policy`` known to ``make_agent``, and so to every command.
+    """Make ``name`` and ``name:argument`` known to ``make_agent``, and so to every command.
 
     Args:
         name: plain, without argument.
-        factory: makes the agent, from what stands after the colon (or None) and ``AgentSettings``, whose ``policy`` is
-            what stands after the ``@``. The same one again changes nothing.
+        factory: makes the agent, from what stands after the colon (or None) and ``AgentSettings``. The same one again
+            changes nothing.
         about: one line for ``ethbrake agents``.
         knows: of the line while it drives, for ``ethbrake agents`` too.
+        takes_policy: whether ``name@policy`` is known, too; the factory finds it in ``AgentSettings.policy``.
 
     Raises ``AlreadyExists`` for a name that another factory has, ``InvalidInput`` for one that is not plain.
 
     """
     if parse_spec(name) != AgentSpec(name, None, None, ()):
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
-    entry = Entry(f"{name}[:ARGUMENT][@POLICY]", about, knows, factory)
+    entry = Entry(f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}", about, knows, factory)
     if name in OLD_NAMES or _ENTRIES.setdefault(name, entry).make is not factory:
         raise AlreadyExists(f"agent {name!r} is registered already")
 

@@ -35,7 +35,8 @@ class Watch(Protocol):
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """``before`` moved to the times ``until_s`` [n] under ``command_mps2`` [n, N]; ended worlds stay at theirs.
 
-        The first step is from the alert to the first decision. Nothing of what is given may be changed.
+        The first step is from the alert to the first decision; where a script decides on the way, a step is seen in
+        parts. Nothing of what is given may be changed.
         """
         ...
 
@@ -44,7 +45,10 @@ def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | Non
     """Fresh agents for the scenario's scripts, by vehicle; those that look ahead know the others."""
     left_out = () if except_for is None else (except_for,) if isinstance(except_for, int) else except_for
     specs = {i: spec for i, spec in scenario.scripts.items() if i not in left_out}
-    scripts = {i: make_single_agent(spec, horizon_s=scenario.horizon_s) for i, spec in specs.items()}
+    scripts = {
+        i: make_single_agent(spec, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
+        for i, spec in specs.items()
+    }
     for vehicle, script in scripts.items():
         set_others(script, vehicle, scripts)
     return scripts
@@ -110,6 +114,7 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
     if not watched_by:
         return before
     now = unpack(engine.packed, before.vehicles)  # the episodes are the same, and so are their vehicles
-    for watch in watched_by:
-        watch.see(before, command_mps2, now.time_s)
+    for part in engine.segments(before, command_mps2):
+        for watch in watched_by:
+            watch.see(*part)
     return now

@@ -13,6 +13,9 @@ from ethbrake_marl.cli.terminal import say, show, write_json
 from ethbrake_marl.defaults import LIST_SEED
 
 if TYPE_CHECKING or LATE:
+    from ethbrake_marl.agents.registry import make_single_agent
+    from ethbrake_marl.agents.rollout import drive
+    from ethbrake_marl.agents.team import Team
     from ethbrake_marl.evaluation.inputs import load_runnable
     from ethbrake_marl.evaluation.per_world import write_output
     from ethbrake_marl.files.plain import read_plain
@@ -25,6 +28,7 @@ if TYPE_CHECKING or LATE:
         scenario_path,
     )
     from ethbrake_marl.scenario.catalogue import SHIPPED
+    from ethbrake_marl.scenario.roles import LEARNER, is_state_free
     from ethbrake_marl.scenario.sample import count_kinds
 
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
@@ -56,13 +60,29 @@ def scenario_show(scenario: Annotated[str, typer.Argument(metavar="NAME|PATH")])
 
 
 @scenario_app.command("validate", epilog="Example: ethbrake scenario validate my-scenario.yaml")
-def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")]) -> None:
-    """Check a scenario: one line, OK or what is wrong."""
+def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")], as_json: JsonOption = False) -> None:
+    """Check a scenario: one line, OK or what is wrong; then what may not be meant."""
     scenario = load_runnable(path)
     sample = scenario.sample(CHECKED_DRAWS, LIST_SEED)
-    learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "none"
+    names = [scenario.vehicle_names[i] for i in scenario.learners]
+    deciding = [i for i in range(scenario.vehicles) if not is_state_free(scenario.scripts.get(i, LEARNER))]
+    braking = Team.copies(make_single_agent("full_brake"), deciding)
+    moving = int((~drive(sample.worlds, braking, scenario).at_rest).sum())
+    late = int((sample.worlds.vehicles.latency_s[:, 0] > 0.0).sum())
+    if as_json:
+        told = {"name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": CHECKED_DRAWS}
+        write_json({**told, "rejected": sample.rejected, "moving_at_horizon": moving, "vehicle_1_late": late})
+        return
     counts = f"{CHECKED_DRAWS:,} worlds drawn, {sample.rejected:,} more refused for an early impact"
+    learners = ", ".join(names) or "none"
     show(f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}{count_kinds(sample)}")
+    if moving:
+        show(
+            f"note: at the horizon ({scenario.horizon_s:g} s) something still moves in {moving:,} of them, though"
+            " whoever decides brakes fully; what comes after counts nowhere. A longer horizon_s sees more"
+        )
+    if late:
+        show(f"note: Vehicle 1, whose braking is the alert, has a latency above 0 in {late:,} of them")
 
 
 @scenario_app.command("new", epilog="Example: ethbrake scenario new my-scenario --based-on paper-distance")

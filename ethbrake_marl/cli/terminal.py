@@ -18,7 +18,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 
-from ethbrake_marl.errors import IncompleteTable, OldSpelling, one_line, plain_text
+from ethbrake_marl.errors import IncompleteTable, OldSpelling, WithoutEffect, one_line, plain_text
 from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
 from ethbrake_marl.progress import Progress as PartProgress
 
@@ -71,7 +71,7 @@ def tell_old_spellings() -> None:
     shown = warnings.showwarning
 
     def show_warning(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-        if issubclass(category, OldSpelling | IncompleteTable):
+        if issubclass(category, OldSpelling | IncompleteTable | WithoutEffect):
             say(f"{'note' if issubclass(category, OldSpelling) else 'warning'}: {message}")
         else:
             shown(message, category, *place, **more)

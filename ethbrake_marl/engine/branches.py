@@ -81,7 +81,8 @@ def first_moments(engine: Engine, count: int) -> tuple[Worlds, Moment]:
     params = packed.params.copy()
     if has_messages(packed.state, params):
         alert = engine._kept(pack(start.alert)).state
-        hear_rows(alert, params, start.wanted, packed.state[:, TIME], engine.scenario.time_step_s)
+        start_s = packed.state[:, TIME]
+        hear_rows(alert, params, start.wanted, start_s, start_s, engine.scenario.time_step_s)
     return start.alert, Moment(packed.state.copy(), params, start.clock.copy(), start.wanted.copy())
 
 

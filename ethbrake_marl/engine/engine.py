@@ -7,15 +7,27 @@ t = 0, when Vehicle 1 brakes; ``reset`` moves exactly to the first moment at whi
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import checked_action
 from ethbrake_marl.engine.running import RUNNING, Running
-from ethbrake_marl.engine.step import BAD_ACTION, OUTCOME_ROWS, START, Step, step_worlds
+from ethbrake_marl.engine.step import (
+    BAD_ACTION,
+    ENDED,
+    FAILED,
+    LAST_STEP,
+    OUTCOME_ROWS,
+    START,
+    STEP,
+    TERMINAL_WEIGHT,
+    TRUNCATED,
+    Step,
+    step_worlds,
+)
 from ethbrake_marl.engine.stream import (
     Roster,
     Script,
@@ -23,23 +35,49 @@ from ethbrake_marl.engine.stream import (
     Stream,
     Told,
     ask_script,
+    ask_where_due,
     begin_script,
     check_alert,
     is_state_free,
-    moved,
     within_capacity,
 )
 from ethbrake_marl.engine.terms import Terms
 from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.observations import ObservationSpec, observation_for, plan_of
-from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.episode import decision_s, number_of_decisions
+from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.messages import hear_rows
-from ethbrake_marl.physics.rows import NO_ROWS, TIME, Packed, has_messages, has_news, has_obstacle, pack, unpack
+from ethbrake_marl.physics.rows import (
+    NO_ROWS,
+    TIME,
+    Packed,
+    command_at,
+    gap_at,
+    has_messages,
+    has_news,
+    has_obstacle,
+    pack,
+    params_at,
+    previous_at,
+    unpack,
+)
 from ethbrake_marl.physics.segment import DONE
 from ethbrake_marl.rewards import Reward, counted_terms
 from ethbrake_marl.scenario import Scenario
 
+ROUNDING = 1e-9  # of a time step: moments that are so close are one
 Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
+
+
+class Way(NamedTuple):
+    """What a step brought before the last stop on its way, where a script on a grid of its own decided."""
+
+    reward: Floats  # [n, N] of what all vehicles share
+    harm: Floats  # [2, n] of the line, by both counts
+    stopped: Bools  # [n]
+    failed: Ints  # [n] status of the kernel where the world could not be moved, else 0
+    in_force: Floats  # [n, N] commands when the step began
 
 
 class Watcher(Protocol):
@@ -116,6 +154,8 @@ class Engine(Running):
         self._memories: dict[Watcher, Any] = {}
         self.steps_made = 0  # steps of the batch that watchers let pass
         self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
+        self._on_own_grid = {i: s for i, s in self._remembering.items() if i not in self.deciders}
+        self._stops: list[tuple[Floats, Floats]] = []  # of the last step: the states there, and what led to them
         self._told = [script for script in self._remembering.values() if isinstance(script, Told)]
         self._learner_index = np.array(self.learners, np.int64)
         total = float(self.reward.harm_count == "total")
@@ -166,6 +206,7 @@ class Engine(Running):
         new._state, new._params = (array.copy() for array in new._kept(start.packed))
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
         new._potential = np.zeros(start.wanted.shape)
+        new._stops = []
         new._begin(np.arange(self.n), start)
         self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
 
@@ -204,7 +245,7 @@ class Engine(Running):
         refuses does not happen: the worlds stay as they are.
         """
         columns = self._columns(actions)
-        if not (self._memories or self._terms.are_foreign):  # nobody can refuse what happens
+        if not (self._memories or self._terms.are_foreign or self._on_own_grid):  # nobody can refuse what happens
             step = self._advance(columns)
         else:
             new = self._apart()
@@ -218,18 +259,24 @@ class Engine(Running):
 
     def _advance(self, columns: Floats) -> Step:
         """Advance every running episode by one time step, in place."""
-        if self._remembering:
+        if len(self._remembering) > len(self._on_own_grid):
             worlds = self.worlds
-            for vehicle, script in self._remembering.items():
+            for vehicle in self._remembering.keys() - self._on_own_grid.keys():
+                script = self._remembering[vehicle]
                 self._wanted[:, vehicle] = within_capacity(ask_script(script, worlds, vehicle), worlds, vehicle, script)
         before = self._terms.objective_harm(self) if self._terms.by_objective else None
+        self._stops = []
+        way = self._start_on_own_grid(columns) if self._on_own_grid else None
         was = self._state.copy() if has_messages(self._state, self._params) else None
         reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
         status = self._step_worlds(columns, reward, outcome)
         if status == BAD_ACTION:  # nothing was moved
             status = self._step_worlds(self._in_range(columns), reward, outcome)
         if was is not None:
-            hear_rows(was, self._params, self._wanted, self._state[:, TIME], self.scenario.time_step_s)
+            until_s = self._state[:, TIME]
+            hear_rows(was, self._params, self._wanted, until_s, until_s, self.scenario.time_step_s)
+        if way is not None:
+            status = self._add_way(way, reward, outcome, status)
         step = Step(reward, outcome, self.reward, {})
         if status != DONE:
             times = self._state[:, 0]
@@ -263,7 +310,7 @@ class Engine(Running):
     def _in_range(self, columns: Floats) -> Floats:
         """The actions [n, L] without the last rounding of a float32; ``InvalidInput`` for one out of range."""
         each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
-        return np.stack(each, axis=1)
+        return np.stack(each, axis=1) if each else columns
 
     def _begin(self, rows: Ints, start: Start) -> None:
         """Tell those who must know that episodes start in ``rows``, and move what depends on them."""
@@ -273,28 +320,121 @@ class Engine(Running):
                 self._memories = {w: w.begun(memory, alert, rows) for w, memory in self._memories.items()}
                 for vehicle, script in self._remembering.items():
                     begin_script(script, alert, vehicle, rows)
-            if self._remembering:
-                self._begin_with_memory(rows, alert, start.clock[:, START])
-        if has_messages(self._state, self._params):
-            moving, params = self._kept(pack(start.alert)).state, self._params[rows]
-            hear_rows(moving, params, self._wanted[rows], self._state[rows, TIME], self.scenario.time_step_s)
+        if self._on_own_grid:
+            self._begin_on_own_grid(rows, start.alert, start.clock[:, START])
+        elif has_messages(self._state, self._params):
+            moving, params, start_s = self._kept(pack(start.alert)).state, self._params[rows], self._state[rows, TIME]
+            hear_rows(moving, params, self._wanted[rows], start_s, start_s, self.scenario.time_step_s)
             self._params[rows] = params
         if self.reward.shaping > 0.0:
             worlds = unpack(Packed(self._state[rows], self._params[rows]))
             self._potential[rows] = self._terms.potentials(worlds, self.scenario)
 
-    def _begin_with_memory(self, rows: Ints, alert: Worlds, start_s: Floats) -> None:
-        """Scripts with a memory act at the alert on the whole batch; then the new worlds move to the first decision.
+    def _start_on_own_grid(self, columns: Floats) -> Way:
+        """Let the scripts on their own grids decide within the step that begins; what comes of the way there."""
+        in_force = self._state[:, command_at(self.scenario.vehicles) : previous_at(self.scenario.vehicles)].copy()
+        steps, last, start_s = (self._clock[:, at] for at in (STEP, LAST_STEP, START))
+        until_s = decision_s(start_s, self.scenario.time_step_s, steps + 1.0)
+        until_s = np.where(steps + 1.0 >= last, self.scenario.horizon_s, until_s)
+        way = self._decide_on_the_way(~self.ended, until_s, self._in_range(columns))
+        self._clock[way.failed != 0, ENDED] = 1.0
+        return way._replace(in_force=in_force)
+
+    def _add_way(self, way: Way, reward: Floats, outcome: Floats, status: int) -> int:
+        """Add the way to the last stop to what came after it, in place; the status of both."""
+        reward += way.reward
+        outcome[: len(way.harm)] += way.harm
+        vehicles = self.scenario.vehicles
+        self._state[way.stopped, previous_at(vehicles) : gap_at(vehicles)] = way.in_force[way.stopped]
+        lost = way.failed != 0
+        outcome[TRUNCATED, lost], outcome[FAILED, lost] = 1.0, way.failed[lost]
+        return int(way.failed[lost][0]) if lost.any() else status
+
+    def _decide_on_the_way(self, running: Bools, until_s: Floats, columns: Floats) -> Way:
+        """Let the scripts on their own grids make all decisions before ``until_s`` [n] in the ``running`` worlds.
+
+        A world is moved to a decision only where that changes a command: the bits depend on where motion changes.
+        """
+        n, N = self._wanted.shape
+        vehicles, step_s = list(self._on_own_grid), self.scenario.time_step_s
+        first_s = self._params[:, params_at(2, N) : params_at(3, N)][:, vehicles].T
+        made = np.maximum(number_of_decisions(first_s, step_s, self._state[:, TIME]), 0.0)
+        due = np.where(running, np.maximum(number_of_decisions(first_s, step_s, until_s), 0.0), made)
+        way = Way(np.zeros((n, N)), np.zeros((2, n)), np.zeros(n, np.bool_), np.zeros(n, np.int64), np.empty(0))
+        while (made < due).any():
+            next_s = np.where(made < due, first_s + made * step_s, np.inf)
+            moment = next_s.min(axis=0)
+            asked = next_s <= moment + ROUNDING * step_s
+            asked &= made < due
+            now = self._state[:, TIME]
+            moment = np.where((moment < np.inf) & (moment > now + ROUNDING * step_s), moment, now)
+            ahead, reward, outcome = self._look_ahead(moment, until_s, columns)
+            worlds, wanted = unpack(ahead), self._wanted.copy()
+            for (vehicle, script), here in zip(self._on_own_grid.items(), asked, strict=True):
+                if here.any():
+                    wanted[here, vehicle] = ask_where_due(script, worlds, vehicle, here)[here]
+            changed = (wanted != self._wanted)[:, vehicles] & (made > 0.0).T  # a first one waits for the latency anyway
+            stops = (moment > now) & changed.any(axis=1) & (outcome[FAILED] == 0.0)
+            way.failed[:] = np.where(outcome[FAILED] != 0.0, outcome[FAILED], way.failed)
+            if stops.any():
+                self._stop(stops, ahead)
+                way.reward[stops] += reward[stops]
+                way.harm[:, stops] += outcome[: len(way.harm), stops]
+                way.stopped[stops] = True
+            self._wanted[:] = wanted
+            made += asked
+            made = np.where(way.failed != 0, due, made)
+        return way
+
+    def _look_ahead(self, until_s: Floats, decision_s: Floats, columns: Floats) -> tuple[Packed, Floats, Floats]:
+        """The worlds at ``until_s`` [n], and reward [n, N] and outcome of the way there; ``decision_s``: the next one.
+
+        Only the learners' commands in ``_wanted`` are changed, by ``columns`` [n, L]; none without any.
+        """
+        clock, settings = np.zeros(self._clock.shape), self._settings.copy()
+        clock[:, START], clock[:, STEP], clock[:, LAST_STEP] = until_s, -1.0, np.inf  # a step from -1 to 0 ends there
+        clock[:, ENDED] = ~(until_s > self._state[:, TIME])
+        settings[TERMINAL_WEIGHT] = 0.0
+        reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
+        state, params = self._state.copy(), self._params.copy()
+        step_worlds(
+            state, params, clock, columns, self._learner_index[: columns.shape[1]], settings, NO_ROWS, self._wanted,
+            reward, outcome,
+        )  # fmt: skip
+        if has_messages(state, params):
+            hear_rows(self._state.copy(), params, self._wanted, state[:, TIME], decision_s, self.scenario.time_step_s)
+        return Packed(state, params), reward, outcome
+
+    def _stop(self, rows: Bools, ahead: Packed) -> None:
+        """Move these rows to where the look ahead found them."""
+        self._state[rows], self._params[rows] = ahead.state[rows], ahead.params[rows]
+        self._stops.append((self._state.copy(), self._wanted.copy()))
+
+    def _begin_on_own_grid(self, rows: Ints, alert: Worlds, start_s: Floats) -> None:
+        """From the alert on scripts with a memory decide on their own grids; then the first decision is near.
 
         Deciders do not: like a learner they coast, and are seen to coast, until their first decision.
         """
-        early = {i: script for i, script in self._remembering.items() if i not in self.deciders}
-        if not early:
-            return
-        self._state[rows] = self._kept(pack(alert)).state
-        worlds = self.worlds
-        for vehicle, script in early.items():
-            wanted = within_capacity(ask_script(script, worlds, vehicle), worlds, vehicle, script)
-            self._wanted[rows, vehicle] = wanted[rows]
-        with renumbered(rows):
-            self._state[rows] = self._kept(moved(alert, self._wanted[rows], start_s)).state
+        began = self._kept(pack(alert)).state
+        self._stops = [(state.copy(), wanted) for state, wanted in self._stops]  # of who goes on; the others did not
+        for state in (self._state, *(state for state, _ in self._stops)):
+            state[rows] = began
+        running, until_s, none = np.zeros(self.n, np.bool_), self._state[:, TIME].copy(), np.empty((self.n, 0))
+        running[rows], until_s[rows] = True, start_s
+        way = self._decide_on_the_way(running, until_s, none)
+        ahead, _, outcome = self._look_ahead(until_s, until_s, none)
+        failed = np.where(way.failed != 0, way.failed, outcome[FAILED].astype(np.int64))
+        if failed.any():
+            raise failure(np.where(failed == 0, DONE, failed), self._state[:, TIME], until_s)
+        self._state[rows], self._params[rows] = ahead.state[rows], ahead.params[rows]
+
+    def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
+        """The last step, made from ``before`` (after a reset: the alert), in parts within which nobody decides.
+
+        Each is worlds, the commands [n, N] that they followed, ``last_mps2`` in the last part, and until when [n].
+        """
+        for state, wanted in self._stops:
+            then = unpack(Packed(state, self._params), before.vehicles)
+            yield before, wanted, then.time_s
+            before = then
+        yield before, last_mps2, self._state[:, TIME].copy()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from ethbrake_marl.errors import (
     count_of,
     describe_error,
 )
-from ethbrake_marl.physics import Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
 from ethbrake_marl.physics.episode import first_decision_s, number_of_decisions
 from ethbrake_marl.physics.failed import failure
 from ethbrake_marl.physics.rows import Packed, harm_at, has_obstacle, pack, state_width
@@ -32,8 +33,9 @@ _SAMPLED_AT_ONCE = 1024  # training worlds are drawn in blocks of at least this 
 class Script(Protocol):
     """Drives one vehicle in every world of a batch of ``n``; one object per vehicle. An ``Agent`` is one with a name.
 
-    With an attribute ``state_free = True`` it is asked only once per episode, right after ``begin``: its command is
-    fixed at the alert and never changes.
+    It is asked when the latency of its vehicle has elapsed, and every time step from then on, whoever learns. With an
+    attribute ``state_free = True`` it is asked only once per episode, right after ``begin``: its command is fixed at
+    the alert and never changes. What it remembers of each episode stands in arrays whose first axis is the world.
     """
 
     def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
@@ -44,7 +46,10 @@ class Script(Protocol):
         """
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Wanted signed acceleration of ``vehicle`` (index from 0) in every world of the batch, [n] m/s2."""
+        """Wanted signed acceleration of ``vehicle`` (index from 0) in every world of the batch, [n] m/s2.
+
+        Not each world need have a decision now: of the others the command is not used, and its memory put back.
+        """
 
 
 @runtime_checkable
@@ -250,6 +255,35 @@ def ask_script(script: Script, worlds: Worlds, vehicle: int) -> Floats:
     return command
 
 
+def ask_where_due(script: Script, worlds: Worlds, vehicle: int, due: Bools) -> Floats:
+    """The command of a script where its decision is due, 0 elsewhere, [n] m/s2; there its memory stays as it was."""
+    before = {} if due.all() else copy.deepcopy(memory_of(script))
+    command = np.where(due, ask_script(script, worlds, vehicle), 0.0)
+    for name, array in memory_of(script).items():
+        if name in before and array.shape == before[name].shape and len(array) == worlds.n:
+            array[~due] = before[name][~due]
+    return within_capacity(command, worlds, vehicle, script, due)
+
+
+def memory_of(owner: object) -> dict[str, Any]:
+    """The arrays that a script keeps, by name: attributes, what stands in tuples and mappings, agents inside it."""
+    if is_agent := hasattr(owner, "begin") and hasattr(owner, "act"):
+        parts = dict(vars(owner)) if hasattr(owner, "__dict__") else {}
+    elif isinstance(owner, Mapping):
+        parts = dict(owner)
+    elif isinstance(owner, tuple | list):
+        parts = {str(at): value for at, value in enumerate(owner)}
+    else:
+        return {}
+    arrays: dict[str, Any] = {}
+    for name, value in parts.items():
+        if getattr(value, "shape", ()):
+            arrays[str(name)] = value
+        elif is_agent or not hasattr(value, "act"):  # the others of one that looks ahead are not inside it
+            arrays |= {f"{name}.{inner}": array for inner, array in memory_of(value).items()}
+    return arrays
+
+
 def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
     """The error to raise for what a script raised: its own, where it speaks for itself."""
     if isinstance(error, EthBrakeError) or is_ours(script):
@@ -259,10 +293,14 @@ def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle:
     return InvalidInput(f"{who}: {what} on {moment}: {describe_error(error)}")
 
 
-def within_capacity(command_mps2: Floats, worlds: Worlds, vehicle: int, script: Script) -> Floats:
-    """A script's command [n], refused with ``AgentFailed`` where it is not within the vehicle's capacities."""
+def within_capacity(
+    command_mps2: Floats, worlds: Worlds, vehicle: int, script: Script, due: Bools | None = None
+) -> Floats:
+    """A script's command [n], refused with ``AgentFailed`` where it is ``due`` and not within the capacities."""
     low, high = -worlds.vehicles.braking_capacity_mps2[:, vehicle], worlds.vehicles.driving_capacity_mps2[:, vehicle]
     good = (command_mps2 >= low) & (command_mps2 <= high)
+    if due is not None:
+        good |= ~due
     if not good.all():
         k = int(np.argmin(good))
         raise AgentFailed(

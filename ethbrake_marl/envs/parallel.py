@@ -22,10 +22,10 @@ from ethbrake_marl.envs.setup import (
     make_engine,
     restart,
 )
-from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.envs.turns import in_turns
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.observations import Observation, Observations
+from ethbrake_marl.observations.state import full_state, state_features
 from ethbrake_marl.physics import Ints
 from ethbrake_marl.rewards import Reward
 
@@ -88,6 +88,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         self.observation_spaces = {agent: feature_box(features) for agent in self.possible_agents}
         self.action_spaces = {agent: action_box() for agent in self.possible_agents}
         self.state_space = feature_box(state_features(self.engine.scenario))
+        self.np_random = np.random.default_rng()  # for wrappers that draw (SuperSuit's); nothing here does
         self._seeded = False
         self._started = False
 
@@ -103,7 +104,10 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
         """Start an episode; see ``envs.setup``."""
-        restart(self.engine, fresh_seed() if seed is None and not self._seeded else seed, options)
+        given = fresh_seed() if seed is None and not self._seeded else seed
+        restart(self.engine, given, options)
+        if given is not None:
+            self.np_random = np.random.default_rng(given)
         self._seeded = self._started = True
         self.agents = self.possible_agents[:]
         self.viewer.began()

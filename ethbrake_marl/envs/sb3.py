@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
@@ -27,16 +27,15 @@ from ethbrake_marl.envs.setup import (
     restart_from,
     warn_of_unknown,
 )
-from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Feature, Observation, Observations
+from ethbrake_marl.observations import Observation, Observations
+from ethbrake_marl.observations.state import Appended, full_state, row_features
 from ethbrake_marl.physics import Bools, Ints, Worlds, concatenate
 from ethbrake_marl.physics.rows import Packed, unpack
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import initial_state_worlds
 
 Rewards = NDArray[np.float32]
-Appended = Literal["number", "state"]
 
 
 def make_sb3_vec_env(
@@ -48,6 +47,7 @@ def make_sb3_vec_env(
     observation: Observation | None = None,
     horizon_is_end: bool = False,
     appended: Appended | None = None,
+    step_infos: bool = False,
 ) -> EthBrakeVecEnv:
     """``n_envs`` worlds for Stable-Baselines3.
 
@@ -62,7 +62,10 @@ def make_sb3_vec_env(
             horizon. Harm is counted to the horizon: nothing lies beyond it, and what is imagined there can grow without
             limit.
         appended: numbers of a row behind the vehicle's own observation. ``number``: the learner's place among the
-            learners (0 = the foremost); ``state``: the full state of the line (``envs.state``), for a central critic.
+            learners (0 = the foremost); ``state``: the full state of the line (``observations.state``), for a central
+            critic.
+        step_infos: infos tell what the other interfaces tell in every step, not at the end of an episode alone; that
+            costs time.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
@@ -72,7 +75,7 @@ def make_sb3_vec_env(
     check_seed(seed)
     engine = make_engine(scenario, n_envs, learners=learners, reward=reward, observation=observation)
     begin = fresh_seed() if seed is None else seed
-    return EthBrakeVecEnv(engine, begin, horizon_is_end=horizon_is_end, appended=appended)
+    return EthBrakeVecEnv(engine, begin, horizon_is_end=horizon_is_end, appended=appended, step_infos=step_infos)
 
 
 class EthBrakeVecEnv(VecEnv):
@@ -81,14 +84,15 @@ class EthBrakeVecEnv(VecEnv):
     With several learners all rows share one policy, and the rows of a world end together. All worlds take their
     episodes from one stream, as in ``EthBrakeVectorEnv``. At the end of an episode its rows' infos hold
     ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, steps ``l``; ``t`` is always 0, no
-    clock is read), and harm under both counts; all other infos are empty. Attributes and methods belong to the whole
-    batch: there are no environments inside.
+    clock is read), and harm under both counts; all other infos are empty, unless ``step_infos``. Attributes and
+    methods belong to the whole batch: there are no environments inside.
 
     Args:
         engine: the running worlds; ``make_sb3_vec_env`` makes them.
         seed: of the stream of worlds.
         horizon_is_end: as in ``make_sb3_vec_env``.
         appended: as in ``make_sb3_vec_env``.
+        step_infos: as in ``make_sb3_vec_env``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -105,15 +109,21 @@ class EthBrakeVecEnv(VecEnv):
     render_mode: str | None = None
 
     def __init__(
-        self, engine: Engine, seed: int, *, horizon_is_end: bool = False, appended: Appended | None = None
+        self,
+        engine: Engine,
+        seed: int,
+        *,
+        horizon_is_end: bool = False,
+        appended: Appended | None = None,
+        step_infos: bool = False,
     ) -> None:
-        if appended not in (None, *get_args(Appended)):
-            raise InvalidInput(f"appended = {appended!r}: must be {' or '.join(get_args(Appended))}, or None")
+        features = row_features(engine.observation.features, appended, engine.scenario)
         if not engine.learners:
             raise InvalidInput(f"scenario {engine.scenario.name!r} has no learner; pass learners=['vehicle_2']")
         self.engine = engine
         self.horizon_is_end = horizon_is_end
         self.appended = appended
+        self.step_infos = step_infos
         self._next_seed: int | None = seed
         self._learners = np.array(engine.learners, np.int64)
         self._actions: NDArray[Any] | None = None
@@ -122,7 +132,7 @@ class EthBrakeVecEnv(VecEnv):
         self._steps = np.zeros(rows, np.int64)
         self._begun = np.zeros(0)  # values of the report at each episode's beginning
         self._started = False
-        super().__init__(rows, feature_box(_row_features(engine, appended)), action_box())
+        super().__init__(rows, feature_box(features), action_box())
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Start the stream of ``seed`` at the next reset (None: fresh entropy); one stream serves all rows."""
@@ -164,7 +174,7 @@ class EthBrakeVecEnv(VecEnv):
         reward = step.reward.take(learners, axis=1).reshape(-1)
         self._return += reward
         self._steps += 1
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos = plain_infos(report(engine, step), learners) if self.step_infos else [{} for _ in range(self.num_envs)]
         over = engine.ended  # all that have ended: an interrupted step may have left some that nobody renewed
         ended = np.flatnonzero(over)
         if len(ended):
@@ -281,14 +291,3 @@ class EthBrakeVecEnv(VecEnv):
     def _refuse_some_rows(self, what: str, indices: VecEnvIndices) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):
             raise InvalidInput(f"{what}: indices {indices!r}; rows share one batch, so leave indices out")
-
-
-def _row_features(engine: Engine, appended: Appended | None) -> tuple[Feature, ...]:
-    """Every number of a row in order."""
-    own = engine.observation.features
-    if appended is None:
-        return own
-    if appended == "state":
-        return (*own, *state_features(engine.scenario))
-    last = len(engine.learners) - 1
-    return (*own, Feature("learner", "1", 1.0, 0.0, float(max(last, 1)), "the learner's place among the learners"))

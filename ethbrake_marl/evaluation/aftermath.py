@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.engine.stream import is_state_free
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.episode import decision_s, first_decision_s, onset_s
@@ -126,11 +128,13 @@ class SampledHarm:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
-        """What watches these worlds (at the alert); None with an obstacle, or if not just Vehicle 2 is driven.
+        """What watches these worlds (at the alert); None with an obstacle, or if others decide than Vehicle 2.
 
         The map knows no obstacle, and its samples are the decisions of Vehicle 2.
         """
         if task.vehicles != (VEHICLE_2,) or obstacle_ahead(worlds).any():
+            return None
+        if not all(map(is_state_free, script_agents(task.scenario, except_for=VEHICLE_2).values())):
             return None
         return cls(worlds, task.scenario)
 

@@ -134,8 +134,8 @@ def _range_of(scenario: Scenario, pair: int) -> Range:
 def _worlds_at(scenario: Scenario, gap_1_m: Floats, gap_2_m: Floats) -> Worlds:
     """Worlds with these first two gaps; everything else as the scenario fixes it."""
     columns = {"gap_1_m": gap_1_m, "gap_2_m": gap_2_m}
-    for field, pairs in (("gaps_m", range(2, scenario.vehicles - 1)), ("speeds_mps", range(scenario.vehicles))):
-        for i in pairs:
+    for field, rule in QUANTITIES.items():
+        for i in range(2 if field == "gaps_m" else 0, rule.count(scenario.vehicles)):
             low, high = scenario.bounds(field)[i]
             name = QUANTITIES[field].column_of(i)
             if low != high:
@@ -143,5 +143,6 @@ def _worlds_at(scenario: Scenario, gap_1_m: Floats, gap_2_m: Floats) -> Worlds:
                     f"scenario {scenario.name!r}: {name} is random, from {low:g} to {high:g}; a criticality map needs"
                     " everything but the first two gaps fixed (paper-distance is such a scenario)"
                 )
-            columns[name] = np.full(gap_1_m.size, low)
+            if field in ("gaps_m", "speeds_mps"):  # a table needs those; the rest it takes from the scenario
+                columns[name] = np.full(gap_1_m.size, low)
     return worlds_from_table(columns, scenario)

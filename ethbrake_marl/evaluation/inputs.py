@@ -103,7 +103,7 @@ def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenari
         scripts = script_agents(scenario, except_for=team.drivers)
         for vehicle, driver in team.drivers.items():
             set_others(driver, vehicle, scripts)
-            with naming_agent(name):
+            with naming_agent(name, [script.name for script in scripts.values()]):
                 _try_out(driver, worlds if getattr(driver, "state_free", False) else worlds.take([0]), vehicle)
 
 

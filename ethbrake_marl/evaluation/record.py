@@ -24,7 +24,7 @@ from ethbrake_marl.scenario import Scenario
 
 SAMPLE_S = 0.02
 
-Segment = tuple[Worlds, Floats, float]  # world (n = 1) at its start, constant command [1, N], time of its end
+Segment = tuple[Worlds, Floats, Floats]  # world (n = 1) at its start, constant command [1, N], time of its end [1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,12 +86,12 @@ def record_episode(
         raise InvalidInput(f"record_episode: sample_s = {sample_s}; must be finite and above 0")
     driven = controlled_vehicle(scenario, vehicle)
     engine = episode_engine(world, copy.deepcopy(agent), scenario, driven)
-    segments: list[Segment] = [(world, engine.worlds.command_mps2, float(engine.worlds.time_s[0]))]
+    segments: list[Segment] = list(engine.segments(world, engine.worlds.command_mps2))
     at_rest = False
     while not engine.ended.all():
         before = engine.worlds
         step = engine.step({})
-        segments.append((before, engine.wanted_mps2.copy(), float(engine.worlds.time_s[0])))
+        segments += engine.segments(before, engine.wanted_mps2.copy())
         at_rest = bool(step.terminated[0])
     if engine.roster.failed:
         raise PhysicsError(engine.roster.failed)
@@ -110,8 +110,8 @@ def _samples(segments: list[Segment], sample_s: float) -> Iterator[tuple[Floats,
     its position one more gap.
     """
     front = 0.0  # position of Vehicle 1 at the start of the segment
-    for number, (before, command, end) in enumerate(segments):
-        start = float(before.time_s[0])
+    for number, (before, command, until_s) in enumerate(segments):
+        start, end = float(before.time_s[0]), float(until_s[0])
         count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
         times = np.linspace(start, end, count + 1)
         post = with_post_ahead(before, np.array([end - start]))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents.knowledge import knowledge_of
 from ethbrake_marl.agents.protocol import check_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.engine.stream import check_alert
 from ethbrake_marl.errors import (
@@ -112,11 +112,12 @@ def _drive_all(
     """Let each agent drive every world, and note in which of them one of them fails."""
     parts: dict[str, list[_Part]] = {name: [] for name in agents}
     lost: dict[int, LeftOut] = {}
+    others = [script.name for script in script_agents(scenario, except_for=driven).values()]
     for name, agent in agents.items():
         chunk_of = _Chunk(sample.worlds, agent, driven, scenario, aftermath)
         for first in range(0, sample.worlds.n, chunk):
             rows = np.arange(first, min(first + chunk, sample.worlds.n))
-            with naming_agent(name):
+            with naming_agent(name, others):
                 outcome, kept, failed = leaving_out_failed(chunk_of.roll_out, rows)
             lost = {row: LeftOut(int(sample.index[row]), seed, name, why) for row, why in failed.items()} | lost
             if outcome is not None:

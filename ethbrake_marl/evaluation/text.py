@@ -149,8 +149,18 @@ def left_out_line(worlds: Sequence[str], whole: int) -> str:
 
 
 def warning_lines(rows: Sequence[SummaryRow]) -> list[str]:
-    """That a table of best known harm does not hold some of these worlds, as a sentence; none where it is complete."""
-    return [f"WARNING: {rows[0].distance.warning}."] if rows and rows[0].distance.warning else []
+    """That a table of best known harm lacks some of these worlds, and where the horizon cut a motion off, as sentences.
+
+    None where all is well.
+    """
+    lines = [f"WARNING: {rows[0].distance.warning}."] if rows and rows[0].distance.warning else []
+    moving = [f"{row.agent} {row.horizon_ends:,}" for row in rows if row.horizon_ends]
+    if moving:
+        lines.append(
+            f"At the horizon ({rows[0].parameters['horizon_s']:g} s) something still moved, and what came after counts"
+            f" nowhere; worlds, of {rows[0].episodes:,}: {', '.join(moving)}."
+        )
+    return lines
 
 
 def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:

@@ -43,6 +43,10 @@ class Wording:
         """What is needed at ``path``, where it is missing."""
         raise TypeError(f"{type(self).__name__} does not say what its files need")
 
+    def instead(self, key: str) -> str:
+        """What there is in place of a key that such files do not have; empty where nothing is known of it."""
+        return ""
+
     def owner(self, path: YamlPath) -> str:
         """Whose value stands at ``path``, in words; empty where that needs no saying."""
         return ""
@@ -103,7 +107,7 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
         inside = wording.known(path)
         if path[-1] in inside:
             return f"{place}: does not go with what stands beside it; a quantity has one distribution"
-        hint = suggestion(str(path[-1]), inside) or f"known: {', '.join(inside)}"
+        hint = wording.instead(str(path[-1])) or suggestion(str(path[-1]), inside) or f"known: {', '.join(inside)}"
         return f"{place}: unknown key; {hint}"
     if detail["type"] == "missing":
         return f"{place}: missing; {wording.needed(path)}"

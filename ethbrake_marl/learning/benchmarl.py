@@ -1,7 +1,8 @@
 """The line as a TorchRL environment and a BenchMARL task; needs the extra ``marl``.
 
 Every world of the batch is a row of one engine. The learners are one group, which ends together: ``done`` belongs to
-the world, so nobody's end cuts off the others. The critic's ``state`` is the full state of the line (``envs.state``).
+the world, so nobody's end cuts off the others. The critic's ``state`` is the full state of the line
+(``observations.state``).
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MultiAgentMLP
 
 from ethbrake_marl.envs.setup import feature_box, make_engine, resolve_scenario
-from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.learning.algorithms.ppo import PpoRecipe
 from ethbrake_marl.learning.model_state import own_random_state
 from ethbrake_marl.learning.run_folder import create_run, write_status
 from ethbrake_marl.learning.team_file import team_content
 from ethbrake_marl.learning.training import resolve
 from ethbrake_marl.observations import observation_for
+from ethbrake_marl.observations.state import full_state, state_features
 from ethbrake_marl.policies.actor import Float32s
 from ethbrake_marl.policies.manifest import NetworkSpec, installed_versions, observation_schema
 from ethbrake_marl.policies.policy import Policy, make_policy, save_policy

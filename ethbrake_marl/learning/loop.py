@@ -18,6 +18,7 @@ from ethbrake_marl.learning.algorithms.protocol import Algorithm
 from ethbrake_marl.learning.model_state import Model
 from ethbrake_marl.learning.progress import (
     AT_HORIZON,
+    OBJECTIVE,
     RETURN,
     Course,
     check_losses,
@@ -27,9 +28,11 @@ from ethbrake_marl.learning.progress import (
 )
 from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.learning.training import Training
+from ethbrake_marl.objectives import objective_harm
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.team import Trained
 from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.rewards import resolved_objective
 from ethbrake_marl.scenario import Scenario
 
 # Column of the log -> info of an episode's end; means over the episodes since the last row, exploration included.
@@ -212,20 +215,28 @@ class BetweenUpdates(BaseCallback):
 def measure_on_list(training: Training) -> Evaluate:
     """What measures the learners' policies on the recipe's fixed list: the means that ``evaluate`` gives on it.
 
-    These alone: no bound is proven and no best known harm is looked up, as nobody is shown them.
+    These alone: no bound is proven and no best known harm is looked up, as nobody is shown them. Where a learner has
+    another objective than total, also what each one's makes of the harm, and the mean of these.
     """
     recipe, scenario = training.recipe, training.scenario
+    objectives = resolved_objective(recipe.reward, scenario.objective, scenario.vehicles)[1]
     worlds = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
 
     def measure(trained: Trained) -> dict[str, float]:
         agents = {"policy": driver_of(trained, scenario)}
         outcome = evaluate(worlds, agents, scenario=scenario, aftermath=False).outcome("policy")
-        return {
+        metrics = {
             "first_impact_harm": mean(outcome.first_impact_harm).value,
             "total_harm": mean(outcome.total_harm).value,
             "collision_rate": float(outcome.collided.mean()),
             AT_HORIZON: float((~outcome.at_rest).mean()),
         }
+        if objectives:
+            harm = objective_harm(outcome.ledger, recipe.reward.harm_count, objectives)
+            each = {scenario.vehicle_names[i]: mean(harm[:, i]).value for i in scenario.learners}
+            metrics[OBJECTIVE] = sum(each.values()) / len(each)
+            metrics |= {f"{OBJECTIVE}_{name}": value for name, value in each.items()}
+        return metrics
 
     return measure
 

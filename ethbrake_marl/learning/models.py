@@ -7,6 +7,7 @@ from collections.abc import Callable
 from stable_baselines3.common.policies import BasePolicy
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.algorithms.networks import tensors_of
 from ethbrake_marl.learning.algorithms.protocol import Algorithm
 from ethbrake_marl.learning.model_state import Model
@@ -20,6 +21,11 @@ from ethbrake_marl.policies.team import PolicyTeam, Trained
 def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVecEnv) -> Model:
     """The model of a training, whose optimisers refuse gradients that are not finite."""
     model = algorithm.build(training, environment)
+    if getattr(model, "get_vec_normalize_env", lambda: None)() is not None:
+        raise InvalidInput(
+            f"algorithm {training.recipe.algorithm!r}: its model is trained under VecNormalize, whose statistics are no"
+            " part of a policy bundle; observations here are scaled already"
+        )
     watch_gradients(model, algorithm)
     return model
 

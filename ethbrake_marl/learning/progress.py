@@ -19,6 +19,7 @@ from ethbrake_marl.learning.model_state import Model
 from ethbrake_marl.policies.team import Trained
 
 HARM_METRIC: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
+OBJECTIVE = "objective"  # mean over the learners of their objectives' harm, where one is another than total
 RETURN = "episode_return"
 AT_HORIZON = "horizon_rate"  # share of the fixed list's episodes in which something still moves at the horizon
 
@@ -35,8 +36,8 @@ CUT_OFF = 0.5  # or any harm that has risen, with so many more of the episodes c
 class Course:
     """The last good policy, the best one, and the evaluations on the way.
 
-    The best is that of least harm on the fixed list, in the ``harm_count`` of the reward, not that of highest
-    return; where no harm is measured there is none.
+    The best is that of least harm on the fixed list, by the learners' objectives and in the ``harm_count`` of the
+    reward, not that of highest return; where no harm is measured there is none.
     """
 
     harm_count: HarmCount = "first"
@@ -65,7 +66,7 @@ class Course:
         """Take in an evaluation of ``policy``; gives the alarm, if this one raises it."""
         extra = {} if episode_return is None else {RETURN: episode_return}
         self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **extra})
-        name = HARM_METRIC[self.harm_count]
+        name = chosen_by(self.evaluations, self.harm_count)
         if name in metrics and metrics[name] < self.best_harm:
             self.best, self.best_harm = policy, metrics[name]
         self.lost = lost_training(self.evaluations, name)
@@ -91,6 +92,12 @@ class Course:
         self.wall_before_s = float(content["wall_s"])
 
 
+def chosen_by(evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
+    """Name of what the best policy has least of: the objective, or the line's harm where an evaluation tells none."""
+    found = evaluations and all(entry.get(prefix + OBJECTIVE) not in (None, "") for entry in evaluations)
+    return prefix + (OBJECTIVE if found else HARM_METRIC[harm_count])
+
+
 def misleading_return(evaluations: Sequence[Mapping[str, float]], harm: str) -> str | None:
     """The alarm if each of the last three evaluations has more return, and more harm, than each of the three before.
 
@@ -105,7 +112,7 @@ def misleading_return(evaluations: Sequence[Mapping[str, float]], harm: str) -> 
     if not all(min(e[name] for e in now) > max(e[name] for e in before) for name in (RETURN, harm)):
         return None
     (gained, harmed), (gains, harms) = ([_mean(part, name) for name in (RETURN, harm)] for part in (before, now))
-    if not harms > (1.0 + RISEN) * harmed:
+    if not harms > harmed + RISEN * abs(harmed):
         return None
     return (
         f"step {int(last[-1]['steps']):,}: since step {int(before[-1]['steps']):,} the return rose from {gained:.4g} to"
@@ -132,7 +139,7 @@ def lost_training(evaluations: Sequence[Mapping[str, float]], harm: str) -> str 
     limit = max(TIMES_LEAST * least[harm], least[harm] + GIVEN_BACK * (measured[0][harm] - least[harm]))
 
     def is_lost(entry: Mapping[str, float]) -> bool:
-        risen = entry[harm] > (1.0 + RISEN) * least[harm]
+        risen = entry[harm] > least[harm] + RISEN * abs(least[harm])
         return entry[harm] > limit or (risen and _cut_off_since(least, entry) > CUT_OFF)
 
     if not all(is_lost(entry) for entry in measured[-LOST_AFTER:]):

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from ethbrake_marl.envs.sb3 import Appended, EthBrakeVecEnv, make_sb3_vec_env
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.durable import remove_unfinished
 from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
@@ -23,6 +23,7 @@ from ethbrake_marl.learning.run_folder import RunDirectory, create_run, has_fini
 from ethbrake_marl.learning.session import Ended, Session
 from ethbrake_marl.learning.team_file import team_content
 from ethbrake_marl.learning.training import Training, check_run_plugins, resolve, training_in
+from ethbrake_marl.observations.state import Appended
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.team import Trained, drivers_of

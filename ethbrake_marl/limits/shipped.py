@@ -66,4 +66,7 @@ def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
             f" at most {MOST_CANDIDATES:,}"
         )
     budget = int(number) if settings.most_candidates is None else min(int(number), settings.most_candidates)
-    return BestHarm(shipped_profiles, harm_count=settings.harm_count, horizon_s=settings.horizon_s, budget=budget)
+    return BestHarm(
+        shipped_profiles, harm_count=settings.harm_count, horizon_s=settings.horizon_s, budget=budget,
+        time_step_s=settings.time_step_s,
+    )  # fmt: skip

@@ -84,8 +84,8 @@ def first_decision_s(worlds: Worlds, deciders: Sequence[int]) -> Floats:
     return first
 
 
-def number_of_decisions(first_s: Floats, time_step_s: float, horizon_s: float) -> Floats:
-    """How many decisions fall before the horizon, the first one at ``first_s``; of the shape of ``first_s``."""
+def number_of_decisions(first_s: Floats, time_step_s: float, horizon_s: Floats | float) -> Floats:
+    """How many decisions fall before the horizon, or another time, the first one at ``first_s``, whose shape it has."""
     return np.ceil((horizon_s - first_s) / time_step_s - _ROUNDING)
 
 

@@ -103,12 +103,14 @@ def chance(key: float, link: int, number: float) -> float:
 
 
 @compiled
-def hear_rows(moving: Floats, params: Floats, wanted: Floats, until_s: Floats, time_step_s: float) -> None:
+def hear_rows(
+    moving: Floats, params: Floats, wanted: Floats, until_s: Floats, decision_s: Floats, time_step_s: float
+) -> None:
     """Take the messages' columns of every world from its time in ``moving`` to ``until_s`` [n], in place.
 
     ``moving`` [n, S] are the worlds as they were, and go along; ``wanted`` [n, N] is what the vehicles want meanwhile.
-    Samples are taken every ``time_step_s``, counted back from ``until_s``. A world that cannot be advanced hears
-    nothing.
+    Samples are taken every ``time_step_s``, counted back from the next decision at ``decision_s`` [n]; who stops before
+    it measures the present, and that sample is not kept. A world that cannot be advanced hears nothing.
     """
     N = vehicles_in(moving)
     head = messages_at(N)
@@ -121,12 +123,17 @@ def hear_rows(moving: Floats, params: Floats, wanted: Floats, until_s: Floats, t
         if told[TAKEN] == 0.0:
             _start(moving[k], told, N, wanted[k], params[k, params_at(2, N) :])
         while moving[k, TIME] < until_s[k]:
-            left = math.ceil((until_s[k] - moving[k, TIME]) / time_step_s - 1e-6) - 1.0
-            end = until_s[k] - max(left, 0.0) * time_step_s
+            left = math.ceil((decision_s[k] - moving[k, TIME]) / time_step_s - 1e-6) - 1.0
+            end = decision_s[k] - max(left, 0.0) * time_step_s
+            stops = end > until_s[k]
+            if stops:
+                end = until_s[k]
             if not _move(moving[k], params[k], wanted[k], end, table, no_rows):
                 break
             _sample(moving[k], told, N)
             _receive(moving[k], told, N)
+            if stops:
+                told[TAKEN] -= 1.0
 
 
 @compiled

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput, WithoutEffect, unknown_name
 from ethbrake_marl.files.messages import first_mistake
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.objectives import Declared, Objective, check_declared, objectives_of
@@ -21,11 +23,16 @@ def _none(value: dict[str, float]) -> bool:
     return not value
 
 
+def _refuse(key: str, right: str) -> NoReturn:
+    raise PydanticCustomError("reward", "{right}", {"right": right, "value": "", "at": (key,)})
+
+
 class RewardParams(BaseModel):
     """Weights of the terms and their constants; a weight of 0 switches a term off.
 
     Args:
-        harm, collision, risk, jerk, terminal, shaping: weights, at least 0, of the terms that the folder's head lists.
+        harm, collision, risk, jerk, terminal, shaping: weights, at least 0, of the terms that the folder's head lists;
+            harm must be given beside any other.
         harm_count: impacts that count, ``first`` of each pair or ``total``.
         objective: whose harm counts, one name or one for each vehicle; None: the scenario's.
         shaping_discount: the learner's own discount, in (0, 1].
@@ -89,6 +96,17 @@ class RewardParams(BaseModel):
                 raise ValueError(str(error).removeprefix("objective: ")) from None
         return value
 
+    @model_validator(mode="after")
+    def _harm_is_meant(self) -> Self:
+        """Harm weighs 1 by default, and an objective is about harm: neither may hold without being meant."""
+        given = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
+        beside = [name for name, weight in self.weights.items() if weight > 0.0 and name in given]
+        if beside and "harm" not in given:
+            _refuse("harm", f"is left out, and would weigh 1 beside {beside[0]}; say harm: 1, or 0 for none")
+        if self.objective is not None and self.harm == 0.0:
+            _refuse("objective", "changes the term harm alone, whose weight is 0; give that a weight, or leave it out")
+        return self
+
     def weight(self, term: str) -> float:
         """The weight of a term of the table, registered or not."""
         found: float = self.terms[term] if term in self.terms else self.__dict__.get(term, 0.0)
@@ -141,7 +159,8 @@ def resolved_objective(
 ) -> tuple[RewardParams, tuple[Objective, ...]]:
     """The reward with its objective settled (the scenario's where it has none), and that of each vehicle.
 
-    Everybody's harm alike, the usual one, is ``None`` and no objectives: it needs no telling apart.
+    Everybody's harm alike, the usual one, is ``None`` and no objectives: it needs no telling apart. So is any where
+    harm weighs nothing, with a warning (``WithoutEffect``).
     Raises ``InvalidInput`` for an objective that does not fit the number of vehicles.
     """
     declared = of_scenario if params.objective is None else params.objective
@@ -149,7 +168,11 @@ def resolved_objective(
         objectives = objectives_of(declared, vehicles)
     except InvalidInput as error:  # the scenario's was found to fit when it was made
         raise InvalidInput(f"reward: {error}") from None
-    if all(objective.kind == "total" for objective in objectives):
+    usual = all(objective.kind == "total" for objective in objectives)
+    if not usual and params.harm == 0.0:
+        what = f"the scenario's objective, {declared if isinstance(declared, str) else ', '.join(declared)},"
+        warnings.warn(WithoutEffect(f"{what} changes nothing: this reward gives harm no weight"), stacklevel=2)
+    if usual or params.harm == 0.0:
         return params.model_copy(update={"objective": None}), ()
     return params.model_copy(update={"objective": declared}), objectives
 
@@ -163,4 +186,5 @@ def _from_settings(settings: Mapping[str, Any]) -> RewardParams:
         return RewardParams(**settings)
     except ValidationError as error:
         first = first_mistake(error)
-        raise InvalidInput(f"reward: {first.place.removeprefix('terms.')} = {first.given!r}: {first.right}") from None
+        given = "" if isinstance(first.given, dict) else f" = {first.given!r}"  # the whole of it is to be read there
+        raise InvalidInput(f"reward: {first.place.removeprefix('terms.')}{given}: {first.right}") from None

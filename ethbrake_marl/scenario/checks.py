@@ -171,7 +171,9 @@ def _check_speeds(scenario: ScenarioFields) -> None:
         if scenario.line_speed_mps is None:
             speed = scenario.quantities("speeds_mps")[i]
             refuse(_path(scenario, "speeds_mps", i), speed, f"must not be above {limit}")
-        right = f"with speed_deviations_mps vehicle_{i + 1} drives {low:g} to {high:g} m/s; must be 0 to {limit}"
+        drives = f"vehicle_{i + 1} drives {low:g}" + ("" if low == high else f" to {high:g}")
+        deviates = "with speed_deviations_mps " if "speed_deviations_mps" in scenario.model_fields_set else ""
+        right = f"{deviates}{drives} m/s; must be 0 to {limit}"
         refuse(("line_speed_mps",), scenario.line_speed_mps, right)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import Document, flow_text
-from ethbrake_marl.scenario.fields import ScenarioFields
+from ethbrake_marl.scenario.fields import Member, ScenarioFields
 from ethbrake_marl.scenario.quantities import ALTERNATIVES
 from ethbrake_marl.scenario.sample import Sample, join_samples
 from ethbrake_marl.scenario.sampling import Channel, check_request, draw_numbers, uniform_numbers
@@ -59,7 +59,8 @@ def build_members(
 
 
 def _is_whole(entry: Any) -> bool:
-    return isinstance(entry, dict) and isinstance(entry.get("scenario"), dict)
+    known = Member.model_fields.keys()  # else the schema names the key that is not
+    return isinstance(entry, dict) and isinstance(entry.get("scenario"), dict) and entry.keys() <= known
 
 
 def member_content(member: ScenarioFields) -> dict[str, Any]:
@@ -72,6 +73,7 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
     """What one member says but its texts, with what stands beside the mixture, each on its line."""
     own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}
     inside = {path[3:]: line for path, line in document.lines.items() if path[:3] == ("mixture", i, "scenario")}
+    own = {**{key: document.content[key] for key in ("vehicles",) if key in document.content}, **own}
     above = {path: line for path, line in document.lines.items() if path and path[0] in beside}
     where = f"{document.file}: mixture[{i}] ({own.get('name', 'without a name')})"
     return Document(where, changed_content(own, beside), {**inside, **above})

@@ -46,6 +46,12 @@ class ScenarioWording(Wording):
             return list(V2X.model_fields)
         return list(_INSIDE[outer]) if outer == "normal" else sorted({*DISTRIBUTIONS, "weights"})
 
+    def instead(self, key: str) -> str:
+        """What the model has in place of friction: what each vehicle's brakes can on that road."""
+        if "friction" not in key and key != "mu":
+            return ""
+        return "the model has no friction; braking_capacity_mps2 is what brakes and road allow, about 9.81 x friction"
+
     def needed(self, path: YamlPath) -> str:
         """What is needed at ``path``, with an example."""
         key = path[-1]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -39,6 +40,7 @@ from ethbrake_marl.shield.told import by_vehicle
 from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
 
 Bound = Literal["coupled", "pairwise"]
+CLOCK = 1e-6  # of a time step: rounding of the clock of whoever asks
 
 
 class HybridAgent(AgentAround):
@@ -193,6 +195,8 @@ class StepShieldAgent(AgentAround):
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The certified command, [n] m/s2. Asked again at the same moment, it says the same.
 
+        In a world whose episode is over as far as the shield foretold, it is full braking.
+
         Raises ``UncertifiedStep`` where a decision was left out.
         """
         return self.act_all(worlds, vehicle, {vehicle: self.policy})
@@ -232,9 +236,12 @@ class StepShieldAgent(AgentAround):
             self.predicted_harm, self._wanted, self._first_s = (
                 values[: worlds.n] for values in (self.predicted_harm, self._wanted, self._first_s)
             )
-        self._follow(worlds.time_s)
+        self._follow(self._on_grid(worlds.time_s))
         if self._asked is None:
-            due = self._due(worlds)
+            if (worlds.time_s != (time_s := self._on_grid(worlds.time_s))).any():
+                worlds = replace(worlds, time_s=time_s)
+            finished = shield.running.finished
+            due = self._due(worlds) & ~finished
             proposed = proposed_actions(policies, worlds, isinstance(vehicle, int))
             proposer = Proposer(policies, worlds) if self._later_rollouts else None
             certified = shield.propose(proposed, seen=state_columns(worlds), only=due, proposer=proposer)
@@ -243,6 +250,8 @@ class StepShieldAgent(AgentAround):
             command = columns[0] if isinstance(vehicle, int) else np.stack(columns, axis=1)
             wanted = self._wanted.copy()
             wanted[due] = command[due]
+            for c, i in enumerate(shield.vehicles):  # nothing is certified after its own end: it holds the brakes
+                by_vehicle(wanted, shield.vehicles)[finished, c] = -worlds.vehicles.braking_capacity_mps2[finished, i]
             self._asked = _Asked(worlds.time_s, certified, wanted)
         return self._asked.wanted.copy()
 
@@ -268,6 +277,12 @@ class StepShieldAgent(AgentAround):
                 " commands on unchanged, and ask it at every decision"
             )
         shield.distrusted = shield.distrusted | wrong
+
+    def _on_grid(self, time_s: Floats) -> Floats:
+        """The times [n] without the last rounding of whoever keeps the clock: 6 x 0.1 s is the decision at 0.6 s."""
+        assert self.shield is not None and self.shield.running is not None
+        due_s = decision_s(self._first_s, self.scenario.time_step_s, self.shield.running.steps)
+        return np.where(np.abs(time_s - due_s) <= CLOCK * self.scenario.time_step_s, due_s, time_s)
 
     def _due(self, worlds: Worlds) -> Bools:
         """Where a decision is due now, [n]. Raises ``UncertifiedStep`` where one was due, and nobody asked."""

@@ -135,6 +135,8 @@ def _baseline(settings: Settings, worlds: Worlds, running: Running) -> Floats:
 
     if isinstance(settings.vehicle, int):
         return np.repeat(alone(settings.vehicle)[:, np.newaxis], settings.width, axis=1)
+    if members > 1:  # a team of one vehicle: no other team is shielded against uncertainty
+        return held(alone(vehicles[0])[:, np.newaxis], settings.width)
     braking = np.full((worlds.n, len(vehicles)), -1.0)
     best, least = braking, plan_harm(running, held(braking, settings.width))
     for c, vehicle in enumerate(vehicles):
@@ -159,8 +161,9 @@ def _better(running: Running, best: Floats, least: Floats, action: Floats, width
 
 
 def _descend(running: Running, action: Floats) -> None:
-    """Improve constant actions [n, K] in place, one vehicle after the other."""
+    """Improve constant actions [n, K] in place, one vehicle after the other; of worlds with one member each."""
     problem = running.problem
+    assert len(running.states) == len(action)  # the kernel does not look
     descend_constants(
         running.states, running.steps, running.ended, problem.clock, problem.bounds, problem.command, problem.latency,
         problem.mass, problem.limit, no_caps(problem.n), problem.vehicles, GRID, ROUNDS, action,

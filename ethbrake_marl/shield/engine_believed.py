@@ -16,7 +16,6 @@ from ethbrake_marl.shield.believed import BelievedShield
 from ethbrake_marl.shield.certify import REASONS
 from ethbrake_marl.shield.engine_shield import Attached, Proposing, Sent
 from ethbrake_marl.shield.options import ShieldOptions
-from ethbrake_marl.shield.rollouts import proposed_actions
 from ethbrake_marl.shield.settings import proposing_agents, shielded_vehicles
 from ethbrake_marl.shield.told import told_before
 
@@ -59,15 +58,11 @@ class AttachedBelieved(Attached):
         decision = None if self.sent is None else self.believed.decision
         return np.zeros(self.engine.n, np.bool_) if decision is None else decision.intervened
 
-    def proposal(self) -> Floats:
-        """What the policy itself would do now, as actions [n]."""
-        if self.policies is None:
-            raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
-        return proposed_actions(self.policies, self.engine.worlds, True)
-
     def decide(self, proposed: Floats) -> Floats:
         """The actions [n] to apply instead of those proposed; the engine applies them."""
         memory, engine = self.believed, self.engine
+        if self.remembering:
+            self.ask_policies()
         after, worlds = memory.branch(), engine.worlds
         command = after.decide(worlds, self.vehicle, lambda: np.asarray(proposed, np.float64), self.policies)
         applied = command_to_action(command, worlds.vehicles, self.vehicle)

@@ -78,16 +78,16 @@ class AttachedHybrid(Attached):
 
         A proposal counts as replaced where it differs by more than the rounding of its 32 bits.
         """
-        assert self.sent is not None
-        applied = float(self.sent.applied[k])
+        assert self.sent is not None and isinstance(self.sent.memory, EpisodeChoice)
+        applied, hybrid = float(self.sent.applied[k]), self.sent.memory.hybrid  # now the next episode may have begun
         return {
             "mode": "episode",
             "proposed_action": proposed,
             "chosen_action": applied,
             "intervened": abs(applied - proposed) > ROUNDING,
-            "chosen_policy": bool(self.hybrid.chosen_policy[k]),
-            "policy_harm": float(self.hybrid.policy_harm[k]),
-            "bound_harm": float(self.hybrid.bound_harm[k]),
+            "chosen_policy": bool(hybrid.chosen_policy[k]),
+            "policy_harm": float(hybrid.policy_harm[k]),
+            "bound_harm": float(hybrid.bound_harm[k]),
         }
 
     def start_info(self, k: int, c: int = 0) -> dict[str, Any]:

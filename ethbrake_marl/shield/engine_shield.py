@@ -27,7 +27,7 @@ from ethbrake_marl.agents.learned import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.stream import begin_script
+from ethbrake_marl.engine.stream import begin_script, is_state_free
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.rows import params_at
@@ -72,12 +72,17 @@ class Attached(ABC):
     Every learner is shielded: one, or in mode ``step`` several. Raises ``InvalidInput`` for another number.
     """
 
+    policies: Mapping[int, Agent] | None = None  # who proposes where nobody else does
+
     def __init__(self, engine: Engine, options: ShieldOptions, memory: object) -> None:
         self.engine = engine
         self.options = options
         self.vehicle = shielded_vehicles(engine, options.where, options.mode)
         self.vehicles = (self.vehicle,) if isinstance(self.vehicle, int) else self.vehicle
         self.sent: Sent | None = None
+        policies = (self.policies or {}).values()
+        self.remembering = any(getattr(policy, "remembers", not is_state_free(policy)) for policy in policies)
+        self._own: tuple[object, Floats] | None = None  # the memory then, and what the policies would do
         self._left = memory
         self.closed = False
         engine.watch(self, memory)
@@ -151,9 +156,22 @@ class Attached(ABC):
     def running(self) -> bool:
         """Whether any episode has begun."""
 
-    @abstractmethod
+    def ask_policies(self) -> Floats | None:
+        """What the policies themselves would do now, as actions, [n] of one vehicle or [n, K]; None without any.
+
+        Each is asked once per decision; one that remembers is asked whoever proposes.
+        """
+        if self.policies is not None and (self._own is None or self._own[0] is not self.memory):
+            single = isinstance(self.vehicle, int)
+            self._own = self.memory, proposed_actions(self.policies, self.engine.worlds, single)
+        return None if self._own is None else self._own[1]
+
     def proposal(self) -> Floats:
         """What stands for a proposal where nobody makes one, as actions [n]; NaN where none is needed."""
+        own = self.ask_policies()
+        if own is None:
+            raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
+        return own
 
     @abstractmethod
     def decide(self, proposed: Floats) -> Floats:
@@ -223,15 +241,11 @@ class AttachedShield(Attached):
         """What was decided last."""
         return None if self.sent is None or self.sent.certified is None else self.sent.certified.decision
 
-    def proposal(self) -> Floats:
-        """What the policies themselves would do now, as actions, [n] of one vehicle or [n, K]."""
-        if self.policies is None:
-            raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
-        return proposed_actions(self.policies, self.engine.worlds, isinstance(self.vehicle, int))
-
     def decide(self, proposed: Floats) -> Floats:
         """The actions to apply instead of those proposed, [n] of one vehicle or [n, K]; the engine applies them."""
         engine, shield = self.engine, self.shield
+        if self.remembering:
+            self.ask_policies()
         proposer = None if self.policies is None else Proposer(self.policies, engine.worlds)
         certified = shield.propose(proposed, seen=seen_columns(engine.packed), only=~engine.ended, proposer=proposer)
         applied = certified.decision.applied

@@ -72,8 +72,17 @@ def policies_of(
 
 
 def engine_of(env: object, interface: type, where: str, maker: str) -> Engine:
-    """The engine of one of this package's environments, whatever wraps it; ``InvalidInput`` for another interface."""
+    """The engine of one of this package's environments, whatever wraps it.
+
+    Raises ``InvalidInput`` for another interface, and where a shield follows that engine already.
+    """
     engine = getattr(getattr(env, "unwrapped", env), "engine", None)
+    for watcher in engine.watchers if isinstance(engine, Engine) else ():
+        if (options := getattr(watcher, "options", None)) is not None:
+            raise InvalidInput(
+                f"{where}: a {options.where} (mode {options.mode}) shields this environment already, and its bound"
+                " holds for one shield alone; give that one other options, or close() it first"
+            )
     if not (isinstance(env, interface) and isinstance(engine, Engine)):
         raise InvalidInput(f"{where}: {env} is not one of this package's environments ({maker})")
     return engine

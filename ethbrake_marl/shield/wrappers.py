@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
-from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
 from ethbrake_marl.actions import checked_action
@@ -65,12 +65,9 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         **options: Any,
     ) -> None:
         settings = read_options("HybridShield", {"mode": mode, **options})
-        if isinstance(env, AECEnv):
-            raise InvalidInput(
-                "HybridShield: takes the parallel environment (eb.parallel_env); with agents acting in turn it is"
-                " eb.shielded_aec(eb.parallel_env(...))"
-            )
-        engine = engine_of(env, ParallelEnv, "HybridShield", "eb.parallel_env")
+        engine = engine_of(
+            env, ParallelEnv, "HybridShield", "eb.parallel_env; with agents acting in turn eb.shielded_aec(that)"
+        )
         super().__init__(env)
         self._engine = engine
         names = engine.scenario.vehicle_names
@@ -138,8 +135,6 @@ def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, 
 
     ``env`` is the parallel environment: in AEC all actions of a step are known only when the last agent has acted.
     """
-    if isinstance(env, AECEnv):
-        raise InvalidInput("shielded_aec: give the parallel environment (eb.parallel_env), not the AEC one")
     return in_turns(HybridShield(env, *args, **settings))
 
 

@@ -8,6 +8,7 @@ import pickle
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents import agent_names, make_agent, optimise_coupled, optimise_pairwise, register_agent, registry
 from ethbrake_marl.agents.protocol import PredictingAgent
 from ethbrake_marl.agents.registry import agent_entries
@@ -192,8 +193,8 @@ def test_register_agent__makes_names_and_policies_known(monkeypatch):
         seen.append((argument, settings.policy, settings.harm_count))
         return make_agent("coast")
 
-    register_agent("mine", factory)
-    register_agent("mine", factory)
+    register_agent("mine", factory, takes_policy=True)
+    register_agent("mine", factory, takes_policy=True)
     for spec in ("mine", "mine:x", "mine@my-run", "mine:x@C:/runs/my run@2"):
         make_agent(spec, harm_count="total")
     assert [each[:2] for each in seen] == [(None, None), ("x", None), (None, "my-run"), ("x", "C:/runs/my run@2")]
@@ -206,3 +207,40 @@ def test_register_agent__makes_names_and_policies_known(monkeypatch):
     for name in ("mine:x", "mine@x", "mine+step"):
         with pytest.raises(InvalidInput, match="must be a plain name"):
             register_agent(name, factory)
+
+
+def test_registered__takes_a_policy_only_where_it_says_so(monkeypatch):
+    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
+    register_agent("leads", lambda argument, settings: make_agent(f"constant:{argument}"))
+    register_agent("learned", lambda argument, settings: make_agent(f"constant:{settings.policy}"), takes_policy=True)
+    assert make_agent("learned@2").name == "constant:2"
+    scenario = eb.load_scenario("paper-random").replace(early_impacts="keep")
+    for role in ("leads:3@anything", "leads@anything"):
+        with pytest.raises(InvalidInput, match=r"leads takes no policy; register_agent\(..., takes_policy=True\) says"):
+            make_agent(role)
+        with pytest.raises(InvalidInput, match="leads takes no policy"):
+            eb.parallel_env(scenario.replace(roles={"vehicle_1": role, "vehicle_2": "learner"}))
+
+
+def test_ladder__as_one_agent_says_what_it_stands_for():
+    with pytest.raises(InvalidInput, match="agent 'ladder': stands for several agents in --agents; here one is needed"):
+        make_agent("ladder")
+
+
+def test_role__that_commands_beyond_its_capacity_is_blamed_itself(monkeypatch):
+    class Beyond:
+        name = "beyond"
+
+        def begin(self, worlds, vehicle, rows):
+            pass
+
+        def act(self, worlds, vehicle):
+            return np.full(worlds.n, -99.0)
+
+    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
+    register_agent("beyond", lambda argument, settings: Beyond())
+    scenario = eb.load_scenario("paper-random").replace(
+        early_impacts="keep", roles={"vehicle_1": "beyond", "vehicle_2": "learner"}
+    )
+    with pytest.raises(InvalidInput, match=r"agent 'beyond', world 0, vehicle_1 at 0.00 s: command -99 m/s2"):
+        eb.evaluate(scenario.sample(3, 7), {"mine": make_agent("full_brake")}, scenario=scenario)

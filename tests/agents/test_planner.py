@@ -5,7 +5,7 @@ import pytest
 
 from ethbrake_marl.agents import make_agent, optimise_coupled
 from ethbrake_marl.agents.planner import Planner
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics import Worlds
@@ -68,3 +68,14 @@ def test_planner__starts_new_episodes_in_some_rows(worlds: Worlds) -> None:
 def test_planner__refuses_a_budget_that_is_none(argument: str) -> None:
     with pytest.raises(InvalidInput, match="candidates per decision"):
         Planner(argument)
+
+
+@pytest.mark.parametrize("spec", ["planner:30", "best_harm:100"])
+@pytest.mark.parametrize("time_step_s", [0.05, 0.2])
+def test_search__decides_when_its_scenario_does(spec, time_step_s):
+    scenario = load_scenario("paper-random").replace(time_step_s=time_step_s)
+    agent = make_agent(spec, scenario=scenario)
+    harm = drive(scenario.sample(20, 7).worlds, agent, scenario, 1).ledger.world_harm("first")
+    assert (harm <= agent.predicted_harm + 1e-9).all()
+    role = scenario.replace(early_impacts="keep", roles={"vehicle_2": spec, "vehicle_3": "learner"})
+    assert script_agents(role)[1]._time_step_s == time_step_s

@@ -193,6 +193,119 @@ def test_memory__behind_every_shield_keeps_the_bound(around):
         assert (harm[agent.chosen_policy] == alone[agent.chosen_policy]).all() and agent.chosen_policy.any()
 
 
+class Recurrent:
+    """A model with the interface of sb3-contrib's recurrent ones, which brakes harder with every step."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        if state is None:
+            state = (np.zeros((1, len(observation), 1), np.float32),)
+        steps = np.where(np.asarray(episode_start)[None, :, None], 0.0, state[0]) if episode_start is not None else 0.0
+        steps = steps + np.zeros((1, len(observation), 1), np.float32)
+        return -np.minimum(steps[0], 10.0) / 10.0, (steps + 1.0,)
+
+
+def test_recurrent_model__keeps_its_state_world_by_world():
+    agent, same = eb.policy_agent(Recurrent()), eb.policy_agent(ramp, initial_state=no_memory)
+    for each in (agent, same):
+        each.begin(WORLDS, 1, np.arange(12))
+    for step in range(5):
+        assert agent.act(WORLDS, 1).tolist() == same.act(WORLDS, 1).tolist()
+        if step == 2:
+            for each in (agent, same):
+                each.begin(WORLDS.take([4, 7]), 1, np.array([4, 7]))
+    rows = np.array([7, 3])
+    assert agent.take(rows).act(WORLDS.take(rows), 1).tolist() == same.take(rows).act(WORLDS.take(rows), 1).tolist()
+    assert harms(agent).tolist() == harms(same).tolist()
+
+
+def test_recurrent_model__whose_state_has_no_axis_of_worlds_is_refused():
+    class Shared(Recurrent):
+        def predict(self, observation, **asked):
+            return super().predict(observation)[0], np.zeros((1, 8))
+
+    with pytest.raises(InvalidInput, match=r"'Shared': predict on 27 features: .* shape \(1, 8\) for two worlds"):
+        eb.policy_agent(Shared())
+
+
+def test_model_trained_under_vec_normalize__drives_by_what_was_counted():
+    stable = pytest.importorskip("stable_baselines3")
+    normalised = stable.common.vec_env.VecNormalize(eb.make_sb3_vec_env("paper-random", 4), clip_obs=2.0)
+    model = stable.PPO("MlpPolicy", normalised, n_steps=64, batch_size=256, n_epochs=1, seed=1).learn(256)
+
+    def with_statistics(seen):
+        return model.predict(normalised.normalize_obs(seen), deterministic=True)[0]
+
+    agent = eb.policy_agent(model)
+    assert harms(agent).tolist() == harms(eb.policy_agent(with_statistics)).tolist()
+    before, mean = policy_sha256(agent), normalised.obs_rms.mean.copy()
+    normalised.obs_rms.mean = mean + 1.0
+    assert policy_sha256(agent) not in (before, None)
+    normalised.obs_rms.mean = mean
+    assert policy_sha256(agent) == before  # asking has counted nothing
+    assert harms(eb.policy_agent(model.policy)).tolist() != harms(agent).tolist()  # the statistics do matter
+
+
+def test_model_of_actions_that_mean_something_else__is_refused():
+    stable, gymnasium = pytest.importorskip("stable_baselines3"), pytest.importorskip("gymnasium")
+    model = stable.PPO("MlpPolicy", gymnasium.wrappers.RescaleAction(eb.EthBrakeEnv(), np.float32(0), np.float32(1)))
+    with pytest.raises(InvalidInput, match=r"gives actions in Box\(0.0, 1.0, .*here they mean \[-1, 1\]"):
+        eb.policy_agent(model)
+
+
+def test_model_that_has_its_environment__observes_what_it_was_trained_on(model):
+    stable, wrappers = pytest.importorskip("stable_baselines3"), pytest.importorskip("gymnasium").wrappers
+    other = eb.ObservationSpec(front=2, rear=0)  # as many features as the usual ones
+    assert other.size == eb.ObservationSpec().size
+    settings = {"env_kwargs": {"observation": other}}
+    for rows in (
+        eb.make_sb3_vec_env("paper-random", 2, observation=other),
+        stable.common.env_util.make_vec_env("EthBrake-v0", **settings),
+    ):
+        theirs = stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=8)
+        assert eb.policy_agent(theirs).observation.front == 2
+        for settings in ({"scenario": SCENARIO}, {"observation": eb.ObservationSpec()}):
+            with pytest.raises(InvalidInput, match=r"trained on other features than ObservationSpec\(front=1, rear=1"):
+                eb.policy_agent(theirs, **settings)
+    rows = stable.common.env_util.make_vec_env("EthBrake-v0", wrapper_class=wrappers.NormalizeObservation)
+    with pytest.raises(InvalidInput, match="trained under NormalizeObservation, which this agent knows nothing of"):
+        eb.policy_agent(stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=8))
+
+
+@pytest.mark.parametrize(("layer", "setting"), [("Dropout", 0.5), ("BatchNorm1d", 4)])
+def test_torch_module__that_draws_or_mixes_worlds_must_be_in_evaluation_mode(layer, setting):
+    torch = pytest.importorskip("torch")
+    module = torch.nn.Sequential(
+        torch.nn.Linear(27, 4), getattr(torch.nn, layer)(setting), torch.nn.Linear(4, 1), torch.nn.Tanh()
+    )
+    with pytest.raises(InvalidInput, match=rf"{layer} is in training mode, .* call eval\(\) of the module first"):
+        eb.policy_agent(module)
+    agent = eb.policy_agent(module.eval())
+    assert harms(agent).tolist() == harms(agent).tolist()
+
+
+@pytest.mark.parametrize("appended", ["number", "state"])
+def test_model_trained_on_rows_with_something_appended__drives_as_there(appended):
+    stable = pytest.importorskip("stable_baselines3")
+    scenario = eb.load_scenario("cooperation-3-pair")
+    rows = eb.make_sb3_vec_env(scenario, 4, seed=3, appended=appended)
+    model = stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=16, n_epochs=1, seed=1)
+    with pytest.raises(InvalidInput, match=r"scenario, observation, or appended \(number or state"):
+        eb.policy_agent(model.policy, scenario=scenario)
+    with pytest.raises(InvalidInput, match="needs the scenario that it was trained in"):
+        eb.policy_agent(model.policy, appended=appended)
+    told = {"scenario": scenario, "appended": appended}  # a model that has its environment needs none of it
+    agents = {1: eb.policy_agent(model.policy, **told), 2: eb.policy_agent(model)}
+    assert agents[1].knows == (eb.agents.knowledge.Source.STATE if appended == "state" else "messages")
+    team = drive(scenario.sample(4, 3, channel="training").worlds, eb.Team(agents, "theirs"), scenario)
+    rows.seed(3)  # the model has set its own
+    seen, over, harm = rows.reset(), np.zeros(4, bool), np.full(4, np.nan)
+    while not over.all():
+        seen, _, done, infos = rows.step(model.predict(seen, deterministic=True)[0])
+        for k in np.flatnonzero(done[::2] & ~over):
+            over[k], harm[k] = True, infos[2 * k]["world_first_impact_harm"]
+    assert team.ledger.world_harm("first") == pytest.approx(harm, rel=1e-4, abs=1e-4)
+
+
 def failing(observation):
     if (observation[:, 0] == observation_of_world(7)).any():
         raise RuntimeError("not this one")

@@ -150,7 +150,7 @@ def test_own_agent__is_evaluated_and_shielded_from_the_users_own_file(tmp_path, 
     assert rows["half_brake+step"]["first_impact_harm"] <= rows["half_brake"]["first_impact_harm"]
     assert run_command(["agents", "--json"]) == 0
     listed = {row["agent"]: row for row in json.loads(capsys.readouterr().out)}
-    assert listed["half_brake[:ARGUMENT][@POLICY]"]["about"] == "half of what the brakes can"
+    assert listed["half_brake[:ARGUMENT]"]["about"] == "half of what the brakes can"
     with pytest.raises(UnknownName, match="did you mean 'half_brake'"):
         make_agent("half_break")
 

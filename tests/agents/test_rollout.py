@@ -5,12 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.registry import make_agent, register_agent
 from ethbrake_marl.agents.rollout import drive, script_agents
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.setup import make_engine
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.evaluation.dataset.recording import Task, record_episodes
+from ethbrake_marl.evaluation.film import film_scenes
+from ethbrake_marl.evaluation.motion import follow_episodes
+from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.observations import observation_for, observe
+from ethbrake_marl.physics import advance
+from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent
 
@@ -127,3 +135,85 @@ def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
     for seen in agent.seen[:3]:
         assert engine.observe(1).tobytes() == seen.tobytes()
         engine.step(np.full((20, 1), -0.5))
+
+
+def test_drive__a_policy_as_a_role_does_what_it_does_when_it_is_driven():
+    def with_roles(**roles):
+        return PAPER.replace(early_impacts="keep", roles={"vehicle_1": "full_brake", **roles})
+
+    universal, braking = make_agent("universal@shipped"), make_agent("full_brake")
+    driven = with_roles(vehicle_2="learner", vehicle_3="full_brake")
+    role = with_roles(vehicle_2="universal@shipped", vehicle_3="learner")
+    both = with_roles(vehicle_2="learner", vehicle_3="learner")
+    worlds = driven.sample(20, 7).worlds
+    harm = drive(worlds, universal, driven, 1).ledger.world_harm("first")
+    for episodes in (
+        drive(worlds, braking, role, 2),
+        drive(worlds, Team({1: universal, 2: braking}, "both"), both),
+    ):
+        assert np.abs(episodes.ledger.world_harm("first") - harm).max() < 1e-9
+    assert 0.0 < harm.mean() < drive(worlds, braking, driven, 1).ledger.world_harm("first").mean()
+
+
+class Swinging:
+    """Brakes the harder the later it is: every decision is another command."""
+
+    name = "swinging"
+
+    def begin(self, worlds, vehicle, rows):
+        pass
+
+    def act(self, worlds, vehicle):
+        return -worlds.vehicles.braking_capacity_mps2[:, vehicle] * (0.3 + 0.6 * np.sin(7.0 * worlds.time_s) ** 2)
+
+
+def make_swinging(argument, settings):
+    return Swinging()
+
+
+@pytest.fixture
+def swinging():
+    """Lines whose first and last vehicle follow a script that decides within the steps of Vehicle 2."""
+    register_agent("swinging", make_swinging)
+    roles = {"vehicle_1": "swinging", "vehicle_2": "learner", "vehicle_3": "swinging"}
+    latency = [0.04, 0.5, {"uniform": [0.2, 0.9]}]
+    return PAPER.replace(early_impacts="keep", roles=roles, latency_s=latency, gaps_m=4)
+
+
+def test_drive__shows_every_part_of_a_step_within_which_nobody_decides(swinging):
+    class Replay:
+        def __init__(self, worlds):
+            self.now, self.harm = worlds, np.zeros((worlds.n, 2))
+
+        def see(self, before, command_mps2, until_s):
+            assert np.array_equal(before.gaps_m, self.now.gaps_m) or np.allclose(before.gaps_m, self.now.gaps_m)
+            self.now, impacts = advance(before, command_mps2, until_s=until_s)
+            self.harm += np.stack([impacts.first_impact_harm.sum(axis=1), impacts.total_harm.sum(axis=1)], axis=1)
+
+    worlds = swinging.sample(30, 7).worlds
+    replay = Replay(worlds)
+    episodes = drive(worlds, make_agent("universal@shipped"), swinging, 1, watched_by=[replay])
+    assert np.abs(replay.now.gaps_m - episodes.final.gaps_m).max() < 1e-9
+    for k, count in enumerate(("first", "total")):
+        assert np.abs(replay.harm[:, k] - episodes.ledger.world_harm(count)).max() < 1e-9
+    assert episodes.ledger.world_harm("total").max() > 1.0
+
+
+def test_record__motion_and_dataset_follow_scripts_that_decide_within_a_step(swinging):
+    sample = swinging.sample(4, 7)
+    agent = make_agent("constant:3")
+    outcome = evaluate(sample, {"it": agent}, scenario=swinging).outcome("it")
+    motions = follow_episodes(sample.worlds, agent, swinging)
+    task = Task(swinging, 7, RewardParams(), observation_for(swinging))
+    recording = record_episodes(sample, agent, "it", task)
+    assert outcome.sampled_harm is None  # its samples are the decisions of Vehicle 2 alone
+    for k, motion in enumerate(motions):
+        record = record_episode(sample.worlds.take([k]), agent, scenario=swinging)
+        for impacts in (record.impacts, motion.impacts):
+            assert (impacts.closing_speed_mps**2).sum() == pytest.approx(outcome.total_harm[k])
+        assert record.gaps_m[-1] == pytest.approx(outcome.final.gaps_m[k])
+        last = recording.positions_m[recording.decisions[k], k]
+        assert record.positions_m[-1] == pytest.approx(last, abs=1e-6)
+        scene = film_scenes(sample.worlds.take([k]), agent, scenario=swinging)[-1]
+        assert scene.total_harm == pytest.approx(outcome.total_harm[k])
+        assert scene.front_m[0] == pytest.approx(last[0], abs=1e-6)

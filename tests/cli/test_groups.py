@@ -6,6 +6,8 @@ import csv
 import json
 from pathlib import Path
 
+from ethbrake_marl.scenario import scenario_path
+
 
 def test_by__tells_every_group_and_writes_it_down(ethbrake, tmp_path: Path):
     out = tmp_path / "w.csv"
@@ -38,6 +40,24 @@ def test_by__what_cannot_be_is_one_line_before_the_work(ethbrake):
 def test_validate__counts_types_and_scenarios(ethbrake):
     assert "; vehicle_1_type: car 714, truck 197, van 89;" in ethbrake("scenario", "validate", "realistic-mixed").out
     assert "; scenario: paper-delay-high 332, paper-delay-low" in ethbrake("scenario", "validate", "mixture-delays").out
+
+
+def test_validate__tells_what_may_not_be_meant(ethbrake, tmp_path: Path):
+    assert "note:" not in ethbrake("scenario", "validate", "paper-random").out
+    text = Path(scenario_path("paper-random")).read_text()
+    odd = tmp_path / "odd.yaml"
+    text = text.replace("name: paper-random", "name: odd").replace("horizon_s: 8", "horizon_s: 2")
+    odd.write_text(text.replace("latency_s: [0, ", "latency_s: [0.3, "))
+    answer = ethbrake("scenario", "validate", str(odd))
+    assert answer.status == 0
+    assert "at the horizon (2 s) something still moves in 1,000 of them" in answer.out
+    assert "Vehicle 1, whose braking is the alert, has a latency above 0 in 1,000 of them" in answer.out
+    told = json.loads(ethbrake("scenario", "validate", str(odd), "--json").out)
+    assert (told["moving_at_horizon"], told["vehicle_1_late"], told["worlds"]) == (1000, 1000, 1000)
+    table = ethbrake("evaluate", "--scenario", str(odd), "--agents", "full_brake", "--episodes", "20").out
+    assert "something still moved, and what came after counts nowhere; worlds, of 20: full_brake 20." in (
+        " ".join(table.split())
+    )
 
 
 def test_set__changes_every_scenario_of_a_mixture(ethbrake):

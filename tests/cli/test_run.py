@@ -120,6 +120,7 @@ def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake, fini
         assert row == {**then[names.get(row["agent"], row["agent"])], "agent": row["agent"]}
 
 
+@pytest.mark.slow
 def test_run_json__prints_the_rows_alone_and_force_replaces(ethbrake, tiny_recipe, finished_run, tmp_path):
     folder = tmp_path / "again"
     shutil.copytree(finished_run, folder)
@@ -145,6 +146,7 @@ def test_train__names_its_folder_after_scenario_recipe_and_seed(ethbrake, tiny_r
     assert run_json(Path("runs/mine"))["status"] == "finished"
 
 
+@pytest.mark.slow
 def test_run__vehicle_chooses_among_several_learners(ethbrake, tiny_recipe, scenario_file, tmp_path):
     scenario = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: learner\n")
     chosen = ["--scenario", scenario, "--vehicle", "vehicle_3", "--episodes", "20", "--output", tmp_path / "new"]
@@ -203,6 +205,7 @@ def ctrl_c_when(monkeypatch: pytest.MonkeyPatch, *moments: Callable[[dict[str, A
     monkeypatch.setattr("ethbrake_marl.cli.terminal.Bars", Pressing)
 
 
+@pytest.mark.slow
 def test_run_interrupted__the_policy_so_far_is_evaluated(ethbrake, tiny_recipe, tmp_path, monkeypatch):
     ctrl_c_when(monkeypatch, lambda shown: shown["done"] == 256)
     folder = tmp_path / "stopped"

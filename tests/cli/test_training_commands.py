@@ -82,6 +82,7 @@ def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_rec
     refused(ethbrake("resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
 
 
+@pytest.mark.slow
 def test_resume__an_interrupted_run_goes_on_as_a_training(ethbrake, tiny_recipe, tmp_path, monkeypatch):
     folder = tmp_path / "stopped"
     with monkeypatch.context() as patch:
@@ -92,6 +93,7 @@ def test_resume__an_interrupted_run_goes_on_as_a_training(ethbrake, tiny_recipe,
     assert (run_json(folder)["status"], run_json(folder)["steps"]) == ("finished", 256)
 
 
+@pytest.mark.slow
 def test_run__with_sac_calls_its_policy_so(ethbrake, tiny_sac, tmp_path):
     answer = ethbrake("run", "--recipe", tiny_sac, "--episodes", "20", "--output", tmp_path / "new", "--json")
     assert answer.status == 0

@@ -16,8 +16,8 @@ from ethbrake_marl.scenario import initial_state_worlds, load_scenario
 PAPER = load_scenario("paper-random").replace(early_impacts="keep")
 
 
-def engine(n=2, third=None, seed=0):
-    scripts = {0: make_agent("full_brake"), 2: third or make_agent("constant:5")}
+def engine(n=2, third=None, seed=0, first=None):
+    scripts = {0: first or make_agent("full_brake"), 2: third or make_agent("constant:5")}
     return Engine(PAPER, n, learners=(1,), scripts=scripts, seed=seed)
 
 
@@ -46,13 +46,13 @@ class Remembering:
         return np.full(worlds.n, -5.0)
 
 
-@pytest.mark.parametrize("third", [None, Remembering()])
-def test_reset__that_fails_leaves_the_running_episodes_alone(third):
-    running, twin = engine(third=third), engine(third=third)
+@pytest.mark.parametrize("first", [None, Remembering()])
+def test_reset__that_fails_leaves_the_running_episodes_alone(first):
+    running, twin = engine(first=first), engine(first=first)
     for one in (running, twin):
         one.step({1: np.zeros(2)})
     before = state(running)
-    with pytest.raises(InvalidInput, match=r"constant:5|vehicle_3"):
+    with pytest.raises(InvalidInput, match=r"constant:5|vehicle_1"):
         running.reset(seed=9, worlds=too_weak(2))
     assert state(running) == before
     assert running.seed == 0
@@ -147,3 +147,84 @@ def test_ended__rows_are_paid_nothing_until_they_are_renewed():
         assert (paid[over] == 0.0).all() and (paid[~over] != 0.0).any(axis=1).all()
         paid_after[over] += 1
     assert (paid_after > 0).all()
+
+
+class Counting:
+    """Brakes with 5 m/s2 plus a little for each decision it has made; notes when it made them."""
+
+    name = "counting"
+
+    def __init__(self, n, adds=0.1):
+        self.made, self.asked_s, self.adds = np.zeros(n, np.int64), np.zeros((n, 99)), adds
+
+    def begin(self, worlds, vehicle, rows):
+        self.made[rows], self.asked_s[rows] = 0, 0.0
+
+    def act(self, worlds, vehicle):
+        self.asked_s[np.arange(worlds.n), self.made] = worlds.time_s
+        self.made += 1
+        return -5.0 - self.adds * (self.made % 7)
+
+
+OWN_GRID = PAPER.replace(latency_s=[0.03, {"uniform": [0.2, 0.7]}, 0.55], horizon_s=3.0)
+
+
+@pytest.mark.parametrize("learners", [(1,), (2,), (1, 2), ()])
+def test_script__decides_on_its_own_grid_whoever_learns(learners):
+    worlds = OWN_GRID.sample(5, 3).worlds
+    counting = Counting(5)
+    others = {i: make_agent("full_brake") for i in (1, 2) if i not in learners}
+    running = Engine(OWN_GRID, 5, learners=learners, scripts={0: counting, **others}, worlds=worlds)
+    paid = 0.0
+    while not running.ended.all():
+        paid = paid + running.step(np.full((5, len(learners)), -1.0)).reward[:, 0]
+    ledger = running.ledger.world_harm("first")
+    assert np.abs(paid + ledger).max() < 1e-9 and ledger.max() > 1.0
+    for row, end_s in enumerate(running.worlds.time_s):
+        made = decisions_before(end_s)
+        assert counting.made[row] == made
+        assert counting.asked_s[row, :made] == pytest.approx(0.03 + 0.1 * np.arange(made), abs=1e-9)
+    scripts = {0: Counting(5), 1: make_agent("full_brake"), 2: make_agent("full_brake")}
+    alone = Engine(OWN_GRID, 5, learners=(), scripts=scripts, deciders=(0,), worlds=worlds)
+    while not alone.ended.all():
+        alone.step({})
+    assert np.abs(alone.ledger.world_harm("first") - ledger).max() < 1e-9
+
+
+def decisions_before(end_s):
+    return int(np.ceil((end_s - 0.03) / 0.1 - 1e-9))
+
+
+def test_script__of_which_a_row_is_renewed_remembers_the_others_as_they_were():
+    counting = Counting(4)
+    scripts = {0: counting, 2: make_agent("full_brake")}
+    running = Engine(OWN_GRID, 4, learners=(1,), scripts=scripts, seed=1)
+    for _ in range(4):
+        running.step(np.zeros((4, 1)))
+    made, wanted, packed = counting.made.copy(), running.wanted_mps2.copy(), running.packed.state.copy()
+    running.renew(np.array([1]))
+    start_s = running.packed.state[1, 0]
+    expected = np.where(np.arange(4) == 1, decisions_before(start_s), made)
+    assert counting.made.tolist() == expected.tolist()
+    for row in (0, 2, 3):
+        assert running.wanted_mps2[row].tolist() == wanted[row].tolist()
+        assert running.packed.state[row].tolist() == packed[row].tolist()
+
+
+def test_script__that_never_changes_its_mind_changes_no_bit():
+    runs = []
+    for third in (Counting(20, adds=0.0), make_agent("constant:5")):
+        running = Engine(OWN_GRID, 20, learners=(1,), scripts={0: make_agent("full_brake"), 2: third}, seed=5)
+        rng = np.random.default_rng(0)
+        runs.append([running.step(rng.uniform(-1.0, 1.0, (20, 1))).reward for _ in range(20)])
+        runs[-1] += [running.worlds.gaps_m, running.worlds.speeds_mps, running.ledger.total_harm]
+    assert all(np.array_equal(a, b) for a, b in zip(*runs, strict=True))
+
+
+def test_jerk__of_a_learner_is_counted_over_the_step_though_a_script_decides_within_it():
+    runs = []
+    for first in (Counting(3), make_agent("full_brake")):
+        scripts = {0: first, 2: make_agent("full_brake")}
+        running = Engine(OWN_GRID, 3, learners=(1,), scripts=scripts, reward={"harm": 0.0, "jerk": 1.0}, seed=5)
+        runs.append([running.step(np.full((3, 1), action)).further["jerk"][:, 1] for action in (-1.0, 0.5, -0.3, 1.0)])
+    assert np.array_equal(*runs) and np.any(runs[0])

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from pettingzoo.utils.conversions import aec_to_parallel
 
+import ethbrake_marl as eb
 from ethbrake_marl.envs.parallel import EthBrakeParallelEnv, env, parallel_env, raw_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from tests.contract.interfaces import FIVE, PAPER, actions
@@ -333,3 +336,30 @@ def test_rewards__do_not_tell_the_harm_before_the_first_decision() -> None:
         _, rewards, _, _, infos = environment.step({"vehicle_2": act(-1.0)})
         told += rewards["vehicle_2"]
     assert -told == near(infos["vehicle_2"]["world_first_impact_harm"] - 12.0)
+
+
+def test_supersuit__frame_skip_draws_from_the_seed_of_the_reset() -> None:
+    supersuit = pytest.importorskip("supersuit")
+
+    def played() -> list[float]:
+        env = supersuit.frame_skip_v0(parallel_env(scenario="cooperation-3-pair", agents="learners"), (1, 4))
+        env.reset(seed=5)
+        times = []
+        while env.agents:
+            infos = env.step({agent: np.array([-1.0], np.float32) for agent in env.agents})[4]
+            times.append(infos["vehicle_2"]["time_s"])
+        return times
+
+    assert played() == played() and len(set(np.diff(played()).round(6))) > 1
+
+
+def test_gymnasium__which_vector_wrappers_take_same_step_is_what_the_page_says() -> None:
+    wrappers = gymnasium.wrappers.vector
+    page = (Path(__file__).resolve().parents[2] / "docs" / "environment.md").read_text("utf-8")
+    for wrap in (wrappers.NormalizeReward, wrappers.RecordEpisodeStatistics, wrappers.ClipAction):
+        wrap(eb.EthBrakeVectorEnv(2, autoreset_mode="SameStep")).reset(seed=1)
+    for wrap in (wrappers.NormalizeObservation, wrappers.FlattenObservation):
+        assert f"`{wrap.__name__}`" in page
+        wrap(eb.EthBrakeVectorEnv(2)).reset(seed=1)
+        with pytest.raises(ValueError, match="SAME_STEP"):
+            wrap(eb.EthBrakeVectorEnv(2, autoreset_mode="SameStep"))

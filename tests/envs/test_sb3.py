@@ -10,8 +10,8 @@ from stable_baselines3.common.vec_env import VecMonitor
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.envs.single import EthBrakeEnv
-from ethbrake_marl.envs.state import full_state
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.observations.state import full_state
 from tests.contract.interfaces import FIVE, PAPER, actions, initial_state
 from tests.envs.lines import CRASH, REST
 
@@ -272,3 +272,23 @@ def test_appended__stands_behind_the_own_observation_in_every_row(appended: Any)
             assert appended == "state" or last[own] == row % 2
             ended += 1
     assert ended > 0
+
+
+def test_step_infos__tell_each_learner_in_every_step_what_the_parallel_environment_tells() -> None:
+    learners = ["vehicle_2", "vehicle_3"]
+    vec = make_sb3_vec_env("paper-random", 2, seed=3, learners=learners, step_infos=True)
+    plain = make_sb3_vec_env("paper-random", 2, seed=3, learners=learners)
+    env = parallel_env("paper-random", learners=learners)
+    vec.reset(), plain.reset(), env.reset(seed=3)
+    ended, cost = False, 0.0
+    while not ended:
+        actions = np.full((4, 1), -0.7, np.float32)
+        *_, dones, infos = vec.step(actions)
+        *_, infos_of_plain = plain.step(actions)
+        *_, told = env.step(dict.fromkeys(learners, actions[0]))
+        ended = bool(dones[0])
+        for row, name in enumerate(learners):
+            assert {key: infos[row][key] for key in told[name]} == told[name]
+        cost += infos[0]["cost"]
+        assert ended or infos_of_plain[:2] == [{}, {}]
+    assert infos[0].keys() == infos_of_plain[0].keys() and cost == pytest.approx(infos[0]["world_first_impact_harm"])

@@ -35,14 +35,14 @@ def test_between__by_hand() -> None:
 def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
     found = bounds_of(shipped("stress-wide"))
     assert found.proven is not None and (found.worlds, found.list_seed) == (5000, 7)
-    assert found.gap(found.best_known_first) == pytest.approx(0.058, abs=5e-4)
-    assert found.gap(found.best_known_total) == pytest.approx(0.123, abs=5e-4)
+    assert found.gap(found.best_known_first) == pytest.approx(0.057, abs=5e-4)
+    assert found.gap(found.best_known_total) == pytest.approx(0.122, abs=5e-4)
     inside = found.proven.between
     assert found.proven.contact_proven_rate - found.proven.impact_proven_rate == pytest.approx(inside.rate)
     assert inside.mean_first is not None and inside.mean_first > 0.9  # nobody leans there
     assert inside.harmless_rate is not None and inside.harmless_rate < 0.55
     (_, _, line) = shipped_lines([found])
-    assert "| 5.8 % |" in line and "| 12.3 % |" in line
+    assert "| 5.7 % |" in line and "| 12.2 % |" in line
     told = json.loads(json.dumps(found.to_json()))
     assert told["gap_total"] == found.gap(found.best_known_total)
     assert told["proven"]["between"]["rate"] == inside.rate

@@ -130,7 +130,7 @@ def test_weight__is_the_usual_one_where_a_reward_does_not_say() -> None:
     assert reward_params({"harm": 1.0}).terms == {"mine": 0.25}
     assert reward_params({"mine": 0.0}).terms == {"mine": 0.0}
     assert reward_params("harm").terms == {}
-    settled = eb.RewardParams(terms={"mine": 3.0})
+    settled = eb.RewardParams(harm=1.0, terms={"mine": 3.0})
     assert eb.RewardParams(**settled.model_dump()) == settled and settled.weight("mine") == 3.0
     assert reward_params({"harm": 0.0, "terms": {"mine": 2}}).weights["mine"] == 2.0
 
@@ -179,7 +179,7 @@ def test_term__counts_in_running_worlds_only() -> None:
         for _ in range(90):
             engine.step(-np.ones((1, 1)))
     eb.register_term("calm", one)
-    ending = eb.make_sb3_vec_env(SCENARIO, 2, reward={"calm": 1.0}).unwrapped.engine
+    ending = eb.make_sb3_vec_env(SCENARIO, 2, reward={"harm": 1.0, "calm": 1.0}).unwrapped.engine
     while not ending.ended.all():
         last = ending.step(-np.ones((2, 1)))
     again = ending.step(-np.ones((2, 1)))

@@ -108,5 +108,8 @@ def test_map__refuses_what_it_cannot_draw(agents: dict, options: dict, message: 
 def test_map__refuses_one_gap_and_random_speeds(pair: Scenario, paper_random: Scenario) -> None:
     with pytest.raises(InvalidInput, match="one gap"):
         criticality_map(pair, FULL)
+    late = DISTANCE.replace(latency_s={"uniform": [0.2, 0.5]})
+    with pytest.raises(InvalidInput, match=r"latency_1_s is random, from 0.2 to 0.5.*needs everything but the first"):
+        criticality_map(late, FULL, cells=2)
     with pytest.raises(InvalidInput, match=r"speed_1_mps is random, from 18 to 22.*paper-distance"):
         criticality_map(paper_random, FULL)

@@ -88,6 +88,19 @@ def test_own_algorithm__trains_resumes_bit_for_bit_and_is_evaluated(tmp_path: Pa
     assert harms[0] == harms[1] == pytest.approx(min(e["first_impact_harm"] for e in result.evaluations))
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_own_algorithm__under_vec_normalize_is_refused_as_no_bundle_holds_its_statistics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    own = sys.modules["my_algorithm"].A2c
+    build = own.build
+    monkeypatch.setattr(own, "build", lambda self, training, rows: build(self, training, VecNormalize(rows)))
+    with pytest.raises(InvalidInput, match="'a2c': its model is trained under VecNormalize, whose statistics are no"):
+        train(_file(tmp_path), SCENARIO, tmp_path / "run")
+
+
 def test_own_algorithm__its_class_checks_the_recipe(tmp_path: Path) -> None:
     loaded = load_recipe(_file(tmp_path))
     assert type(loaded).__name__ == "A2cRecipe" and loaded.rounds == 8

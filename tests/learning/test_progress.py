@@ -122,6 +122,27 @@ def test_course__the_best_is_judged_by_the_count_of_the_reward(policy) -> None:
     }  # fmt: skip
 
 
+def test_course__the_best_and_the_alarms_go_by_the_objective_where_one_is_told(policy) -> None:
+    by_steps = [policy.__class__(policy.manifest.model_copy(update={"steps": k}), policy.tensors) for k in range(4)]
+    course, alarms = Course(), []
+    for each, line, objective in zip(by_steps, (24.0, 30.0, 20.0, 18.0), (8.0, 0.1, 6.0, 7.0), strict=True):
+        metrics = {"first_impact_harm": line, "objective": objective, "objective_vehicle_2": objective}
+        alarms.append(course.add_evaluation(each, metrics, None))
+    assert course.kept is by_steps[1] and course.best_harm == 0.1
+    assert alarms[:3] == [None] * 3 and "objective is 7, and was 0.1" in alarms[3]
+    adversary = Course()  # an amount below 0 that falls is no harm that has risen
+    for k, each in enumerate([*by_steps, *by_steps]):
+        assert adversary.add_evaluation(each, {"first_impact_harm": 20.0 + k, "objective": -20.0 - k}, float(k)) is None
+    assert adversary.best_harm == -27.0
+
+
+def test_course__that_was_begun_without_an_objective_goes_on_by_harm(policy) -> None:
+    course = Course()
+    course.add_evaluation(policy, {"first_impact_harm": 9.0}, None)
+    course.add_evaluation(policy, {"first_impact_harm": 9.5, "objective": 1.0}, None)
+    assert course.best_harm == 9.0
+
+
 def test_course__comes_back_from_its_json(policy) -> None:
     course = Course()
     course.add_evaluation(policy, {"first_impact_harm": 9.0}, None)

@@ -182,6 +182,7 @@ def train_and_die(name: str, folder: Path) -> int:
     return subprocess.run([sys.executable, "-c", program, name, str(folder)], check=False).returncode
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_resume__after_kill_9_the_weights_are_the_same(
     name: str, whole: Callable[[str], tuple[Path, TrainResult]], tmp_path: Path

@@ -22,6 +22,7 @@ from ethbrake_marl.evaluation import outcome as outcome_module
 from ethbrake_marl.learning import train as train_module
 from ethbrake_marl.learning.progress import TrainingDiverged
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of, shipped_recipes
+from ethbrake_marl.objectives import objective_harm, objectives_of
 from ethbrake_marl.policies.policy import Policy, load_policy
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario import load_scenario
@@ -355,3 +356,24 @@ def test_train__on_a_terminal_rewrites_one_line(tmp_path, capsys, monkeypatch):
     train_module.train(TINY_PPO.replace(total_steps=256), "paper-random", tmp_path / "run")
     told = capsys.readouterr().err
     assert told.count("\n") == 1 and told.endswith("\n") and told.count("\r") > 1
+
+
+def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tmp_path: Path) -> None:
+    objectives = ["total", "own", "weighted:0.001,0.001,1"]
+    scenario = SCENARIO.replace(
+        objective=objectives, roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "learner"}
+    )
+    recipe = TINY_PPO.replace(total_steps=6 * 128, evaluation={"every_updates": 1, "worlds": 10, "seed": 7})
+    result = train_module.train(recipe, scenario, tmp_path / "run", on_progress=None)
+    rows = [row for row in _rows(tmp_path / "run" / "progress.csv") if row["eval/objective"]]
+    best = min(result.evaluations, key=lambda each: each["objective"])
+    worlds = scenario.sample(10, 7).worlds
+    kept = load_policy(tmp_path / "run" / "policy")
+    assert len(rows) == len(result.evaluations) > 3 and kept.manifest.steps == best["steps"]
+    ledger = evaluate(worlds, {"kept": LearnedAgent(kept)}, scenario=scenario).outcome("kept").ledger
+    for name, vehicle in (("vehicle_2", 1), ("vehicle_3", 2)):
+        harm = objective_harm(ledger, "first", objectives_of(objectives, 3))[:, vehicle].mean()
+        assert best[f"objective_{name}"] == pytest.approx(harm)
+    assert best["objective"] == (best["objective_vehicle_2"] + best["objective_vehicle_3"]) / 2
+    plain = train_module.train(recipe, SCENARIO, tmp_path / "plain", on_progress=None)
+    assert not any("objective" in name for name in plain.evaluations[0])

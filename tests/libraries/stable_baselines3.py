@@ -10,7 +10,12 @@ LIBRARY = Library(
     title="Stable-Baselines3",
     package="stable-baselines3",
     requires=("stable-baselines3==2.9.2",),
-    about=("The native `VecEnv` is the fast way: all worlds are advanced together, with no environment in between."),
+    about=(
+        "The native `VecEnv` is the fast way: all worlds are advanced together, with no environment in between. "
+        "`VecNormalize` and sb3-contrib's recurrent models drive as they were trained ([a policy of another "
+        "library](extending.md#a-policy-of-another-library)): load a saved model with its `VecNormalize`, which no zip "
+        "holds. Statistics of Gymnasium's `NormalizeObservation` belong into a function around the model."
+    ),
     in_ci=True,
 )
 

@@ -11,7 +11,11 @@ LIBRARY = Library(
     about=(
         "From PettingZoo to Stable-Baselines3; the learners share one policy. SuperSuit's copies are not "
         "seeded, and it does not hand on truncation: `train/supersuit_ppo.py` closes these traps, and "
-        "`eb.make_sb3_vec_env` has none of them and is many times faster."
+        "`eb.make_sb3_vec_env` has none of them and is many times faster. Two more traps: `black_death_v3` takes an "
+        "episode for over only where every agent is terminated and truncated at once, so it steps on after the end, "
+        "which is an error here (it is not needed: all agents end together); `agent_indicator_v0` marks the agent with "
+        "the largest bound of all features (20) in place of 1, which lies outside the space that it states "
+        '(`appended="number"` of `make_sb3_vec_env` does not). `frame_skip_v0` works.'
     ),
     in_ci=True,
 )

@@ -107,7 +107,7 @@ BUGS: dict[str, Bug] = {
         REWARDS, '[0 if params.harm_count == "first" else 1]', '[1 if params.harm_count == "first" else 0]', OF_REWARDS
     ),
     "weights of social value orientation swapped": Bug(
-        OBJECTIVES, "(math.cos(angle), math.sin(angle))", "(math.sin(angle), math.cos(angle))", OF_REWARDS
+        OBJECTIVES, "return float(sums[0]), float(sums[1])", "return float(sums[1]), float(sums[0])", OF_REWARDS
     ),
     "an objective's harm so far paid again in every step": Bug(
         TERMS,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.envs.state import state_features
 from ethbrake_marl.observations import Feature, ObservationSpec, choose_observation
+from ethbrake_marl.observations.state import state_features
 from ethbrake_marl.rewards import REWARDS, TERMS, RewardParams, Term
 from ethbrake_marl.scenario import load_scenario
 

@@ -38,6 +38,7 @@ def build(**changed: str | None) -> Scenario:
 
 # (key whose line is replaced, the line there instead, place and value in the message, what would be right)
 BAD = [
+    ("gaps_m", "road_friction: 0.7", "road_friction", "the model has no friction; braking_capacity_mps2 is"),
     ("gaps_m", "gaps_km: 0.007", "gaps_km", "unknown key; did you mean gaps_m (metres)?"),
     ("speeds_mps", "speeds_kmh: 72", "speeds_kmh", "did you mean speeds_mps (metres per second)?"),
     ("mass_t", "mass_kg: 4500", "mass_kg", "did you mean mass_t (tonnes)?"),

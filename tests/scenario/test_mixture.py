@@ -128,6 +128,7 @@ def test_file__may_name_a_file_beside_it(tmp_path: Path):
         ("mixture: [{scenario: paper-random, weight: 0}]", "mixture[0].weight = 0: must be greater than 0"),
         ("mixture: [{scenario: mixture-delays}]", "mixture-delays is a mixture itself; list its scenarios here"),
         ("mixture: [{scenario: paper-random}, {scenario: paper-random}]", "mixture[1]: paper-random is given twice"),
+        ("mixture: [{scenario: paper-random, weigth: 2}, {scenario: paper-random}]", "mixture[0].weigth: unknown key"),
         (
             "mixture: [{scenario: paper-random}, {scenario: stress-wide}]",
             "line 2: mixture: horizon_s must be the same in all: paper-random has 8, stress-wide has 16; give horizon_s"
@@ -155,6 +156,16 @@ def test_bad_mixtures__are_one_error(tmp_path: Path, given: str, message: str):
     with pytest.raises(InvalidInput) as caught:
         load_scenario(tmp_path / "mine.yaml")
     assert message in str(caught.value), str(caught.value)
+
+
+def test_vehicles__beside_members_written_out_holds_for_those_that_say_nothing_else(tmp_path: Path):
+    line = "gaps_m: 7, speeds_mps: 20, braking_capacity_mps2: 9, driving_capacity_mps2: 5, latency_s: 0.5, mass_t: 1"
+    text = "name: mine\nvehicles: 5\nmixture:\n  - scenario: {name: a, %s%s}\n  - scenario: {name: b, %s}\n"
+    (tmp_path / "mine.yaml").write_text(text % (line, "", line))
+    assert [member.vehicles for member in load_scenario(tmp_path / "mine.yaml").members] == [5, 5]
+    (tmp_path / "mine.yaml").write_text(text % (line, ", vehicles: 3", line))
+    with pytest.raises(InvalidInput, match="vehicles = 5: its scenarios have 3, which nothing beside them can change"):
+        load_scenario(tmp_path / "mine.yaml")
 
 
 def test_names__are_read_from_files_only():

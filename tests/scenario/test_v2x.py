@@ -12,9 +12,9 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
 from ethbrake_marl.envs.parallel import parallel_env
-from ethbrake_marl.envs.state import full_state, state_features
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import observation_for, observe
+from ethbrake_marl.observations.state import full_state, state_features
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.physics.episode import CLOCK_WIDTH
 from ethbrake_marl.physics.rows import Packed, pack, unpack, with_news_columns

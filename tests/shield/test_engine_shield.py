@@ -6,6 +6,7 @@ import copy
 import pickle
 import threading
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -14,12 +15,14 @@ from gymnasium.wrappers import Autoreset
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.step import STEP
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.physics import advance
 from ethbrake_marl.physics.rows import harm_at, speed_at
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
@@ -31,6 +34,7 @@ from ethbrake_marl.shield import (
     StepShieldAgent,
 )
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
+from ethbrake_marl.shield.team_agent import ShieldedTeam
 from tests.shield.beyond_horizon import above_later
 
 PAPER = load_scenario("paper-random")
@@ -155,15 +159,6 @@ def test_wrapped_in_mid_episode__needs_a_reset_first():
         env.step(DRIVE)
     env.reset(seed=0)
     env.step(DRIVE)
-
-
-def test_nested__the_outer_shields_action_passes_the_inner_one_or_is_refused():
-    inner = ShieldedEnv(gymnasium.make("EthBrake-v0").unwrapped)
-    outer = ShieldedEnv(inner)
-    outer.reset(seed=0)
-    info = play(outer)
-    assert info["world_first_impact_harm"] <= inner.attached.shield.first_bound[0]
-    assert inner.attached.shield.bound.tolist() == outer.attached.shield.bound.tolist()
 
 
 def test_autoreset__of_gymnasium_inside_is_left_alone():
@@ -312,6 +307,43 @@ def test_agent__compares_the_last_step_too():
     with pytest.raises(UncertifiedStep, match="must pass its commands on unchanged"):
         drive(worlds, Between(agents[1], late=1.89), scenario, 1)
     assert agents[1].shield.running.finished.all()
+
+
+class DrivesOff:
+    """Brakes until it stands, and then drives."""
+
+    name = "drives_off"
+
+    def begin(self, worlds, vehicle, rows):
+        pass
+
+    def act(self, worlds, vehicle):
+        v = worlds.vehicles
+        stands = worlds.speeds_mps[:, vehicle] == 0.0
+        return np.where(stands, v.driving_capacity_mps2[:, vehicle], -v.braking_capacity_mps2[:, vehicle])
+
+
+@pytest.mark.parametrize("team", [False, True])
+def test_host__with_a_clock_of_its_own_gets_full_braking_after_the_shields_own_end(team):
+    worlds = PAPER.sample(40, 7).worlds
+    rows, harm, braking = np.arange(40), np.zeros(40), -worlds.vehicles.braking_capacity_mps2
+    agent = StepShieldAgent(DrivesOff(), PAPER, uncertainty="gaps_m=0.02")
+    if team:
+        agent = ShieldedTeam(Team({1: DrivesOff()}, "team"), PAPER, uncertainty="gaps_m=0.02").drivers[1]
+    bound_of = agent.together if team else agent
+    agent.begin(worlds, 1, rows)
+    wanted = braking.copy()
+    wanted[:, 1] = 0.0
+    for k in range(4, 100):  # until 5 x 0.1 s nobody asks
+        if k > 4:
+            worlds = replace(worlds, time_s=np.full(40, k * 0.1))  # 6 x 0.1 is not 0.6
+            wanted[:, 1] = agent.act(worlds, 1)
+            assert wanted[:, 1].tolist() == agent.act(worlds, 1).tolist()  # asked again at the same moment
+        worlds, impacts = advance(worlds, wanted, until_s=np.full(40, (k + 1) * 0.1))
+        harm += impacts.first_impact_harm.sum(axis=1)
+    assert bound_of.shield.running.finished.all() and not bound_of.shield.distrusted.any()
+    assert (harm <= bound_of.predicted_harm + 1e-9).all()
+    assert wanted[:, 1].tolist() == braking[:, 1].tolist()
 
 
 def test_horizon__what_still_moves_then_is_told_and_warned_of_once():

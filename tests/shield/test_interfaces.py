@@ -8,9 +8,13 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from pettingzoo import AECEnv
 from pettingzoo.test import api_test, parallel_api_test
+from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.envs.parallel import env as aec_env
 from ethbrake_marl.envs.parallel import parallel_env
@@ -282,8 +286,39 @@ def test_closed__a_shield_says_so_and_bounds_nothing_more(begun):
 
 
 def test_shield__of_an_environment_in_turns_points_to_its_own_maker():
-    with pytest.raises(InvalidInput, match=r"in turn it is eb.shielded_aec\(eb.parallel_env\(...\)\)"):
-        HybridShield(aec_env(), mode="step")
+    for make in (HybridShield, shielded_aec):
+        with pytest.raises(InvalidInput, match=r"with agents acting in turn eb.shielded_aec\(that\)"):
+            make(aec_env(), mode="step")
+
+
+@pytest.mark.parametrize(
+    ("first", "again", "between"),
+    [
+        (lambda: HybridShield(parallel_env(), mode="step"), HybridShield, BaseParallelWrapper),
+        (lambda: HybridShield(parallel_env(), mode="step"), shielded_aec, BaseParallelWrapper),
+        (lambda: shielded_aec(parallel_env(), mode="step"), shielded_aec, BaseWrapper),
+        (lambda: shielded_aec(parallel_env(), mode="step"), HybridShield, BaseWrapper),
+        (lambda: ShieldedEnv(EthBrakeEnv()), ShieldedEnv, gymnasium.wrappers.RecordEpisodeStatistics),
+        (
+            lambda: ShieldedVectorEnv(EthBrakeVectorEnv(2)),
+            ShieldedVectorEnv,
+            gymnasium.wrappers.vector.RecordEpisodeStatistics,
+        ),
+        (lambda: ShieldedVecEnv(make_sb3_vec_env("paper-random", 2)), ShieldedVecEnv, VecMonitor),
+    ],
+)
+def test_shield__of_a_shielded_environment_is_refused_naming_the_first(first, again, between):
+    shielded = first()
+    name = "HybridShield" if isinstance(shielded, AECEnv) else type(shielded).__name__
+    for inner in (shielded, between(shielded), shielded.unwrapped):
+        with pytest.raises(InvalidInput, match=rf"a {name} \(mode step\) shields this environment already"):
+            again(inner, mode="step")
+
+
+def test_shield__of_an_environment_whose_shield_was_closed_is_another_one():
+    env = EthBrakeEnv()
+    ShieldedEnv(env).close()
+    ShieldedEnv(env, mode="step").reset(seed=1)
 
 
 def test_shielded_aec__refuses_an_unusable_proposal_in_its_own_turn():
@@ -293,3 +328,46 @@ def test_shielded_aec__refuses_an_unusable_proposal_in_its_own_turn():
     with pytest.raises(InvalidInput, match="action of vehicle_2"):
         env.step([3.0])
     assert env.agent_selection == "vehicle_2"
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda policy: ShieldedVectorEnv(EthBrakeVectorEnv(8, autoreset_mode="SameStep"), policy, mode="episode"),
+        lambda policy: ShieldedVecEnv(make_sb3_vec_env("paper-random", 8), policy, mode="episode"),
+    ],
+    ids=["vector", "sb3"],
+)
+def test_episode_mode__tells_the_bound_of_the_episode_that_ended(make):
+    env = make(make_agent("full_brake"))
+    env.reset()
+    told = 0
+    while told < 12:
+        bound = env.attached.hybrid.bound_harm.copy()
+        found = env.step(np.zeros((8, 1)))
+        ended = np.flatnonzero(found[2] if len(found) == 4 else found[2] | found[3])
+        for k in ended:
+            shown = found[3][k]["shield"]["bound_harm"] if len(found) == 4 else found[4]["shield"]["bound_harm"][k]
+            assert shown == bound[k]
+        told += len(ended)
+
+
+@pytest.mark.parametrize("believed", [False, True])
+def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(believed):
+    asked = []
+
+    def remembering(observation, state):
+        asked.append(float(state[0, 0]))
+        return -np.minimum(state, 10.0) / 10.0, state + 1.0
+
+    policy = eb.policy_agent(remembering, initial_state=lambda n: np.zeros((n, 1)))
+    env = HybridShield(parallel_env(), policy, mode="step", believed=believed)
+    env.reset(seed=7)
+    for actions in ({"vehicle_2": [-0.3]}, {}, {"vehicle_2": [-0.9]}, {"vehicle_2": [1.0]}):
+        env.step(actions)
+    assert policy._steps.tolist() == [4]
+    env.attached.proposal()
+    with pytest.raises(InvalidInput):
+        env.step({"vehicle_2": [-0.3], "vehicle_9": [0.0]})
+    env.step({})
+    assert policy._steps.tolist() == [5]

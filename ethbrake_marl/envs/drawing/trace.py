@@ -44,6 +44,7 @@ class Motion:
     right_m: Floats  # [n]
     struck: Floats  # [k, 4] impacts shortly before the start: world, pair, time, closing speed
     stepped_in: Bools | None  # [n] by a shield; None: there is none
+    parts: tuple[tuple[Worlds, Floats, Floats], ...] = ()  # once it is closed: ``Engine.segments``
 
 
 Memory = tuple[Motion, ...]  # the motions that are kept, the running one last
@@ -112,48 +113,54 @@ def close_motion(motion: Motion, engine: Engine) -> Motion:
     """The motion that has led to where the engine is."""
     worlds = engine.worlds
     command = np.where(motion.fresh[:, np.newaxis], worlds.command_mps2, motion.command_mps2)
-    return replace(motion, command_mps2=command, until_s=worlds.time_s)
+    parts = tuple(engine.segments(motion.start, command))
+    return replace(motion, command_mps2=command, until_s=worlds.time_s, parts=parts)
 
 
 def scenes(engine: Engine, motion: Motion, row: int, times_s: Floats | None = None) -> list[Scene]:
     """What world ``row`` of a closed motion shows at these times of it [k], or at its end alone."""
-    start, until = float(motion.start.time_s[row]), float(motion.until_s[row])
-    times = np.array([until]) if times_s is None else times_s
-    count = len(times)
-    world, command = motion.start.take([row]), motion.command_mps2[[row]]
-    post = with_post_ahead(world, np.array([until - start])).take(np.zeros(count, np.int64))
-    moved, _ = advance(post, command, until_s=times)
-    impacts = _rows(world, command, np.array([until]))
-    fronts = fronts_of(motion.front_m[row] + (post.obstacle_gap_m - moved.obstacle_gap_m), moved.gaps_m)
-    earlier = [Struck(int(m[1]), float(m[3]), float(m[2])) for m in motion.struck if m[0] == row]
-    now = zip(impacts.pair.tolist(), impacts.closing_speed_mps.tolist(), impacts.time_s.tolist(), strict=True)
-    struck = [*earlier, *(Struck(*each) for each in now)]
-    latency, alert_view = world.vehicles.latency_s[0], View(float(motion.left_m[row]), float(motion.right_m[row]))
-    hit_until = _harm_until(impacts, times)
-    obstacle = world.obstacle_gap_m[0] + motion.front_m[row]
-    return [
-        Scene(
-            title=engine.scenario.name,
-            time_s=float(time),
-            view=follow(alert_view, fronts[k]),
-            front_m=fronts[k],
-            gaps_m=moved.gaps_m[k],
-            speeds_mps=moved.speeds_mps[k],
-            command_mps2=np.where(latency <= time, command[0], 0.0),
-            braking_mps2=world.vehicles.braking_capacity_mps2[0],
-            driving_mps2=world.vehicles.driving_capacity_mps2[0],
-            latency_s=latency,
-            hit=moved.pair_hit[k],
-            struck=tuple(s for s in struck if time - FLASH_S < s.time_s <= time),
-            first_harm=float(motion.harm[row, 0] + hit_until[k, 0]),
-            total_harm=float(motion.harm[row, 1] + hit_until[k, 1]),
-            obstacle_m=float(obstacle),
-            learners=engine.learners or tuple(engine.deciders),
-            shield=None if motion.stepped_in is None or motion.fresh[row] else bool(motion.stepped_in[row]),
-            ended=bool(engine.ended[row]) and time == float(engine.packed.state[row, TIME]),
-        )
-        for k, time in enumerate(times)
-    ]
+    times = motion.until_s[[row]] if times_s is None else times_s
+    alert_view = View(float(motion.left_m[row]), float(motion.right_m[row]))
+    obstacle = motion.start.obstacle_gap_m[row] + motion.front_m[row]
+    front_m, harm = motion.front_m[row], motion.harm[row]
+    struck = [Struck(int(m[1]), float(m[3]), float(m[2])) for m in motion.struck if m[0] == row]
+    shown: list[Scene] = []
+    for part in motion.parts:
+        world, command, until = part[0].take([row]), part[1][[row]], part[2][[row]]
+        now = times if part is motion.parts[-1] else times[times <= until]
+        times = times[len(now) :]
+        post = with_post_ahead(world, until - world.time_s).take(np.zeros(len(now) + 1, np.int64))
+        moved, _ = advance(post, command, until_s=np.append(now, until))
+        impacts = _rows(world, command, until)
+        fronts = fronts_of(front_m + (post.obstacle_gap_m - moved.obstacle_gap_m), moved.gaps_m)
+        told = zip(impacts.pair.tolist(), impacts.closing_speed_mps.tolist(), impacts.time_s.tolist(), strict=True)
+        struck += [Struck(*each) for each in told]
+        latency, done = world.vehicles.latency_s[0], harm + _harm_until(impacts, np.append(now, until))
+        shown += [
+            Scene(
+                title=engine.scenario.name,
+                time_s=float(time),
+                view=follow(alert_view, fronts[k]),
+                front_m=fronts[k],
+                gaps_m=moved.gaps_m[k],
+                speeds_mps=moved.speeds_mps[k],
+                command_mps2=np.where(latency <= time, command[0], 0.0),
+                braking_mps2=world.vehicles.braking_capacity_mps2[0],
+                driving_mps2=world.vehicles.driving_capacity_mps2[0],
+                latency_s=latency,
+                hit=moved.pair_hit[k],
+                struck=tuple(s for s in struck if time - FLASH_S < s.time_s <= time),
+                first_harm=float(done[k, 0]),
+                total_harm=float(done[k, 1]),
+                obstacle_m=float(obstacle),
+                learners=engine.learners or tuple(engine.deciders),
+                shield=None if motion.stepped_in is None or motion.fresh[row] else bool(motion.stepped_in[row]),
+                ended=bool(engine.ended[row]) and time == float(engine.packed.state[row, TIME]),
+            )
+            for k, time in enumerate(now)
+        ]
+        front_m, harm = fronts[-1][0], done[-1]
+    return shown
 
 
 def moments(motion: Motion, row: int, fps: float) -> Floats:
@@ -165,13 +172,16 @@ def moments(motion: Motion, row: int, fps: float) -> Floats:
 
 def _end(motion: Motion) -> tuple[Floats, Floats]:
     """Where Vehicle 1 is when a closed motion ends [n] m, and the impacts that are then still shown [k, 4]."""
-    post = with_post_ahead(motion.start, motion.until_s - motion.start.time_s)
-    after, _ = advance(post, motion.command_mps2, until_s=motion.until_s)
-    rows = _rows(motion.start, motion.command_mps2, motion.until_s)
-    columns = (rows.world, rows.pair, rows.time_s, rows.closing_speed_mps)
-    struck = np.concatenate([motion.struck, np.stack(columns, axis=1).astype(np.float64)])
-    shown = struck[:, 2] > motion.until_s[struck[:, 0].astype(np.int64)] - FLASH_S
-    return motion.front_m + (post.obstacle_gap_m - after.obstacle_gap_m), struck[shown]
+    front_m, struck = motion.front_m, [motion.struck]
+    for start, command, until_s in motion.parts:
+        post = with_post_ahead(start, until_s - start.time_s)
+        after, _ = advance(post, command, until_s=until_s)
+        front_m = front_m + (post.obstacle_gap_m - after.obstacle_gap_m)
+        rows = _rows(start, command, until_s)
+        columns = (rows.world, rows.pair, rows.time_s, rows.closing_speed_mps)
+        struck.append(np.stack(columns, axis=1).astype(np.float64))
+    found = np.concatenate(struck)
+    return front_m, found[found[:, 2] > motion.until_s[found[:, 0].astype(np.int64)] - FLASH_S]
 
 
 def _rows(worlds: Worlds, command: Floats, until_s: Floats) -> ImpactRows:

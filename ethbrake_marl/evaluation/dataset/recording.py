@@ -190,12 +190,13 @@ class _Road:
 
     def follow(self, engine: Engine) -> None:
         """The engine has made a step, the first one from the alert to the first decision."""
-        now, before = engine.worlds, self._before
-        moving = np.flatnonzero(now.time_s > before.time_s)
-        until_s = now.time_s[moving]
-        post = with_post_ahead(before.take(moving), until_s - before.time_s[moving])
-        after, _ = advance(post, engine.wanted_mps2[moving], until_s=until_s)
-        self._front_m[moving] += post.obstacle_gap_m - after.obstacle_gap_m
+        now = engine.worlds
+        for before, command, end_s in engine.segments(self._before, engine.wanted_mps2):
+            moving = np.flatnonzero(end_s > before.time_s)
+            until_s = end_s[moving]
+            post = with_post_ahead(before.take(moving), until_s - before.time_s[moving])
+            after, _ = advance(post, command[moving], until_s=until_s)
+            self._front_m[moving] += post.obstacle_gap_m - after.obstacle_gap_m
         front = self._front_m[:, np.newaxis]
         self.positions_m.append(np.concatenate([front, front - np.cumsum(now.gaps_m, axis=1)], axis=1))
         self.speeds_mps.append(now.speeds_mps)

@@ -82,6 +82,11 @@ def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sam
     """
     samples = [level.scenario.sample(episodes, seed) for level in levels]
     for k, level in enumerate(levels):
+        if level.scenario.observation != levels[0].scenario.observation:
+            raise InvalidInput(
+                f"level {level.name!r}: its observation differs from that of {levels[0].name!r}, so that what it gains"
+                f" would not be cooperation's; levels may differ in {_MAY_DIFFER}"
+            )
         _check_same(levels[0], samples[0], level, samples[k], (*_LINE, *_WORLD, *_VEHICLE))
         clear = next(j for j in range(k + 1) if levels[j].scenario.v2x == level.scenario.v2x)
         _check_same(levels[clear], samples[clear], level, samples[k], ("latency_s",))

@@ -12,7 +12,7 @@ from pathlib import Path
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.durable import remove_folder
 from ethbrake_marl.learning.loop import StopAt
-from ethbrake_marl.learning.progress import HARM_METRIC
+from ethbrake_marl.learning.progress import OBJECTIVE, chosen_by
 from ethbrake_marl.learning.run_folder import RunDirectory, is_finished, progress_rows, wait_for_others
 from ethbrake_marl.learning.training import Training, check_same
 from ethbrake_marl.policies.policy import Policy, has_bundle
@@ -22,8 +22,9 @@ from ethbrake_marl.studies.jobs.training import TrainingJob, finish_training
 _MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
 RESULTS = (
     "steps",  # decisions of learners in whole updates
-    "policy_steps",  # decisions after which the kept policy was taken: the one of least harm on the recipe's list
+    "policy_steps",  # decisions after which the kept policy was taken: the best one on the recipe's list
     *_MEASURED,  # of the kept policy on that list
+    OBJECTIVE,  # likewise, where a learner has another objective than total
     *(f"last_{name}" for name in _MEASURED),  # of the last one
     "policy_sha256",  # of the kept policy's manifest, of several vehicle_i=... each
 )
@@ -67,15 +68,15 @@ def read_results(training: Training, folder: Path) -> tuple[str, ...]:
     table = [row for row in progress_rows(folder) if row.get(f"eval/{_MEASURED[0]}")]
     if not table:
         raise InvalidInput(f"{RunDirectory(folder).progress}: holds no evaluation; delete its folder to train anew")
-    harm = f"eval/{HARM_METRIC[training.recipe.reward.harm_count]}"
+    harm = chosen_by(table, training.recipe.reward.harm_count, "eval/")
     kept, last = min(table, key=lambda row: float(row[harm])), table[-1]
     trained = read_trained(RunDirectory(folder).policy)
     if isinstance(trained, Policy):
         sha256 = trained.manifest.manifest_sha256
     else:
         sha256 = " ".join(f"{name}={policy.manifest.manifest_sha256}" for name, policy in trained.members.items())
-    measured = [row[f"eval/{name}"] for row in (kept, last) for name in _MEASURED]
-    return (last["steps"], kept["steps"], *measured, sha256)
+    measured, later = ([row[f"eval/{name}"] for name in _MEASURED] for row in (kept, last))
+    return (last["steps"], kept["steps"], *measured, kept.get(f"eval/{OBJECTIVE}", ""), *later, sha256)
 
 
 @contextmanager

@@ -85,7 +85,7 @@ def _write_parquet(path: Path, plan: SweepPlan, results: Results) -> None:
     arrays = {}
     for name, column in zip(columns, values, strict=True):
         kind, read = _kind(name)
-        arrays[name] = pa.array([read(value) for value in column], getattr(pa, kind)())
+        arrays[name] = pa.array([read(value) if value else None for value in column], getattr(pa, kind)())
     with new_file(path) as partial:
         pq.write_table(pa.table(arrays), partial)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.progress import HARM_METRIC
+from ethbrake_marl.learning.progress import HARM_METRIC, OBJECTIVE
 from ethbrake_marl.learning.run_folder import RunDirectory
 from ethbrake_marl.studies.jobs.training import TrainingJob
 from ethbrake_marl.studies.sweep.job import RESULTS, do_job, read_results
@@ -35,8 +35,8 @@ class TrialEnd:
     results: tuple[str, ...]  # the values of a sweep's ``RESULTS``
 
     def harm(self, training_harm: str) -> float:
-        """Least harm on the tuning's list, of the kept policy, m2/s2."""
-        return float(self.results[RESULTS.index(training_harm)])
+        """Least harm on the tuning's list, of the kept policy, by the learners' objectives, m2/s2."""
+        return float(self.results[RESULTS.index(OBJECTIVE)] or self.results[RESULTS.index(training_harm)])
 
 
 def do_trial(job: TrialJob, log: Path) -> TrialEnd | None:
@@ -77,7 +77,7 @@ class _Judge:
 
     def __call__(self, evaluation: Mapping[str, float]) -> str | None:
         step = int(self._job.times * evaluation["updates"]) // self._job.updates
-        self._study.report(self._job.number, step, evaluation[self._harm])
+        self._study.report(self._job.number, step, evaluation.get(OBJECTIVE, evaluation[self._harm]))
         self.pruned = step < self._job.times and self.prunes()
         return PRUNED if self.pruned else None
 

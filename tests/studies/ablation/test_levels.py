@@ -64,6 +64,7 @@ PAPER = load_scenario("cooperation-2-paper")
         ({"time_step_s": 0.05}, "time_step_s"),
         ({"horizon_s": 9}, r"horizon_s differs .* \(9; there 8\)"),
         ({"latency_s": [0, 0.5, 0.9]}, "latency_s"),
+        ({"observation": ["own"]}, "observation differs from that of .cooperation-2-paper."),
     ],
 )
 def test_common_worlds__other_physics_are_refused(changes, what):

@@ -1,14 +1,18 @@
 """The full state of a line as one vector, for centralised critics: all vehicles, all pairs, the time.
 
-It reuses the features of ``observations`` and hides nothing: no latency keeps a value from a critic.
+It reuses the features of ``observations`` and hides nothing: no latency keeps a value from a critic. Rows of learners
+may end with it, or with the learner's place among the learners (``appended``).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal, get_args
 
 import numpy as np
 
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import (
     NEIGHBOUR_FEATURES,
     OBSTACLE_FEATURES,
@@ -21,6 +25,8 @@ from ethbrake_marl.observations import (
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.physics.worlds import known_at_once
 from ethbrake_marl.scenario import Scenario
+
+Appended = Literal["number", "state"]  # what a row holds behind the vehicle's own observation
 
 _OWN_ONLY = ObservationSpec(front=0, rear=0)
 _PAIR_MEANING = {"gap": "free distance between the two", "hit": "1 if the pair has had an impact"}
@@ -58,3 +64,26 @@ def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
     features = state_features(scenario)[-len(columns) :]
     rest = [np.clip(c / f.scale, f.low, f.high) for c, f in zip(columns, features, strict=True)]
     return np.concatenate([*vehicles, np.stack(rest, axis=1)], axis=1, dtype=np.float32)
+
+
+def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: Scenario) -> tuple[Feature, ...]:
+    """Every number of a learner's row in order; raises ``InvalidInput`` for another word than ``Appended`` has."""
+    if appended not in (None, *get_args(Appended)):
+        raise InvalidInput(f"appended = {appended!r}: must be {' or '.join(get_args(Appended))}, or None")
+    if appended is None:
+        return own
+    if appended == "state":
+        return (*own, *state_features(scenario))
+    last = len(scenario.learners) - 1
+    return (*own, Feature("learner", "1", 1.0, 0.0, float(max(last, 1)), "the learner's place among the learners"))
+
+
+def appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
+    """What stands behind the own observation of one learner, from worlds and vehicle: [n, features]."""
+
+    def number(worlds: Worlds, vehicle: int) -> Observations:
+        if vehicle not in scenario.learners:
+            raise InvalidInput(f"appended = 'number': vehicle_{vehicle + 1} is no learner of {scenario.name!r}")
+        return np.full((worlds.n, 1), scenario.learners.index(vehicle), np.float32)
+
+    return number if appended == "number" else lambda worlds, _: full_state(worlds, scenario)
