@@ -113,7 +113,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError
     from ethbrake_marl.errors import MissingExtra as MissingExtra
 
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"
 
 
 def _read_homes() -> dict[str, str]:
