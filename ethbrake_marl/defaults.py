@@ -1,4 +1,4 @@
-"""What an option of the command line stands for and may be, without what works with it: --help imports no numpy."""
+"""Defaults and choices of the options of the command line, apart from what works with them: --help imports no numpy."""
 
 from __future__ import annotations
 

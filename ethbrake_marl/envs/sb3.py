@@ -82,7 +82,7 @@ class EthBrakeVecEnv(VecEnv):
     """Rows are learners: row ``k * L + l`` is learner l (front to rear) of world k, for L learners in each world.
 
     With several learners all rows share one policy, and the rows of a world end together. All worlds take their
-    episodes from one stream, as in ``EthBrakeVectorEnv``. At the end of an episode its rows' infos hold
+    episodes from one stream. At the end of an episode its rows' infos hold
     ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, steps ``l``; ``t`` is always 0, no
     clock is read), and harm under both counts; all other infos are empty, unless ``step_infos``. Attributes and
     methods belong to the whole batch: there are no environments inside.

@@ -30,6 +30,11 @@ def harms(agent, worlds=WORLDS):
     return drive(worlds, agent, SCENARIO, 1).ledger.world_harm("first")
 
 
+@pytest.fixture(autouse=True)
+def own_names(monkeypatch):
+    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
+
+
 def shielded(agent, around):
     """The agent with this around it, through a name of its own."""
     eb.register_agent(f"theirs_{id(agent)}", lambda argument, settings: agent)

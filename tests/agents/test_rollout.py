@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents import registry
 from ethbrake_marl.agents.registry import make_agent, register_agent
 from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.agents.team import Team
@@ -172,8 +173,9 @@ def make_swinging(argument, settings):
 
 
 @pytest.fixture
-def swinging():
+def swinging(monkeypatch):
     """Lines whose first and last vehicle follow a script that decides within the steps of Vehicle 2."""
+    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
     register_agent("swinging", make_swinging)
     roles = {"vehicle_1": "swinging", "vehicle_2": "learner", "vehicle_3": "swinging"}
     latency = [0.04, 0.5, {"uniform": [0.2, 0.9]}]

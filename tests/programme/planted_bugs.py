@@ -233,10 +233,13 @@ BUGS: dict[str, Bug] = {
     ),
     # ------------------------------------------------------------ learning
     "the best policy judged by the other count": Bug(
-        COURSE, "        name = HARM_METRIC[self.harm_count]\n", '        name = HARM_METRIC["first"]\n', OF_LEARNING
+        COURSE,
+        "name = chosen_by(self.evaluations, self.harm_count)",
+        'name = chosen_by(self.evaluations, "first")',
+        OF_LEARNING,
     ),
     "no alarm where the harm rises with the return": Bug(
-        COURSE, "harms > (1.0 + RISEN) * harmed", "harms < (1.0 - RISEN) * harmed", OF_LEARNING
+        COURSE, "harms > harmed + RISEN * abs(harmed)", "harms < harmed - RISEN * abs(harmed)", OF_LEARNING
     ),
     "a collapse must be four times the least harm": Bug(
         COURSE, "max(TIMES_LEAST * least[harm],", "max(4.0 * least[harm],", OF_LEARNING

@@ -121,6 +121,7 @@ class Parallel(Play):
         self.policy.fails = True
         try:
             self.env.step({})
+            raise Failure  # nobody asked it again: what it answered before a call that failed stands
         finally:
             self.policy.fails = False
 

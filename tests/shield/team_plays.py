@@ -49,6 +49,7 @@ class Members:
             setattr(one, how, True)
             try:
                 self.asked()
+                raise Failure  # nobody asked it again: what it answered before a call that failed stands
             except (ValueError, IndexError) as error:
                 raise Failure from error
             finally:
