@@ -91,6 +91,7 @@ def test_job__whose_policy_was_taken_away_is_done_again(finished_sweep, small, t
     assert load_policy(run).manifest.manifest_sha256 in (folder / TABLE).read_text()
 
 
+@pytest.mark.slow
 def test_team__that_has_lost_a_policy_is_trained_again(write_sweep, tiny, tmp_path):
     job = {"level": "3-pair", "recipe": str(tiny), "set": {"scheme": "independent", "total_steps": 1}}
     folder, file = tmp_path / "out", write_sweep(jobs=[job])
