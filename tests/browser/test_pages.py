@@ -21,6 +21,8 @@ from tests.browser.conftest import AGENTS
 from tests.pages.hostile import HOSTILE
 from tests.pages.test_frame import whole_page
 
+pytestmark = pytest.mark.slow
+
 Open = Callable[..., Any]
 MOST_BYTES = 5 << 20
 MOST_MS = 2_000

@@ -75,6 +75,7 @@ def test_export__is_a_recipe_that_trains_the_best_trial_again_to_the_bit(finishe
     assert "ethbrake train --scenario paper-random --recipe best.yaml" in text
 
 
+@pytest.mark.slow
 def test_trials__that_ended_are_kept_and_more_go_on_as_if_they_had_been_asked_for_at_once(
     finished_tuning, write_tuning, tmp_path, capsys
 ):
@@ -114,6 +115,7 @@ def test_disturbed_tuning__has_the_same_table(finished_tuning, write_tuning, tmp
     assert export.read_text() == (finished_tuning.parent / "best.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_broken_trials__are_marked_failed_and_others_done_in_their_place(write_tuning, tmp_path):
     file, folder = write_tuning(), tmp_path / "out"
     plan = plan_tuning(read_tuning(file))
@@ -138,6 +140,7 @@ def test_trial__that_diverges_is_failed_with_its_reason_and_the_others_go_on(wri
     assert len(list((tmp_path / "out" / "trials").glob("*/policy"))) == 1 + len(failed)  # the same is not trained twice
 
 
+@pytest.mark.slow
 def test_no_trial__that_ends_well_is_exit_status_1(write_tuning, tmp_path, capsys):
     file = write_tuning(search={"reward.harm": {"low": 1e299, "high": 1e300}})
     export = tmp_path / "best.yaml"
