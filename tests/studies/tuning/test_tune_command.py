@@ -130,6 +130,7 @@ def test_broken_trials__are_marked_failed_and_others_done_in_their_place(write_t
     assert [row["state"] for row in read(folder / TABLE)] == ["failed", "finished", "finished"]
 
 
+@pytest.mark.slow
 def test_trial__that_diverges_is_failed_with_its_reason_and_the_others_go_on(write_tuning, tmp_path, capsys):
     file = write_tuning(search={"reward.harm": {"choices": [0.05, 1e300]}}, sampler={"name": "random"})
     assert tune(file, tmp_path / "out", "--trials", "4") == 0
@@ -167,6 +168,7 @@ def test_folder_of_other_versions__is_refused_with_their_names(finished_tuning, 
     assert "was tuned with torch 1.0, here 2." in told and "numpy" not in told
 
 
+@pytest.mark.slow
 def test_storage__can_be_shared_by_folders(write_tuning, tmp_path):
     plan, storage = plan_tuning(read_tuning(write_tuning())), f"sqlite:///{tmp_path / 'study.db'}"
     with closing(LocalWorkers(2)) as workers:
