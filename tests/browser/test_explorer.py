@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import subprocess
@@ -16,6 +17,8 @@ from ethbrake_marl.evaluation import Evaluation, evaluate
 from ethbrake_marl.evaluation.inputs import LIST_SEED, make_lineup
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario, read_initial_states
+
+pytestmark = pytest.mark.slow  # what the server answers is tried without a browser, too
 
 ROOT = Path(__file__).resolve().parents[2]
 AGENTS = ("full_brake", "e_v2x_bm", "ppo@shipped", "ppo@shipped+step")
@@ -311,18 +314,19 @@ def test_other_world__is_fetched(open_explorer: Open, scenario: Scenario) -> Non
     assert {name: value for name, value in harms(page).items() if name in AGENTS} == expected
 
 
-@pytest.mark.parametrize("width", [360, 768, 1440])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_page__has_no_sideways_scroll(open_explorer: Open, width: int, scheme: str) -> None:
-    page = open_explorer(width=width, color_scheme=scheme)
+def test_page__has_no_sideways_scroll_and_both_schemes(open_explorer: Open) -> None:
+    page = open_explorer()
     wait_until(page, f"!!{EXPLORER}.best")
     page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    back, ink = page.evaluate(
-        "[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color]"
-    )
-    light = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (back, ink)]
-    assert (light[0] < light[1]) == (scheme == "dark")
+    for width, scheme in itertools.product((360, 768, 1440), ("light", "dark")):
+        page.set_viewport_size({"width": width, "height": 900})
+        page.emulate_media(color_scheme=scheme)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        back, ink = page.evaluate(
+            "[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color]"
+        )
+        light = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (back, ink)]
+        assert (light[0] < light[1]) == (scheme == "dark"), (width, scheme)
 
 
 def test_page__is_worked_by_keys_alone(open_explorer: Open) -> None:

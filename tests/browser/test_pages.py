@@ -21,20 +21,20 @@ from tests.browser.conftest import AGENTS
 from tests.pages.hostile import HOSTILE
 from tests.pages.test_frame import whole_page
 
+pytestmark = pytest.mark.slow
+
 Open = Callable[..., Any]
 MOST_BYTES = 5 << 20
 MOST_MS = 2_000
 
 
-@pytest.mark.parametrize("width", [360, 500, 768, 1440])
-def test_report__never_scrolls_sideways(open_page: Open, report_file: Path, width: int) -> None:
-    check_width(open_page(report_file, width=width), width)
+def test_report__never_scrolls_sideways(open_page: Open, report_file: Path) -> None:
+    check_widths(open_page(report_file), 360, 500, 768, 1440)
 
 
-@pytest.mark.parametrize("width", [360, 1440])
-def test_reproduction__never_scrolls_sideways(open_page: Open, reproduction_file: Path, width: int) -> None:
-    page = open_page(reproduction_file, width=width)
-    check_width(page, width)
+def test_reproduction__never_scrolls_sideways(open_page: Open, reproduction_file: Path) -> None:
+    page = open_page(reproduction_file)
+    check_widths(page, 360, 1440)
     assert page.evaluate("document.querySelectorAll('svg').length") == 3
 
 
@@ -46,31 +46,32 @@ def reproduction_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return settings.folder / "index.html"
 
 
-@pytest.mark.parametrize(("width", "hint"), [(360, "block"), (768, "block"), (1440, "none")])
-def test_figures__say_that_they_scroll_and_can_be_read(
-    open_page: Open, report_file: Path, width: int, hint: str
-) -> None:
-    page = open_page(report_file, width=width)
+def test_figures__say_that_they_scroll_and_can_be_read(open_page: Open, report_file: Path) -> None:
+    page = open_page(report_file)
     broad = "document.querySelector('.drawing:has(svg.broad)')"
-    assert page.evaluate(f"getComputedStyle({broad}, '::before').display") == hint
-    assert page.evaluate(f"{broad}.scrollWidth > {broad}.clientWidth") == (hint == "block")
-    least_px = page.evaluate(
-        "Math.min(...[...document.querySelectorAll('.drawing svg')]"
-        ".map((e) => e.clientWidth / e.viewBox.baseVal.width))"
-    )
-    assert least_px * 8.0 >= 9.0  # labels are of 8 pt or more
-    assert page.locator("figure > p").first.evaluate("(e) => parseFloat(getComputedStyle(e).fontSize)") >= 13.0
+    for width, hint in ((360, "block"), (768, "block"), (1440, "none")):
+        page.set_viewport_size({"width": width, "height": 900})
+        assert page.evaluate(f"getComputedStyle({broad}, '::before').display") == hint
+        assert page.evaluate(f"{broad}.scrollWidth > {broad}.clientWidth") == (hint == "block")
+        least_px = page.evaluate(
+            "Math.min(...[...document.querySelectorAll('.drawing svg')]"
+            ".map((e) => e.clientWidth / e.viewBox.baseVal.width))"
+        )
+        assert least_px * 8.0 >= 9.0  # labels are of 8 pt or more
+        assert page.locator("figure > p").first.evaluate("(e) => parseFloat(getComputedStyle(e).fontSize)") >= 13.0
 
 
-def check_width(page: Any, width: int) -> None:
+def check_widths(page: Any, *widths: int) -> None:
     """Nothing stands outside a page whose every part is open."""
     page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
-    assert page.evaluate("document.documentElement.scrollWidth") == width
-    outside = page.evaluate(
-        "[...document.querySelectorAll('body *')].filter((e) => e.getBoundingClientRect().right > innerWidth + 1 &&"
-        " !e.closest('.wide, .drawing, svg, .skip')).map((e) => e.outerHTML.slice(0, 80))"
-    )
-    assert outside == []
+    for width in widths:
+        page.set_viewport_size({"width": width, "height": 900})
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        outside = page.evaluate(
+            "[...document.querySelectorAll('body *')].filter((e) => e.getBoundingClientRect().right > innerWidth + 1 &&"
+            " !e.closest('.wide, .drawing, svg, .skip')).map((e) => e.outerHTML.slice(0, 80))"
+        )
+        assert outside == [], width
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -125,13 +126,14 @@ def test_report__every_control_has_a_name(open_page: Open, report_file: Path) ->
 
 
 def test_pages__hostile_texts_run_nothing_and_load_nothing(open_page: Open, tmp_path: Path) -> None:
-    for k, text in enumerate(HOSTILE):
-        path = tmp_path / f"{k}.html"
+    path = tmp_path / "hostile.html"
+    path.write_text(whole_page("nothing"), "utf-8")
+    page = open_page(path)
+    page.on("dialog", lambda dialog: pytest.fail(dialog.message))
+    for text in HOSTILE:
         path.write_text(whole_page(text), "utf-8")
-        page = open_page(path)
-        page.on("dialog", lambda dialog: pytest.fail(dialog.message))
+        page.reload()
         assert page.locator("script, iframe, img, form, a[href^=javascript]").count() == 0
-        page.context.close()
 
 
 def test_report__hostile_agent_is_text_in_the_player(open_page: Open, tmp_path: Path) -> None:
@@ -151,9 +153,8 @@ def test_report__hostile_agent_is_text_in_the_player(open_page: Open, tmp_path: 
     assert page.locator(".head strong").first.inner_text() in HOSTILE
 
 
-@pytest.mark.parametrize("width", [360, 768])
-def test_report__long_names_never_scroll_sideways(open_page: Open, long_names_file: Path, width: int) -> None:
-    check_width(open_page(long_names_file, width=width), width)
+def test_report__long_names_never_scroll_sideways(open_page: Open, long_names_file: Path) -> None:
+    check_widths(open_page(long_names_file), 360, 768)
 
 
 @pytest.fixture(scope="module")

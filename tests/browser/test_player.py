@@ -11,6 +11,8 @@ import pytest
 from ethbrake_marl.evaluation import Evaluation
 from tests.browser.conftest import AGENTS
 
+pytestmark = pytest.mark.slow
+
 Open = Callable[..., Any]
 PLAYER = "document.querySelector('.player').player"
 

@@ -74,6 +74,7 @@ def few_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scaling, "costs_by_vehicles", lambda effort: by_vehicles(shortly, (2, 3)))
 
 
+@pytest.mark.slow
 def test_bench_scaling__writes_a_picture_once(ethbrake, few_counts, tmp_path: Path):
     picture = tmp_path / "scaling.png"
     answer = ethbrake("bench", "--scaling", picture)

@@ -209,6 +209,7 @@ def test_shield_and_equal_time__are_compared_among_themselves(
     assert (refused.status, refused.err.count("\n")) == (2, 1) and "is about another kind of results" in refused.err
 
 
+@pytest.mark.slow
 def test_compare__sees_that_an_agents_file_was_edited(results: Path, tmp_path: Path) -> None:
     """Each evaluation is a process of its own, as a person's two commands are."""
     file = tmp_path / "mine.py"

@@ -94,7 +94,9 @@ def test_replay__says_what_is_missing(ethbrake, tmp_path):
     assert answer.status == 2 and "leave --initial-states out" in answer.err
 
 
-@pytest.mark.parametrize("text", HOSTILE)
+@pytest.mark.parametrize(
+    "text", [pytest.param(text, marks=pytest.mark.slow if k % 6 else ()) for k, text in enumerate(HOSTILE)]
+)
 def test_replay__of_anything_else_is_refused_in_one_line(ethbrake, tmp_path, monkeypatch, text):
     monkeypatch.chdir(tmp_path)
     passport = str(EXAMPLE)

@@ -284,7 +284,7 @@ def test_command_line__a_full_disk_behind_stdout_is_one_line():
     assert (process.returncode, process.stderr) == (2, "ethbrake: error: output: No space left on device\n")
 
 
-@pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
+@pytest.mark.parametrize("encoding", [pytest.param("latin-1", marks=pytest.mark.slow), "ascii"])
 def test_command_line__a_table_on_a_narrow_stdout_is_still_printed(encoding):
     process = program(
         "import sys; from ethbrake_marl.cli.app import main;"

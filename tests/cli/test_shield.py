@@ -35,7 +35,7 @@ def test_shield__prints_its_rows_as_json_and_as_a_table(ethbrake):
         ("shield", "--agents", "full_brake"),
         ("picture", "shield-modes", "--agents", "coast", "--output", "x.png"),
         ("picture", "shield", "--agents", "coast,full_brake", "--output", "x.png"),
-        ("picture", "robustness", "--output", "x.png"),
+        pytest.param(("picture", "robustness", "--output", "x.png"), marks=pytest.mark.slow),
     ],
     ids=lambda command: " ".join(command[:2]),
 )

@@ -201,6 +201,7 @@ def test_clone__in_mid_episode_goes_on_alike_and_apart(name: str, scenario: Scen
     assert [interface.step(action).bits() for action in actions(8, 90, interface.n)] == twin_turns
 
 
+@pytest.mark.slow
 def test_spawn__another_process_sees_the_same_bits() -> None:
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         elsewhere = pool.apply(all_digests)

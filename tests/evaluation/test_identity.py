@@ -86,7 +86,11 @@ ABOUT = {"worlds_sha256": worlds_sha256(SAMPLE.worlds, SAMPLE.index), "scenario_
         ("shield", ("shield", "--agents", "full_brake")),
         ("equal-time", ("equal-time", "--agents", "coast", "--against", "coast", "--repeats", "1", "--seed", "7")),
         ("best-harm", ("best-harm", "--budget", "20")),
-        ("robustness", ("picture", "robustness", "--uncertainty", "mass_t.vehicle_3=1%", "--output", "x.png")),
+        pytest.param(
+            "robustness",
+            ("picture", "robustness", "--uncertainty", "mass_t.vehicle_3=1%", "--output", "x.png"),
+            marks=pytest.mark.slow,
+        ),
         ("price", (*PRICE, "--output", "x.png")),
     ],
     ids=lambda each: each if isinstance(each, str) else "",

@@ -105,6 +105,7 @@ def team_rows() -> list[ModeRow]:
     return compare_modes(agents, PAIR.sample(60, 3).worlds, Task(PAIR, (1, 2), "total"))
 
 
+@pytest.mark.slow
 def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: list[ModeRow]) -> None:
     worlds = PAIR.sample(60, 3).worlds
     assert [row.mode for row in team_rows] == ["none", "step", "step-alert", "step-cap"] * 2

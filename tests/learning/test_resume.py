@@ -116,7 +116,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Pat
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("name", ["ppo", "sac"])
-@pytest.mark.parametrize("step", [1, 37, 61, 76])
+@pytest.mark.parametrize(
+    "step", [pytest.param(step, marks=pytest.mark.slow if step in (1, 61) else ()) for step in (1, 37, 61, 76)]
+)
 def test_resume__after_ctrl_c_everything_is_as_if_nobody_had_stopped_it(
     name: str,
     step: int,
@@ -209,10 +211,10 @@ def _stopped(folder: Path, monkeypatch: pytest.MonkeyPatch, step: int = 100) -> 
     ("file", "damage"),
     [
         ("checkpoint.json", "truncated"),
-        ("checkpoint.json", "missing"),
-        ("state.json", "flipped"),
+        pytest.param("checkpoint.json", "missing", marks=pytest.mark.slow),
+        pytest.param("state.json", "flipped", marks=pytest.mark.slow),
         ("arrays.safetensors", "truncated"),
-        ("policy/weights.safetensors", "missing"),
+        pytest.param("policy/weights.safetensors", "missing", marks=pytest.mark.slow),
     ],
 )
 def test_resume__a_damaged_checkpoint_is_found_and_the_one_before_is_used(

@@ -56,6 +56,7 @@ def test_evaluate__finds_the_limits_once_for_table_csv_and_json(calls: Counter[s
     assert calls == {"evaluation": 1, "limits": 1, "avoidability": 1, "bound": 1, "best known": 1}
 
 
+@pytest.mark.slow
 def test_run__finds_the_limits_once_per_evaluation(calls: Counter[str], tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(TINY_RECIPE))
     lines = ["--episodes", "20", "--output", str(tmp_path / "run"), "--json"]

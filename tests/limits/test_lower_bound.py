@@ -138,7 +138,12 @@ def test_paper_lists__are_bounded_near_the_best_known_harm():
 
 @pytest.mark.parametrize(
     ("name", "n"),
-    [("paper-random", 2000), ("paper-delay-low", 2000), ("paper-delay-middle", 2000), ("paper-delay-high", 2000)],
+    [
+        ("paper-random", 2000),
+        pytest.param("paper-delay-low", 2000, marks=pytest.mark.slow),
+        pytest.param("paper-delay-middle", 2000, marks=pytest.mark.slow),
+        ("paper-delay-high", 2000),
+    ],
 )
 @pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_best_known_harm__is_never_below_the_bound_and_near_it(name, n, harm_count):

@@ -29,7 +29,7 @@ def driven(agent: object, scenario: Scenario, n: int, seed: int = 7, vehicle: in
 
 
 @pytest.mark.parametrize("scenario", LISTS.values(), ids=list(LISTS))
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", [pytest.param(way, marks=() if way == "drive" else pytest.mark.slow) for way in WAYS])
 def test_robust__at_the_corners_no_world_is_above_the_first_bound(scenario: Scenario, way: str) -> None:
     harm, bound, replaced = shielded(way, scenario, 15, 7)
     assert (harm <= bound + ABOVE).all()
@@ -90,7 +90,7 @@ def test_believed__no_world_depends_on_the_batch(spec: str) -> None:
     np.testing.assert_allclose(whole.speeds_mps[4], alone.speeds_mps[0], atol=1e-6)
 
 
-@pytest.mark.parametrize("vehicles", [2, 4])
+@pytest.mark.parametrize("vehicles", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_believed__shields_lines_of_other_lengths(vehicles: int) -> None:
     scenario = load_scenario("paper-random").replace(
         vehicles=vehicles, braking_capacity_mps2=6.0, driving_capacity_mps2=6.0, mass_t=5.0, latency_s=0.1,
@@ -149,6 +149,7 @@ def test_interior__what_it_cannot_certify_is_refused_when_the_agent_is_made() ->
         make_agent("coast+robust:interior:believed", scenario=BASE.replace(obstacle_gap_m=60.0))
 
 
+@pytest.mark.slow
 def test_believed__bounds_nothing_where_its_vehicle_had_an_impact_before_the_first_decision() -> None:
     late = BASE.replace(latency_s=[0.0, 1.2, 0.5])
     for spec in ("coast+step:believed", "coast+robust:believed"):

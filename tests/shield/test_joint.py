@@ -125,7 +125,9 @@ def test_caps__reject_what_only_moves_harm_to_another():
     assert decision.intervened.tolist() == [[True, False]] and decision.applied[0, 0] == -1.0
 
 
-@pytest.mark.parametrize(("level", "N"), [(3, 3), (4, 3), (3, 5)])
+@pytest.mark.parametrize(
+    ("level", "N"), [(3, 3), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((4, 3), (3, 5)))]
+)
 @pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_engine__realises_the_last_bound_to_the_bit_and_the_bound_never_rises(level, N, harm_count):
     scenario = scenario_of(level, N)

@@ -90,6 +90,7 @@ def test_processes__give_the_same_tally_and_a_shard_whose_process_was_killed_is_
     assert len(list(folder.path.glob("shard-*.json"))) == 4
 
 
+@pytest.mark.slow
 def test_processes__are_ended_where_a_shard_fails_or_on_ctrl_c(asked, monkeypatch, tmp_path: Path) -> None:
     changed = replace(asked, identity={**asked.identity, "seed": 12})
     with pytest.raises(InvalidInput, match="seed changed since the evaluation began"):

@@ -106,6 +106,7 @@ def test_benchmarks__each_measures_something() -> None:
             assert 0.0 < speed.lowest == speed.value == speed.highest
 
 
+@pytest.mark.slow
 def test_start__takes_processor_time_of_another_process() -> None:
     (speed,) = speeds_of("import and first step", SHORT)
     assert (speed.unit, speed.floor, speed.worlds) == ("s", 2.0, 1)

@@ -28,7 +28,10 @@ RECORDED = {
 }
 
 
-@pytest.mark.parametrize(("scenario", "harm_count"), RECORDED)
+@pytest.mark.parametrize(
+    ("scenario", "harm_count"),
+    [pytest.param(*each, marks=pytest.mark.slow if each[1] == "total" else ()) for each in RECORDED],
+)
 def test_tally__is_the_one_that_was_recorded(scenario, harm_count):
     asked = ask(Question(load_scenario(scenario), AGENTS, 1_200, 11, harm_count))
     tally = answer_shard(asked, 0, 1_000) + answer_shard(asked, 1_000, 1_200)

@@ -61,6 +61,7 @@ def test_tally__is_the_same_bits_in_any_shards_and_blocks(asked, tally: Tally, s
     )
 
 
+@pytest.mark.slow
 def test_tally__is_the_same_bits_from_two_processes(paper_random: Scenario) -> None:
     asked = ask(Question(paper_random, ("full_brake", "e_v2x_bm"), 3_000, 5))
     alone = evaluate_shards(asked, shards=1)

@@ -67,6 +67,7 @@ def test_ablate__writes_tables_and_figures(ablation):
     assert pair["searched"]["best_known"]["value"] <= pair["searched"]["full_brake"]["value"]
 
 
+@pytest.mark.slow
 def test_ablate__the_shield_goes_around_what_was_trained(ablation, tmp_path, tiny, capsys):
     """The trainings of the other ablation are used, in a copy without its settings."""
     folder = tmp_path / "shielded"
@@ -107,6 +108,7 @@ def test_page__plays_the_same_worlds_at_every_level(ablation, column):
     assert again.same and again.passport.policy_sha == passport.policy_sha
 
 
+@pytest.mark.slow
 def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(ablation, tmp_path, tiny, monkeypatch, capsys):
     """Stopped in the middle of the second training; ended by two processes."""
     folder, trained = tmp_path / "stopped", []

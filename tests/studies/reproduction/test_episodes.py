@@ -35,6 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_trajectories__are_watched_side_by_side(folder: Path) -> None:
     page = Page((folder / "index.html").read_text("utf-8"))
     assert page.open == [] and "Passports" in page.text
@@ -44,6 +45,7 @@ def test_trajectories__are_watched_side_by_side(folder: Path) -> None:
     assert titles[0] == "Scenario 1, as stated" and len(set(titles)) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", [0, 3])
 def test_trajectories__passports_play_them_again(folder: Path, world: int) -> None:
     content = json.loads((folder / "trajectories" / EPISODES).read_text("utf-8"))

@@ -79,6 +79,7 @@ def test_finished_jobs__are_not_repeated_and_the_table_is_the_same(finished_swee
     assert all(path.stat().st_mtime_ns == then for path, then in kept.items() if gone not in path.parents)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gone", ["policy", "policy/weights.safetensors"])
 def test_job__whose_policy_was_taken_away_is_done_again(finished_sweep, small, tmp_path, gone):
     folder, file = tmp_path / "again", tmp_path / "sweep.yaml"
@@ -91,6 +92,7 @@ def test_job__whose_policy_was_taken_away_is_done_again(finished_sweep, small, t
     assert load_policy(run).manifest.manifest_sha256 in (folder / TABLE).read_text()
 
 
+@pytest.mark.slow
 def test_team__that_has_lost_a_policy_is_trained_again(write_sweep, tiny, tmp_path):
     job = {"level": "3-pair", "recipe": str(tiny), "set": {"scheme": "independent", "total_steps": 1}}
     folder, file = tmp_path / "out", write_sweep(jobs=[job])
@@ -128,6 +130,7 @@ def test_dry_run__prints_jobs_and_cost_and_makes_nothing(finished_sweep, small, 
     assert {job["state"] for job in json.loads(capsys.readouterr().out)["jobs"]} == {"finished"}
 
 
+@pytest.mark.slow
 def test_failures__end_in_a_table_with_their_last_lines(write_sweep, tiny, tmp_path, capsys):
     good = {"scenario": "paper-random", "recipe": str(tiny)}
     bad = {**good, "set": {"reward.harm": 1e300}}

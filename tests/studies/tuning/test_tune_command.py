@@ -75,6 +75,7 @@ def test_export__is_a_recipe_that_trains_the_best_trial_again_to_the_bit(finishe
     assert "ethbrake train --scenario paper-random --recipe best.yaml" in text
 
 
+@pytest.mark.slow
 def test_trials__that_ended_are_kept_and_more_go_on_as_if_they_had_been_asked_for_at_once(
     finished_tuning, write_tuning, tmp_path, capsys
 ):
@@ -114,6 +115,7 @@ def test_disturbed_tuning__has_the_same_table(finished_tuning, write_tuning, tmp
     assert export.read_text() == (finished_tuning.parent / "best.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_broken_trials__are_marked_failed_and_others_done_in_their_place(write_tuning, tmp_path):
     file, folder = write_tuning(), tmp_path / "out"
     plan = plan_tuning(read_tuning(file))
@@ -128,6 +130,7 @@ def test_broken_trials__are_marked_failed_and_others_done_in_their_place(write_t
     assert [row["state"] for row in read(folder / TABLE)] == ["failed", "finished", "finished"]
 
 
+@pytest.mark.slow
 def test_trial__that_diverges_is_failed_with_its_reason_and_the_others_go_on(write_tuning, tmp_path, capsys):
     file = write_tuning(search={"reward.harm": {"choices": [0.05, 1e300]}}, sampler={"name": "random"})
     assert tune(file, tmp_path / "out", "--trials", "4") == 0
@@ -138,6 +141,7 @@ def test_trial__that_diverges_is_failed_with_its_reason_and_the_others_go_on(wri
     assert len(list((tmp_path / "out" / "trials").glob("*/policy"))) == 1 + len(failed)  # the same is not trained twice
 
 
+@pytest.mark.slow
 def test_no_trial__that_ends_well_is_exit_status_1(write_tuning, tmp_path, capsys):
     file = write_tuning(search={"reward.harm": {"low": 1e299, "high": 1e300}})
     export = tmp_path / "best.yaml"
@@ -164,6 +168,7 @@ def test_folder_of_other_versions__is_refused_with_their_names(finished_tuning, 
     assert "was tuned with torch 1.0, here 2." in told and "numpy" not in told
 
 
+@pytest.mark.slow
 def test_storage__can_be_shared_by_folders(write_tuning, tmp_path):
     plan, storage = plan_tuning(read_tuning(write_tuning())), f"sqlite:///{tmp_path / 'study.db'}"
     with closing(LocalWorkers(2)) as workers:
