@@ -50,7 +50,7 @@ SECONDS_PER_MUTANT = {True: 1.2, False: 5.0}  # one process, for the estimate: w
 THRESHOLD = 0.95
 EQUIVALENT = of_physics.EQUIVALENT | of_others.EQUIVALENT
 
-PYTEST = ("-x", "-q", "-p", "no:cacheprovider", "-p", "no:randomly", "--rootdir=.")
+PYTEST = ("-x", "-q", "-m", "not long", "-p", "no:cacheprovider", "-p", "no:randomly", "--rootdir=.")
 # tests that take seconds each without compilation
 SECONDS_EACH = ("oracle", "order_one", "50-1", "long_lines", "ten_thousand", "none_missed", "scan", "fresh_worlds")
 LEFT_TO_COMPILED = ("-k", " and ".join(f"not {name}" for name in SECONDS_EACH))
