@@ -19,7 +19,7 @@ from pathlib import Path
 
 from filelock import FileLock
 
-RESULTS = 9  # values of a row
+RESULTS = 10  # values of a row
 
 
 def count(folder: Path, seed: int, steps: int, sleep_s: float) -> tuple[str, ...]:
