@@ -25,7 +25,7 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"
 os.environ["SDL_AUDIODRIVER"] = "dummy"
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 
-pytest_plugins = ["tests.fixtures.evaluation", "tests.fixtures.policies"]
+pytest_plugins = ["tests.fixtures.evaluation", "tests.fixtures.pictures", "tests.fixtures.policies"]
 
 # Typer builds all commands for each command line, 100 ms; the suite has a thousand in one process.
 _build_command = functools.cache(typer.main.get_command_from_info)
@@ -71,13 +71,6 @@ def _own_user_files() -> Iterator[None]:
         if now != then:
             now.clear()
             now.update(then)
-
-
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are made and not drawn, which takes most of a page: for tests that look at what stands beside them."""
-    empty = b'<svg xmlns="http://www.w3.org/2000/svg" width="9pt" height="9pt" viewBox="0 0 9 9"/>'
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda figure, file, **how: file.write(empty))
 
 
 @pytest.fixture(autouse=True)

@@ -29,6 +29,7 @@ def test_shield__prints_its_rows_as_json_and_as_a_table(ethbrake):
     assert "full_brake" in table and "needed" in table and f"{rows[2]['harm']:.2f}" in table
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     "command",
     [
