@@ -164,7 +164,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainResult]:
     return folder, train(TINY, SCENARIO, folder)
 
 
-@pytest.mark.parametrize("at", [6, 10, 14])
+@pytest.mark.parametrize("at", [pytest.param(6, marks=pytest.mark.slow), 10, pytest.param(14, marks=pytest.mark.slow)])
 def test_training__stops_in_any_stage_and_resumes_bit_for_bit(
     at: int, whole: tuple[Path, TrainResult], tmp_path: Path
 ) -> None:

@@ -164,10 +164,10 @@ def test_centralised__the_critic_sees_the_line_and_the_actor_does_not() -> None:
 @pytest.mark.parametrize(
     "scheme",
     [
-        pytest.param("shared", marks=pytest.mark.slow),  # shared: as one learner; independent: as turns, of one turn
+        pytest.param("shared", marks=pytest.mark.slow),  # these three have less to keep than turns
         pytest.param("independent", marks=pytest.mark.slow),
         "turns",
-        "centralised",
+        pytest.param("centralised", marks=pytest.mark.slow),
     ],
 )
 def test_resume__after_a_failure_or_ctrl_c_it_ends_as_if_nothing_had_happened(
