@@ -31,7 +31,14 @@ def test_deceleration__writes_a_png_of_that_world(ethbrake, tmp_path):
     assert (tmp_path / "curve-0.png").read_bytes() != (tmp_path / "curve-5.png").read_bytes()
 
 
-@pytest.mark.parametrize(("ending", "magic"), [(".svg", b"<?xml"), (".pdf", b"%PDF"), (".PNG", PNG)])
+@pytest.mark.parametrize(
+    ("ending", "magic"),
+    [
+        (".svg", b"<?xml"),
+        pytest.param(".pdf", b"%PDF", marks=pytest.mark.slow),
+        pytest.param(".PNG", PNG, marks=pytest.mark.slow),
+    ],
+)
 def test_picture__is_written_as_its_name_ends_and_the_same_bytes_again(ethbrake, tmp_path, ending, magic):
     written = []
     for name in ("one", "other"):

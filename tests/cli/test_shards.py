@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-LIST = ("evaluate", "--agents", "full_brake,coast", "--episodes", "2300", "--seed", "11")
+LIST = ("evaluate", "--agents", "full_brake", "--episodes", "2300", "--seed", "11")
 SHARDED = (*LIST, "--shards", "3")
 
 

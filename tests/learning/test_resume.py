@@ -285,7 +285,11 @@ def test_resume__refuses_what_it_cannot_go_on_with(
 
 @pytest.mark.parametrize(
     ("part", "change"),
-    [("recipe", {"gamma": 0.9}), ("recipe", {"seed": 5}), ("scenario", {"horizon_s": 9.0})],
+    [
+        ("recipe", {"gamma": 0.9}),
+        pytest.param("recipe", {"seed": 5}, marks=pytest.mark.slow),
+        pytest.param("scenario", {"horizon_s": 9.0}, marks=pytest.mark.slow),
+    ],
 )
 def test_resume__an_edited_configuration_is_another_training(
     part: str, change: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -334,7 +334,13 @@ def _fits(recipe: Any, decisions: int) -> bool:
     return sac or (decisions % recipe.batch_size == 0 and decisions >= recipe.counterfactuals)
 
 
-@pytest.mark.parametrize("name", sorted(shipped_recipes()))
+OF_THEIR_KIND = ("cooperation", "cooperation-ppo", "modes", "ppo-paper", "sac-paper")  # others differ in numbers
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name in OF_THEIR_KIND else pytest.mark.slow) for name in sorted(shipped_recipes())],
+)
 def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> None:
     recipe = load_recipe(name)
     if recipe.algorithm == "ppo":

@@ -262,6 +262,7 @@ def test_report__says_where_the_horizon_cut_episodes_off(pair: Scenario, html: s
     assert "from the alert to rest." in html
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_write_report__overwrites_only_by_force(tmp_path: Path, pair: Scenario) -> None:
     rows = summarise(evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair))
     path = tmp_path / "report.html"
