@@ -120,6 +120,7 @@ def test_training__any_learners_any_objective_any_line(tmp_path: Path, learners:
     assert train(recipe.replace(total_steps=32), longer, tmp_path / "longer").status == "finished"
 
 
+@pytest.mark.slow
 def test_training__gets_better_from_scratch(tmp_path: Path) -> None:
     """Random weights hardly act; after 30 updates of 256 counterfactuals much of the harm of coasting is gone."""
     recipe = SHIPPED.replace(

@@ -160,6 +160,7 @@ def test_speed__is_not_far_below_the_calibration(name: str, least: float) -> Non
         assert speed.highest / calibration.value > least
 
 
+@pytest.mark.slow
 def test_scaling__costs_are_per_world_step() -> None:
     by_worlds = list(costs_by_worlds(SHORT, (1, 3)))
     assert [(cost.what, cost.worlds, cost.vehicles) for cost in by_worlds] == [
