@@ -132,7 +132,7 @@ def test_caps__reject_what_only_moves_harm_to_another():
 def test_engine__realises_the_last_bound_to_the_bit_and_the_bound_never_rises(level, N, harm_count):
     scenario = scenario_of(level, N)
     cap = "baseline" if harm_count == "first" else None
-    worlds = scenario.sample(12, 5).worlds
+    worlds = scenario.sample(8, 5).worlds
     for name, adversary in ADVERSARIES.items():
         for hostile in ("all", "one"):
             found = joint_attack(scenario, worlds, adversary, hostile=hostile, harm_count=harm_count, cap=cap, seed=1)

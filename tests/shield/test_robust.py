@@ -121,7 +121,7 @@ def test_every_member__realises_at_most_the_bound_to_the_bit(N, harm_count, who)
     uncertainty = parse_uncertainty(ALL[N])
     members = uncertainty.members(worlds)
     M, tight = members.n // worlds.n, 0
-    for m in range(0, M, 5):
+    for m in range(0, M, 10):
         truth = members.take(np.arange(worlds.n) * M + m)
         shielded = StepShieldAgent(
             Adversary(who, m),
@@ -155,7 +155,7 @@ def test_every_member__is_bounded_by_the_same_actions():
 @pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_no_width__is_step_mode_to_the_bit(harm_count):
     scenario = line(3)
-    worlds = scenario.sample(30, 3).worlds
+    worlds = scenario.sample(12, 3).worlds
     harms, bounds = [], []
     for settings in ({}, {"uncertainty": "latency_s=0,mass_t=0%"}):
         shielded = StepShieldAgent(Adversary("random"), scenario, harm_count=harm_count, **settings)
