@@ -223,7 +223,7 @@ def test_start__version_every_help_and_completion_import_nothing_heavy() -> None
     assert "Train a policy, or the policies of several learners, into a run's folder." in out
 
 
-@pytest.mark.parametrize("use", ["ethbrake_marl.Scenario", "run_command(['scenario', 'list'])"])
+@pytest.mark.parametrize("use", ["ethbrake_marl.Scenario", "run_command(['scenario', 'show', 'paper-random'])"])
 def test_start__environments_are_registered_by_what_is_more_than_help(use: str) -> None:
     program = f"""
 import ethbrake_marl

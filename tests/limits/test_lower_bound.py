@@ -145,7 +145,7 @@ def test_paper_lists__are_bounded_near_the_best_known_harm():
         ("paper-delay-high", 1000),
     ],
 )
-@pytest.mark.parametrize("harm_count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", pytest.param("total", marks=pytest.mark.slow)])
 def test_best_known_harm__is_never_below_the_bound_and_near_it(name, n, harm_count):
     scenario = load_scenario(name)
     worlds = scenario.sample(n, seed=7).worlds

@@ -18,7 +18,10 @@ def test_search__finds_no_way_past_the_shield_but_many_without_it() -> None:
     assert found.loose > 0.5
 
 
-@pytest.mark.parametrize("name", [name for name in LEAKS if "further off" not in name])  # that one takes longer lines
+EASY = [name for name in LEAKS if "further off" not in name]  # that one takes longer lines
+
+
+@pytest.mark.parametrize("name", [*EASY[:3], *(pytest.param(name, marks=pytest.mark.slow) for name in EASY[3:])])
 def test_search__finds_each_leak(name: str) -> None:
     found = search(100, 5, LEAKS[name], until_found=True)
     assert found.first is not None and found.excess > 1e-6
