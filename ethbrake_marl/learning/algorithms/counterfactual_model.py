@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from ethbrake_marl.engine.branches import Act, Moment, Offsets, branch, join_moments, moment_of, play_to_the_end
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS
+from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS, Adam
 from ethbrake_marl.learning.algorithms.scout import Scout, choose_rows
 from ethbrake_marl.learning.recipe import ActorShape
 from ethbrake_marl.physics import Bools, Floats, Ints
@@ -57,7 +57,7 @@ class AveragedActor(BasePolicy):
         self._average(0.0, towards_learning=False)
         self.scout = Scout(inputs) if focus > 0.0 else None
         learned = [*self.learning.parameters(), *(self.scout.parameters() if self.scout is not None else ())]
-        self.optimizer = torch.optim.Adam(learned, lr=rate(1.0), eps=1e-5)
+        self.optimizer = Adam(learned, lr=rate(1.0), eps=1e-5)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
         """Begin with these tensors of a bundle."""
