@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import Estimate
-from ethbrake_marl.figures.style import GREY, Figure, add_caption, label_text, new_figure, series_style, style_axes
+from ethbrake_marl.figures.style import GREY, add_caption, label_text, new_figure, series_style, style_axes
 
 Series = Sequence[tuple[str, Sequence[Estimate]]]
 """Label and estimates, one for each name."""

@@ -361,5 +361,5 @@ def test_gymnasium__which_vector_wrappers_take_same_step_is_what_the_page_says()
     for wrap in (wrappers.NormalizeObservation, wrappers.FlattenObservation):
         assert f"`{wrap.__name__}`" in page
         wrap(eb.EthBrakeVectorEnv(2)).reset(seed=1)
-        with pytest.raises(ValueError, match="SAME_STEP"):
+        with pytest.raises((ValueError, AssertionError)):  # Gymnasium 1.1 asserts, without a word
             wrap(eb.EthBrakeVectorEnv(2, autoreset_mode="SameStep"))

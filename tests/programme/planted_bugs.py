@@ -21,26 +21,42 @@ from tests.programme.planting import Patch, first_red, misfits
 from tests.programme.suites import ROOT
 
 REWARDS, V2X, ENGINE, TERMS, STEPPING, STARTS, OBJECTIVES = (
-    f"ethbrake_marl/{name}.py"
-    for name in (
-        "rewards/terms", "scenario/v2x", "engine/engine", "engine/terms", "engine/step", "engine/stream", "objectives",
-    )
+    "ethbrake_marl/rewards/terms.py",
+    "ethbrake_marl/scenario/v2x.py",
+    "ethbrake_marl/engine/engine.py",
+    "ethbrake_marl/engine/terms.py",
+    "ethbrake_marl/engine/step.py",
+    "ethbrake_marl/engine/stream.py",
+    "ethbrake_marl/objectives.py",
 )  # fmt: skip
 SB3 = "ethbrake_marl/envs/sb3.py"
 COMPARISON, OPTIMUM, PLAN = (
-    f"ethbrake_marl/studies/ablation/{name}.py" for name in ("comparison", "joint_optimum", "plan")
+    "ethbrake_marl/studies/ablation/comparison.py",
+    "ethbrake_marl/studies/ablation/joint_optimum.py",
+    "ethbrake_marl/studies/ablation/plan.py",
 )
 EXACT, SEEDS, TABLE, REGRET, ROLLOUT = (
-    f"ethbrake_marl/evaluation/{name}.py" for name in ("exact", "seed_statistics", "table", "regret", "rollout")
+    "ethbrake_marl/evaluation/exact.py",
+    "ethbrake_marl/evaluation/seed_statistics.py",
+    "ethbrake_marl/evaluation/table.py",
+    "ethbrake_marl/evaluation/regret.py",
+    "ethbrake_marl/evaluation/rollout.py",
 )
 SHARDS = "ethbrake_marl/studies/shards.py"
 COURSE, LOOP, EVENTS, KEPT, INDEPENDENT, RECIPE = (
-    f"ethbrake_marl/learning/{name}.py"
-    for name in ("progress", "loop", "run_log", "training", "algorithms/independent_ppo", "recipe")
+    "ethbrake_marl/learning/progress.py",
+    "ethbrake_marl/learning/loop.py",
+    "ethbrake_marl/learning/run_log.py",
+    "ethbrake_marl/learning/training.py",
+    "ethbrake_marl/learning/algorithms/independent_ppo.py",
+    "ethbrake_marl/learning/recipe.py",
 )
 
 
-SAMPLING, MIXTURE = (f"ethbrake_marl/scenario/{name}.py" for name in ("sampling", "mixture"))
+SAMPLING, MIXTURE = (
+    "ethbrake_marl/scenario/sampling.py",
+    "ethbrake_marl/scenario/mixture.py",
+)
 
 
 class Bug(NamedTuple):

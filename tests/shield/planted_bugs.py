@@ -42,15 +42,23 @@ WHOLE = tuple(
     for name in ("joint", "engine_shield", "step", "rollouts", "interfaces", "interference", "interior")
 )
 KERNEL, MEMBERS, CERTIFY, ALERT, GUARD, ROLLOUTS, ATTACHED, COMPARISON, TEAM = (
-    f"ethbrake_marl/shield/{name}.py"
-    for name in (
-        "certify_kernel", "members", "certify", "alert", "step_shield", "rollouts", "engine_shield", "comparison",
-        "team_agent",
-    )
+    "ethbrake_marl/shield/certify_kernel.py",
+    "ethbrake_marl/shield/members.py",
+    "ethbrake_marl/shield/certify.py",
+    "ethbrake_marl/shield/alert.py",
+    "ethbrake_marl/shield/step_shield.py",
+    "ethbrake_marl/shield/rollouts.py",
+    "ethbrake_marl/shield/engine_shield.py",
+    "ethbrake_marl/shield/comparison.py",
+    "ethbrake_marl/shield/team_agent.py",
 )  # fmt: skip
 FORMS, INSIDE, WAIT, MOTION, TOUCH, ROUGH = (
-    f"ethbrake_marl/shield/{name}.py"
-    for name in ("forms", "interior", "interior_kernel", "enclosure_motion", "enclosure_touch", "enclosure_rough")
+    "ethbrake_marl/shield/forms.py",
+    "ethbrake_marl/shield/interior.py",
+    "ethbrake_marl/shield/interior_kernel.py",
+    "ethbrake_marl/shield/enclosure_motion.py",
+    "ethbrake_marl/shield/enclosure_touch.py",
+    "ethbrake_marl/shield/enclosure_rough.py",
 )
 
 BUGS: dict[str, tuple[Patch, ...]] = {

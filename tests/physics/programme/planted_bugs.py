@@ -30,10 +30,16 @@ QUICK = (
 WHOLE = ("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py")
 
 EVENTS, IMPACT, SEGMENT, ADVANCE = (
-    f"ethbrake_marl/physics/{name}.py" for name in ("events", "impact", "segment", "advance")
+    "ethbrake_marl/physics/events.py",
+    "ethbrake_marl/physics/impact.py",
+    "ethbrake_marl/physics/segment.py",
+    "ethbrake_marl/physics/advance.py",
 )
 HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/obstacle.py"
-FLIGHTS, LOWER_BOUND = (f"ethbrake_marl/limits/{name}.py" for name in ("flights", "lower_bound"))
+FLIGHTS, LOWER_BOUND = (
+    "ethbrake_marl/limits/flights.py",
+    "ethbrake_marl/limits/lower_bound.py",
+)
 PROFILES = "ethbrake_marl/search/profiles.py"
 
 
