@@ -81,14 +81,14 @@ class _Follower:
         starts = np.searchsorted(rows.world, np.arange(some.size + 1)).tolist()  # they come world by world
         for k, first, end in zip(some.tolist(), starts[:-1], starts[1:], strict=True):
             self._impacts[k].append(ImpactRows(*(column[first:end] for column in columns)))
-            world = before if before.n == 1 else before.take([k])
-            command, until = command_mps2[k], float(until_s[k])
-            if until > float(world.time_s[0]):
-                pieces = segment_pieces(world, command, until)
-                way = _way(pieces, until)
-                pieces[:, 1] += self._way_m[k]
-                self._pieces[k].append(pieces)
-                self._way_m[k] += way
+        some = np.flatnonzero(until_s > before.time_s)
+        for k, pieces in zip(
+            some.tolist(), segment_pieces(before.take(some), command_mps2[some], until_s[some]), strict=True
+        ):
+            way = _way(pieces, float(until_s[k]))
+            pieces[:, 1] += self._way_m[k]
+            self._pieces[k].append(pieces)
+            self._way_m[k] += way
         count = _steps_taken_over(self._drivers, before.n)
         for k in np.flatnonzero(count > self._count).tolist():
             self._stepped_in[k].append(float(before.time_s[k]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.compiled import compiled
 from ethbrake_marl.physics.episode import onset_s
 from ethbrake_marl.physics.impact import GAP, MASS, SPEED, resolve_impacts
@@ -61,41 +60,40 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
     return count
 
 
-def segment_pieces(world: Worlds, command_mps2: Floats, until_s: float) -> Floats:
-    """The motion of one world until a time, under one command: a row per piece of constant acceleration.
+def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> list[Floats]:
+    """The motion of each world until a time, under one command: a row per piece of constant acceleration.
 
     Args:
-        world: n = 1, of N vehicles; it stays as it is.
-        command_mps2: signed acceleration wanted, [N] m/s2.
-        until_s: where the segment ends, s.
+        worlds: n, of N vehicles; they stay as they are.
+        command_mps2: signed accelerations wanted, [n, N] m/s2.
+        until_s: where the segments end, [n] s.
 
-    Returns [k, 1 + N + 2 N]: the absolute time at which the piece begins (s), how far Vehicle 1 has come since the
-    segment began, the gaps (m), the speeds (m/s) and the accelerations (m/s2). Raises ``InvalidInput`` for more than
-    one world.
+    Returns for each world [k, 1 + N + 2 N]: the absolute time at which the piece begins (s), how far Vehicle 1 has come
+    since the segment began, the gaps (m), the speeds (m/s) and the accelerations (m/s2).
 
     """
-    if world.n != 1:
-        raise InvalidInput(f"segment_pieces: {world.n} worlds given; exactly 1 is needed")
-    start = float(world.time_s[0])
-    duration = float(until_s) - start
-    front_gap = float(with_post_ahead(world, np.array([duration])).obstacle_gap_m[0])  # says where Vehicle 1 is
-    v, N = world.vehicles, world.N
-    table = np.zeros((TABLE_ROWS, N + 1))
-    place_obstacle(table, front_gap, 0.0)
-    table[COMMAND, 1:], table[SPEED, 1:] = command_mps2, world.speeds_mps[0]
-    table[MASS, 1:], table[LIMIT, 1:] = v.mass_t[0], v.speed_limit_mps[0]
-    table[ONSET, 0] = onset_s(0.0, start)
-    table[ONSET, 1:] = [onset_s(float(latency), start) for latency in v.latency_s[0]]
-    table[GAP, 1:N] = world.gaps_m[0]
-    capacity = _CAPACITY
-    while True:
-        rows = np.zeros((capacity, 3 * (N + 1)))
-        count = abs(_pieces(table.copy(), float(v.restitution[0]), duration, rows))
-        if count <= capacity:
-            break
-        capacity = count
-    seen = [*range(N + 1), *range(N + 2, 2 * N + 2), *range(2 * N + 3, 3 * N + 3)]  # all but the post's own
-    rows = rows[:count, seen]
-    rows[:, 0] += start
-    rows[:, 1] = front_gap - rows[:, 1]
-    return rows
+    v, N, durations = worlds.vehicles, worlds.N, until_s - worlds.time_s
+    front_gaps = with_post_ahead(worlds, durations).obstacle_gap_m  # says where Vehicle 1 is
+    latencies, restitutions = v.latency_s, v.restitution
+    wanted = [*range(N + 1), *range(N + 2, 2 * N + 2), *range(2 * N + 3, 3 * N + 3)]  # all but the post's own
+    found = []
+    for k in range(worlds.n):
+        start = float(worlds.time_s[k])
+        table = np.zeros((TABLE_ROWS, N + 1))
+        place_obstacle(table, float(front_gaps[k]), 0.0)
+        table[COMMAND, 1:], table[SPEED, 1:] = command_mps2[k], worlds.speeds_mps[k]
+        table[MASS, 1:], table[LIMIT, 1:] = v.mass_t[k], v.speed_limit_mps[k]
+        table[ONSET, 0], table[ONSET, 1:] = onset_s(0.0, start), latencies[k] - start
+        table[GAP, 1:N] = worlds.gaps_m[k]
+        capacity = _CAPACITY
+        while True:
+            rows = np.empty((capacity, 3 * (N + 1)))
+            count = abs(_pieces(table.copy(), float(restitutions[k]), float(durations[k]), rows))
+            if count <= capacity:
+                break
+            capacity = count
+        pieces = rows[:count, wanted]
+        pieces[:, 0] += start
+        pieces[:, 1] = front_gaps[k] - pieces[:, 1]
+        found.append(pieces)
+    return found
