@@ -43,6 +43,7 @@ PROGRAM = re.compile(r"```python\n((?:(?!```).)*?{name}(?:(?!```).)*?)```", re.D
 def run(command: str, folder: Path) -> str:
     """What a command tells on stderr and stdout, in this order; raises ``RuntimeError`` where it fails."""
     words = shlex.split(command)
+    words[1:] = [str(ROOT / word) if word.startswith("docs/studies/") else word for word in words[1:]]
     called = [sys.executable, *(["-m", "ethbrake_marl"] if words[0] == "ethbrake" else []), *words[1:]]
     variables = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100", "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
     done = subprocess.run(called, cwd=folder, env=variables, capture_output=True, text=True, check=False)

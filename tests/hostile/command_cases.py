@@ -148,7 +148,6 @@ def _words() -> Iterator[Case]:
             ("train", "--recipe", word),
             ("evaluate", *FEW, "--objective", word),
             ("shield", *FEW, "--agents", word),
-            ("evaluate", *FEW, "--shield", word),
             ("export", word, "--onnx", "x.onnx"),
             ("learning-curves", "--output", "o", "--scenario", word),
             ("ablate", "--levels", word, "--output", "o"),

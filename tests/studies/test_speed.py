@@ -10,10 +10,6 @@ from collections.abc import Callable
 import numba
 import numpy as np
 import pytest
-
-from ethbrake_marl.cli.machine import this_machine
-from ethbrake_marl.physics import advance, make_worlds
-from ethbrake_marl.studies import speed as benchmark
 from ethbrake_marl.studies.scaling import (
     APART,
     EMERGENCY,
@@ -24,6 +20,10 @@ from ethbrake_marl.studies.scaling import (
     make_lines,
     scaling_figure,
 )
+
+from ethbrake_marl.cli.machine import this_machine
+from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.studies import speed as benchmark
 from ethbrake_marl.studies.speed import (
     BENCHMARKS,
     Benchmark,
