@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,13 @@ def run(command: str, folder: Path) -> str:
     return done.stderr + done.stdout
 
 
+@cache
+def told_by(command: str) -> str:
+    """What a command tells that several tables may show."""
+    with tempfile.TemporaryDirectory() as folder:
+        return run(command, Path(folder))
+
+
 def differing_block(block: Shown, place: How, folder: Path) -> list[str]:
     """What the commands of a block print that is not shown; how far they are (``500 of 2,000``) is not compared."""
     found = []
@@ -67,7 +75,7 @@ def differing_block(block: Shown, place: How, folder: Path) -> list[str]:
 
 def differing_table(table: Shown, place: How, folder: Path) -> list[str]:
     """The figures of a table that its commands do not tell."""
-    told = "\n".join(run(command, folder) for command in place.by)
+    told = "\n".join(map(told_by, place.by))
     return [figure for figure in missing_figures(table.text, told) if figure not in place.quoted]
 
 
