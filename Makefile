@@ -84,7 +84,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "== Installing ethbrake_marl"
 	@$(INSTALL) -e .
 	@echo "== Compiling the physics, beside the rest of the installation"
-	@PYTHONPATH="$(CURDIR)" $(BIN)/python -c "from ethbrake_marl.cli import doctor; raise SystemExit(not doctor.compile_ahead(training=False)[0])" & \
+	@PYTHONPATH="$(CURDIR)" $(BIN)/python -c "from ethbrake_marl.cli import doctor; raise SystemExit(not doctor.compile_ahead(training=False, run_alone=True)[0])" & \
 	compiling=$$!; \
 	trap "kill $$compiling" INT TERM; \
 	echo "== Installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX),: uv looks for the build for this machine)"; \

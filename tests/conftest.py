@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import functools
 import os
 import signal
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import typer.main
 from hypothesis import settings
+
+from ethbrake_marl.files import yaml
 
 # Before the first numerical import: each pool reads its variable once.
 for _pool in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -20,10 +25,30 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"
 os.environ["SDL_AUDIODRIVER"] = "dummy"
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 
-pytest_plugins = ["tests.fixtures.evaluation", "tests.fixtures.policies"]
+pytest_plugins = ["tests.fixtures.evaluation", "tests.fixtures.pictures", "tests.fixtures.policies"]
 
-# Typer reads the signatures of all commands for each command line, 70 ms; the suite has a thousand in one process.
-typer.main.get_params_from_function = functools.cache(typer.main.get_params_from_function)
+# Typer builds all commands for each command line, 100 ms; the suite has a thousand in one process.
+_build_command = functools.cache(typer.main.get_command_from_info)
+
+
+def _copied_command(*given: Any, **how: Any) -> Any:
+    command = copy.copy(_build_command(*given, **how))
+    command.params = [*command.params]  # which get one more, `--plugin`, for each command line
+    return command
+
+
+typer.main.get_command_from_info = _copied_command
+
+# The suite reads the shipped files several thousand times, 10 ms each: what is parsed is the same for the same text.
+_parse = functools.cache(yaml._parse)
+
+
+def _parsed_once(text: str, file: str) -> yaml.Document:
+    document = _parse(text, file)
+    return dataclasses.replace(document, content=copy.deepcopy(document.content))
+
+
+yaml._parse = _parsed_once
 
 # A shell's background job ignores Ctrl-C, and so would all processes that it starts; the tests send it.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import ast
 import importlib
+import json
 import os
 import platform
 import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 
 import numba
@@ -133,7 +137,7 @@ def test_keep_kernel__on_a_full_disk_costs_a_warning(monkeypatch):
 
 @pytest.fixture
 def copied(monkeypatch, tmp_path) -> Path:
-    package = tmp_path / "ethbrake_marl"
+    package = tmp_path / "copied" / "ethbrake_marl"
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(kernel_store, "_PACKAGE", package)
     return package
@@ -215,7 +219,7 @@ def test_kernel_sources__find_every_import(copied):
 # ---------------------------------------------------------------- processes
 
 PROGRAM = """
-import sys, time
+import os, time
 import numpy as np
 from pathlib import Path
 from numba.core import event
@@ -228,9 +232,8 @@ class Count(event.Listener):
     def on_end(self, happened):
         pass
 
-ready, go = map(Path, sys.argv[1:])
-ready.touch()
-while not go.exists():
+Path(f"ready-{os.getpid()}").touch()
+while len(list(Path().glob("ready-*"))) < int(os.environ["AT_ONCE"]):
     time.sleep(0.001)
 event.register("numba:compile", Count())
 table = np.zeros((IMPACT_ROWS, 2))
@@ -238,56 +241,83 @@ table[MASS] = 1.0
 table[SPEED] = 2.0, 4.0
 print(pool(table, SPEED, SPEED, 0, 1, GAP), *table[GAP], *sorted(set(Count.names)))
 """
-SAME = "1 3.0 3.0"  # two of one mass, the one behind faster: one block, at the mean of both speeds
-COMPILED = f"{SAME} pool"
+SAME = "1 3.0 3.0\n"  # two of one mass, the one behind faster: one block, at the mean of both speeds
+COMPILED = "1 3.0 3.0 pool\n"
+
+# Each program runs in a process of its own, forked from one that has imported numba, and not this package. A warm one
+# has compiled something, too, which takes most of the time. What a program prints goes to a file named by its number.
+SERVER = """
+import json, os, runpy, sys, tempfile
+import numba
+if "warm" in sys.argv:
+    numba.njit(lambda x: x + 1.0)(1.0)
+for line in sys.stdin:
+    package, folder, environment = json.loads(line)
+    children = []
+    for number in range(int(environment["AT_ONCE"])):
+        children.append(os.fork())
+        if not children[-1]:
+            os.chdir(folder)
+            os.environ.update(environment)
+            numba.config.reload_config()
+            sys.path[0], tempfile.tempdir = package, folder
+            for stream in (1, 2):
+                os.dup2(os.open(f"out-{number}", os.O_CREAT | os.O_WRONLY | os.O_APPEND), stream)
+            runpy.run_path("program.py", run_name="__main__")
+            sys.exit()
+    for child in children:
+        os.waitpid(child, 0)
+    print(flush=True)
+"""
 
 
-def begin(package: Path, folder: Path, name: str) -> subprocess.Popen:
-    environment = {**os.environ, "PYTHONPATH": str(package.parent), "TMPDIR": str(folder)}
-    environment["NUMBA_DISABLE_JIT"] = "0"
-    command = [sys.executable, "-c", PROGRAM, str(folder / name), str(folder / "go")]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    process = subprocess.Popen(command, env=environment, cwd=folder, text=True, **pipes)
-    while not (folder / name).exists() and process.poll() is None:
-        time.sleep(0.001)
-    return process
+@pytest.fixture(scope="module")
+def server() -> Iterator[Callable[[str], subprocess.Popen[str]]]:
+    if not hasattr(os, "fork"):
+        pytest.skip("processes cannot be forked here")
+    options = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    options["env"] = {**os.environ, "NUMBA_DISABLE_JIT": "0"}
+    with ExitStack() as running:
+        yield cache(lambda way: running.enter_context(subprocess.Popen([sys.executable, "-c", SERVER, way], **options)))
 
 
-def run(package: Path, folder: Path) -> str:
-    (folder / "go").touch()
-    out, errors = begin(package, folder, "alone").communicate(timeout=120)
-    assert errors == ""
-    return out.strip()
+@pytest.fixture
+def run(server, tmp_path: Path) -> Callable[..., str]:
+    def run(package: Path = PACKAGE, program: str = PROGRAM, *, at_once: int = 1, way: str = "warm") -> str:
+        """What a program prints in processes of its own, with its errors, in alphabetical order."""
+        for file in (*tmp_path.glob("out-*"), *tmp_path.glob("ready-*")):
+            file.unlink()
+        (tmp_path / "program.py").write_text(program, "utf-8")
+        environment = {name: value for name, value in os.environ.items() if name.startswith("NUMBA_C")}
+        request = [str(package.parent), str(tmp_path), environment | {"AT_ONCE": str(at_once)}]
+        server(way).stdin.write(json.dumps(request) + "\n")
+        server(way).stdin.flush()
+        assert server(way).stdout.readline() == "\n"
+        return "".join(sorted((tmp_path / f"out-{number}").read_text("utf-8") for number in range(at_once)))
+
+    return run
 
 
-def test_kernels__of_a_moved_package_are_at_hand_and_an_edited_callee_compiles_anew(copied, tmp_path):
-    assert run(PACKAGE, tmp_path) == COMPILED
-    assert run(copied, tmp_path) == SAME
+def test_kernels__of_a_moved_package_are_at_hand_and_one_damaged_or_an_edited_callee_compiles_anew(run, copied):
+    assert run(PACKAGE) == COMPILED
+    assert run(copied) == SAME
+    for file in cache_folder().iterdir():
+        file.write_bytes(file.read_bytes()[:-1])
+    assert run(copied) == COMPILED
     with (copied / "physics" / "events.py").open("a") as file:
         file.write("# a change\n")
-    assert run(copied, tmp_path) == COMPILED
-    assert run(PACKAGE, tmp_path) == SAME
+    assert run(copied) == COMPILED
+    assert run(PACKAGE) == SAME
 
 
-def test_kernels__that_two_processes_need_at_once_are_compiled_by_one(tmp_path):
-    both = [begin(PACKAGE, tmp_path, name) for name in ("one", "two")]
-    (tmp_path / "go").touch()
-    ends = [process.communicate(timeout=120) for process in both]
-    assert sorted(out.strip() for out, _ in ends) == [SAME, COMPILED] and [errors for _, errors in ends] == ["", ""]
+def test_kernels__that_two_processes_need_at_once_are_compiled_by_one(run):
+    assert run(at_once=2) == SAME + COMPILED
     assert not list(cache_folder().glob("*.lock"))
 
 
-def test_kernels__that_are_damaged_are_compiled_anew_and_replaced(tmp_path):
-    assert run(PACKAGE, tmp_path) == COMPILED
-    for file in cache_folder().iterdir():
-        file.write_bytes(file.read_bytes()[:-1])
-    assert run(PACKAGE, tmp_path) == COMPILED
-    assert run(PACKAGE, tmp_path) == SAME
-
-
-def test_kernels__without_a_folder_to_write_to_are_compiled_in_each_process(monkeypatch, tmp_path):
+def test_kernels__without_a_folder_to_write_to_are_compiled_in_each_process(monkeypatch, tmp_path, run):
     monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/x")
-    assert [run(PACKAGE, tmp_path), run(PACKAGE, tmp_path)] == [COMPILED, COMPILED]
+    assert run(at_once=2) == COMPILED + COMPILED
     assert not list(tmp_path.glob("ethbrake_marl-*"))
 
 
@@ -319,16 +349,12 @@ for function, value in ((inner, 2.0), (inner, -1.0), (other, 3.0), (other, -1.0)
 TOLD = "seen 2.0\nseen 1.0\n3.0\n('negative', -1.0)\nseen 3.0\nseen 1.0\n4.0\n('negative', -1.0)\n"
 
 
-def test_kernels__raise_and_print_inside_of_what_they_call_also_when_they_were_loaded(tmp_path):
-    (tmp_path / "program.py").write_text(INNER)
-    environment = {**os.environ, "PYTHONPATH": str(PACKAGE.parent), "NUMBA_DISABLE_JIT": "0"}
-    command = [sys.executable, "program.py"]
-    for loaded in ([], [".entry"], [".linked"]):
+def test_kernels__raise_and_print_inside_of_what_they_call_also_when_they_were_loaded(run):
+    for loaded, way in (([], "warm"), ([".entry"], "cold"), ([".linked"], "cold")):
         for file in cache_folder().iterdir():
             if loaded and file.suffix not in loaded:
                 file.unlink()
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-        assert (done.stdout, done.stderr) == (TOLD, "")
+        assert run(program=INNER, way=way) == TOLD
     assert {file.suffix for file in cache_folder().iterdir()} == {".entry", ".linked"}
 
 
@@ -361,18 +387,18 @@ def test_kernels__are_not_compiled_once_for_each_number_that_stands_in_a_source(
 
 
 @pytest.mark.skipif((sys.platform, platform.machine()) != ("linux", "x86_64"), reason="none are built for this machine")
-def test_ready_made_kernels__are_taken_where_the_own_store_has_none_unless_they_are_damaged(monkeypatch, tmp_path):
+def test_ready_made_kernels__are_taken_where_the_own_store_has_none_unless_they_are_damaged(monkeypatch, tmp_path, run):
     with monkeypatch.context() as chosen:
         chosen.setenv("NUMBA_CPU_NAME", "x86-64-v2")
         chosen.setenv("NUMBA_CPU_FEATURES", "")
-        assert run(PACKAGE, tmp_path) == COMPILED
+        assert run(way="cold") == COMPILED
     wheel = pack({file.name: file.read_bytes() for file in cache_folder().glob("*.entry")}, tmp_path)
     site = tmp_path / "site"
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
     subprocess.run([*pip, str(wheel)], check=True, timeout=120)
     shutil.copytree(PACKAGE, site / "ethbrake_marl", ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "another"))
-    assert run(site / "ethbrake_marl", tmp_path) == SAME
+    assert run(site / "ethbrake_marl") == SAME
     (kernel,) = (site / "ethbrake_marl_kernels").glob("*.entry")
     kernel.write_bytes(kernel.read_bytes()[:-1])
-    assert run(site / "ethbrake_marl", tmp_path) == COMPILED
+    assert run(site / "ethbrake_marl") == COMPILED

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.test_imports import tree_of
+
 ROOT = Path(__file__).resolve().parents[1]
 
 # File -> what it alone may use. docs/security.md says why each is none of a stranger's files.
@@ -91,7 +93,7 @@ def offences(root: Path) -> list[str]:
     found, used = [], {(file, what) for file, every in PLACES.items() for what in every}
     for path in sorted((*root.glob("ethbrake_marl/**/*.py"), *root.glob("train/*.py"))):
         file = path.relative_to(root).as_posix()
-        for line, what in forbidden(ast.parse(path.read_text("utf-8"))):
+        for line, what in forbidden(tree_of(path)):
             top = what.split(".")[0]
             if top in PLACES.get(file, ()):
                 used.discard((file, top))

@@ -9,6 +9,8 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+from tests.test_imports import tree_of
+
 PACKAGE = Path(__file__).resolve().parents[1] / "ethbrake_marl"
 
 TRANSCENDENTAL = {
@@ -88,6 +90,6 @@ def called(node: ast.AST) -> set[str]:
 def test_the_package__calls_nothing_that_differs_by_processor_but_what_is_listed() -> None:
     found = set()
     for path in sorted(PACKAGE.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        for node in ast.walk(tree_of(path)):
             found |= {(path.relative_to(PACKAGE).as_posix(), name) for name in called(node)}
     assert found == set(REMAINS)

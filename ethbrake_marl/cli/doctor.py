@@ -46,6 +46,11 @@ _DOORS = (
     ("evaluate", "--agents", "full_brake,ppo@shipped+episode,full_brake+step", "--episodes", "1"),
     ("shield", "--agents", "full_brake", "--episodes", "3"),
 )
+# What `ethbrake run` uses but for three small kernels, without torch, and no more than that.
+_FOR_A_RUN = (
+    *("-m", "ethbrake_marl", "evaluate", "--episodes", "20", "--report", "page.html"),
+    *("--agents", "full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo@shipped,ppo@shipped+episode"),
+)
 _FIRST_STEP = """
 import ethbrake_marl as eb
 for given in ({}, {"reward": {"harm": 0.05, "shaping": 0.05}}):  # shaped, as PPO is trained
@@ -177,16 +182,17 @@ def _golden_baseline() -> tuple[bool, str]:
     return found == wanted, f"E-V2X-BM at gaps 7 and 7 m: {found} (known: {wanted})"
 
 
-def compile_ahead(*, training: bool) -> tuple[bool, str]:
+def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
     """Call the commands of ``_DOORS`` on a few worlds, side by side on all cores, and tell how far they are.
 
-    ``training``: the one that needs torch, too. Whether all ended well, and what there is to say.
+    ``training``: the one that needs torch, too. ``run_alone``: only what a run uses, which `make venv` asks for.
+    Whether all ended well, and what there is to say.
     """
     if is_temporary(cache_folder()):
         return False, "no folder can be written to keep what is compiled; set NUMBA_CACHE_DIR to a writable folder"
     begun, failed = perf_counter(), []
     doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if training or door[0] != "run"]
-    doors.append(("-c", _FIRST_STEP, "first step"))
+    doors = [_FOR_A_RUN] if run_alone else [*doors, ("-c", _FIRST_STEP, "first step")]
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         called = {pool.submit(_call, door, folder): door[2] for door in doors}
         waiting = set(called)

@@ -9,8 +9,10 @@ from pathlib import Path
 
 import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
 from matplotlib.figure import Figure as Figure  # the type that every figure has, for modules outside this folder
 from matplotlib.font_manager import findfont, get_font
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from ethbrake_marl.envs.drawing.scene import COLOURS as COLOURS  # one palette for figures and frames
 from ethbrake_marl.errors import plain_text
@@ -35,6 +37,14 @@ _NO_DATES: dict[str, dict[str, None]] = {  # what would differ from one writing 
 
 class ShownFigure(Figure):
     """A figure that a notebook shows, whether or not pyplot is loaded there."""
+
+    def draw(self, renderer: RendererBase) -> None:
+        """Draw it; the first of the two times that a writing draws it, where nothing is kept, it is only laid out."""
+        engine = self.get_layout_engine()
+        if isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
+            engine.execute(self)
+        else:
+            super().draw(renderer)
 
     def _repr_png_(self) -> bytes:
         return picture_bytes(self, "shown.png")

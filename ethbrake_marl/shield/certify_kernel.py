@@ -77,7 +77,7 @@ def better_plan(
 
 @compiled
 def copy_action(action: Floats, to: Floats) -> None:
-    """Copy the actions of one decision, one for each vehicle."""
+    """Copy the actions of one decision, one for each vehicle, or what else is a row of numbers."""
     for c in range(to.shape[0]):
         to[c] = action[c]
 
@@ -204,7 +204,8 @@ def certify_worlds(
     for k in range(n):
         a, b = k * M, k * M + M
         if ended[a:b].all():
-            after[a:b] = states[a:b]
+            for m in range(a, b):
+                copy_action(states[m], after[m])
             last = min(steps[k], plans.shape[1] - 1)
             for c in range(plans.shape[2]):
                 out[k, c, APPLIED], out[k, c, REASON] = plans[k, last, c], ENDED

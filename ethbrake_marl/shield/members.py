@@ -103,7 +103,9 @@ def take_steps(
     going = 0
     for m in range(ended.shape[0]):
         if ended[m]:
-            after[m, :], over[m] = states[m], True
+            over[m] = True
+            for c in range(states.shape[1]):  # not by rows: see ``put`` in limits.first_meeting
+                after[m, c] = states[m, c]
             continue
         outcome = take_step(world, m, states[m], step, action, after[m])
         if outcome < GOES_ON:

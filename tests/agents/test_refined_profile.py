@@ -57,6 +57,7 @@ def test_refined__of_any_line_obstacle_and_step(name, vehicle, changes):
     assert realised.tolist() == agent.predicted_harm.tolist()
 
 
+@pytest.mark.slow
 def test_refined__does_as_well_as_the_slow_one():
     """With 500 candidates at most a hundredth more harm than the closed-loop search, which takes far longer."""
     slow, fast = (eb.make_agent(f"ppo@shipped+refined{way}", scenario=SCENARIO) for way in ("", ":profile"))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,10 +8,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from filelock import FileLock
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.cli.late import import_late
 from ethbrake_marl.scenario import new_scenario_text
+from tests.fixtures.pictures import draw_nothing
 
 TINY_RECIPE = {
     "name": "tiny",
@@ -78,10 +81,19 @@ def tiny_recipe(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def finished_run(tmp_path_factory: pytest.TempPathFactory, tiny_recipe: Path) -> Path:
-    """The folder of an `ethbrake run` with 60 worlds; not to be changed."""
-    folder = tmp_path_factory.mktemp("runs") / "tiny"
-    status = run_command(["run", "--recipe", str(tiny_recipe), "--episodes", "60", "--output", str(folder), "--json"])
-    assert status == 0
+    """The folder of an `ethbrake run` with 60 worlds, made once for all processes of xdist; not to be changed.
+
+    Its pictures are empty; tests/figures draws them, and a slow test a whole run.
+    """
+    alone = "PYTEST_XDIST_WORKER" not in os.environ
+    base = tmp_path_factory.getbasetemp() if alone else tmp_path_factory.getbasetemp().parent
+    folder, done = base / "finished_run", base / "finished_run.done"
+    with FileLock(base / "finished_run.lock"), pytest.MonkeyPatch.context() as patch:
+        draw_nothing(patch)
+        if not done.exists():
+            words = ["--recipe", str(tiny_recipe), "--episodes", "60", "--output", str(folder), "--force", "--json"]
+            assert run_command(["run", *words]) == 0
+            done.touch()
     return folder
 
 

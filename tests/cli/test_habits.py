@@ -126,6 +126,14 @@ def test_doctor_compile__tells_how_far_it_is_and_what_failed(ethbrake, monkeypat
     assert failed == "compile: shield failed: no luck"
 
 
+def test_compile_ahead__for_a_run_alone_calls_one_command(monkeypatch, tmp_path):
+    called = []
+    monkeypatch.setattr(doctor, "_call", lambda door, folder: called.append(door) or "")
+    assert doctor.compile_ahead(training=False, run_alone=True)[0]
+    ((*_, agents),) = called
+    assert set(agents.split(",")) >= {"full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo@shipped+episode"}
+
+
 def test_doctor_compile__where_nothing_can_be_kept_does_not_begin(ethbrake, monkeypatch):
     monkeypatch.setattr(doctor, "is_temporary", lambda folder: True)
     monkeypatch.setattr(doctor, "_call", None)

@@ -125,6 +125,7 @@ EXAMPLE = Passport(
 )
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_evaluate_report__its_passports_can_be_replayed(ethbrake, tmp_path):
     page = tmp_path / "report.html"
     answer = ethbrake("evaluate", "--agents", "full_brake,constant:3+step", "--episodes", "12", "--report", page)

@@ -29,6 +29,7 @@ def test_shield__prints_its_rows_as_json_and_as_a_table(ethbrake):
     assert "full_brake" in table and "needed" in table and f"{rows[2]['harm']:.2f}" in table
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     "command",
     [
@@ -69,7 +70,7 @@ def test_picture__shows_the_modes(ethbrake, tmp_path):
 TEAM = ("--scenario", "cooperation-3-pair", "--agents", "full_brake,policy@shipped", "--episodes", "12")
 
 
-def test_shield__of_several_learners_tells_bound_interventions_and_shares(ethbrake, tmp_path):
+def test_shield__of_several_learners_tells_bound_interventions_and_shares_and_can_be_compared(ethbrake, tmp_path):
     answer = ethbrake("shield", *TEAM, "--json")
     assert answer.status == 0
     rows = json.loads(answer.out)
@@ -83,13 +84,10 @@ def test_shield__of_several_learners_tells_bound_interventions_and_shares(ethbra
     assert set(rows[5]["policy_sha256"]) == {"vehicle_2", "vehicle_3"} and rows[0]["policy_sha256"] == {}
     table = ethbrake("shield", *TEAM, "--harm-count", "total").out
     assert "minus no shield" in table and "What each vehicle bears" in table and "full_brake, step-cap" in table
-
-
-def test_compare__takes_the_results_of_a_shielded_team(ethbrake, tmp_path):
     file = tmp_path / "shield.json"
-    file.write_text(ethbrake("shield", *TEAM, "--json").out)
-    answer = ethbrake("compare", file, file)
-    assert answer.status == 0 and "step-cap" in answer.out
+    file.write_text(answer.out)
+    compared = ethbrake("compare", file, file)
+    assert compared.status == 0 and "step-cap" in compared.out
 
 
 @pytest.mark.parametrize("command", [("picture", "shield"), ("picture", "shield-modes")])

@@ -50,20 +50,20 @@ def settings(request: pytest.FixtureRequest) -> dict[str, Any]:
 
 
 def test_pettingzoo__parallel_api(settings: dict[str, Any]) -> None:
-    parallel_api_test(ethbrake_v0.parallel_env(**settings), num_cycles=300)
+    parallel_api_test(ethbrake_v0.parallel_env(**settings), num_cycles=150)
 
 
 def test_pettingzoo__api(settings: dict[str, Any]) -> None:
-    api_test(ethbrake_v0.env(**settings), num_cycles=300)
+    api_test(ethbrake_v0.env(**settings), num_cycles=150)
 
 
 def test_pettingzoo__seeds(settings: dict[str, Any]) -> None:
-    parallel_seed_test(lambda: ethbrake_v0.parallel_env(**settings), num_cycles=100)
-    seed_test(lambda: ethbrake_v0.env(**settings), num_cycles=100)
+    parallel_seed_test(lambda: ethbrake_v0.parallel_env(**settings), num_cycles=40)
+    seed_test(lambda: ethbrake_v0.env(**settings), num_cycles=40)
 
 
 def test_pettingzoo__state(settings: dict[str, Any]) -> None:
-    state_test(ethbrake_v0.env(**settings), ethbrake_v0.parallel_env(**settings), num_cycles=100)
+    state_test(ethbrake_v0.env(**settings), ethbrake_v0.parallel_env(**settings), num_cycles=40)
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)

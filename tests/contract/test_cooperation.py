@@ -64,8 +64,8 @@ def test_levels__of_three_vehicles_have_the_lines_of_the_random_test(name: str) 
 @pytest.mark.filterwarnings("ignore:reset. unknown option")
 def test_pettingzoo__holds(scenario: Any) -> None:
     parallel_api_test(ethbrake_v0.parallel_env(scenario=scenario), num_cycles=150)
-    api_test(ethbrake_v0.env(scenario=scenario), num_cycles=150)
-    parallel_seed_test(lambda: ethbrake_v0.parallel_env(scenario=scenario), num_cycles=60)
+    api_test(ethbrake_v0.env(scenario=scenario), num_cycles=60)
+    parallel_seed_test(lambda: ethbrake_v0.parallel_env(scenario=scenario), num_cycles=20)
 
 
 @pytest.mark.parametrize(

@@ -104,10 +104,10 @@ def test_interfaces__agree_behind_the_shield_and_differ_from_the_bare_ones() -> 
 @pytest.mark.usefixtures("_no_warnings")
 def test_pettingzoo__checkers_pass(mode: str) -> None:
     given = MODES[mode]
-    parallel_api_test(HybridShield(parallel_env(), **given), num_cycles=200)
-    api_test(shielded_aec(parallel_env(), **given), num_cycles=200)
-    parallel_seed_test(lambda: HybridShield(parallel_env(), **given), num_cycles=60)
-    seed_test(lambda: shielded_aec(parallel_env(), **given), num_cycles=60)
+    parallel_api_test(HybridShield(parallel_env(), **given), num_cycles=100)
+    api_test(shielded_aec(parallel_env(), **given), num_cycles=100)
+    parallel_seed_test(lambda: HybridShield(parallel_env(), **given), num_cycles=20)
+    seed_test(lambda: shielded_aec(parallel_env(), **given), num_cycles=20)
 
 
 @pytest.mark.usefixtures("_no_warnings")

@@ -124,6 +124,7 @@ def test_tables_of_scenarios__hold_the_numbers_of_their_files(begin: str) -> Non
         assert {float(each) for each in re.findall(r"\d+(?:\.\d+)?", " ".join(told[:3]))} <= numbers, row
 
 
+@pytest.mark.slow
 def test_speeds__outside_their_range_are_as_shown() -> None:
     (block,) = (each for each in printed_blocks() if each.begin.startswith("paper-random full_brake  "))
     assert [line(*case) for case in CASES] == block.text.splitlines()

@@ -24,6 +24,7 @@ sampling, price, equal_time, scaling = (
 )
 PAPER = load_scenario("paper-random")
 BASE = load_scenario("cooperation-2-paper")
+SHORT = Effort(1, 1e-6)
 PNG = b"\x89PNG"
 
 
@@ -128,9 +129,42 @@ def test_equal_time__no_table_holds_its_worlds_and_the_page_has_its_columns():
 
 
 @pytest.mark.slow
-def test_scaling__tells_two_costs_of_every_number():
-    shortly = Effort(1, 1e-6)
-    batches, single = (list(scaling.by_worlds(shortly, (1, 2))), list(scaling.by_vehicles(shortly, (2, 3))))
-    assert [cost.worlds for cost in batches] == [1, 1, 2, 2] and [cost.vehicles for cost in single] == [2, 2, 3, 3]
-    assert "ns per vehicle-step" in str(batches[0])
-    assert picture_bytes(scaling.draw(batches, single, "caption"), "scaling.png").startswith(PNG)
+def test_scaling__costs_are_per_world_step() -> None:
+    by_worlds = list(scaling.by_worlds(SHORT, (1, 3)))
+    assert [(cost.what, cost.worlds, cost.vehicles) for cost in by_worlds] == [
+        (scaling.EMERGENCY, 1, 3),
+        (scaling.ENGINE, 1, 3),
+        (scaling.EMERGENCY, 3, 3),
+        (scaling.ENGINE, 3, 3),
+    ]
+    by_vehicles = list(scaling.by_vehicles(SHORT, (2, 4)))
+    assert [(cost.what, cost.vehicles) for cost in by_vehicles] == [
+        (scaling.EMERGENCY, 2),
+        (scaling.APART, 2),
+        (scaling.EMERGENCY, 4),
+        (scaling.APART, 4),
+    ]
+    assert all(0.0 < cost.nanoseconds < math.inf for cost in by_worlds + by_vehicles)
+
+
+@pytest.mark.parametrize("vehicles", [2, 3, 50])
+def test_lines__are_the_same_every_time_and_apart_in_their_first_step(vehicles: int) -> None:
+    worlds, again = scaling.make_lines(40, vehicles), scaling.make_lines(40, vehicles)
+    assert worlds.speeds_mps.shape == (40, vehicles)
+    assert (worlds.gaps_m == again.gaps_m).all() and (worlds.speeds_mps == again.speeds_mps).all()
+    after, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, 0.1)
+    assert impacts.count.sum() == 0 and (after.gaps_m > 0.0).all()
+
+
+def test_scaling__draws_batches_left_and_single_worlds_right() -> None:
+    by_worlds = [scaling.Cost(scaling.EMERGENCY, n, 3, 50.0) for n in (1, 10, 100)]
+    by_vehicles = [scaling.Cost(scaling.APART, 256, N, 10.0 * N) for N in (2, 4)]
+    figure = scaling.draw(by_worlds, by_vehicles, "somewhere")
+    left, right = figure.axes
+    costs, proportional = left.get_lines()
+    assert costs.get_ydata() == pytest.approx([0.05, 0.5, 5.0]) and proportional.get_ydata() == pytest.approx(
+        [0.05, 0.5, 5.0]
+    )
+    assert right.get_lines()[0].get_ydata() == pytest.approx([20.0, 40.0])
+    assert "ns per vehicle-step" in str(by_worlds[0])
+    assert [text.get_text() for text in right.get_legend().get_texts()] == [scaling.APART, "proportional"]

@@ -43,22 +43,21 @@ def test_registration__gymnasium_and_pettingzoo_make_it_by_id() -> None:
     assert isinstance(in_turn, pettingzoo.AECEnv) and isinstance(in_turn.unwrapped, EthBrakeParallelEnv)
 
 
-def test_registration__gymnasium_can_import_the_package_by_the_id() -> None:
-    assert run("import gymnasium; print(gymnasium.make('ethbrake_marl:EthBrake-v0').unwrapped)").startswith(
-        "<EthBrakeEnv"
-    )
-
-
-def test_import__stays_light_until_a_name_is_used() -> None:
+def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_id() -> None:
     program = (
         "import sys, ethbrake_marl as eb\n"
         "heavy = lambda: sorted({'torch', 'numba', 'stable_baselines3', 'matplotlib', 'pydantic'} & set(sys.modules))\n"
-        "print(heavy()); eb.parallel_env().reset(seed=0); print(heavy()); eb.make_sb3_vec_env; print(heavy())"
+        "print(heavy()); p = eb.parallel_env(); p.reset(seed=0); print(heavy())\n"
+        "import gymnasium; e = gymnasium.make('ethbrake_marl:EthBrake-v0'); print(e.unwrapped)\n"
+        "e.reset(seed=0); e.step(e.action_space.sample())\n"
+        "a = eb.EthBrakeEnv(render_mode='ansi'); a.reset(seed=0); a.render()\n"
+        "print(e.unwrapped.engine.watchers, p.engine.watchers, *{'PIL', 'pygame', 'matplotlib'} & set(sys.modules))"
     )
-    first, second, third = run(program).splitlines()
+    first, second, third, watched_and_drawn = run(program).splitlines()
     assert first == "[]"
     assert second == "['numba', 'pydantic']"
-    assert "stable_baselines3" in third and "torch" in third
+    assert third.startswith("<EthBrakeEnv")
+    assert watched_and_drawn == "() ()"
 
 
 @pytest.mark.parametrize("name", ethbrake_marl.__all__)

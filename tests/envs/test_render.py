@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import copy
-import os
 import pickle
-import subprocess
 import sys
 from importlib import import_module
 from importlib.util import find_spec
@@ -206,22 +204,6 @@ def test_render__without_a_mode_or_an_episode_is_one_clear_error() -> None:
         parallel_env().render()
     with pytest.raises(InvalidInput, match="call reset first"):
         parallel_env(render_mode="rgb_array").render()
-
-
-def test_none__imports_no_drawing_library_and_nobody_watches() -> None:
-    program = (
-        "import sys, ethbrake_marl as eb, gymnasium\n"
-        "e = gymnasium.make('EthBrake-v0'); e.reset(seed=0); e.step([0.0]); p = eb.parallel_env(); p.reset(seed=0)\n"
-        "assert not e.unwrapped.engine.watchers and not p.engine.watchers\n"
-        "print(sorted({'PIL', 'pygame', 'matplotlib'} & set(sys.modules)))\n"
-        "a = eb.EthBrakeEnv(render_mode='ansi'); a.reset(seed=0); a.render()\n"
-        "print(sorted({'PIL', 'pygame', 'matplotlib'} & set(sys.modules)))"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
-        check=True,
-    )  # fmt: skip
-    assert result.stdout.splitlines() == ["[]", "[]"]
 
 
 def test_human__without_its_library_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -79,16 +79,17 @@ def test_table_and_figure__show_every_row(rows: list[ModeRow]) -> None:
 def test_worlds_that_cannot_be_advanced__are_out_for_all_modes_and_named(
     rows: list[ModeRow], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ethbrake_marl.evaluation.shield_modes.CHUNK", 25)
+    monkeypatch.setattr("ethbrake_marl.evaluation.shield_modes.CHUNK", 15)
     task, agents = Task(PAPER, (1,)), {"full_brake": make_agent("full_brake"), "coast": make_agent("coast")}
-    found = compare_modes(agents, plant(WORLDS, [2, 40]), task)
-    assert [[world for world, _ in row.left_out] for row in found] == [[2, 40]] * 8
+    worlds = WORLDS.take(np.arange(24))
+    found = compare_modes(agents, plant(worlds, [2, 20]), task)
+    assert [[world for world, _ in row.left_out] for row in found] == [[2, 20]] * 8
     assert "contact was missed" in found[0].left_out[0][1]
-    expected = compare_modes(agents, WORLDS.take(without(60, [2, 40])), task)
+    expected = compare_modes(agents, worlds.take(without(24, [2, 20])), task)
     assert [replace(row, left_out=()) for row in found] == expected
-    assert found[0].to_json()["left_out"][1]["world"] == 40 and rows[0].to_json()["left_out"] == []
+    assert found[0].to_json()["left_out"][1]["world"] == 20 and rows[0].to_json()["left_out"] == []
     with pytest.raises(PhysicsError):
-        compare_modes(agents, plant(WORLDS, list(range(60))), task)
+        compare_modes(agents, plant(worlds, list(range(24))), task)
 
 
 @pytest.mark.parametrize(
@@ -102,12 +103,12 @@ def test_behind_shields__those_that_do_not_know_the_world_are_left_out(spec: str
 @pytest.fixture(scope="module")
 def team_rows() -> list[ModeRow]:
     agents = {name: make_agent(name) for name in ("full_brake", "coast")}
-    return compare_modes(agents, PAIR.sample(60, 3).worlds, Task(PAIR, (1, 2), "total"))
+    return compare_modes(agents, PAIR.sample(30, 3).worlds, Task(PAIR, (1, 2), "total"))
 
 
 @pytest.mark.slow
 def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: list[ModeRow]) -> None:
-    worlds = PAIR.sample(60, 3).worlds
+    worlds = PAIR.sample(30, 3).worlds
     assert [row.mode for row in team_rows] == ["none", "step", "step-alert", "step-cap"] * 2
     alone = drive(worlds, Team.copies(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("total")
     for row, cap in ((team_rows[5], None), (team_rows[7], "baseline")):
@@ -148,7 +149,7 @@ def test_team__tables_and_figure_show_bound_and_shares(team_rows: list[ModeRow])
     assert len(axes.containers) == 6 and "without a shield" in axes.get_xlabel()
     told = team_rows[1].to_json()
     assert told["vehicles"][0] == {**told["vehicles"][0], "vehicle": "vehicle_1", "replaced": None}
-    text = Page(page("Shield", [shield_section(ShieldEvidence(team_rows, "60 worlds"))])).text
+    text = Page(page("Shield", [shield_section(ShieldEvidence(team_rows, "30 worlds"))])).text
     assert "Minus no shield" in text and "coast, step-cap, vehicle_3" in text.replace("\u200b", "")
 
 

@@ -46,7 +46,7 @@ def test_figure__every_axis_says_what_it_is_and_its_unit(figures: dict[str, Figu
         assert agents or any(UNIT.search(each.replace("\n", " ")) for each in (*beside, axes.get_title(loc="left")))
 
 
-@pytest.mark.parametrize("name", ["harm", "regret", "parts"])
+@pytest.mark.parametrize("name", ["harm", "learning"])
 def test_figure__travels_with_its_fonts(figures: dict[str, Figure], name: str) -> None:
     svg = picture_bytes(figures[name], "a.svg")
     assert b"<text" not in svg and b"font-family" not in svg

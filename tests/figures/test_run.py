@@ -11,7 +11,7 @@ from ethbrake_marl.evaluation import EpisodeRecord, Evaluation, evaluate, record
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.figures.episode import trajectories
 from ethbrake_marl.figures.run import harm_against_total_gap, learning_curve
-from ethbrake_marl.figures.style import COLOURS, picture_bytes, series_style
+from ethbrake_marl.figures.style import COLOURS, ShownFigure, picture_bytes, series_style
 from ethbrake_marl.scenario import Scenario
 
 POINTS = [
@@ -53,6 +53,13 @@ def test_learning_curve__no_reference_looks_like_the_policy(evaluation: Evaluati
     figure = learning_curve(POINTS, references=[*rows, *rows])
     policy, *references = figure.axes[0].lines
     assert policy.get_color() not in {line.get_color() for line in references}
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.svg", "a.pdf"])
+def test_picture_bytes__laid_out_without_being_drawn_is_what_matplotlib_makes(name, evaluation, monkeypatch) -> None:
+    ours = picture_bytes(learning_curve(POINTS, references=summarise(evaluation), caption="seed 3"), name)
+    monkeypatch.setattr(ShownFigure, "draw", Figure.draw)
+    assert ours == picture_bytes(learning_curve(POINTS, references=summarise(evaluation), caption="seed 3"), name)
 
 
 def test_learning_curve__without_points_is_refused() -> None:

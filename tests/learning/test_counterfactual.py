@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import signal
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.algorithms.counterfactual import widened
 from ethbrake_marl.learning.algorithms.counterfactual_model import CounterfactualModel, Tried, trusted_targets
+from ethbrake_marl.learning.algorithms.networks import Adam
 from ethbrake_marl.learning.progress import TrainingDiverged
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import resume, train
@@ -51,6 +54,21 @@ def test_targets__keep_the_slope_and_never_leave_the_trust_radius() -> None:
     np.testing.assert_allclose(target, [0.3, 0.025, -0.025, 0.05, 1.0, -1.975, -2.0, 1.975], rtol=1e-5)
     np.testing.assert_allclose(weight[[0, 1, 2, 4]], [3.0, 6.0, 6.0, 3.0], rtol=1e-6)
     np.testing.assert_allclose((weight * (target - mean))[:4], gradient[:4], rtol=1e-5)  # the slope where it stands
+
+
+def test_adam__is_torchs_without_its_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = []
+    for kind in (torch.optim.Adam, Adam):
+        weight = torch.nn.Parameter(torch.linspace(-1.0, 1.0, 30))
+        optimizer = kind([weight], lr=1e-2, eps=1e-5)
+        for step in range(4):
+            optimizer.zero_grad()
+            (weight.sin() * (step + weight)).sum().backward()
+            optimizer.step()
+        kind([weight]).load_state_dict(optimizer.state_dict())
+        ended.append(weight.detach().numpy().tobytes())
+        monkeypatch.setitem(sys.modules, "torch._dynamo", None)  # whoever imports it from now on fails
+    assert ended[0] == ended[1]
 
 
 def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> None:
@@ -120,6 +138,7 @@ def test_training__any_learners_any_objective_any_line(tmp_path: Path, learners:
     assert train(recipe.replace(total_steps=32), longer, tmp_path / "longer").status == "finished"
 
 
+@pytest.mark.slow
 def test_training__gets_better_from_scratch(tmp_path: Path) -> None:
     """Random weights hardly act; after 30 updates of 256 counterfactuals much of the harm of coasting is gone."""
     recipe = SHIPPED.replace(

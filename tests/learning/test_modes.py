@@ -19,7 +19,7 @@ from ethbrake_marl.learning.algorithms.modes_model import ModesModel, NoOtherMod
 from ethbrake_marl.learning.models import make_model
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.registry import algorithm_named
-from ethbrake_marl.learning.train import _environment, resume, train
+from ethbrake_marl.learning.train import TrainResult, _environment, resume, train
 from ethbrake_marl.learning.training import resolve
 from ethbrake_marl.policies.policy import load_policy
 from ethbrake_marl.progress import Progress
@@ -157,11 +157,20 @@ def _weights(run: Path) -> list[bytes]:
     return [(run / name / "weights.safetensors").read_bytes() for name in ("policy", "policy-last")]
 
 
-@pytest.mark.parametrize("at", [6, 10, 14])
-def test_training__stops_in_any_stage_and_resumes_bit_for_bit(at: int, tmp_path: Path) -> None:
-    whole = train(TINY, SCENARIO, tmp_path / "whole")
-    assert (whole.status, whole.steps, whole.updates) == ("finished", 512, 16)
-    assert whole.policy.manifest.network.networks == 2 and whole.policy.manifest.format_version == 3
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainResult]:
+    """The training that nobody stops, and its folder."""
+    folder = tmp_path_factory.mktemp("modes") / "whole"
+    return folder, train(TINY, SCENARIO, folder)
+
+
+@pytest.mark.parametrize("at", [pytest.param(6, marks=pytest.mark.slow), 10, pytest.param(14, marks=pytest.mark.slow)])
+def test_training__stops_in_any_stage_and_resumes_bit_for_bit(
+    at: int, whole: tuple[Path, TrainResult], tmp_path: Path
+) -> None:
+    reference, expected = whole
+    assert (expected.status, expected.steps, expected.updates) == ("finished", 512, 16)
+    assert expected.policy.manifest.network.networks == 2 and expected.policy.manifest.format_version == 3
 
     def ctrl_c(progress: Progress) -> None:
         if progress.updates == at:
@@ -170,8 +179,8 @@ def test_training__stops_in_any_stage_and_resumes_bit_for_bit(at: int, tmp_path:
     stopped = train(TINY, SCENARIO, tmp_path / "run", on_progress=ctrl_c)
     assert stopped.status == "interrupted" and 0 < stopped.updates < 16
     result = resume(tmp_path / "run")
-    assert (result.status, result.evaluations) == ("finished", whole.evaluations)
-    assert _weights(tmp_path / "run") == _weights(tmp_path / "whole")
+    assert (result.status, result.evaluations) == ("finished", expected.evaluations)
+    assert _weights(tmp_path / "run") == _weights(reference)
     assert eb.make_agent(f"counterfactual@{tmp_path / 'run'}", scenario=SCENARIO).name.startswith("counterfactual@")
 
 
@@ -182,6 +191,7 @@ def test_training__any_count_any_objective_any_line(tmp_path: Path) -> None:
     assert result.status == "finished" and load_policy(tmp_path / "run").manifest.network.networks == 3
 
 
+@pytest.mark.slow
 def test_training__the_gate_gains_over_both_networks(tmp_path: Path) -> None:
     """The first network coasts, the second one imitates templates: the mixture does much better than the first."""
     recipe = TINY.replace(

@@ -65,6 +65,7 @@ def test_scout__learns_the_mean_size_of_what_is_to_be_expected() -> None:
     assert expected[1] == pytest.approx(3.0, rel=0.05) and expected[0] < 0.05
 
 
+@pytest.mark.slow
 def test_training__with_a_scout_resumes_bit_for_bit(tmp_path: Path) -> None:
     whole = train(TINY, SCENARIO, tmp_path / "whole")
 

@@ -42,7 +42,8 @@ def test_worlds__are_seeded_and_no_two_copies_are_alike(script: ModuleType) -> N
     assert np.array_equal(seen[:2], native)  # copy 0 lives in the training worlds of its seed
 
 
-def test_worlds__tell_which_episodes_the_horizon_cut_off(script: ModuleType) -> None:
+def test_worlds__tell_which_episodes_the_horizon_cut_off(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(script, "COPIES", 4)
     worlds = script.make_worlds(PAIR)
     worlds.seed(1)
     worlds.reset()

@@ -161,7 +161,15 @@ def test_centralised__the_critic_sees_the_line_and_the_actor_does_not() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize("scheme", ["shared", "independent", "turns", "centralised"])
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        pytest.param("shared", marks=pytest.mark.slow),  # these three have less to keep than turns
+        pytest.param("independent", marks=pytest.mark.slow),
+        "turns",
+        pytest.param("centralised", marks=pytest.mark.slow),
+    ],
+)
 def test_resume__after_a_failure_or_ctrl_c_it_ends_as_if_nothing_had_happened(
     scheme: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

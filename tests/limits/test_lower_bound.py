@@ -127,10 +127,10 @@ def test_early__impacts_before_the_latency_are_certain():
 
 
 def test_paper_lists__are_bounded_near_the_best_known_harm():
-    worlds = load_scenario("paper-random").sample(10_000, seed=7).worlds
+    worlds = load_scenario("paper-random").sample(2_000, seed=7).worlds
     bound, verdict = lower_bound(worlds), avoidability(worlds)
-    assert 6.0 < bound.harm.mean() < 6.6
-    assert 0.62 < bound.impact_proven.mean() < 0.635
+    assert 5.8 < bound.harm.mean() < 6.4
+    assert 0.6 < bound.impact_proven.mean() < 0.635
     assert not np.any(bound.impact_proven & verdict.avoidable)
     assert np.all(bound.impact_proven[verdict.reason == 2])
     assert np.array_equal(bound.harm, lower_bound(worlds, harm_count="total").harm)
@@ -139,13 +139,13 @@ def test_paper_lists__are_bounded_near_the_best_known_harm():
 @pytest.mark.parametrize(
     ("name", "n"),
     [
-        ("paper-random", 2000),
+        ("paper-random", 1000),
         pytest.param("paper-delay-low", 2000, marks=pytest.mark.slow),
         pytest.param("paper-delay-middle", 2000, marks=pytest.mark.slow),
-        ("paper-delay-high", 2000),
+        ("paper-delay-high", 1000),
     ],
 )
-@pytest.mark.parametrize("harm_count", ["first", "total"])
+@pytest.mark.parametrize("harm_count", ["first", pytest.param("total", marks=pytest.mark.slow)])
 def test_best_known_harm__is_never_below_the_bound_and_near_it(name, n, harm_count):
     scenario = load_scenario(name)
     worlds = scenario.sample(n, seed=7).worlds
@@ -189,7 +189,7 @@ def test_decisions__the_bound_of_every_shipped_list_is_near_the_best_known_and_n
 @pytest.mark.parametrize("name", ["paper-random", "paper-random-early", "paper-delay-high"])
 @pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_best_constant_deceleration__is_never_below_the_bound(name, harm_count):
-    worlds = load_scenario(name).sample(400, seed=8).worlds
+    worlds = load_scenario(name).sample(150, seed=8).worlds
     best = optimise_coupled(worlds, 1, harm_count=harm_count)
     bound = lower_bound(worlds, harm_count=harm_count)
     assert np.all(bound.harm <= best.harm)

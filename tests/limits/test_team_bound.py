@@ -188,10 +188,10 @@ def at_random(problem, rng, phases=8):
     return follow_profiles(problem, Profiles(ends, np.clip(low + (high - low) * share, low, high)))
 
 
-def check(worlds, vehicles, budget, draws, seed):
+def check(worlds, vehicles, budget, draws, seed, steps=STEPS):
     """No joint profile, searched or drawn, does less harm than the bound."""
     rng = np.random.default_rng(seed)
-    for told, step in STEPS:
+    for told, step in steps:
         for harm_count in ("first", "total"):
             bound = team_bound(worlds, vehicles, harm_count=harm_count, horizon_s=HORIZON_S, time_step_s=told)
             problem = profile_problem(worlds, vehicles, harm_count=harm_count, horizon_s=HORIZON_S, time_step_s=step)
@@ -202,7 +202,7 @@ def check(worlds, vehicles, budget, draws, seed):
 
 @pytest.mark.parametrize("region", REGIONS)
 def test_bound__is_never_above_a_joint_profile(region):
-    check(worlds_of(region, 12, 3, seed=61), (1, 2), budget=150, draws=3, seed=62)
+    check(worlds_of(region, 8, 3, seed=61), (1, 2), budget=100, draws=3, seed=62)
 
 
 LINES = {
@@ -226,7 +226,8 @@ def test_bound__is_never_above_a_joint_profile_of_any_line(kind):
     for k, region in enumerate(
         ("plain", "any latency", "masses 0.05 to 100 t, restitution to 1", "weak brakes behind")
     ):
-        check(worlds_of(region, 6, N, 70 + k, obstacle), vehicles, budget=100, draws=2, seed=k)
+        steps = STEPS[k % len(STEPS) :][:1]
+        check(worlds_of(region, 6, N, 70 + k, obstacle), vehicles, budget=100, draws=2, seed=k, steps=steps)
 
 
 @pytest.mark.long

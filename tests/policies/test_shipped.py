@@ -177,7 +177,7 @@ LOWERED = {
 }
 
 
-@pytest.mark.parametrize("harm_count", HARM_COUNTS)
+@pytest.mark.parametrize("harm_count", ["first", pytest.param("total", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("test", list(LOWERED))
 def test_shipped__refined_is_nowhere_below_the_shipped_table(test: str, harm_count: HarmCount) -> None:
     scenario = load_scenario(test)

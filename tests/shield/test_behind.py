@@ -16,7 +16,7 @@ PAIR, PAPER = (load_scenario(name) for name in ("cooperation-3-pair", "paper-ran
 
 
 def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeypatch):
-    worlds, task = PAIR.sample(30, 7).worlds, Task(PAIR, (1, 2), "total")
+    worlds, task = PAIR.sample(12, 7).worlds, Task(PAIR, (1, 2), "total")
     team = ShieldedTeam(Team.copies(make_agent("coast"), (1, 2)), PAIR, harm_count="total", logging=True)
     ledger = drive(worlds, team, PAIR).ledger
     whole = drive_chunks(make_agent("coast"), worlds, task)
@@ -24,15 +24,15 @@ def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeyp
     assert whole.vehicle_harm.tolist() == ledger.vehicle_harm("total").tolist()
     assert whole.bound.tolist() == team.predicted_harm.tolist() and (whole.harm <= whole.bound).all()
     assert whole.baseline.tolist() == team.shield.baseline_shares.tolist()
-    logged = np.zeros((30, 2), np.int64)
+    logged = np.zeros((12, 2), np.int64)
     for entry in team.shield.log:
         logged[entry.world, entry.vehicle - 1] += 1
     assert whole.replaced.tolist() == logged.tolist() and (logged.sum(axis=0) > 0).all()
     assert (whole.replaced <= whole.decisions[:, np.newaxis]).all()
-    monkeypatch.setattr(behind_module, "CHUNK", 7)
+    monkeypatch.setattr(behind_module, "CHUNK", 5)
     parts = drive_chunks(make_agent("coast"), worlds, task)
     assert all(np.array_equal(*columns) for columns in zip(whole, parts, strict=True))
-    assert stack([whole, parts]).replaced.shape == (2, 30, 2)
+    assert stack([whole, parts]).replaced.shape == (2, 12, 2)
 
 
 def test_put_shield__of_one_learner_it_is_the_shield_of_one():

@@ -31,9 +31,9 @@ def driven(agent: object, scenario: Scenario, n: int, seed: int = 7, vehicle: in
 @pytest.mark.parametrize("scenario", LISTS.values(), ids=list(LISTS))
 @pytest.mark.parametrize("way", [pytest.param(way, marks=() if way == "drive" else pytest.mark.slow) for way in WAYS])
 def test_robust__at_the_corners_no_world_is_above_the_first_bound(scenario: Scenario, way: str) -> None:
-    harm, bound, replaced = shielded(way, scenario, 15, 7)
+    harm, bound, replaced = shielded(way, scenario, 8, 7)
     assert (harm <= bound + ABOVE).all()
-    assert replaced > 15
+    assert replaced > 8
 
 
 @pytest.mark.slow
@@ -67,14 +67,14 @@ def test_gate__of_the_ranges_is_red_where_a_world_is_above(monkeypatch: pytest.M
 
 
 def test_step__in_the_middle_promises_nothing_of_the_corners() -> None:
-    harm, bound, _ = shielded("coast", NEVER_HEARD, 60, 7, robust=None)
+    harm, bound, _ = shielded("coast", NEVER_HEARD, 30, 7, robust=None)
     assert (harm > bound + 1.0).any()
 
 
 @pytest.mark.parametrize("robust", [None, "corners", pytest.param("interior", marks=pytest.mark.slow)])
 def test_believed__where_everything_is_known_the_bound_is_that_of_the_best_constant(robust: str | None) -> None:
-    harm, bound = driven(BelievedShieldAgent(Hostile("drive"), BASE, robust=robust), BASE, 40)
-    _, best = driven(make_agent("e_v2x_bm", scenario=BASE), BASE, 40)
+    harm, bound = driven(BelievedShieldAgent(Hostile("drive"), BASE, robust=robust), BASE, 20)
+    _, best = driven(make_agent("e_v2x_bm", scenario=BASE), BASE, 20)
     if robust == "interior":  # an upper bound, which is not exact where impacts coincide
         assert (bound >= best - 1e-4).all() and np.isclose(bound, best, atol=1e-4).mean() > 0.9
     else:
@@ -84,7 +84,7 @@ def test_believed__where_everything_is_known_the_bound_is_that_of_the_best_const
 
 @pytest.mark.parametrize("spec", ["coast+step:believed", "coast+robust:believed", "ppo@shipped/ppo+episode:believed"])
 def test_believed__no_world_depends_on_the_batch(spec: str) -> None:
-    worlds = PERIODIC.sample(6, 3).worlds
+    worlds = PERIODIC.sample(5, 3).worlds
     whole = drive(worlds, make_agent(spec, scenario=PERIODIC), PERIODIC, 1).final
     alone = drive(worlds.take([4]), make_agent(spec, scenario=PERIODIC), PERIODIC, 1).final
     np.testing.assert_allclose(whole.speeds_mps[4], alone.speeds_mps[0], atol=1e-6)

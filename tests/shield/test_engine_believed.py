@@ -45,7 +45,7 @@ def driven(env: Any, world: int, action: float = 0.0) -> list[dict[str, Any]]:
 def test_parallel__does_what_the_agent_of_evaluations_does(scenario: Scenario | str, mode: str) -> None:
     scenario = load_scenario(scenario) if isinstance(scenario, str) else scenario
     env = HybridShield(parallel_env(scenario), mode=mode, believed=True)
-    for world in range(2):
+    for world in range(1 if mode == "robust" else 2):
         told = driven(env, world)
         agent = make_agent(f"coast+{mode}:believed", scenario=scenario)
         alone = drive(scenario.sample(1, 7, first=world).worlds, agent, scenario, 1).ledger.world_harm("first")[0]
@@ -57,7 +57,7 @@ def test_parallel__does_what_the_agent_of_evaluations_does(scenario: Scenario | 
 @pytest.mark.parametrize("scenario", LISTS.values(), ids=list(LISTS))
 def test_robust__at_the_corners_no_world_is_above_the_first_bound_that_was_told(scenario: Scenario) -> None:
     env = HybridShield(parallel_env(scenario), mode="robust", believed=True)
-    for seed in range(6):
+    for seed in range(3):
         told = driven(env, seed, 1.0)
         assert harm_of(env) <= told[1]["bound_harm"] + ABOVE
 
@@ -111,24 +111,24 @@ def test_every_interface__decides_alike() -> None:
     assert decided[2:] == [each["chosen_action"] for each in told[1:]]
     venv = ShieldedVecEnv(make_sb3_vec_env(PERIODIC, 3, seed=7), believed=True)
     venv.reset()
-    for _ in range(100):
+    for _ in range(40):
         *_, infos = venv.step(np.full((3, 1), 1.0))
     assert all(info["shield"]["believed"] for info in infos)
 
 
 def test_vector__rows_that_begin_again_are_those_of_a_fresh_episode() -> None:
-    env = ShieldedVectorEnv(EthBrakeVectorEnv(num_envs=4, scenario=PERIODIC), mode="robust", believed=True)
+    env = ShieldedVectorEnv(EthBrakeVectorEnv(num_envs=2, scenario=PERIODIC), mode="robust", believed=True)
     env.reset(seed=5)
-    rng, first, bounds = np.random.default_rng(0), np.ones(4, bool), np.zeros(4)
+    rng, first, bounds = np.random.default_rng(0), np.ones(2, bool), np.zeros(2)
     ended = 0
     for _ in range(120):
-        _, _, terminated, truncated, infos = env.step(rng.uniform(-1.0, 1.0, (4, 1)).astype(np.float32))
+        _, _, terminated, truncated, infos = env.step(rng.uniform(-1.0, 1.0, (2, 1)).astype(np.float32))
         told, running = infos["shield"]["bound_harm"], infos["_shield"]
         bounds = np.where(first & running, told, bounds)
         assert (told[running] <= bounds[running] + ABOVE).all()
         first = np.where(running, terminated | truncated, first)
         ended += int((terminated | truncated).sum())
-    assert ended >= 6
+    assert ended >= 3
 
 
 def test_refused__calls_leave_the_shield_as_it_was() -> None:

@@ -116,7 +116,7 @@ def test_sb3__the_log_tells_episodes_apart():
 def test_sb3__learns_under_the_shield():
     env = ShieldedVecEnv(make_sb3_vec_env("paper-random", 4), intervention_penalty=1.0)
     model = PPO("MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, seed=3, device="cpu")
-    model.learn(256)
+    model.learn(128)
     assert np.isfinite(env.step(np.zeros((4, 1), np.float32))[1]).all()
 
 
@@ -262,8 +262,8 @@ def test_infos__hold_the_bound_after_a_reset_already_with_the_keys_of_a_step(opt
 @pytest.mark.parametrize("name", INTERFACES)
 @pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.engine_shield.MovingAtHorizon")
 def test_attack__through_every_interface_stays_within_the_bound_at_the_alert(name):
-    realised, bound, _ = INTERFACES[name](60, 5)  # make test-shield: 10,000
-    assert len(realised) == len(bound) >= 60
+    realised, bound, _ = INTERFACES[name](24, 5)  # make test-shield: 10,000
+    assert len(realised) == len(bound) >= 24
     assert (np.array(realised) <= np.array(bound) + 1e-9).all() and max(bound) > 0.0
 
 

@@ -132,9 +132,9 @@ def test_caps__reject_what_only_moves_harm_to_another():
 def test_engine__realises_the_last_bound_to_the_bit_and_the_bound_never_rises(level, N, harm_count):
     scenario = scenario_of(level, N)
     cap = "baseline" if harm_count == "first" else None
-    worlds = scenario.sample(12, 5).worlds
-    for name, adversary in ADVERSARIES.items():
-        for hostile in ("all", "one"):
+    worlds = scenario.sample(8, 5).worlds
+    for k, (name, adversary) in enumerate(ADVERSARIES.items()):
+        for hostile in ("all", "one") if level > 3 or N > 3 else ("one" if k % 2 else "all",):
             found = joint_attack(scenario, worlds, adversary, hostile=hostile, harm_count=harm_count, cap=cap, seed=1)
             assert found.realised.tolist() == found.last_bound.tolist(), name
             assert (found.realised <= found.bound).all() and found.rises == 0 and found.over_cap == 0

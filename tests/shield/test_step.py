@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHo
 
 SCENARIO = load_scenario("paper-random")
 TASK = Task(SCENARIO, (1,))
-WORLDS = SCENARIO.sample(120, 3).worlds
+WORLDS = SCENARIO.sample(60, 3).worlds
 
 
 class Wavering:
@@ -42,7 +42,7 @@ class Wavering:
 @pytest.mark.parametrize(("N", "harm_count"), [(3, "first"), (5, "total")])
 def test_falsification__no_adversary_gets_above_the_bound(name, N, harm_count):
     scenario = line(N)
-    found = attack(scenario, scenario.sample(40, 11).worlds, ADVERSARIES[name], harm_count=harm_count)
+    found = attack(scenario, scenario.sample(24, 11).worlds, ADVERSARIES[name], harm_count=harm_count)
     assert (found.realised <= found.bound).all()
     assert found.realised.tolist() == found.last_bound.tolist()
 
@@ -167,7 +167,7 @@ def test_review__tells_the_harm_of_the_engine_also_where_the_bound_is_not_it(mod
 
 
 def test_review__of_an_agent_driven_twice_is_of_the_last_batch():
-    smaller, again = WORLDS.take(np.arange(60, 90)), StepShieldAgent(Wavering(), SCENARIO, logging=True)
+    smaller, again = WORLDS.take(np.arange(30, 50)), StepShieldAgent(Wavering(), SCENARIO, logging=True)
     fresh = StepShieldAgent(Wavering(), SCENARIO, logging=True)
     drive(WORLDS, again, SCENARIO, 1)
     drive(smaller, again, SCENARIO, 1)
@@ -175,12 +175,12 @@ def test_review__of_an_agent_driven_twice_is_of_the_last_batch():
     assert {entry.episode for entry in again.shield.log} == {0, 1}
     for told, expected in zip(review(again, smaller, 1), review(fresh, smaller, 1), strict=True):
         assert told.tolist() == expected.tolist()
-    with pytest.raises(InvalidInput, match="120 worlds, but 30 were driven last"):
+    with pytest.raises(InvalidInput, match="60 worlds, but 20 were driven last"):
         review(again, WORLDS, 1)
 
 
 @pytest.mark.parametrize("agent", [StepShieldAgent, HybridAgent])
-@pytest.mark.parametrize("sizes", [(60, 30), (30, 60), (60, 1)])
+@pytest.mark.parametrize("sizes", [(20, 10), (1, 20)])
 def test_agent__drives_a_batch_of_another_size_as_a_fresh_one_does(agent, sizes):
     used = agent(make_agent("constant:3"), SCENARIO)
     for n in sizes:

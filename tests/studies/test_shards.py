@@ -69,6 +69,7 @@ def test_killed__goes_on_with_what_is_left_in_any_number_of_shards(asked, tally,
     assert driven == []
 
 
+@pytest.mark.slow
 def test_processes__give_the_same_tally_and_a_shard_whose_process_was_killed_is_driven_again(
     asked, tally, tmp_path: Path
 ) -> None:

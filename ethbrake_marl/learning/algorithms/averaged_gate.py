@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
 from ethbrake_marl.learning.algorithms.modes import ModesPlan
-from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS
+from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS, Adam
 from ethbrake_marl.learning.algorithms.scout import Scout
 from ethbrake_marl.learning.recipe import ActorShape
 from ethbrake_marl.physics import Floats
@@ -40,7 +40,7 @@ class AveragedGate(nn.Module):
         self.learning = copy.deepcopy(self.average)
         self.scout = Scout(inputs) if focus > 0.0 else None
         learned = [*self.learning.parameters(), *(self.scout.parameters() if self.scout is not None else ())]
-        self.optimizer = torch.optim.Adam(learned, lr=rate(1.0), eps=1e-5)
+        self.optimizer = Adam(learned, lr=rate(1.0), eps=1e-5)
         self.register_buffer("seen", torch.zeros(plan.gate_memory, inputs))
         self.register_buffer("more", torch.zeros(plan.gate_memory, networks))
         self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))

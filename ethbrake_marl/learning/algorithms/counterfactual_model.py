@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from ethbrake_marl.engine.branches import Act, Moment, Offsets, branch, join_moments, moment_of, play_to_the_end
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS
+from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS, Adam
 from ethbrake_marl.learning.algorithms.scout import Scout, choose_rows
 from ethbrake_marl.learning.recipe import ActorShape
 from ethbrake_marl.physics import Bools, Floats, Ints
@@ -54,10 +54,15 @@ class AveragedActor(BasePolicy):
         last = nn.Linear(shape.policy[-1], 1)
         self.learning = nn.Sequential(*create_mlp(inputs, -1, list(shape.policy), activation), last)
         self._spec = shape.spec(inputs)
+        average = [*self._layers(self.mlp_extractor["policy_net"]), self.action_net]
+        pairs = list(zip(average, self._layers(self.learning), strict=True))
+        self._pairs = [
+            (getattr(mean, name), getattr(learns, name)) for mean, learns in pairs for name in ("weight", "bias")
+        ]
         self._average(0.0, towards_learning=False)
         self.scout = Scout(inputs) if focus > 0.0 else None
         learned = [*self.learning.parameters(), *(self.scout.parameters() if self.scout is not None else ())]
-        self.optimizer = torch.optim.Adam(learned, lr=rate(1.0), eps=1e-5)
+        self.optimizer = Adam(learned, lr=rate(1.0), eps=1e-5)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
         """Begin with these tensors of a bundle."""
@@ -75,7 +80,7 @@ class AveragedActor(BasePolicy):
         with torch.no_grad():
             values = torch.from_numpy(observation)
             for layer in self.learning:
-                values = values.relu_() if isinstance(layer, nn.ReLU) else layer(values)
+                values = values.relu_() if isinstance(layer, nn.ReLU) else layer.forward(values)
         found: Float32s = values[:, 0].numpy()
         return found
 
@@ -98,15 +103,12 @@ class AveragedActor(BasePolicy):
         return self.forward(observation)
 
     def _average(self, keep: float, *, towards_learning: bool) -> None:
-        average = [*self._layers(self.mlp_extractor["policy_net"]), self.action_net]
         with torch.no_grad():
-            for mean, learns in zip(average, self._layers(self.learning), strict=True):
-                for name in ("weight", "bias"):
-                    one, other = getattr(mean, name), getattr(learns, name)
-                    if towards_learning:
-                        one.lerp_(other, 1.0 - keep)
-                    else:
-                        other.copy_(one)
+            for mean, learns in self._pairs:
+                if towards_learning:
+                    mean.lerp_(learns, 1.0 - keep)
+                else:
+                    learns.copy_(mean)
 
     @staticmethod
     def _layers(network: nn.Module) -> list[nn.Linear]:

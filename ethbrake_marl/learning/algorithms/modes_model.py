@@ -29,6 +29,7 @@ from ethbrake_marl.learning.algorithms.counterfactual_model import (
 )
 from ethbrake_marl.learning.algorithms.mode_worlds import Shown, drive_from, explore, own_worlds, show_templates
 from ethbrake_marl.learning.algorithms.modes import ModesPlan, Stage, stages_of
+from ethbrake_marl.learning.algorithms.networks import Adam
 from ethbrake_marl.learning.algorithms.scout import Scout, choose_rows
 from ethbrake_marl.learning.recipe import ActorShape
 from ethbrake_marl.physics import Floats
@@ -171,7 +172,7 @@ class ModesModel(CounterfactualModel):
 
     def _imitate(self, pupil: AveragedActor, shown: Shown, seed: int) -> None:
         """Teach a network what templates do."""
-        pupil.optimizer = torch.optim.Adam(pupil.learning.parameters(), lr=self.lr_schedule(1.0), eps=1e-5)
+        pupil.optimizer = Adam(pupil.learning.parameters(), lr=self.lr_schedule(1.0), eps=1e-5)
         seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
         generator = torch.Generator().manual_seed(seed)
         for _ in range(self.plan.imitation_epochs):

@@ -8,9 +8,11 @@ sees both: the state, and whose place it judges.
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import numpy as np
+import torch
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from torch import Tensor, nn
@@ -19,6 +21,14 @@ from ethbrake_marl.policies.actor import Float32s
 from ethbrake_marl.policies.manifest import Activation, NetworkSpec, tensor_table
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
+
+
+class Adam(torch.optim.Adam):
+    """torch's, to the bit, without what imports torch's compiler (1 to 3 CPU-s), which has nothing to do here."""
+
+
+for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_dict"):
+    setattr(Adam, _name, torch.no_grad()(inspect.unwrap(getattr(torch.optim.Adam, _name))))
 
 
 class CentralCriticPolicy(ActorCriticPolicy):

@@ -20,7 +20,7 @@ from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.studies.shards import evaluate_shards
 
 AGENTS = ("full_brake", "e_v2x_bm:pairwise")
-N = 7_300
+N = 3_300
 
 FAILING = """
 import numpy as np
@@ -52,7 +52,7 @@ def tally(asked) -> Tally:
     return evaluate_shards(asked, shards=1)
 
 
-@pytest.mark.parametrize(("shards", "block"), [(2, 2_000), (7, 1_000), (3, 5_000)])
+@pytest.mark.parametrize(("shards", "block"), [(2, 2_000), (4, 1_000), (3, 5_000)])
 def test_tally__is_the_same_bits_in_any_shards_and_blocks(asked, tally: Tally, shards: int, block: int) -> None:
     found = evaluate_shards(asked, shards=shards, block=block)
     assert found == tally
@@ -74,7 +74,7 @@ def test_rows__are_those_of_evaluate_on_the_same_worlds(asked, tally: Tally, pap
     sharded, whole = summarise_shards(asked, tally), summarise(evaluation)
     for one, other in zip(sharded, whole, strict=True):
         assert one.collision_rate.value == other.collision_rate.value
-        assert one.collision_rate.interval == pytest.approx(other.collision_rate.interval, abs=2e-4)
+        assert one.collision_rate.interval == pytest.approx(other.collision_rate.interval, abs=4e-4)
         names = ("first_impact_harm", "total_harm", "first_difference", "total_difference", "first_decrease",
                  "total_decrease", "predicted_harm", "sampled_harm", "shoved_m", "collisions", "horizon_ends", "knows",
                  "hidden_share", "episodes", "policy_share", "beside_paper", "scenario_sha256")  # fmt: skip
@@ -86,10 +86,10 @@ def test_rows__are_those_of_evaluate_on_the_same_worlds(asked, tally: Tally, pap
 
 
 def test_regret__where_a_table_holds_every_world(paper_random: Scenario) -> None:
-    question = Question(paper_random, ("full_brake", "e_v2x_bm:pairwise"), 1_200, 7)
+    question = Question(paper_random, ("full_brake", "e_v2x_bm:pairwise"), 1_100, 7)
     asked = ask(question)
     found = summarise_shards(asked, evaluate_shards(asked, shards=2))
-    sample = paper_random.sample(1_200, 7)
+    sample = paper_random.sample(1_100, 7)
     lineup = make_lineup(question.agents, paper_random)
     whole = summarise(evaluate(sample, lineup, scenario=paper_random, seed=7))
     for one, other in zip(found, whole, strict=True):
@@ -102,15 +102,15 @@ def test_regret__where_a_table_holds_every_world(paper_random: Scenario) -> None
 def test_worlds_that_fail__are_left_out_for_all_agents(tmp_path: Path, paper_random: Scenario) -> None:
     file = tmp_path / "failing.py"
     file.write_text(FAILING.format(below=5.01))
-    question = Question(paper_random, ("full_brake", f"{file}:make"), 2_500, 7)
+    question = Question(paper_random, ("full_brake", f"{file}:make"), 1_100, 7)
     asked = ask(question)
-    one, three = (evaluate_shards(asked, shards=k) for k in (1, 3))
-    sample = paper_random.sample(2_500, 7)
+    one, two = (evaluate_shards(asked, shards=k) for k in (1, 2))
+    sample = paper_random.sample(1_100, 7)
     bad = np.flatnonzero(sample.worlds.gaps_m[:, 0] < 5.01)
-    assert one == three and one.worlds == 2_500 - bad.size and bad.size > 0
+    assert one == two and one.worlds == 1_100 - bad.size and bad.size > 0
     assert [(left.world, left.seed, left.reason) for left in one.left_out] == [(k, 7, "planted") for k in bad.tolist()]
     rows = summarise_shards(asked, one)
-    good = np.setdiff1d(np.arange(2_500), bad)
+    good = np.setdiff1d(np.arange(1_100), bad)
     whole = summarise(
         evaluate(sample.worlds.take(good), make_lineup(["full_brake"], paper_random), scenario=paper_random)
     )
@@ -140,7 +140,7 @@ def test_tally__comes_back_from_json_as_it_was(tally: Tally) -> None:
 
 def test_worlds_hash__tells_another_list(paper_random: Scenario, tally: Tally) -> None:
     for scenario, seed in ((paper_random, 12), (load_scenario("paper-random-early"), 11)):
-        other = ask(Question(scenario, ("full_brake",), 2_000, seed))
+        other = ask(Question(scenario, ("full_brake",), N, seed))
         assert evaluate_shards(other, shards=1).worlds_hash != tally.worlds_hash
 
 

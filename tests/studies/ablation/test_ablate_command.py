@@ -20,6 +20,7 @@ from ethbrake_marl.learning import train as learning_train
 from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.studies.ablation.plan import Plan, Training, read_levels, with_scheme
 from ethbrake_marl.studies.jobs import training as trainings
+from tests.fixtures.pictures import draw_nothing
 
 LEVELS = "cooperation-0-sensors,cooperation-3-pair,cooperation-3-congested"
 SMALL = ["--levels", LEVELS, "--seeds", "2", "--episodes", "20", "--search-episodes", "4", "--budget", "50"]
@@ -30,7 +31,9 @@ SMALL += ["--steps", "128", "--scheme", "shared"]
 def ablation(tmp_path_factory, tiny) -> Path:
     """The folder of a small ablation; not to be changed."""
     folder = tmp_path_factory.mktemp("ablation") / "whole"
-    assert run_command(["ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        draw_nothing(patch)
+        assert run_command(["ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL]) == 0
     return folder
 
 

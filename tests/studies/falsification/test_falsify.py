@@ -42,7 +42,7 @@ def test_falsify__keeps_nothing_where_nothing_is_wrong() -> None:
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
 def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count: eb.HarmCount) -> None:
     measure = make_measure("bound", "coast+step", None, SCENARIO, harm_count)
-    found = falsify(measure, 512, 1)
+    found = falsify(measure, 256, 1)
     assert found.measured.score.max() <= 1e-9 and found.sample.worlds.n > 3
     assert np.array_equal(found.measured.score, found.measured.harm - found.measured.reference)
 

@@ -32,6 +32,7 @@ def tiny_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(curves, "CURVES", {"low": ("low",), "high": ("high",)})
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_full__trains_draws_and_keeps_what_is_trained(tiny_groups, settings: Settings) -> None:
     full = replace(settings, mode="full", episodes=5)
     (item,) = choose_items(["learning-low"])

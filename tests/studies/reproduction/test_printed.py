@@ -47,7 +47,7 @@ def test_decrease__follows_from_the_printed_harms() -> None:
 
 
 def test_compare_rows__full_braking_agrees_at_200_ms_and_the_hybrid_is_excluded_as_stated() -> None:
-    besides = [beside(AS_STATED, 2_000), beside(AT_200_MS, 2_000)]
+    besides = [beside(AS_STATED, 1_000), beside(AT_200_MS, 1_000)]
     rows = [printed(RANDOM_TEST, agent) for agent in ("Non-E", "Hybrid PPO")]
     found = {verdict.what: verdict for verdict in compare_rows(rows, besides)}
     stated, early = found["Non-E, average harm (as stated)"], found[f"Non-E, average harm ({AT_200_MS.name})"]

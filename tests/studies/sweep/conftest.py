@@ -8,7 +8,9 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.studies.jobs import local
 from tests.learning.tiny import TINY_PPO
+from tests.studies.jobs.inside import Inside
 
 RECIPE = {
     **TINY_PPO.model_dump(mode="json"),
@@ -47,8 +49,10 @@ def small(tiny: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def finished_sweep(tmp_path_factory: pytest.TempPathFactory, small: dict[str, Any]) -> Path:
-    """The folder of that sweep, run by one process without a disturbance; not to be changed."""
+    """The folder of that sweep, run by this process without a disturbance; not to be changed."""
     folder = tmp_path_factory.mktemp("sweep")
     (folder / "sweep.yaml").write_text(yaml.safe_dump(small))
-    assert run_command(["sweep", str(folder / "sweep.yaml"), "--output", str(folder / "out"), "--jobs", "1"]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(local, "LocalWorkers", Inside)
+        assert run_command(["sweep", str(folder / "sweep.yaml"), "--output", str(folder / "out"), "--jobs", "1"]) == 0
     return folder / "out"

@@ -20,6 +20,8 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import train
 from ethbrake_marl.policies.policy import load_policy
+from ethbrake_marl.studies.jobs import local
+from tests.studies.jobs.inside import Inside
 from tests.studies.sweep.disturbing import PROGRAM, holders, journal, parent
 
 TABLE = "results.csv"
@@ -60,7 +62,10 @@ def test_job__is_the_training_that_train_makes(finished_sweep, tiny, tmp_path):
     assert float(row["last_total_harm"]) == alone.evaluations[-1]["total_harm"]
 
 
-def test_finished_jobs__are_not_repeated_and_the_table_is_the_same(finished_sweep, small, tmp_path, capsys):
+def test_finished_jobs__are_not_repeated_and_the_table_is_the_same(
+    finished_sweep, small, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(local, "LocalWorkers", Inside)
     folder, file = tmp_path / "again", tmp_path / "sweep.yaml"
     shutil.copytree(finished_sweep, folder)
     file.write_text(yaml.safe_dump(small))

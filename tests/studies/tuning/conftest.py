@@ -8,6 +8,8 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.studies.jobs import local
+from tests.studies.jobs.inside import Inside
 from tests.studies.sweep.conftest import RECIPE
 
 
@@ -47,9 +49,11 @@ TRIALS = 5
 
 @pytest.fixture(scope="session")
 def finished_tuning(tmp_path_factory: pytest.TempPathFactory, small: dict[str, Any]) -> Path:
-    """The folder of that tuning, done by one process without a disturbance; not to be changed."""
+    """The folder of that tuning, done by this process without a disturbance; not to be changed."""
     folder = tmp_path_factory.mktemp("tuning")
     (folder / "tuning.yaml").write_text(yaml.safe_dump(small))
     command = ["tune", str(folder / "tuning.yaml"), "--output", str(folder / "out"), "--trials", str(TRIALS)]
-    assert run_command([*command, "--export", str(folder / "best.yaml")]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(local, "LocalWorkers", Inside)
+        assert run_command([*command, "--export", str(folder / "best.yaml")]) == 0
     return folder / "out"

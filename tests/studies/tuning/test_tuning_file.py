@@ -111,11 +111,15 @@ measure:
 )
 def test_bad_files__are_refused_with_file_and_line(tmp_path, old, new, line, reason):
     path = tmp_path / "mine.yaml"
-    path.write_text(WRITTEN)
-    plan_tuning(read_tuning(path))
     path.write_text(WRITTEN.replace(old, new, 1))
     with pytest.raises(InvalidInput, match=f"^{path}, line {line}: (?!.*, line ).*{reason}"):
         plan_tuning(read_tuning(path))
+
+
+def test_bad_files__without_their_mistake_are_planned(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(WRITTEN)
+    plan_tuning(read_tuning(path))
 
 
 @pytest.mark.parametrize("changes", [{"recipe": "pppo"}, searching(gama=RATE), {"prune": 1}])
