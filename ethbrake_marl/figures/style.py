@@ -41,7 +41,7 @@ class ShownFigure(Figure):
     def draw(self, renderer: RendererBase) -> None:
         """Draw it; the first of the two times that a writing draws it, where nothing is kept, it is only laid out."""
         engine = self.get_layout_engine()
-        if isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
+        if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
             engine.execute(self)
         else:
             super().draw(renderer)

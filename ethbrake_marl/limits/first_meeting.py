@@ -103,7 +103,7 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
     """Put a cell on the heap, whose first cell is the one of least harm; the new number of cells."""
     at = count
     while at > 0 and heap[(at - 1) // 2, HARM] > harm:
-        for c in range(CELL_WIDTH):  # numba compiles the copy of a row together with the text of an error, for 3 CPU-s
+        for c in range(heap.shape[1]):  # numba compiles the copy of a row with the text of an error, for 3 CPU-s
             heap[at, c] = heap[(at - 1) // 2, c]
         at = (at - 1) // 2
     heap[at, HARM], heap[at, EARLY], heap[at, LATE], heap[at, SOFT], heap[at, HARD] = harm, early, late, soft, hard
@@ -120,10 +120,10 @@ def drop_first(heap: Floats, count: int) -> int:
             below += 1
         if heap[below, HARM] >= heap[count, HARM]:
             break
-        for c in range(CELL_WIDTH):
+        for c in range(heap.shape[1]):
             heap[at, c] = heap[below, c]
         at, below = below, 2 * below + 1
-    for c in range(CELL_WIDTH):
+    for c in range(heap.shape[1]):
         heap[at, c] = heap[count, c]
     return count
 
