@@ -10,7 +10,6 @@ LIST_SEED = 7  # of the worlds on which everything is measured; has nothing to d
 HarmCount = Literal["first", "total"]
 HARM_COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
 
-OLD_SHIELDS = ("none", "episode", "step", "robust")  # of ``--shield``, the old spelling of ``+episode`` and so on
 UNCERTAINTY_EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
 
 SEARCH_BUDGET = 100_000  # candidates per world and count, of ``best-harm``
@@ -21,5 +20,3 @@ MeasureName = Literal["harm", "regret", "difference", "bound"]  # what ``falsify
 MEASURES: tuple[MeasureName, ...] = get_args(MeasureName)
 HINDSIGHT = "best_harm"  # the reference of regret, unless another is given
 MOST_NAMED_WORLDS = 1000  # of a file
-
-PRICE_CHANNELS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")  # presets of v2x

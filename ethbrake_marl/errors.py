@@ -201,10 +201,6 @@ def naming_agent(name: str, others: Collection[str] = ()) -> Iterator[None]:
         raise AgentFailed(name, error.row, error.reason) from error
 
 
-class OldSpelling(FutureWarning):
-    """Something is written as it was before this version; the message holds the new spelling. The next refuses it."""
-
-
 class FailedWorld(UserWarning):
     """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
 

@@ -17,7 +17,6 @@ PLACES = {
     "ethbrake_marl/physics/compiled.py": {"pickle"},  # machine code that this user, or root, has compiled
     "ethbrake_marl/studies/jobs/work.py": {"pickle"},  # calls between processes of our own
     "ethbrake_marl/files/plugins.py": {"exec", "compile"},  # a plug-in that the user names is code
-    "ethbrake_marl/learning/legacy.py": {"load"},  # a model of Stable-Baselines3, only with --i-trust-this-file
 }
 MODULES = {"pickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "runpy", "code", "codeop"}
 BUILTINS = {"eval", "exec", "compile", "__import__"}
@@ -164,7 +163,6 @@ def test_leave__that_is_no_longer_needed_is_told(tmp_path: Path) -> None:
     assert offences(tmp_path) == [
         "ethbrake_marl/files/plugins.py: may use compile, and does not",
         "ethbrake_marl/files/plugins.py: may use exec, and does not",
-        "ethbrake_marl/learning/legacy.py: may use load, and does not",
         "ethbrake_marl/physics/compiled.py: may use pickle, and does not",
         "ethbrake_marl/studies/jobs/work.py: may use pickle, and does not",
     ]

@@ -10,7 +10,7 @@ import pytest
 
 from ethbrake_marl.studies.reproduction.folder import checked_result
 from ethbrake_marl.studies.reproduction.item import Settings
-from ethbrake_marl.studies.reproduction.items import ITEMS, choose_items, item_names
+from ethbrake_marl.studies.reproduction.items import ITEMS, choose_items
 from ethbrake_marl.studies.reproduction.markdown import FIGURES, PREFIX, docs_page
 from ethbrake_marl.studies.reproduction.measure import (
     FULL_BRAKE,
@@ -38,7 +38,7 @@ def test_page__is_made_of_the_committed_data() -> None:
 
 
 def test_page__has_every_item_and_every_gap() -> None:
-    assert list(RESULTS) == item_names()
+    assert list(RESULTS) == [item.name for item in ITEMS]
     rows = RESULTS["gaps"]["tables"][0]["rows"]
     assert [row[0] for row in rows] == [gap.name for gap in GAPS]
 
@@ -51,7 +51,7 @@ def test_page__every_figure_is_there_and_small_and_no_other() -> None:
         assert 1_000 < (DOCS / FIGURES / name).stat().st_size < MOST_BYTES, name
 
 
-@pytest.mark.parametrize("name", item_names())
+@pytest.mark.parametrize("name", [item.name for item in ITEMS])
 def test_verdict__is_that_of_the_comparisons(name: str) -> None:
     result = RESULTS[name]
     again = summarise_verdicts([Verdict(**each) for each in result["comparisons"]])

@@ -6,7 +6,6 @@ shields, which stand above this folder, are in the same list without being impor
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -16,9 +15,9 @@ import numpy as np
 
 from ethbrake_marl.agents.knowledge import Knowledge, Source
 from ethbrake_marl.agents.protocol import Agent, check_agent
-from ethbrake_marl.agents.spelling import OLD_NAMES, OLD_SPELLINGS, AgentSpec, is_around, parse_spec
+from ethbrake_marl.agents.spelling import AgentSpec, is_around, parse_spec
 from ethbrake_marl.agents.team import Driver, Team
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, OldSpelling, describe_error, unknown_name
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, describe_error, unknown_name
 from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.scenario import Scenario
 
@@ -210,7 +209,7 @@ def make_agent(
         horizon_s = HORIZON_S if scenario is None else scenario.horizon_s
     if not isinstance(horizon_s, int | float | np.number) or not 0.0 < horizon_s < float("inf"):
         raise InvalidInput(f"horizon_s {horizon_s!r}: must be a positive number of seconds")
-    written = current_spelling(spec, scenario=scenario, harm_count=harm_count)
+    written = parse_spec(spec)
     settings = AgentSettings(
         written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty,
         time_step_s or (0.1 if scenario is None else scenario.time_step_s),
@@ -228,22 +227,6 @@ def make_single_agent(spec: str, **settings: Any) -> Agent:
     if isinstance(agent, Team):
         raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
     return agent
-
-
-def current_spelling(spec: str, *, scenario: Scenario | None = None, harm_count: HarmCount = "first") -> AgentSpec:
-    """The parts of a spec; one in the old spelling of a policy is written as it is now, with an ``OldSpelling``."""
-    written = parse_spec(spec)
-    if written.name not in OLD_NAMES:
-        return written
-    old = replace(written, policy=None, around=()).core
-    if written.policy is None or old not in OLD_SPELLINGS:
-        now = OLD_SPELLINGS.get(old, OLD_SPELLINGS[written.name])
-        raise InvalidInput(f"agent {spec!r}: is nobody; what goes around an agent is written behind it: ppo@PATH{now}")
-    algorithm_of = Entry("", "", (), "policies.shipped:algorithm_of").load()
-    around = "".join([OLD_SPELLINGS[old], *(f"+{each}" for each in written.around)])
-    new = f"{algorithm_of(written.policy, scenario, harm_count)}@{written.policy}{around}"
-    warnings.warn(OldSpelling(f"agent {spec!r}: is written {new!r} now"), stacklevel=2)
-    return parse_spec(new)
 
 
 def find_entry(written: AgentSpec) -> Entry:
@@ -300,7 +283,7 @@ def register_agent(
     if parse_spec(name) != AgentSpec(name, None, None, ()):
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
     entry = Entry(f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}", about, knows, factory)
-    if name in OLD_NAMES or _ENTRIES.setdefault(name, entry).make is not factory:
+    if _ENTRIES.setdefault(name, entry).make is not factory:
         raise AlreadyExists(f"agent {name!r} is registered already")
 
 

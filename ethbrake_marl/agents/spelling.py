@@ -22,18 +22,6 @@ BELIEVED = (  # on what was received
 )  # fmt: skip
 AROUND = (*REFINED, *SHIELDS, *BELIEVED)  # in the order in which they are put around an agent
 
-OLD_SPELLINGS = {  # of a policy; ``hybrid@PATH`` is ``ppo@PATH+episode`` now
-    "rehearsed": "+refined",
-    "hybrid": "+episode",
-    "hybrid:pairwise": "+episode:pairwise",
-    "hybrid:rehearsed": "+refined+episode",
-    "step": "+step",
-    "step:rehearsed": "+refined+step",
-    "robust": "+robust",
-    "robust:rehearsed": "+refined+robust",
-}
-OLD_NAMES = frozenset(old.partition(":")[0] for old in OLD_SPELLINGS)
-
 _WITH_BUDGET = re.compile(r"refined:[0-9]+(us)?")
 _IN_FILE = re.compile(r"(?P<name>[^:]+\.py:[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
 _BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")

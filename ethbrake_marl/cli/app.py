@@ -19,11 +19,10 @@ from ethbrake_marl.cli.best_harm import best_harm_command
 from ethbrake_marl.cli.compare import compare_command
 from ethbrake_marl.cli.dataset import dataset_command
 from ethbrake_marl.cli.doctor import doctor_command
-from ethbrake_marl.cli.equal_time import equal_time_command
 from ethbrake_marl.cli.evaluate import evaluate_command, shield_command
 from ethbrake_marl.cli.explore import explore_command
 from ethbrake_marl.cli.falsify import falsify_command
-from ethbrake_marl.cli.options import VersionOption, rename_old_options
+from ethbrake_marl.cli.options import VersionOption
 from ethbrake_marl.cli.parts import CommandWithParts
 from ethbrake_marl.cli.picture import picture_app
 from ethbrake_marl.cli.plugins import accept_plugins, check_commands, prepare_commands
@@ -39,12 +38,11 @@ from ethbrake_marl.cli.terminal import (
     say,
     shell_asks,
     tell_compilation,
-    tell_old_spellings,
+    tell_warnings,
     tolerate_narrow_streams,
 )
 from ethbrake_marl.cli.train import (
     export_command,
-    import_legacy_command,
     learning_curves_command,
     resume_command,
     train_command,
@@ -83,9 +81,6 @@ app.command("tune", epilog="Example: ethbrake tune tuning.yaml --output runs/tun
 app.command("ablate", epilog="Example: ethbrake ablate --quick --output runs/ablation-quick")(ablate_command)
 app.command("generalise", epilog=GENERALISE)(generalise_command)
 app.command("export", epilog="Example: ethbrake export runs/early --onnx early.onnx")(export_command)
-app.command(
-    "import-legacy", epilog="Example: ethbrake import-legacy old.zip --output old --algorithm sac --i-trust-this-file"
-)(import_legacy_command)
 app.command("best-harm", epilog="Example: ethbrake best-harm --episodes 200 --budget 20000 --json")(best_harm_command)
 app.command(
     "evaluate",
@@ -119,14 +114,13 @@ app.command("leaderboard", epilog="Example: ethbrake leaderboard mine.json their
 )
 app.command("doctor", epilog="Example: ethbrake doctor")(doctor_command)
 app.command("bench", epilog="Example: ethbrake bench --quick")(bench_command)
-app.command("equal-time", epilog="Example: ethbrake equal-time --episodes 200 --repeats 1")(equal_time_command)
 
 
 def main() -> None:
     """Entry point: run the command line and exit with its status."""
     gc.set_threshold(20_000)  # Python's 700 costs a run 1.5 CPU-s, and there is next to no garbage in circles
     tolerate_narrow_streams()
-    tell_old_spellings()
+    tell_warnings()
     tell_compilation()
     sys.exit(run_command(sys.argv[1:]))
 
@@ -140,7 +134,6 @@ def run_command(arguments: Sequence[str]) -> int:
         check_commands(app)
         variable = None if shell_asks(os.environ) else _NO_VARIABLE  # None: the usual one
         command = prepare_commands(accept_plugins(get_command(app)))
-        arguments = rename_old_options(arguments, command)
         with naming_extras():
             status = command(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)
         sys.stdout.flush()

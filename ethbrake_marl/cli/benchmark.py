@@ -16,7 +16,7 @@ if TYPE_CHECKING or LATE:
     from ethbrake_marl.evaluation import check_target
     from ethbrake_marl.evaluation.per_world import write_output
     from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
-    from ethbrake_marl.studies.benchmark.leaderboard import Leaderboard, read_leaderboard, verify
+    from ethbrake_marl.studies.benchmark.leaderboard import Leaderboard, read_leaderboard
     from ethbrake_marl.studies.benchmark.suite import load_suite
     from ethbrake_marl.studies.benchmark.table import RANK, SCORE, leaderboard_markdown, leaderboard_table, list_table
 
@@ -51,7 +51,7 @@ def benchmark_command(
         write_json(entry.model_dump(mode="json"))
         return
     result_console().print(list_table(entry, chosen))
-    mean = entry.mean_of_driven.estimate.in_words(digits=1, scale=100.0, unit=" %")
+    mean = entry.mean_of_driven.in_words(digits=1, scale=100.0, unit=" %")
     if entry.overall is not None:
         show(f"{agent}: overall {mean} of what is possible, mean over {len(chosen.lists)} lists of suite {suite}")
     else:
@@ -66,23 +66,17 @@ def leaderboard_command(
     output: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also write the table, as a page (.html) or Markdown (.md).")
     ] = None,
-    verify_entries: Annotated[
-        bool, typer.Option("--verify", help="Let every agent drive again, and refuse figures that this does not give.")
-    ] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check entries of `ethbrake benchmark`, and show them as one table.
+    """Show entries of `ethbrake benchmark` as one table, sorted by their score.
 
-    Refused by name: entries of another suite, changed ones, those without some list or world, of a policy made with a
-    seed of the suite, and those that stand among the others twice.
+    Refused by name: entries of another suite, and changed ones.
     """
     if output is not None:
         _check_ending(output, (*_PAGES, _MARKDOWN), "the table ends in .html or .md")
         check_target(output, force=force)
     found = read_leaderboard(entries)
-    if verify_entries:
-        _verify(found)
     if output is not None:
         write_output(output, _as_file(found, output).encode(), force=force)
         say(f"table: {output}")
@@ -102,14 +96,6 @@ def _as_file(found: Leaderboard, output: Path) -> str:
     from ethbrake_marl.studies.benchmark.page import leaderboard_page
 
     return leaderboard_page(found)
-
-
-def _verify(found: Leaderboard) -> None:
-    """Drive every entry again, and say what was found."""
-    for row in found.rows:
-        with interruptible("nothing was written"), progress_bars() as bars:
-            same = verify(row, found.suite, on_progress=bars.show_progress)
-        say(f"{row.path}: {same}")
 
 
 def _check_ending(path: Path, endings: tuple[str, ...], right: str) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING or LATE:
     from ethbrake_marl.evaluation.compare import Comparison, compare_results
     from ethbrake_marl.evaluation.results_file import read_result
 
-_FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield, equal-time (--json) or run.")
+_FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield (--json) or run.")
 _HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", "harm": "Harm"}
 _POLICIES = {"same": "the same", "other": "another", "none": ""}
 

@@ -18,7 +18,6 @@ from ethbrake_marl.cli.options import (
     ListEpisodesOption,
     ListSeedOption,
     ObjectiveOption,
-    OldShieldOption,
     PerWorldOption,
     ScenarioOption,
     SetOption,
@@ -91,7 +90,6 @@ def evaluate_command(
     episodes: ListEpisodesOption = None,
     seed: ListSeedOption = None,
     harm_count: HarmCountOption = "first",
-    shield: OldShieldOption = "none",
     uncertainty: UncertaintyOption = None,
     initial_states: StatesOption = None,
     vehicle: VehicleOption = None,
@@ -124,14 +122,14 @@ def evaluate_command(
         evaluate_in_shards(
             chosen, names, shards=shards, jobs=jobs, ray=ray, output=output, rows=rows,
             episodes=EPISODES if episodes is None else episodes, seed=LIST_SEED if seed is None else seed,
-            harm_count=harm_count, shield=shield, uncertainty=uncertainty, objectives=objectives, as_json=as_json,
+            harm_count=harm_count, uncertainty=uncertainty, objectives=objectives, as_json=as_json,
         )  # fmt: skip
         return
     sample, list_seed = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
     if by is not None:
         check_group(kind_columns(sample.types, sample.scenarios), by)
     intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
-    lineup = make_lineup(names, chosen, harm_count=harm_count, shield=shield, uncertainty=intervals)
+    lineup = make_lineup(names, chosen, harm_count=harm_count, uncertainty=intervals)
     check_agents(lineup, sample.worlds, chosen)
     evaluation, summary = _drive(sample, list_seed, lineup, chosen, report, harm_count=harm_count, force=force)
     groups = {} if by is None else summarise_by(evaluation, by)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,8 +10,7 @@ import typer
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli.terminal import show, write_json
-from ethbrake_marl.defaults import EPISODES, LIST_SEED, OLD_SHIELDS, UNCERTAINTY_EXAMPLE, HarmCount
-from ethbrake_marl.errors import OldSpelling
+from ethbrake_marl.defaults import EPISODES, LIST_SEED, UNCERTAINTY_EXAMPLE, HarmCount
 
 ScenarioOption = Annotated[
     str,
@@ -51,10 +49,6 @@ AgentsOption = Annotated[str, typer.Option(metavar="A,B,...", help="Who drives, 
 ListEpisodesOption = Annotated[int | None, typer.Option(help="Worlds of the list.", show_default=str(EPISODES))]
 ListSeedOption = Annotated[int | None, typer.Option(help="Seed of the list.", show_default=str(LIST_SEED))]
 HarmCountOption = Annotated[HarmCount, typer.Option(help="Harm that agents minimise: first impacts only, or all.")]
-OldShieldOption = Annotated[
-    str,
-    typer.Option(metavar="|".join(OLD_SHIELDS), help="Old: now +SHIELD behind an agent, such as ppo@shipped+step."),
-]
 StatesOption = Annotated[
     Path | None, typer.Option(metavar="CSV|YAML", help="Your own worlds: one per row, or named ones of falsify.")
 ]
@@ -109,24 +103,3 @@ def _show_version(asked: bool) -> None:
 VersionOption = Annotated[
     bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
 ]
-
-OLD_OPTIONS = {"--count": "--harm-count"}
-
-
-def rename_old_options(arguments: Sequence[str], command: Any) -> list[str]:
-    """The same line with every option of the version before as it is written today, and a warning.
-
-    ``command`` is the whole command line; one of its commands that has no such option today never had the old one.
-    """
-    for argument in arguments:
-        command = getattr(command, "commands", {}).get(argument, command)
-    options = {option for parameter in command.params for option in parameter.opts}
-    renamed = []
-    for argument in arguments:
-        option, equals, value = argument.partition("=")
-        new = OLD_OPTIONS.get(option, option)
-        new = new if new in options else option
-        if new != option:
-            warnings.warn(OldSpelling(f"{option} is written {new} now"), stacklevel=2)
-        renamed.append(f"{new}{equals}{value}")
-    return renamed

@@ -9,8 +9,8 @@ import typer
 
 from ethbrake_marl.cli.late import LATE
 from ethbrake_marl.cli.options import ForceOption, JsonOption, ScenarioOption, SetOption, VehicleOption
-from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
-from ethbrake_marl.defaults import LIST_SEED, PRICE_CHANNELS, HarmCount
+from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, write_json
+from ethbrake_marl.defaults import LIST_SEED, HarmCount
 from ethbrake_marl.errors import count_of
 
 if TYPE_CHECKING or LATE:
@@ -20,11 +20,9 @@ if TYPE_CHECKING or LATE:
     from ethbrake_marl.evaluation.deceleration import deceleration_curve
     from ethbrake_marl.evaluation.identity import result_identity
     from ethbrake_marl.evaluation.inputs import load_driven, load_evaluated, make_agents, make_proposers
-    from ethbrake_marl.evaluation.text import left_out_line
     from ethbrake_marl.learning.settings import read_settings
     from ethbrake_marl.scenario import Task
     from ethbrake_marl.shield.uncertainty import parse_uncertainty
-    from ethbrake_marl.studies.price import AGENTS, price_figure, price_of_not_knowing, price_tables
 
 picture_app = typer.Typer(
     rich_markup_mode=None,
@@ -194,56 +192,4 @@ def picture_robustness(
     else:
         result_console().print(robustness_table(points))
     tell_left_out(points[0].left_out, episodes)
-    say(f"picture: {target}")
-
-
-@picture_app.command(
-    "price", epilog="Example: ethbrake picture price --channels nominal,blocked --episodes 100 --output price.png"
-)
-def picture_price(
-    output: PictureOption,
-    agents: Annotated[
-        str | None,
-        typer.Option(
-            metavar="A,B,...",
-            help="Who drives. Who says believed is compared with the same that knows.",
-            show_default="a ladder of six",
-        ),
-    ] = None,
-    channels: Annotated[
-        str, typer.Option(metavar="A,B,...", help="Presets of v2x; those that send messages also periodically.")
-    ] = ",".join(PRICE_CHANNELS),
-    scenario: ScenarioOption = "cooperation-2-paper",
-    episodes: Annotated[int, typer.Option(help="Worlds of the list.", min=1)] = 100,
-    seed: Annotated[int, typer.Option(help="Seed of the list.")] = LIST_SEED,
-    harm_count: Annotated[HarmCount, typer.Option(help="Harm that agents minimise; both are measured.")] = "first",
-    vehicle: VehicleOption = None,
-    settings: SetOption = None,
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """What it costs to decide on what was received: agents beside the same ones that see through the channel.
-
-    Prints the figures, too, as Markdown.
-    """
-    target = picture_target(output, force=force)
-    from ethbrake_marl.figures.style import write_picture
-
-    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
-    with interruptible("nothing was written"), progress_bars() as bars:
-        found = price_of_not_knowing(
-            chosen, channels=channels.split(","), agents=AGENTS if agents is None else agents.split(","), n=episodes,
-            seed=seed, harm_count=harm_count, on_progress=lambda what, done: bars.show(what, done, episodes),
-        )  # fmt: skip
-    caption = (
-        f"{chosen.name} over each channel: {count_of(episodes, 'world')} of the list of seed {seed}. Harm on what was"
-        " received, minus that of the same agent which reads the line as it is; 95 % intervals, paired by world."
-    )
-    write_picture(target, price_figure(found.rows, caption=caption), force=force)
-    if as_json:
-        write_json(found.to_json())
-    else:
-        show(price_tables(found.rows))
-    if found.left_out:
-        say(left_out_line(list(map(str, found.left_out)), episodes * len(found.identities)))
     say(f"picture: {target}")

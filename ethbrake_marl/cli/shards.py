@@ -74,7 +74,6 @@ def evaluate_in_shards(
     episodes: int,
     seed: int,
     harm_count: HarmCount,
-    shield: str,
     uncertainty: str | None,
     objectives: Sequence[str],
     as_json: bool,
@@ -92,14 +91,13 @@ def evaluate_in_shards(
         episodes: worlds of the list.
         seed: of the list.
         harm_count: harm that agents minimise.
-        shield: the old way to put one around learned agents.
         uncertainty: what robust shields do not know.
         objectives: under which results are told, too.
         as_json: print JSON alone.
 
     """
     intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
-    lineup = make_lineup(agents, scenario, harm_count=harm_count, shield=shield, uncertainty=intervals)
+    lineup = make_lineup(agents, scenario, harm_count=harm_count, uncertainty=intervals)
     question = Question(scenario, tuple(lineup), episodes, seed, harm_count, uncertainty, tuple(objectives))
     check_agents(lineup, scenario.sample(1, seed).worlds, scenario)
     asked = ask(question)

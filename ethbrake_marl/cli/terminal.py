@@ -18,7 +18,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 
-from ethbrake_marl.errors import IncompleteTable, OldSpelling, WithoutEffect, one_line, plain_text
+from ethbrake_marl.errors import IncompleteTable, WithoutEffect, one_line, plain_text
 from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
 from ethbrake_marl.progress import Progress as PartProgress
 
@@ -66,13 +66,13 @@ def tolerate_narrow_streams() -> None:
         sys.stdout.reconfigure(errors="replace")
 
 
-def tell_old_spellings() -> None:
-    """Show what is written as before this version in one line, without the place in this package's code."""
+def tell_warnings() -> None:
+    """Show the package's own warnings in one line, without the place in its code."""
     shown = warnings.showwarning
 
     def show_warning(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-        if issubclass(category, OldSpelling | IncompleteTable | WithoutEffect):
-            say(f"{'note' if issubclass(category, OldSpelling) else 'warning'}: {message}")
+        if issubclass(category, IncompleteTable | WithoutEffect):
+            say(f"warning: {message}")
         else:
             shown(message, category, *place, **more)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,7 +24,7 @@ from ethbrake_marl.cli.options import (
     TrainingSeedOption,
 )
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, write_json
-from ethbrake_marl.errors import AlreadyExists, check_one_learner
+from ethbrake_marl.errors import check_one_learner
 from ethbrake_marl.progress import Progress
 
 if TYPE_CHECKING or LATE:
@@ -34,7 +34,6 @@ if TYPE_CHECKING or LATE:
     from ethbrake_marl.learning.schemes import check_scheme, who_drives_what
     from ethbrake_marl.learning.settings import read_settings
     from ethbrake_marl.policies.onnx import onnx_model
-    from ethbrake_marl.policies.policy import save_policy
     from ethbrake_marl.policies.shipped import load_named_policy
 
 if TYPE_CHECKING:
@@ -203,26 +202,3 @@ def export_command(
     check_target(onnx, force=force)
     write_output(onnx, onnx_model(load_named_policy(policy)), force=force)
     say(f"written: {onnx}")
-
-
-def import_legacy_command(
-    file: Annotated[Path, typer.Argument(metavar="FILE.zip", help="What Stable-Baselines3's save() wrote.")],
-    output: Annotated[Path, typer.Option("--output", metavar="FOLDER", help="The new policy bundle.")],
-    scenario: ScenarioOption = "paper-random",
-    algorithm: Annotated[Literal["ppo", "sac"], typer.Option(help="Which algorithm saved it.")] = "ppo",
-    settings: SetOption = None,
-    trusted: Annotated[
-        bool, typer.Option("--i-trust-this-file", help="Reading the file runs the code inside it: I know who wrote it.")
-    ] = False,
-) -> None:
-    """Make a policy bundle from a .zip of Stable-Baselines3.
-
-    Such a file can do anything that you can, when it is read. A bundle cannot: share those instead.
-    """
-    if output.exists() or output.is_symlink():
-        raise AlreadyExists(f"{output}: is there already; give another name")
-    from ethbrake_marl.learning.legacy import import_legacy  # torch takes seconds to load
-
-    chosen = load_runnable(scenario, read_settings(settings).scenario)
-    save_policy(import_legacy(file, chosen, algorithm=algorithm, trusted=trusted), output)
-    say(f"written: {output}; use it as {algorithm}@{output}")

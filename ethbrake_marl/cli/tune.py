@@ -76,7 +76,7 @@ def tune_command(
             force = force or _is_an_export(plan, export)
             _check_export(plan, export, force)
         if dry_run:
-            _show_plan(plan, output, trials, jobs, as_json)
+            _show_plan(plan, trials, jobs, as_json)
             return
         with closing(workers_for(ray, jobs, jobs)) as workers, progress_bars() as bars:
 
@@ -123,7 +123,7 @@ def _show_state(bars: Bars, state: TuningState) -> None:
     bars.show("tuning", state.done, state.total, note=state.note, label=f"tuning{least}")
 
 
-def _show_plan(plan: TuningPlan, output: Path, trials: int, jobs: int, as_json: bool) -> None:
+def _show_plan(plan: TuningPlan, trials: int, jobs: int, as_json: bool) -> None:
     from ethbrake_marl.studies.jobs.cost import told_seconds
     from ethbrake_marl.studies.tuning.cost import seconds_per_trial
 

@@ -12,7 +12,6 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.running import RUNNING
 from ethbrake_marl.engine.stream import Roster
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics.rows import params_at
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -36,7 +35,6 @@ def restore_engine(engine: Engine, arrays: Mapping[str, NDArray[Any]]) -> None:
     Raises ``InvalidInput``, before anything is changed, naming the array that is missing or has another shape, and
     where a shield follows the engine, which would know nothing of these worlds.
     """
-    arrays = with_own_latency(arrays, engine.scenario.vehicles)
     if engine.watchers:
         raise InvalidInput("engine snapshot: a shield follows this engine; restore first, then put the shield around")
     for name in RUNNING:
@@ -53,18 +51,6 @@ def restore_engine(engine: Engine, arrays: Mapping[str, NDArray[Any]]) -> None:
     for vehicle, script in engine._remembering.items():
         prefix = f"script.{vehicle}."
         _remember(script, {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
-
-
-def with_own_latency(arrays: Mapping[str, NDArray[Any]], vehicles: int, prefix: str = "") -> Mapping[str, NDArray[Any]]:
-    """The arrays of a snapshot, also of an earlier one, whose news by link had the own latencies on its diagonal."""
-    name, old, N = f"{prefix}params", params_at(5, vehicles), vehicles
-    params = arrays.get(name)
-    if params is None or params.ndim != 2 or params.shape[1] != old + N * N:
-        return arrays
-    news = params[:, old:].copy()
-    own = news[:, :: N + 1].copy()
-    news[:, :: N + 1] = params[:, params_at(2, N) : params_at(3, N)]
-    return {**arrays, name: np.concatenate([params[:, :old], own, news], axis=1)}
 
 
 def _memory(owner: object) -> Arrays:

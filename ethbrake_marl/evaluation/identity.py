@@ -27,13 +27,11 @@ Kind = Literal[
     "evaluate",
     "evaluate-shards",
     "shield",
-    "equal-time",
     "best-harm",
     "ablate",
     "generalise",
     "learning-curves",
     "robustness",
-    "price",
 ]
 _PACKAGES = ("ethbrake-marl", "numba", "numpy")
 _WORDS = {"name", "title", "description", "source"}  # what a scenario is called changes nothing

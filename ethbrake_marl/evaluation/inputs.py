@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.registry import current_spelling, make_agent, make_single_agent
+from ethbrake_marl.agents.registry import make_agent, make_single_agent
 from ethbrake_marl.agents.rollout import script_agents, set_others
-from ethbrake_marl.agents.spelling import AgentSpec, parse_spec
+from ethbrake_marl.agents.spelling import parse_spec
 from ethbrake_marl.agents.team import Driver, Team, team_of
-from ethbrake_marl.defaults import EPISODES, LIST_SEED, OLD_SHIELDS, HarmCount
+from ethbrake_marl.defaults import EPISODES, LIST_SEED, HarmCount
 from ethbrake_marl.engine.stream import ask_script, begin_script
-from ethbrake_marl.errors import InvalidInput, OldSpelling, check_one_learner, naming_agent, unknown_name
+from ethbrake_marl.errors import InvalidInput, check_one_learner, naming_agent
 from ethbrake_marl.evaluation.named_worlds import read_named_worlds
 from ethbrake_marl.files.overrides import Override, changed_parts
 from ethbrake_marl.physics import Worlds
@@ -38,7 +36,6 @@ LADDER = (  # from no decision at all up to the best that is known
     "best_harm",
 )
 _LADDER_SPEC = "ladder"
-_LEARNED = ("ppo", "sac", "counterfactual", "universal", "team")  # around whom ``--shield`` puts a shield
 
 
 def load_runnable(name_or_path: str, settings: Sequence[Override] = ()) -> Scenario:
@@ -112,20 +109,16 @@ def make_lineup(
     scenario: Scenario,
     *,
     harm_count: HarmCount = "first",
-    shield: str = "none",
     uncertainty: Uncertainty | None = None,
 ) -> dict[str, Driver]:
-    """One fresh agent per spec of ``make_agent``, by its spec as it is written now, to drive the scenario's learners.
+    """One fresh agent per spec of ``make_agent``, by its spec, to drive the scenario's learners.
 
     ``ladder`` stands for every agent of ``LADDER``. ``harm_count`` is the harm that optimising and choosing agents
-    minimise. ``shield`` (one of ``OLD_SHIELDS``) is the old way to put ``+SHIELD`` behind every learned agent that has
-    none. ``uncertainty`` is what agents with ``+robust`` certify against. Raises ``InvalidInput`` for a spec given
-    twice, a shield that nobody gets, an uncertainty that is missing or that nobody uses, and what ``make_agent``
-    raises.
+    minimise. ``uncertainty`` is what agents with ``+robust`` certify against. Raises ``InvalidInput`` for a spec given
+    twice, an uncertainty that is missing or that nobody uses, and what ``make_agent`` raises.
     """
     specs = [each for spec in specs for each in (LADDER if spec == _LADDER_SPEC else [spec])]
-    written = [current_spelling(spec, scenario=scenario, harm_count=harm_count) for spec in specs]
-    written = _behind(shield, written)
+    written = [parse_spec(spec) for spec in specs]
     for k, each in enumerate(written):
         if each in written[:k]:
             raise InvalidInput(f"agent {str(each)!r} is given twice; each agent drives every world once")
@@ -195,26 +188,3 @@ def _place_of_role(name_or_path: str, role: str) -> str:
     if not Path(name_or_path).is_file():
         return f"scenario {name_or_path!r}"
     return read_yaml(name_or_path).where(("roles", role))
-
-
-def _behind(shield: str, written: Sequence[AgentSpec]) -> list[AgentSpec]:
-    """Each learned agent that has no shield with this one behind it, the others as they are; ``none`` changes nothing.
-
-    Raises ``UnknownName`` for another shield, ``InvalidInput`` if nobody gets it.
-    """
-    if shield == "none":
-        return list(written)
-    if shield not in OLD_SHIELDS:
-        raise unknown_name("shield", shield, OLD_SHIELDS)
-    shielded = [
-        replace(each, around=(*each.around, shield)) if each.name in _LEARNED and each.shield is None else each
-        for each in written
-    ]
-    if shielded == list(written):
-        raise InvalidInput(
-            f"shield {shield}: nobody of {', '.join(map(str, written))} gets it; it is put around what learned and has"
-            f" no shield yet; any agent gets it as full_brake+{shield}"
-        )
-    now = ",".join(map(str, shielded))
-    warnings.warn(OldSpelling(f"shield {shield}: is written behind each agent now: {now}"), stacklevel=3)
-    return shielded

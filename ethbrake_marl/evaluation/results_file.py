@@ -1,4 +1,4 @@
-"""Results as files: what ``evaluate``, ``shield``, ``equal-time`` and ``run`` write, and how it is read again."""
+"""Results as files: what ``evaluate``, ``shield`` and ``run`` write, and how it is read again."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ HARMS = ("first_impact_harm", "total_harm")
 USUAL: Mapping[str, str | None] = {"harm_count": "first", "uncertainty": None}  # settings of agents
 _COMPARED: dict[Kind, tuple[str, ...]] = {  # harms of each
     "evaluate": HARMS,
-    "equal-time": HARMS,
     "shield": ("harm",),
     "evaluate-shards": HARMS,
 }
@@ -103,10 +102,10 @@ class Result:
 
 
 def read_result(path: Path) -> Result:
-    """Read what ``evaluate``, ``shield`` or ``equal-time`` printed with ``--json``, or ``ethbrake run`` wrote.
+    """Read what ``evaluate`` or ``shield`` printed with ``--json``, or ``ethbrake run`` wrote.
 
     Raises ``InvalidInput`` for anything else, also for other kinds of results, in which no agents stand beside each
-    other, and for a result without hashes, as earlier versions wrote them.
+    other, and for a result without hashes.
     """
     try:
         content = parse_strict_json(read_plain(path, _LIMIT_BYTES))
@@ -118,10 +117,7 @@ def read_result(path: Path) -> Result:
     for row in rows:
         for key, kind in _NEEDED.items():
             if not isinstance(row.get(key), kind):
-                raise InvalidInput(
-                    f"{path}: {key} is missing or no {kind.__name__}; a results file of an earlier version has no"
-                    " hashes: evaluate again"
-                )
+                raise InvalidInput(f"{path}: {key} is missing or no {kind.__name__}: evaluate again")
         _check_numbers(path, row)
     if len({tuple(told_of(row, key) for key in SAME) for row in rows}) > 1:
         raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
@@ -166,10 +162,7 @@ def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
     for row in several:
         kind = row.get("kind")
         if not isinstance(kind, str):
-            raise InvalidInput(
-                f"{path}: is no results file, as ethbrake evaluate --json prints one, or of an earlier version (kind is"
-                " missing): evaluate again"
-            )
+            raise InvalidInput(f"{path}: is no results file, as ethbrake evaluate --json prints one (kind is missing)")
         if kind not in get_args(Kind):
             raise InvalidInput(f"{path}: {unknown_name('kind of results', kind, get_args(Kind))}")
         if kind not in _COMPARED:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +13,6 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.conditions import parameter_line, parameters
 from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.evaluation.regret import assess
-from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.evaluation.table import SummaryRow
 from ethbrake_marl.figures.style import COLOURS, add_caption, label_text, new_figure, series_style, style_axes
 from ethbrake_marl.harm import HARM_COUNTS
@@ -115,32 +114,6 @@ def harm_in_parts(evaluation: Evaluation) -> Figure:
     panels[0].invert_yaxis()
     _legend(figure, panels[0])
     add_caption(figure, f"Mean per world. {parameter_line(parameters(evaluation))}.")
-    return figure
-
-
-def harm_against_time(points: Mapping[str, tuple[float, Estimate, Estimate]], *, caption: str = "") -> Figure:
-    """Mean harm of each agent, by first impacts and in total, against its time per world (ms).
-
-    Raises ``InvalidInput`` without points.
-    """
-    if not points:
-        raise InvalidInput("harm_against_time: no points; time at least one agent")
-    figure = new_figure(10.0, 4.0)
-    for axes, count, place in zip(figure.subplots(1, 2, sharey=True), HARM_COUNTS, (1, 2), strict=True):
-        style_axes(axes)
-        for number, (agent, point) in enumerate(points.items()):
-            estimate = point[place]
-            assert isinstance(estimate, Estimate)
-            style = series_style(number)
-            axes.plot(point[0], estimate.value, label=label_text(agent), **{**style, "linestyle": "none"})
-            low, high = estimate.interval or (estimate.value, estimate.value)
-            axes.vlines(point[0], low, high, color=str(style["color"]), linewidth=1.2)
-        axes.set_xscale("log")
-        axes.set_xlabel("Processor time per world (ms)", fontsize=9)
-        axes.set_ylabel(_TITLES[count], fontsize=9)
-        axes.set_ylim(bottom=0.0)
-    _legend(figure, figure.axes[0])
-    add_caption(figure, caption)
     return figure
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ethbrake_marl.engine.snapshot import Arrays, with_own_latency
+from ethbrake_marl.engine.snapshot import Arrays
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.files.arrays import ArrayHeader, ArrayRow, check_arrays
 from ethbrake_marl.learning.algorithms.protocol import Algorithm
@@ -52,10 +52,9 @@ def check_fits(folder: Path, state: TrainingState, model: Model, algorithm: Algo
         ) from None
 
 
-def _check_arrays(kept: Arrays, model: Model, algorithm: Algorithm) -> None:
+def _check_arrays(arrays: Arrays, model: Model, algorithm: Algorithm) -> None:
     environment: Any = model.env
     environment.reset()
-    arrays = dict(with_own_latency(kept, environment.engine.scenario.vehicles, _ENGINE))
     rows = [_row(f"policy.{name}", tensor.numpy()) for name, tensor in model.policy.state_dict().items()]
     rows += [_row(name, tensor.numpy()) for name, tensor in algorithm.learned_beside(model).items()]
     for name, optimizer in algorithm.optimizers(model).items():

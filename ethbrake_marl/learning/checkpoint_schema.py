@@ -101,7 +101,7 @@ class _Between(_Part):
 class Numbers(_Part):
     """``state.json``: what ``capture_model``, ``BetweenUpdates.state`` and the session keep of a training."""
 
-    training: Sha256 | None = None  # which one, see ``Training.identity``; earlier versions do not say it
+    training: Sha256  # which one, see ``Training.identity``
     counters: _Counters
     learning_rates: dict[str, Annotated[float, Field(strict=False, ge=0.0, le=1.0)]]
     random: _Generators

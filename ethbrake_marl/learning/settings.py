@@ -9,7 +9,6 @@ from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.overrides import Override, changed_parts, parse_overrides
 from ethbrake_marl.learning.recipe import WORDS, TrainingRecipe
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.quantities import OLD_KEYS
 
 _NO_SETTING = {"name", *WORDS}  # they tell about a file, and change nothing
 _TOGETHER = (("gamma", "reward.shaping_discount"),)  # keys of a recipe whose values must be equal
@@ -40,7 +39,7 @@ def read_settings(texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe]
     Raises ``UnknownName`` with a suggestion for a key that neither has.
     """
     known = {
-        "scenario": {*Scenario.model_fields, *OLD_KEYS} - _NO_SETTING,
+        "scenario": {*Scenario.model_fields} - _NO_SETTING,
         "recipe": {key for recipe in recipes for key in type(recipe).model_fields} - _NO_SETTING,
     }
     found: dict[str, list[Override]] = {"scenario": [], "recipe": []}
@@ -51,7 +50,7 @@ def read_settings(texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe]
         inside = override.inside() if whose == [override.top] else override
         owners = [each for each in whose if inside.top in known[each]]
         if not owners:
-            raise unknown_name("setting", inside.top, {key for each in whose for key in known[each]} - {*OLD_KEYS})
+            raise unknown_name("setting", inside.top, {key for each in whose for key in known[each]})
         if len(owners) > 1:
             raise InvalidInput(f"--set {override.key}: write scenario.{override.key} or recipe.{override.key}")
         found[owners[0]].append(inside)

@@ -249,25 +249,15 @@ def _newest(run: RunDirectory, training: str, other_versions: bool) -> tuple[Tra
     remove_unfinished(run.checkpoints)
     state, damaged = newest_usable(run.checkpoints)
     if state is not None:
-        _check_training(run, state, training, other_versions)
+        if state.numbers["training"] != training:
+            name = run.checkpoint(state.steps).name
+            raise InvalidInput(
+                f"{run.config}: was changed after the checkpoint {name} of this training; put it back as it was, or"
+                " train again in another folder"
+            )
         if not other_versions:
             _check_versions(run, state.versions)
     return state, damaged
-
-
-def _check_training(run: RunDirectory, state: TrainingState, training: str, other_versions: bool) -> None:
-    """Raise ``InvalidInput`` for a checkpoint of another training than ``config.json`` asks for."""
-    then, name = state.numbers.get("training"), run.checkpoint(state.steps).name
-    if then is None and not other_versions:
-        raise InvalidInput(
-            f"{run.path}: {name} was written by an earlier version, which does not say of which training it is; go on"
-            " all the same with --other-versions"
-        )
-    if then not in (None, training):
-        raise InvalidInput(
-            f"{run.config}: was changed after the checkpoint {name} of this training; put it back as it was, or train"
-            " again in another folder"
-        )
 
 
 def _check_versions(run: RunDirectory, then: Mapping[str, str]) -> None:

@@ -1,4 +1,4 @@
-"""The check that a policy's features are still what their names stand for; earlier names are read as today's."""
+"""The check that a policy's features are still what their names stand for."""
 
 from __future__ import annotations
 
@@ -8,20 +8,12 @@ import numpy as np
 
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.observations import choose_observation
-from ethbrake_marl.policies.manifest import (
-    FeatureDefinition,
-    Manifest,
-    content_sha256,
-    observation_schema,
-    scaling_sha256,
-)
+from ethbrake_marl.policies.manifest import FeatureDefinition, Manifest, observation_schema
 from ethbrake_marl.scenario.features import FEATURES
 
-_OLD, _TODAY = "hazard.", "obstacle."  # a group of features that was renamed
 
-
-def check_observed(path: Path, manifest: Manifest) -> Manifest:
-    """The manifest, in today's names.
+def check_observed(path: Path, manifest: Manifest) -> None:
+    """Compare what the policy observes with what these features are now.
 
     Raises ``InvalidInput`` naming a registered feature that is missing or was changed, ``CorruptBundle`` for features
     that this version does not have, or scales otherwise.
@@ -29,21 +21,16 @@ def check_observed(path: Path, manifest: Manifest) -> Manifest:
     seen = manifest.observation
     for feature in seen.registered:
         _check_registered(path, feature)
-    names = tuple(_TODAY + name.removeprefix(_OLD) if name.startswith(_OLD) else name for name in seen.features)
     try:
-        spec = choose_observation(names)
+        today = observation_schema(choose_observation(seen.features))
     except InvalidInput:
         raise _other_features(path, manifest) from None
-    today = observation_schema(spec)
-    same = (seen.front, seen.rear, names, [each.name for each in seen.registered]) == (
-        today.front, today.rear, today.features, [each.name for each in today.registered],
-    )  # fmt: skip
-    if not same or seen.scaling_sha256 != scaling_sha256(spec, seen.features):
+    was, now = (
+        (each.front, each.rear, each.features, [part.name for part in each.registered], each.scaling_sha256)
+        for each in (seen, today)
+    )
+    if was != now:
         raise _other_features(path, manifest)
-    if names == seen.features:
-        return manifest
-    renamed = manifest.model_copy(update={"observation": today})
-    return renamed.model_copy(update={"manifest_sha256": content_sha256(renamed.model_dump(mode="json"))})
 
 
 def _check_registered(path: Path, was: FeatureDefinition) -> None:

@@ -98,16 +98,6 @@ def make_policy(tensors: Mapping[str, Float32s], **manifest: Any) -> Policy:
         raise InvalidInput(f"policy: {error}") from None
 
 
-def actor_only(policy: Policy) -> Policy:
-    """The same policy without its critic, which it does not need to act: the same actions from half the bytes."""
-    network = policy.manifest.network.model_copy(update={"value_hidden": ()})
-    names = {row.name for row in tensor_table(network)}
-    fields = {name: getattr(policy.manifest, name) for name in Manifest.model_fields}
-    del fields["weights_sha256"], fields["manifest_sha256"]
-    tensors = {name: tensor for name, tensor in policy.tensors.items() if name in names}
-    return make_policy(tensors, **{**fields, "network": network})
-
-
 def save_policy(policy: Policy, folder: Path, *, replace: bool = False) -> None:
     """Write ``policy`` as the new folder ``folder``, completely or not at all; raises ``AlreadyExists``.
 
@@ -187,7 +177,8 @@ def _manifest(path: Path) -> Manifest:
             f"{path}: its content has SHA-256 {found}, but it says {manifest.manifest_sha256}; it was changed after it"
             " was saved"
         )
-    return check_observed(path, manifest)
+    check_observed(path, manifest)
+    return manifest
 
 
 def _serialise(tensors: Mapping[str, Float32s]) -> bytes:

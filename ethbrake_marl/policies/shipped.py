@@ -16,7 +16,7 @@ from ethbrake_marl.policies.policy import Policy, load_policy
 from ethbrake_marl.scenario import Scenario
 
 SHIPPED = "shipped"
-BUNDLE, CARD = "policy", "card.md"
+BUNDLE = "policy"
 
 PolicyKind = Literal["ppo", "sac", "counterfactual", "universal", "policy"]
 _BEST_FIRST: tuple[PolicyKind, ...] = ("counterfactual", "ppo", "sac", "universal")  # of ``policy``, where several are
@@ -75,16 +75,3 @@ def load_named_policy(
     if slash:
         return load_shipped(name)
     return load_shipped(shipped_name(kind, None if scenario is None else scenario.name, harm_count))
-
-
-def algorithm_of(path: str, scenario: Scenario | None, harm_count: HarmCount) -> str:
-    """The algorithm that trained the policy at ``path``, with which its agent's name begins: ``ppo`` or ``sac``."""
-    return load_named_policy(path, "ppo", scenario, harm_count).manifest.algorithm
-
-
-def card(name: str) -> str:
-    """The card of a shipped policy, in Markdown."""
-    folders = shipped_policies()
-    if name not in folders:
-        raise unknown_name("shipped policy", name, folders)
-    return (folders[name] / CARD).read_text("utf-8")

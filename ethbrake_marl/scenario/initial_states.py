@@ -26,7 +26,6 @@ from ethbrake_marl.scenario.quantities import (
     OPTIONAL,
     QUANTITIES,
     QuantityRule,
-    rename_old_keys,
 )
 from ethbrake_marl.scenario.sampling import obstacle_gap
 from ethbrake_marl.scenario.schema import Scenario
@@ -125,7 +124,7 @@ def initial_state_worlds(initial_state: Mapping[str, Any], scenario: Scenario) -
         raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
     given: dict[Entry, Floats] = {}
     known = _quantities(scenario)
-    for field, value in rename_old_keys(initial_state, "initial_state").items():
+    for field, value in initial_state.items():
         if field not in known:
             if field in OPTIONAL:
                 raise InvalidInput(f"initial_state: {field} is not of this scenario: {scenario.name!r} has no {field}")
@@ -209,7 +208,6 @@ def _known_columns(header: list[str], scenario: Scenario, where: str) -> list[En
     known = table_columns(scenario)
     if twice := [name for name, times in Counter(header).items() if times > 1]:
         raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
-    header = list(rename_old_keys(dict.fromkeys(header), where))
     for name in header:
         if name not in known:
             hint = suggestion(name, known) or f"known: {', '.join(known)}"

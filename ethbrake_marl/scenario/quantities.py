@@ -6,12 +6,9 @@ the tables of initial states and the sampling.
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
-from ethbrake_marl.errors import OldSpelling
 from ethbrake_marl.files.messages import UNITS
 
 BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the numbers of one Philox counter
@@ -139,19 +136,3 @@ OPTIONAL = {
 DECLARED = {**QUANTITIES, **OTHERWISE, **OPTIONAL}  # every key that declares a quantity
 # A scenario has exactly one of each two, or at most one where what they declare is optional.
 ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "obstacle_gap_m": "obstacle_margin_m"}
-
-OLD_KEYS = {"hazard_gap_m": "obstacle_gap_m", "hazard_margin_m": "obstacle_margin_m"}  # accepted, with a warning
-
-
-def rename_old_keys(given: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """The same mapping with every key of the version before as it is written today, and an ``OldSpelling`` warning.
-
-    An old key beside its new one stays, and is refused like any unknown key.
-    """
-    renamed: dict[str, Any] = {}
-    for key, value in given.items():
-        new = OLD_KEYS.get(key, key)
-        if new != key and new not in given:
-            warnings.warn(OldSpelling(f"{where}: {key} is written {new} now"), stacklevel=4)
-        renamed[new if new not in given else key] = value
-    return renamed

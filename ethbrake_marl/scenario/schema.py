@@ -26,7 +26,7 @@ from ethbrake_marl.scenario.checks import (
 )
 from ethbrake_marl.scenario.fields import OF_EVERY_VEHICLE, ScenarioFields
 from ethbrake_marl.scenario.mixture import WORDS, build_members, changed_content, draw_mixture
-from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OLD_KEYS, OPTIONAL, rename_old_keys
+from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OPTIONAL
 from ethbrake_marl.scenario.roles import LEARNER, complete_roles
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.sampling import Channel, draw_list, quantity_bounds
@@ -184,7 +184,6 @@ class Scenario(ScenarioFields):
         A new way to declare gaps or speeds takes the place of the old one. In a mixture the values are new in every
         member.
         """
-        changes = rename_old_keys(changes, f"scenario {self.name!r}")
         return Scenario(**changed_content(self.declared(), changes))
 
     def with_learners(self, learners: Sequence[str | int]) -> Scenario:
@@ -231,7 +230,6 @@ def _build(scenario: Scenario, document: Document) -> None:
     """Validate the document's content into ``scenario``."""
     if not isinstance(document.content, dict):
         raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance name: my-scenario")
-    document = _of_today(document)
     members: tuple[Scenario, ...] = ()
     if "mixture" in document.content:
         document, members = build_members(document, Scenario.from_document)
@@ -240,15 +238,6 @@ def _build(scenario: Scenario, document: Document) -> None:
     except ValidationError as error:
         raise explain(error, document, ScenarioWording(Scenario.model_fields)) from None
     scenario._members = members
-
-
-def _of_today(document: Document) -> Document:
-    """The document with the keys of the version before renamed, each on its line."""
-    content = rename_old_keys(document.content, document.file)
-    lines = {
-        (OLD_KEYS.get(str(path[0]), path[0]), *path[1:]) if path else path: n for path, n in document.lines.items()
-    }
-    return Document(document.file, content, {**lines, **document.lines})
 
 
 def _plain(value: Any) -> Any:

@@ -99,7 +99,6 @@ class OperatingPoint(NamedTuple):
 
     allowance: float  # m2/s2 above the bound that certificates may reach
     intervention_rate: float  # share of decisions, of all shielded vehicles together
-    intervened_worlds: float  # share of worlds with at least one
     harm: float  # mean over worlds (m2/s2)
     left_out: LeftOutRows = ()  # worlds that could not be advanced: in no point, whichever allowance met them
 
@@ -135,8 +134,7 @@ def _operating_points(worlds: Worlds, policy: Driver, task: Task, allowances: Se
     for allowance in allowances:
         found = drive_behind(put_shield(policy, task, allowance=allowance), worlds, task)
         rate = float(found.replaced.sum() / (found.decisions.sum() * found.replaced.shape[1]))
-        worlds_share = float((found.replaced > 0).any(axis=1).mean())
-        points.append(OperatingPoint(float(allowance), rate, worlds_share, float(found.harm.mean())))
+        points.append(OperatingPoint(float(allowance), rate, float(found.harm.mean())))
     return points
 
 

@@ -201,7 +201,7 @@ def test_register_agent__makes_names_and_policies_known(monkeypatch):
     assert {each[2] for each in seen} == {"total"} and "mine" in agent_names()
     with pytest.raises(AlreadyExists):
         register_agent("mine", lambda argument, settings: make_agent("coast"))
-    for taken in ("step", "hybrid"):
+    for taken in ("coast", "ppo"):
         with pytest.raises(AlreadyExists):
             register_agent(taken, factory)
     for name in ("mine:x", "mine@x", "mine+step"):

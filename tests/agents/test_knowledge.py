@@ -11,7 +11,6 @@ import pytest
 
 from ethbrake_marl.agents import believed, make_agent
 from ethbrake_marl.agents.believed import told_to
-from ethbrake_marl.agents.honesty import changed_decisions
 from ethbrake_marl.agents.knowledge import Source, combine, knowledge_of, knowledge_text, sees_through
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.registry import agent_entries, find_entry
@@ -24,6 +23,7 @@ from ethbrake_marl.policies.policy import save_policy
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.v2x import PRESETS, hidden_from
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from tests.agents.honesty import changed_decisions
 from tests.test_contact_features import contact_policy
 
 PAPER = load_scenario("paper-random")
@@ -248,19 +248,9 @@ def test_changed_decisions__finds_who_reads_what_others_heard_or_what_will_never
     assert changed_decisions(Guessing(reads), BLOCKED, vehicle=vehicle) > 10
 
 
-def test_changed_decisions__lets_other_learners_brake_fully_and_refuses_what_does_not_fit():
+def test_changed_decisions__lets_other_learners_brake_fully():
     pair = load_scenario("cooperation-3-pair").replace(v2x="blocked")
     assert [changed_decisions(make_agent("full_brake"), pair, vehicle=i) for i in (1, 2)] == [0, 0]
-    for wrong, words in (
-        ({"vehicle": 7}, r"honesty: vehicle = 7: must be a whole number in 0\.\.2"),
-        ({"vehicle": "vehicle_2"}, "honesty: vehicle = 'vehicle_2'"),
-        ({"seed": -1}, "honesty: seed = -1"),
-        ({}, "exactly one learner"),
-    ):
-        with pytest.raises(InvalidInput, match=words):
-            changed_decisions(make_agent("full_brake"), pair, **wrong)
-    with pytest.raises(InvalidInput, match="scenario = 'paper-random': must be a Scenario"):
-        changed_decisions(make_agent("full_brake"), "paper-random")
 
 
 @pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo@shipped/ppo+episode:believed"])

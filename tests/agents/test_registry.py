@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import warnings
 
 import numpy as np
 import pytest
@@ -13,11 +12,10 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents import registry
 from ethbrake_marl.agents.refined import Refined
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.spelling import OLD_SPELLINGS, AgentSpec, parse_spec
+from ethbrake_marl.agents.spelling import AgentSpec, parse_spec
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.errors import InvalidInput, OldSpelling, UnknownName
+from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
 
@@ -56,8 +54,6 @@ def test_spec__is_taken_apart_and_written_again(spec, parts):
         ("ppo:x@shipped", "ppo takes no argument"),
         ("ppo@", "a path is needed after '@'"),
         ("ppo+step", "a policy is needed: ppo@PATH"),
-        ("hybrid", r"written behind it: ppo@PATH\+episode"),
-        ("step:pairwise@shipped", r"written behind it: ppo@PATH\+step"),
         ("ppo@shipped+robust", r"agent 'ppo@shipped\+robust': mode robust needs an uncertainty"),
     ],
 )
@@ -94,20 +90,10 @@ def test_shields__go_around_any_agent_and_hold(spec, kind):
     assert (outcome.total_harm <= outcome.predicted_harm + 1e-9).all()
 
 
-@pytest.mark.parametrize("old", OLD_SPELLINGS)
-def test_old_spellings__make_the_same_agent_and_say_how_it_is_written_now(old):
-    with pytest.warns(OldSpelling) as told:
-        (new, agent) = next(iter(make_lineup([f"{old}@shipped/sac"], SCENARIO, **_uncertain(old)).items()))
-    assert new == f"sac@shipped/sac{OLD_SPELLINGS[old]}" == agent.name
-    assert [str(each.message) for each in told] == [f"agent '{old}@shipped/sac': is written {new!r} now"]
-
-
-def test_old_spellings__are_told_once():
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("default")
-        for _ in range(3):
-            make_agent("hybrid@shipped", scenario=SCENARIO)
-    assert len(told) == 1
+@pytest.mark.parametrize("spec", ["hybrid", "hybrid@shipped", "step:rehearsed@shipped", "robust@shipped"])
+def test_agent__names_of_earlier_versions_are_unknown(spec):
+    with pytest.raises(UnknownName, match=f"unknown agent {spec.partition('@')[0].partition(':')[0]!r}; "):
+        make_agent(spec, scenario=SCENARIO)
 
 
 OWN_FILE = """
@@ -170,9 +156,3 @@ def test_own_horizon__is_the_scenarios():
     for agent in (ours, theirs):
         agent.begin(worlds, 1, np.arange(20))
     assert ours.predicted_harm.tolist() == theirs.predicted_harm.tolist()
-
-
-def _uncertain(old):
-    from ethbrake_marl.shield import parse_uncertainty
-
-    return {"uncertainty": parse_uncertainty("gaps_m=0.5")} if old.startswith("robust") else {}

@@ -233,8 +233,8 @@ def test_policy__a_damaged_bundle_is_refused_by_file(ethbrake, finished_run, tmp
     data = bytearray(weights.read_bytes())
     data[-1] ^= 1
     weights.write_bytes(data)
-    for agent in ("ppo", "hybrid", "hybrid:pairwise"):
-        answer = ethbrake("evaluate", "--episodes", "5", "--agents", f"{agent}@{bundle}")
+    for around in ("", "+episode", "+episode:pairwise"):
+        answer = ethbrake("evaluate", "--episodes", "5", "--agents", f"ppo@{bundle}{around}")
         refused(answer, str(weights), "SHA-256")
 
 

@@ -1,16 +1,14 @@
-"""``ethbrake bench``: the table, the JSON, the picture; measuring itself is tested in tests/studies/test_speed.py."""
+"""``ethbrake bench``: the table and the JSON; measuring itself is tested in tests/studies/test_speed.py."""
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ethbrake_marl.cli import bench as bench_commands
 from ethbrake_marl.cli.machine import this_machine
-from ethbrake_marl.studies import scaling
 from ethbrake_marl.studies import speed as benchmark
 from ethbrake_marl.studies.speed import Benchmark, Effort, Speed
 
@@ -63,32 +61,3 @@ def test_bench_json__is_pure_and_complete(ethbrake, efforts):
     assert found["machine"]["cores"] >= 1 and found["machine"]["processor"]
     assert efforts == [benchmark.QUICK] * 3
     assert "bench: 1 of 3" in answer.err
-
-
-@pytest.fixture
-def few_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scaling with few worlds and vehicles, hardly measured."""
-    shortly = Effort(1, 1e-6)
-    by_worlds, by_vehicles = scaling.costs_by_worlds, scaling.costs_by_vehicles
-    monkeypatch.setattr(scaling, "costs_by_worlds", lambda effort: by_worlds(shortly, (1, 2)))
-    monkeypatch.setattr(scaling, "costs_by_vehicles", lambda effort: by_vehicles(shortly, (2, 3)))
-
-
-@pytest.mark.slow
-def test_bench_scaling__writes_a_picture_once(ethbrake, few_counts, tmp_path: Path):
-    picture = tmp_path / "scaling.png"
-    answer = ethbrake("bench", "--scaling", picture)
-    assert answer.status == 0
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    assert len(answer.out.splitlines()) == 8 and "ns per vehicle-step" in answer.out
-    assert f"picture: {picture}" in answer.err
-    again = ethbrake("bench", "--scaling", picture)
-    assert again.status == 2 and "is there already" in again.err
-    forced = ethbrake("bench", "--scaling", picture, "--force", "--json")
-    costs = json.loads(forced.out)["costs"]
-    assert len(costs) == 8 and {cost["vehicles"] for cost in costs} == {2, 3}
-
-
-def test_bench_scaling__another_ending_is_refused(ethbrake, tmp_path: Path):
-    answer = ethbrake("bench", "--scaling", tmp_path / "scaling.jpg")
-    assert answer.status == 2 and "pictures are written as PNG, SVG or PDF" in answer.err

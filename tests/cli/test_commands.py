@@ -19,7 +19,6 @@ COMMANDS = [
     "ablate",
     "generalise",
     "export",
-    "import-legacy",
     "evaluate",
     "doctor",
     "bench",

@@ -39,9 +39,8 @@ def test_cli_page__has_every_command_and_agent():
         "ablate",
         "generalise",
         "export",
-        "import-legacy",
     }
-    measuring = {"evaluate", "compare", "falsify", "shield", "best-harm", "equal-time", "benchmark", "leaderboard"}
+    measuring = {"evaluate", "compare", "falsify", "shield", "best-harm", "benchmark", "leaderboard"}
     looking = {"agents", "record", "replay", "explore", "reproduce"}
     assert names(app) == training | measuring | looking | {"doctor", "bench", "dataset"}
     for command in names(app) | {"scenario", "recipe"}:

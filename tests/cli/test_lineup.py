@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import agent_names
-from ethbrake_marl.errors import InvalidInput, OldSpelling, UnknownName
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import LADDER, check_agents, choose_worlds, make_lineup
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield import HybridAgent, StepShieldAgent
+from ethbrake_marl.shield import HybridAgent
 from ethbrake_marl.studies.experiment import run_folder
 
 SCENARIO = load_scenario("paper-random")
@@ -45,16 +45,6 @@ def test_lineup__the_hybrids_bound_and_count_are_as_asked(finished_run, shield, 
     (agent,) = make_lineup([f"ppo@{finished_run}+{shield}"], SCENARIO, harm_count="total").values()
     assert isinstance(agent, HybridAgent)
     assert (agent.bound, agent.harm_count) == (bound, "total")
-
-
-def test_lineup__shields_are_put_around_who_has_none_in_the_old_way(finished_run):
-    spec = f"ppo@{finished_run}"
-    with pytest.warns(OldSpelling, match="shield step: is written behind each agent now"):
-        lineup = make_lineup([spec, f"{spec}+episode", "coast"], SCENARIO, shield="step")
-    assert list(lineup) == [f"{spec}+step", f"{spec}+episode", "coast"]
-    assert [type(agent) for agent in lineup.values()][:2] == [StepShieldAgent, HybridAgent]
-    with pytest.raises(UnknownName, match="did you mean 'step'"):
-        make_lineup([spec], SCENARIO, shield="stap")
 
 
 def test_check_agents__a_constant_above_the_capacity_of_any_world_is_refused_before_the_work():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 
 import pytest
@@ -85,38 +84,3 @@ def test_criticality__takes_a_range_of_both_gaps(ethbrake, tmp_path):
     answer = ethbrake(*arguments, "--gaps", "9", "8", "--force")
     assert answer.status == 2
     assert "0 <= low < high" in answer.err
-
-
-def test_price__prints_a_table_for_each_agent_and_draws_them(ethbrake, tmp_path):
-    out = tmp_path / "price.png"
-    options = ("--channels", "sensors-only,blocked", "--agents", "coast,e_v2x_bm:believed", "--episodes", "4")
-    answer = ethbrake("picture", "price", *options, "--output", out)
-    assert answer.status == 0 and out.read_bytes().startswith(PNG)
-    heads = [line for line in answer.out.splitlines() if line.startswith("| channel")]
-    assert heads == [
-        "| channel | `coast`, first | `coast`, total |",
-        "| channel | `e_v2x_bm`, first | `e_v2x_bm:believed`, first | price, first | `e_v2x_bm`, total |"
-        " `e_v2x_bm:believed`, total | price, total |",
-    ]
-    assert answer.out.count("| blocked, periodic | ") == 2
-    told = json.loads(ethbrake("picture", "price", *options, "--output", out, "--force", "--json").out)
-    assert [(row["channel"], row["agent"]) for row in told][:2] == [
-        ("sensors-only", "coast"), ("sensors-only", "e_v2x_bm:believed")
-    ]  # fmt: skip
-    assert len({row["scenario_sha256"] for row in told}) == 3 and {row["kind"] for row in told} == {"price"}
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (("--channels", "nomnal"), "channel 'nomnal': must be a preset of v2x"),
-        (("--agents", "full_brake"), "none of the agents is compared"),
-        (("--agents", "e_v2x_bm:believed,nobdy"), "nobdy"),
-        (("--episodes", "0"), "--episodes"),
-        (("--scenario", "cooperation-3-pair"), "learn"),
-    ],
-)
-def test_price__what_cannot_be_is_refused_and_nothing_is_written(ethbrake, tmp_path, options, words):
-    answer = ethbrake("picture", "price", *options, "--output", tmp_path / "price.png")
-    assert answer.status == 2 and words in answer.err
-    assert list(tmp_path.iterdir()) == []

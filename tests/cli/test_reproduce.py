@@ -6,12 +6,12 @@ import json
 
 import pytest
 
-from ethbrake_marl.studies.reproduction.items import item_names
+from ethbrake_marl.studies.reproduction.items import ITEMS
 
 
 def test_reproduce__lists_every_item(ethbrake) -> None:
     answer = ethbrake("reproduce", "--list", "--json")
-    assert [each["name"] for each in json.loads(answer.out)] == item_names()
+    assert [each["name"] for each in json.loads(answer.out)] == [item.name for item in ITEMS]
 
 
 def test_reproduce__says_what_it_takes_makes_one_item_and_keeps_it(ethbrake, tmp_path) -> None:

@@ -40,7 +40,6 @@ def test_lineup__robust_agents_certify_against_the_uncertainty():
             ("--agents", "ppo@shipped+robust", "--uncertainty", "latency_s=1000"),
             "uncertainty: latency_s=1000: vehicle_2 may decide first at 1000.5 s; must be before the horizon, 8 s",
         ),
-        (("--agents", "full_brake", "--shield", "robust", "--uncertainty", "gaps_m=1"), "nobody of full_brake gets it"),
     ],
 )
 def test_evaluate__what_does_not_fit_is_one_line(ethbrake, options, message):

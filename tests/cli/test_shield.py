@@ -10,7 +10,7 @@ import pytest
 from ethbrake_marl.agents import registry
 from ethbrake_marl.agents.registry import Entry, make_agent
 from ethbrake_marl.agents.team import Team
-from ethbrake_marl.errors import InvalidInput, OldSpelling
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.catalogue import shipped_folder
@@ -114,16 +114,6 @@ def test_shield__what_has_a_shield_already_is_refused(ethbrake, tmp_path, comman
     answer = ethbrake(*command.split(), option, spec, "--episodes", "3", *output)
     assert (answer.status, answer.out) == (2, "")
     assert f"agent {spec!r}: has a shield already" in answer.err and len(answer.err.strip().splitlines()) == 1
-
-
-@pytest.mark.parametrize("shield", ["episode", "step"])
-def test_evaluate__a_shield_that_nobody_gets_is_refused(ethbrake, shield):
-    for agents in ("full_brake", "full_brake+step", "full_brake,ppo@shipped+episode"):
-        answer = ethbrake("evaluate", "--agents", agents, "--shield", shield, "--episodes", "3")
-        assert answer.status == 2 and f"shield {shield}: nobody of " in answer.err
-    with pytest.warns(OldSpelling, match=rf"is written behind each agent now: full_brake,ppo@shipped\+{shield}$"):
-        lineup = make_lineup(["full_brake", "ppo@shipped"], load_scenario("paper-random"), shield=shield)
-    assert list(lineup) == ["full_brake", f"ppo@shipped+{shield}"]
 
 
 def test_evaluate__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch):

@@ -1,4 +1,4 @@
-"""`ethbrake resume`, `learning-curves`, `export` and `import-legacy`, with trainings of a few small updates."""
+"""`ethbrake resume`, `learning-curves` and `export`, with trainings of a few small updates."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ from pathlib import Path
 import onnx
 import pytest
 import yaml
-from stable_baselines3 import PPO
 
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.policies.policy import load_policy
 from ethbrake_marl.scenario import load_scenario
@@ -173,14 +171,3 @@ def test_export__writes_onnx(ethbrake, finished_run, tmp_path, monkeypatch):
     refused(ethbrake("export", finished_run, "--onnx", tmp_path / "policy.onnx"), "is there already")
     refused(ethbrake("export", finished_run, "--onnx", tmp_path / "none" / "policy.onnx"), "there is no folder")
     refused(ethbrake("export", finished_run, "--onnx", tmp_path / "new.onnx"), "needs the package onnx")
-
-
-def test_import_legacy__needs_trust_and_makes_a_bundle(ethbrake, tmp_path):
-    environment = make_sb3_vec_env("paper-random", 4)
-    PPO("MlpPolicy", environment, n_steps=8, batch_size=8, device="cpu").save(tmp_path / "old.zip")
-    arguments = ("import-legacy", tmp_path / "old.zip", "--output", tmp_path / "new")
-    refused(ethbrake(*arguments), "runs the code inside it", "--i-trust-this-file")
-    assert not (tmp_path / "new").exists()
-    assert ethbrake(*arguments, "--i-trust-this-file").status == 0
-    assert ethbrake("evaluate", "--episodes", "5", "--agents", f"ppo@{tmp_path / 'new'}", "--json").status == 0
-    refused(ethbrake(*arguments, "--i-trust-this-file"), "is there already")

@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -43,12 +44,20 @@ PROGRAM = re.compile(r"```python\n((?:(?!```).)*?{name}(?:(?!```).)*?)```", re.D
 def run(command: str, folder: Path) -> str:
     """What a command tells on stderr and stdout, in this order; raises ``RuntimeError`` where it fails."""
     words = shlex.split(command)
+    words[1:] = [str(ROOT / word) if word.startswith("docs/studies/") else word for word in words[1:]]
     called = [sys.executable, *(["-m", "ethbrake_marl"] if words[0] == "ethbrake" else []), *words[1:]]
     variables = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100", "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
     done = subprocess.run(called, cwd=folder, env=variables, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"exit status {done.returncode}: {done.stderr[-300:]}")
     return done.stderr + done.stdout
+
+
+@cache
+def told_by(command: str) -> str:
+    """What a command tells that several tables may show."""
+    with tempfile.TemporaryDirectory() as folder:
+        return run(command, Path(folder))
 
 
 def differing_block(block: Shown, place: How, folder: Path) -> list[str]:
@@ -66,7 +75,7 @@ def differing_block(block: Shown, place: How, folder: Path) -> list[str]:
 
 def differing_table(table: Shown, place: How, folder: Path) -> list[str]:
     """The figures of a table that its commands do not tell."""
-    told = "\n".join(run(command, folder) for command in place.by)
+    told = "\n".join(map(told_by, place.by))
     return [figure for figure in missing_figures(table.text, told) if figure not in place.quoted]
 
 

@@ -107,7 +107,7 @@ TABLES: dict[str, How] = {
     "| training seed | default, tuning": TRAINED,
     "| what the vehicles do | first-impact harm": TRAINED,
     "| list | above B, interior": _by(SEARCH, "make test-shield"),
-    "| channel | `": _by(SEARCH, "ethbrake picture price --episodes 1000 --output price-of-not-knowing.png"),
+    "| channel | `": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),
     "| level | who proposes | alone": _by(SEARCH),
     "| robust mode | worlds | above": _by(SEARCH, "make test-shield"),
     "| intervals | mode | above": _by(SEARCH, "make test-shield"),
@@ -149,7 +149,7 @@ TABLES: dict[str, How] = {
     "| planted | search | first found after": _by(SEARCH),
     "| agent | 0.1, 0.3 s | 0.3, 0.6 s": _by(SEARCH),
     "| total gap (m) | 10-12": _by(SUITE, "tests/test_paper_page.py"),
-    "| step (s) | first-impact, mean": _by(SUITE, "tests/studies/test_sampling.py"),
+    "| step (s) | first-impact, mean": _by(SUITE, "tests/docs/test_studies.py"),
     "| width | shield | bound": _by(SEARCH),
     "| leak | first restart above": _by(SEARCH, "make test-shield"),
     "| gate | measured | at most": _by(SEARCH, "make test-physics"),
@@ -213,12 +213,12 @@ PICTURES: dict[str, How] = {
     ),
     "sampled-convergence.png": _by(
         NIGHTLY,
-        "python -c \"from ethbrake_marl.studies.sampling import sampling_report as r; r('sampled-convergence.png')\"",
+        "python docs/studies/sampling.py sampled-convergence.png",
     ),
     "shield-robustness.png": _by(
         SEARCH, "ethbrake picture robustness --agent ppo@shipped --episodes 300 --output shield-robustness.png"
     ),
-    "price-of-not-knowing.png": _by(SEARCH, "ethbrake picture price --episodes 1000 --output price-of-not-knowing.png"),
+    "price-of-not-knowing.png": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),
     "shield-operating.png": _by(TRAINING),
     "shield-modes.png": _by(TRAINING),
     "regimes.png": _by(NIGHTLY, "the program on its page"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -14,5 +15,6 @@ def load(name: str) -> ModuleType:
     spec = spec_from_file_location(f"site_{name}", DOCS / "extension" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = module_from_spec(spec)
+    sys.modules[spec.name] = module  # where its data classes look for it
     spec.loader.exec_module(module)
     return module

@@ -73,9 +73,6 @@ def test_results__say_worlds_scenario_policy_and_versions() -> None:
     assert found.outcome("ppo").take(np.array([0])).policies == found.outcome("ppo").policies
 
 
-PRICE = (
-    "picture", "price", "--scenario", "paper-random", "--channels", "paper", "--agents", "coast,e_v2x_bm:believed"
-)  # fmt: skip
 ABOUT = {"worlds_sha256": worlds_sha256(SAMPLE.worlds, SAMPLE.index), "scenario_sha256": scenario_sha256(SCENARIO)}
 
 
@@ -84,14 +81,12 @@ ABOUT = {"worlds_sha256": worlds_sha256(SAMPLE.worlds, SAMPLE.index), "scenario_
     [
         ("evaluate", ("evaluate", "--agents", "full_brake")),
         ("shield", ("shield", "--agents", "full_brake")),
-        ("equal-time", ("equal-time", "--agents", "coast", "--against", "coast", "--repeats", "1", "--seed", "7")),
         ("best-harm", ("best-harm", "--budget", "20")),
         pytest.param(
             "robustness",
             ("picture", "robustness", "--uncertainty", "mass_t.vehicle_3=1%", "--output", "x.png"),
             marks=pytest.mark.slow,
         ),
-        ("price", (*PRICE, "--output", "x.png")),
     ],
     ids=lambda each: each if isinstance(each, str) else "",
 )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
-import json
 import signal
 import sys
 from collections.abc import Iterator
@@ -18,12 +16,11 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput, UnknownName
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.observations import observe
-from ethbrake_marl.policies.manifest import content_sha256, observation_schema
-from ethbrake_marl.policies.policy import load_policy, save_policy
+from ethbrake_marl.policies.policy import load_policy
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario import scenario_json_schema
 from ethbrake_marl.scenario.features import FEATURES
@@ -167,29 +164,6 @@ def test_policy__whose_feature_is_missing_or_was_changed_is_refused_by_name(mine
 def lambda_free(worlds: Any, vehicle: int) -> Any:
     """Another function under the same name."""
     return worlds.speeds_mps[:, vehicle]
-
-
-def test_policy__trained_before_the_group_was_renamed_is_read_and_gives_the_same_bits(tmp_path: Path) -> None:
-    shipped = eb.load_policy(Path(eb.__file__).parent / "_policies" / "ppo-paper-random-obstacle")
-    save_policy(shipped, tmp_path / "old")
-    file = tmp_path / "old" / "manifest.json"
-    manifest = json.loads(file.read_text())
-    features = [name.replace("obstacle.", "hazard.") for name in manifest["observation"]["features"]]
-    spec = shipped.observation
-    rows = [[n, f.unit, f.scale, f.low, f.high] for n, f in zip(features, spec.features, strict=True)]
-    digest = hashlib.sha256(json.dumps(rows).encode()).hexdigest()
-    manifest["observation"] = {**manifest["observation"], "features": features, "scaling_sha256": digest}
-    file.write_text(json.dumps({**manifest, "manifest_sha256": content_sha256(manifest)}))
-    old = load_policy(tmp_path / "old")
-    assert old.manifest.observation == observation_schema(spec) == shipped.manifest.observation
-    seen = np.random.default_rng(0).normal(size=(40, spec.size)).astype(np.float32)
-    assert old(seen).tobytes() == shipped(seen).tobytes()
-    save_policy(old, tmp_path / "new")
-    assert load_policy(tmp_path / "new").manifest == old.manifest
-    manifest["observation"]["scaling_sha256"] = "0" * 64
-    file.write_text(json.dumps({**manifest, "manifest_sha256": content_sha256(manifest)}))
-    with pytest.raises(CorruptBundle, match="features or their scaling are not those of this version"):
-        load_policy(tmp_path / "old")
 
 
 def test_feature__that_is_not_finite_is_named_with_world_and_step() -> None:

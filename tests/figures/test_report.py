@@ -11,11 +11,10 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, evaluate, record_episode, summarise
 from ethbrake_marl.evaluation.regret import assess
 from ethbrake_marl.figures.episode import trajectories
-from ethbrake_marl.figures.report import harm_against_time, harm_by_agent, harm_in_parts, regret_distribution
+from ethbrake_marl.figures.report import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.figures.run import harm_against_total_gap, learning_curve
 from ethbrake_marl.figures.style import label_text, new_figure, picture_bytes
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.studies.equal_time import equal_time, equal_time_figure
 
 UNIT = re.compile(r"\((m|s|m/s|m/s²|m²/s²|ms|µs|ns)\)|steps|Worlds|Decisions")
 
@@ -29,14 +28,13 @@ def figures(evaluation: Evaluation) -> dict[str, Figure]:
         "harm": harm_by_agent(rows),
         "regret": regret_distribution(evaluation),
         "parts": harm_in_parts(evaluation),
-        "time": harm_against_time({"a": (1.0, rows[0].first_impact_harm, rows[0].total_harm)}),
         "gap": harm_against_total_gap(evaluation),
         "learning": learning_curve(points, references=rows),
         "episode": trajectories({"a": record}),
     }
 
 
-@pytest.mark.parametrize("name", ["harm", "regret", "parts", "time", "gap", "learning", "episode"])
+@pytest.mark.parametrize("name", ["harm", "regret", "parts", "gap", "learning", "episode"])
 def test_figure__every_axis_says_what_it_is_and_its_unit(figures: dict[str, Figure], name: str) -> None:
     for axes in figures[name].axes:
         below = [other for other in axes.get_shared_x_axes().get_siblings(axes) if other.get_xlabel()]
@@ -48,7 +46,7 @@ def test_figure__every_axis_says_what_it_is_and_its_unit(figures: dict[str, Figu
         assert agents or any(UNIT.search(each.replace("\n", " ")) for each in (*beside, axes.get_title(loc="left")))
 
 
-@pytest.mark.parametrize("name", ["harm", "time"])  # one of plain numbers, one with powers
+@pytest.mark.parametrize("name", ["harm", "learning"])
 def test_figure__travels_with_its_fonts(figures: dict[str, Figure], name: str) -> None:
     svg = picture_bytes(figures[name], "a.svg")
     assert b"<text" not in svg and b"font-family" not in svg
@@ -78,14 +76,8 @@ def test_regret_distribution__shares_are_those_of_the_worlds(
 def test_figures__without_limits_or_rows(pair: Scenario) -> None:
     result = evaluate(pair.sample(3, 0), {"coast": make_agent("coast")}, scenario=pair)
     assert regret_distribution(result).axes
-    for wrong in (lambda: harm_by_agent([]), lambda: harm_against_time({})):
-        with pytest.raises(InvalidInput):
-            wrong()
-
-
-def test_equal_time__gives_its_figure(pair: Scenario) -> None:
-    rows = equal_time(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair, against="coast", repeats=1)
-    assert len(equal_time_figure(rows, caption="2 worlds").axes) == 2
+    with pytest.raises(InvalidInput):
+        harm_by_agent([])
 
 
 @pytest.mark.parametrize("text", ["$x^2$", "a_b$", "\u202eabc", "测试🚗", "x" * 500, "</text><script>"])

@@ -116,7 +116,7 @@ def _values() -> Iterator[Case]:
         yield _case(
             "agent",
             ("evaluate", *FEW, "--agents", spec),
-            certain=spec not in ("ppo@shipped", "hybrid@shipped", "ladder", "constant:-7"),
+            certain=spec not in ("ppo@shipped", "ladder", "constant:-7"),
         )
     for number in NUMBERS:
         for option in ("--episodes", "--seed"):
@@ -148,7 +148,6 @@ def _words() -> Iterator[Case]:
             ("train", "--recipe", word),
             ("evaluate", *FEW, "--objective", word),
             ("shield", *FEW, "--agents", word),
-            ("evaluate", *FEW, "--shield", word),
             ("export", word, "--onnx", "x.onnx"),
             ("learning-curves", "--output", "o", "--scenario", word),
             ("ablate", "--levels", word, "--output", "o"),

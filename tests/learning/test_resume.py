@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from ethbrake_marl.learning import train as train_module
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.run_folder import create_run
 from ethbrake_marl.learning.train import TrainResult, resume, train
-from ethbrake_marl.learning.training import Training, resolve
+from ethbrake_marl.learning.training import Training
 from ethbrake_marl.policies.policy import Policy, load_policy
 from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_PPO
@@ -303,17 +302,6 @@ def test_resume__an_edited_configuration_is_another_training(
         resume(tmp_path / "run", measure=_measure)
     file.write_text(json.dumps({**config, part: {**config[part], "title": "Words change no training"}}))
     assert resume(tmp_path / "run", measure=_measure).status == "finished"
-
-
-def test_resume__a_checkpoint_that_does_not_say_of_which_training_it_is_is_one_of_other_versions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(train_module, "resolve", lambda *of: replace(resolve(*of), identity=None))
-        _stopped(tmp_path / "run", monkeypatch)
-    with pytest.raises(InvalidInput, match=r"does not say of which training it is; .*--other-versions"):
-        resume(tmp_path / "run", measure=_measure)
-    assert resume(tmp_path / "run", measure=_measure, other_versions=True).status == "finished"
 
 
 @pytest.mark.parametrize(

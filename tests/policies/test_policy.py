@@ -19,7 +19,8 @@ import safetensors.numpy
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
 from ethbrake_marl.policies import policy as bundle
 from ethbrake_marl.policies.manifest import content_sha256
-from ethbrake_marl.policies.policy import Policy, actor_only, load_policy, make_policy, save_policy
+from ethbrake_marl.policies.policy import Policy, load_policy, make_policy, save_policy
+from tests.docs.site import load
 
 Spoil = Callable[[Path], None]
 
@@ -393,8 +394,8 @@ def test_load_policy__runs_nothing_and_opens_nothing_else(policy: Policy, tmp_pa
     assert seen["torch"] is False
 
 
-def test_actor_only__acts_the_same_without_the_critic(policy: Policy, tmp_path: Path) -> None:
-    save_policy(actor_only(policy), tmp_path / "policy")
+def test_ship_policy__acts_the_same_without_the_critic(policy: Policy, tmp_path: Path) -> None:
+    save_policy(load("../studies/ship_policy").actor_only(policy), tmp_path / "policy")
     loaded = load_policy(tmp_path / "policy")
     assert not any(name.startswith("value") for name in loaded.tensors)
     assert loaded.manifest.scenario == policy.manifest.scenario

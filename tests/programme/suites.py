@@ -167,12 +167,11 @@ TABLES = ("tests/evaluation/test_table.py", "tests/evaluation/test_rollout.py")
 EVALUATION = Suite(
     files=(
         "evaluation/*.py", "figures/curves.py", "figures/criticality.py", "figures/deceleration.py",
-        "studies/sampling.py",
     ),
     quick={
         "evaluation/statistics.py": ("tests/evaluation/test_statistics.py",),
         "evaluation/seed_statistics.py": ("tests/evaluation/test_seed_statistics.py",),
-        "figures/curves.py": ("tests/figures/test_learning_curves.py", "tests/studies/test_sampling.py"),
+        "figures/curves.py": ("tests/figures/test_learning_curves.py",),
         "evaluation/rollout.py": ("tests/evaluation/test_rollout.py", "tests/agents/test_team.py"),
         "evaluation/outcome.py": ("tests/evaluation/test_rollout.py", "tests/evaluation/test_left_out.py"),
         "evaluation/regret.py": ("tests/evaluation/test_regret.py",),
@@ -184,7 +183,6 @@ EVALUATION = Suite(
         "figures/criticality.py": ("tests/figures/test_criticality.py",),
         "figures/deceleration.py": ("tests/figures/test_deceleration.py",),
         "evaluation/shield_modes.py": ("tests/evaluation/test_shield_modes.py",),
-        "studies/sampling.py": ("tests/studies/test_sampling.py",),
         "evaluation/per_world.py": ("tests/evaluation/test_report.py", "tests/evaluation/test_per_world.py"),
     },
     otherwise=TABLES,
@@ -224,7 +222,7 @@ LEARNING = Suite(
     },
     otherwise=TRAINED,
     whole=("tests/learning", "tests/cli/test_training_commands.py"),
-    left_out=frozenset({"__init__.py", "benchmarl.py", "legacy.py", "onnx.py"}),  # of other formats
+    left_out=frozenset({"__init__.py", "benchmarl.py", "onnx.py"}),  # of other formats
     interpreted=frozenset({"policies/actor.py"}),
     preloaded=(*SCIENCE, *TORCH),
 )

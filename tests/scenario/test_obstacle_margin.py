@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl import observation_for
-from ethbrake_marl.errors import InvalidInput, OldSpelling
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import (
     Scenario,
     initial_state_worlds,
@@ -76,28 +76,11 @@ def test_margin__is_an_obstacle_for_everybody():
     assert scenario.replace(obstacle_gap_m=42).replace(obstacle_margin_m=1).obstacle_gap_m is None
 
 
-def test_old_keys__mean_the_same_with_a_warning(tmp_path):
-    new = build(obstacle_margin_m=1.5)
-    with pytest.warns(OldSpelling, match=r"scenario 'given': hazard_margin_m is written obstacle_margin_m now"):
-        assert build(hazard_margin_m=1.5) == new
-    with pytest.warns(OldSpelling, match="hazard_gap_m is written obstacle_gap_m now"):
-        assert new.replace(hazard_gap_m=42) == new.replace(obstacle_gap_m=42)
-    columns = {f"gap_{p}_m": [7] for p in (1, 2)} | {f"speed_{i}_mps": [10] for i in (1, 2, 3)}
-    with pytest.warns(OldSpelling, match="initial states: hazard_gap_m"):
-        assert worlds_from_table({**columns, "hazard_gap_m": [30]}, new).obstacle_gap_m.tolist() == [30]
-    with pytest.warns(OldSpelling, match="initial_state: hazard_gap_m"):
-        state = initial_state_worlds({"gaps_m": 7, "speeds_mps": 20, "hazard_gap_m": 60}, new)
-    assert state.obstacle_gap_m.tolist() == [60]
-    file = tmp_path / "given.yaml"
-    file.write_text(yaml_of({"speeds_mps": 20, **REST}) + "hazard_margin_m: -1\n")
-    last = len(file.read_text().splitlines())
-    with pytest.warns(OldSpelling), pytest.raises(InvalidInput, match=rf"line {last}: obstacle_margin_m = -1"):
-        load_scenario(file)
-
-
-def test_old_keys__are_refused_beside_the_new_ones():
+def test_key__of_an_earlier_version_is_unknown():
     with pytest.raises(InvalidInput, match="hazard_gap_m: unknown key; known: "):
-        build(obstacle_gap_m=42, hazard_gap_m=42)
+        build(hazard_gap_m=42)
+    with pytest.raises(InvalidInput, match="initial_state: unknown key 'hazard_gap_m'; "):
+        initial_state_worlds({"gaps_m": 7, "speeds_mps": 20, "hazard_gap_m": 60}, build(obstacle_margin_m=1.5))
 
 
 def yaml_of(content: dict[str, object]) -> str:

@@ -14,16 +14,6 @@ import pytest
 from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.studies import speed as benchmark
-from ethbrake_marl.studies.scaling import (
-    APART,
-    EMERGENCY,
-    ENGINE,
-    Cost,
-    costs_by_vehicles,
-    costs_by_worlds,
-    make_lines,
-    scaling_figure,
-)
 from ethbrake_marl.studies.speed import (
     BENCHMARKS,
     Benchmark,
@@ -158,44 +148,3 @@ def test_speed__is_not_far_below_the_calibration(name: str, least: float) -> Non
     assert speeds
     for speed in speeds:
         assert speed.highest / calibration.value > least
-
-
-@pytest.mark.slow
-def test_scaling__costs_are_per_world_step() -> None:
-    by_worlds = list(costs_by_worlds(SHORT, (1, 3)))
-    assert [(cost.what, cost.worlds, cost.vehicles) for cost in by_worlds] == [
-        (EMERGENCY, 1, 3),
-        (ENGINE, 1, 3),
-        (EMERGENCY, 3, 3),
-        (ENGINE, 3, 3),
-    ]
-    by_vehicles = list(costs_by_vehicles(SHORT, (2, 4)))
-    assert [(cost.what, cost.vehicles) for cost in by_vehicles] == [
-        (EMERGENCY, 2),
-        (APART, 2),
-        (EMERGENCY, 4),
-        (APART, 4),
-    ]
-    assert all(0.0 < cost.nanoseconds < math.inf for cost in by_worlds + by_vehicles)
-
-
-@pytest.mark.parametrize("vehicles", [2, 3, 50])
-def test_lines__are_the_same_every_time_and_apart_in_their_first_step(vehicles: int) -> None:
-    worlds, again = make_lines(40, vehicles), make_lines(40, vehicles)
-    assert worlds.speeds_mps.shape == (40, vehicles)
-    assert (worlds.gaps_m == again.gaps_m).all() and (worlds.speeds_mps == again.speeds_mps).all()
-    after, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, 0.1)
-    assert impacts.count.sum() == 0 and (after.gaps_m > 0.0).all()
-
-
-def test_scaling_figure__shows_batches_left_and_single_worlds_right() -> None:
-    by_worlds = [Cost(EMERGENCY, n, 3, 50.0) for n in (1, 10, 100)]
-    by_vehicles = [Cost(APART, 256, N, 10.0 * N) for N in (2, 4)]
-    figure = scaling_figure(by_worlds, by_vehicles, "somewhere")
-    left, right = figure.axes
-    costs, proportional = left.get_lines()
-    assert costs.get_ydata() == pytest.approx([0.05, 0.5, 5.0]) and proportional.get_ydata() == pytest.approx(
-        [0.05, 0.5, 5.0]
-    )
-    assert right.get_lines()[0].get_ydata() == pytest.approx([20.0, 40.0])
-    assert [text.get_text() for text in right.get_legend().get_texts()] == [APART, "proportional"]

@@ -21,11 +21,11 @@ _MARGIN = 12
 _ROAD_TOP, _ROAD_BOTTOM = 84, 138
 _LANE = (_ROAD_TOP + _ROAD_BOTTOM) // 2
 _BODY = 13  # half of a body's height
-_PANEL_TOP, _PANEL_BOTTOM = 172, 268
+_PANEL_TOP = 172
 _TITLE = 540  # width that is left beside the clock
 _FINE = 2  # shapes are drawn so many times larger, for smooth edges
 
-_PAPER, _INK, _GREY, _LIGHT = "#ffffff", "#1a1a1a", "#6b6b6b", "#d9d9d9"
+_PAPER, _INK, _GREY = "#ffffff", "#1a1a1a", "#6b6b6b"
 _ASPHALT, _DASH = "#4a4d52", "#e8e8e8"
 _BRAKE, _DRIVE, _FLASH, _SHIELD = "#c1121f", "#2a7f3f", "#ffd60a", "#6a3d9a"
 

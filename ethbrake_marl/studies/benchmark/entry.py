@@ -42,22 +42,6 @@ _SAME_HARM = 1e-6  # of means (m2/s2), relative or absolute: what another machin
 Count = Annotated[int, Field(ge=0)]
 
 
-class Told(Strict):
-    """A value and its 95 % interval."""
-
-    value: float
-    interval: tuple[float, float] | None = None
-
-    @property
-    def estimate(self) -> Estimate:
-        """The same as an ``Estimate``."""
-        return Estimate(self.value, self.interval)
-
-
-def _told(estimate: Estimate) -> Told:
-    return Told(value=estimate.value, interval=estimate.interval)
-
-
 class ListResult(Strict):
     """What an agent did on one list; harms are means per world (m2/s2)."""
 
@@ -66,18 +50,14 @@ class ListResult(Strict):
     policies: dict[str, Sha256]  # vehicle -> the policy that drives it
     policy_seeds: dict[str, dict[str, int]]  # vehicle -> what its policy says of the seeds of its training
     knows: str
-    realised_share: Told
-    worst_decile_regret: Told
-    first_impact_harm: Told
-    total_harm: Told
-    collision_rate: Told
+    realised_share: Estimate
+    worst_decile_regret: Estimate
+    first_impact_harm: Estimate
+    total_harm: Estimate
+    collision_rate: Estimate
     below_best_known: Count  # worlds in which it does less harm than the best known of the suite
     horizon_ends: Count  # worlds that the horizon cut off
     outcome_sha256: Sha256  # of the harm of every pair in every world
-
-    def harm(self, harm_count: str) -> float:
-        """Mean harm under one count, m2/s2."""
-        return (self.first_impact_harm if harm_count == "first" else self.total_harm).value
 
 
 class NotDriven(Strict):
@@ -98,8 +78,8 @@ class Entry(Strict):
     versions: dict[str, str]
     lists: dict[str, ListResult | NotDriven]
     lists_driven: Count
-    mean_of_driven: Told  # mean share over the lists that were driven
-    overall: Told | None
+    mean_of_driven: Estimate  # mean share over the lists that were driven
+    overall: Estimate | None
     entry_sha256: Sha256  # of everything above
 
     @property
@@ -134,16 +114,11 @@ def make_entry(suite: Suite, spec: str, *, on_progress: OnProgress | None = None
             continue
         _check_seeds(spec, policy_seeds(driver, each), suite)
         lists[each.name] = _drive_list(each, sample, spec, driver, on_progress)
-    return bind_entry(suite, spec, lists)
-
-
-def bind_entry(suite: Suite, spec: str, lists: Mapping[str, ListResult | NotDriven]) -> Entry:
-    """The entry that has these results; raises ``InvalidInput`` if no list was driven."""
     driven = [each for each in lists.values() if isinstance(each, ListResult)]
     if not driven:
         reasons = [each.not_driven for each in lists.values() if isinstance(each, NotDriven)]
         raise InvalidInput(f"suite {suite.name}: {spec!r} can drive no list of it: {reasons[0]}")
-    shares = _told(mean_of_lists([each.realised_share.estimate for each in driven]))
+    shares = mean_of_lists([each.realised_share for each in driven])
     entry = Entry(
         format="ethbrake-benchmark-entry",
         format_version=1,
@@ -186,17 +161,14 @@ def policy_seeds(driver: Driver, each: SuiteList) -> dict[str, dict[str, int]]:
 
 
 def _check_seeds(spec: str, seeds: Mapping[str, Mapping[str, int]], suite: Suite) -> None:
-    if used := suite_seed_used(seeds, suite):
-        raise InvalidInput(f"agent {spec!r}: {used}: the suite would not measure it, but what it was made with")
-
-
-def suite_seed_used(seeds: Mapping[str, Mapping[str, int]], suite: Suite) -> str | None:
-    """What says that a policy was trained or chosen with a seed of the suite, in words; None if nothing does."""
+    """Refuse a policy that was trained or chosen with a seed of the suite."""
     for vehicle, each in seeds.items():
         for purpose, seed in each.items():
             if seed in suite.seeds:
-                return f"its policy of {vehicle} was made with {purpose} seed {seed}, which is suite {suite.name}'s own"
-    return None
+                raise InvalidInput(
+                    f"agent {spec!r}: its policy of {vehicle} was made with {purpose} seed {seed}, which is suite"
+                    f" {suite.name}'s own: the suite would not measure it, but what it was made with"
+                )
 
 
 def _make_driver(each: SuiteList, sample: Sample, spec: str) -> Driver:
@@ -256,11 +228,11 @@ def _result(
         policies=policies_by_name(outcome.policies, each.scenario),
         policy_seeds=seeds,
         knows=knowledge_text(outcome.knows),
-        realised_share=_told(realised_share(harm, full, best)),
-        worst_decile_regret=_told(worst_mean(harm - best)),
-        first_impact_harm=_told(mean(outcome.first_impact_harm)),
-        total_harm=_told(mean(outcome.total_harm)),
-        collision_rate=_told(rate(int(outcome.collided.sum()), content.worlds)),
+        realised_share=realised_share(harm, full, best),
+        worst_decile_regret=worst_mean(harm - best),
+        first_impact_harm=mean(outcome.first_impact_harm),
+        total_harm=mean(outcome.total_harm),
+        collision_rate=rate(int(outcome.collided.sum()), content.worlds),
         below_best_known=int((harm < best - TOLERANCE).sum()),
         horizon_ends=int((~outcome.at_rest).sum()),
         outcome_sha256=content_sha256(outcome.ledger),

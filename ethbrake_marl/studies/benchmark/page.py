@@ -71,14 +71,14 @@ def _cells(result: ListResult) -> list[Cell]:
     """The same as cells of a page."""
     shares = (result.realised_share, result.collision_rate)
     harms = [result.worst_decile_regret, result.first_impact_harm, result.total_harm]
-    first, last = (_cell(told.estimate) for told in shares)
+    first, last = (_cell(told) for told in shares)
     moving = Cell(f"{100.0 * result.horizon_ends / result.worlds:.1f}")
-    return [first, *(_cell(told.estimate, scale=1.0, digits=2) for told in harms), last, moving]
+    return [first, *(_cell(told, scale=1.0, digits=2) for told in harms), last, moving]
 
 
 def _list_cell(entry: Entry, name: str) -> Cell:
     result = entry.lists[name]
-    return _cell(result.realised_share.estimate) if isinstance(result, ListResult) else Cell("–")
+    return _cell(result.realised_share) if isinstance(result, ListResult) else Cell("–")
 
 
 def _cell(estimate: Estimate, *, scale: float = 100.0, digits: int = 1) -> Cell:

@@ -91,8 +91,8 @@ def _short_figures(result: ListResult) -> list[str]:
     """The figures of a list in words, in the order of the headings; intervals of the two that rank."""
     harms = (result.first_impact_harm, result.total_harm)
     return [
-        result.realised_share.estimate.in_words(digits=1, scale=100.0),
-        result.worst_decile_regret.estimate.in_words(digits=1),
+        result.realised_share.in_words(digits=1, scale=100.0),
+        result.worst_decile_regret.in_words(digits=1),
         *(f"{told.value:.2f}" for told in harms),
         f"{100.0 * result.collision_rate.value:.1f}",
         f"{100.0 * result.horizon_ends / result.worlds:.1f}",

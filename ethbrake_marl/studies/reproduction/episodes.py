@@ -67,7 +67,7 @@ def keep_episodes(folder: Path, content: Mapping[str, Any] | None) -> None:
 
 
 def kept_player(folder: Path) -> Part | None:
-    """The player of the episodes that were kept; None where there are none, as for an item made by an older version.
+    """The player of the episodes that were kept; None where there are none.
 
     Raises ``InvalidInput`` for a file that does not hold what ``keep_episodes`` writes.
     """

@@ -106,11 +106,6 @@ ITEMS = (
 )
 
 
-def item_names() -> list[str]:
-    """Every item, in the order of the paper."""
-    return [item.name for item in ITEMS]
-
-
 def choose_items(names: Sequence[str]) -> list[Item]:
     """The items of these names in the order of the paper, all of them for none.
 

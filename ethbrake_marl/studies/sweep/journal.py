@@ -18,7 +18,6 @@ from typing import Any, Self
 
 from ethbrake_marl.errors import describe_error, one_line
 from ethbrake_marl.files.plain import parse_strict_json
-from ethbrake_marl.learning.progress import OBJECTIVE
 from ethbrake_marl.studies.jobs.run import Attempt
 from ethbrake_marl.studies.sweep.job import RESULTS
 from ethbrake_marl.studies.sweep.plan import Row
@@ -57,8 +56,7 @@ def read_journal(folder: Path) -> tuple[Results, int]:
 
 
 def _checked(results: Mapping[str, Any]) -> tuple[str, ...]:
-    told = {OBJECTIVE: "", **results}  # an earlier version did not tell it
-    values = tuple(told[name] for name in RESULTS)
+    values = tuple(results[name] for name in RESULTS)
     if not all(isinstance(value, str) for value in values):
         raise ValueError("results must be text")
     return values

@@ -9,8 +9,10 @@ import pytest
 from ethbrake_marl.limits.best_harm import search_list
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
-from ethbrake_marl.studies.benchmark.freeze import NewList, freeze_suite
 from ethbrake_marl.studies.benchmark.suite import Suite, load_suite
+from tests.docs.site import load
+
+freezing = load("../studies/freeze_suite")
 
 TINY = {"paper-random": ("first", 901), "paper-random-obstacle": ("total", 902), "cooperation-3-pair": ("total", 903)}
 WORLDS = 12
@@ -23,9 +25,9 @@ def suites(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, (harm_count, seed) in TINY.items():
         scenario = load_scenario(name)
         table = search_list(scenario, scenario.sample(WORLDS, seed), counts=(harm_count,), budget=300, threads=1)
-        lists.append(NewList(name, "small", scenario, seed, WORLDS, harm_count, table))
+        lists.append(freezing.NewList(name, "small", scenario, seed, WORLDS, harm_count, table))
     folder = tmp_path_factory.mktemp("suites")
-    freeze_suite("tiny", lists, folder)
+    freezing.freeze_suite("tiny", lists, folder)
     return folder
 
 

@@ -17,9 +17,9 @@ from ethbrake_marl.policies.manifest import content_sha256
 from ethbrake_marl.policies.policy import load_policy
 from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.studies.benchmark.entry import NotDriven, make_entry, read_entry
-from ethbrake_marl.studies.benchmark.freeze import freeze_suite
 from ethbrake_marl.studies.benchmark.score import mean_of_lists, realised_share, worst_mean
 from ethbrake_marl.studies.benchmark.suite import load_suite
+from tests.docs.site import load
 
 
 def test_realised_share__is_0_for_full_braking_and_1_for_the_best_known():
@@ -165,4 +165,4 @@ def test_another_table__is_refused(suites, tmp_path):
 
 def test_frozen_suites__stay(suites):
     with pytest.raises(AlreadyExists, match="is frozen"):
-        freeze_suite("tiny", [], suites)
+        load("../studies/freeze_suite").freeze_suite("tiny", [], suites)

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
-from ethbrake_marl.studies.benchmark.leaderboard import Row, read_leaderboard, verify
+from ethbrake_marl.studies.benchmark.leaderboard import read_leaderboard
 from ethbrake_marl.studies.benchmark.page import leaderboard_page
 from ethbrake_marl.studies.benchmark.suite import plain_sha256
 from ethbrake_marl.studies.benchmark.table import leaderboard_markdown
@@ -66,35 +65,6 @@ def leave_out_list(content):
     del content["lists"]["cooperation-3-pair"]
 
 
-def leave_out_world(content):
-    content["lists"]["paper-random"]["worlds"] = 11
-
-
-def other_world(content):
-    told = content["lists"]["paper-random"]["worlds_sha256"]
-    content["lists"]["paper-random"]["worlds_sha256"] = ("1" if told[0] == "0" else "0") + told[1:]
-
-
-def better_share(content):
-    content["lists"]["paper-random"]["realised_share"] = {"value": 0.9, "interval": [0.8, 1.0]}
-
-
-def better_mean(content):
-    content["mean_of_driven"]["value"] = content["overall"]["value"] = 0.99
-
-
-def wider_overall(content):
-    content["overall"]["interval"] = [-3.0, 99.0]
-
-
-def drop_interval(content):
-    content["lists"]["paper-random"]["total_harm"]["interval"] = None
-
-
-def suite_seed(content):
-    content["lists"]["paper-random"]["policy_seeds"] = {"vehicle_2": {"training": 901}}
-
-
 def other_suite(content):
     content["suite_sha256"] = "0" * 64
 
@@ -104,19 +74,14 @@ def more_lists(content):
 
 
 REFUSED = [
-    (leave_out_list, "leaves out 1 list: cooperation-3-pair"),
-    (leave_out_world, "list paper-random: 11 worlds; the list has 12"),
-    (other_world, "list paper-random: other worlds: SHA-256"),
-    (better_share, "list paper-random: realised_share is 0.9, but the harm that it tells gives"),
-    (better_mean, "its mean share is not that of its 3 driven lists"),
-    (wider_overall, "its mean share is not that of its 3 driven lists"),
-    (drop_interval, "has no interval around it"),
-    (suite_seed, "its policy of vehicle_2 was made with training seed 901, which is suite tiny's own"),
+    (leave_out_list, "is about another suite: tiny with SHA-256 "),
     (other_suite, "is about another suite: tiny with SHA-256 000000000000"),
-    (more_lists, "has a list that suite tiny has not: easy"),
+    (more_lists, "is about another suite: tiny with SHA-256 "),
     (lambda content: content.pop("versions"), "versions: is missing"),
     (lambda content: content.update(score=1), "score: unknown key"),
     (lambda content: content.update(lists_driven=True), "lists_driven: must be"),
+    (lambda content: content["overall"].update(value="1"), "overall.value: must be a number"),
+    (lambda content: content["overall"].update(mean=1.0), "overall.mean: "),
 ]
 
 
@@ -133,15 +98,6 @@ def test_edited_numbers__do_not_fit_the_entrys_own_hash(tiny, kept):
         read_leaderboard(paths(kept), tiny)
 
 
-def test_entries__that_stand_there_twice_are_refused(tiny, kept):
-    shutil.copy(kept / "coast.json", kept / "again.json")
-    with pytest.raises(InvalidInput, match=r"again\.json: is the same agent with the same policies as .*coast\.json"):
-        read_leaderboard([*paths(kept), kept / "again.json"], tiny)
-    change(kept / "again.json", lambda content: content.update(agent="mine"))
-    with pytest.raises(InvalidInput, match=r"again\.json: does the same in every world as .*coast\.json"):
-        read_leaderboard([*paths(kept), kept / "again.json"], tiny)
-
-
 def test_files_that_are_no_entries__are_refused(tiny, kept):
     (kept / "coast.json").write_text("[]")
     with pytest.raises(InvalidInput, match=r"coast\.json"):
@@ -153,26 +109,3 @@ def test_files_that_are_no_entries__are_refused(tiny, kept):
         read_leaderboard([], tiny)
     with pytest.raises(UnknownName, match="suite 'tiny'"):
         read_leaderboard([kept / "full_brake.json"])
-
-
-def test_verification__drives_again_and_finds_edits_that_fit_each_other(tiny, kept):
-    found = read_leaderboard([kept / "coast.json", kept / "full_brake+episode.json"], tiny)
-    assert [verify(row, tiny) for row in found.rows] == ["the same, bit for bit"] * 2
-    coast = next(row.entry for row in found.rows if row.entry.agent == "coast")
-
-    def collide_less(content):
-        content["lists"]["paper-random"]["collision_rate"] = {"value": 0.25, "interval": [0.1, 0.5]}
-
-    change(kept / "coast.json", collide_less)
-    (row,) = read_leaderboard([kept / "coast.json"], tiny).rows
-    with pytest.raises(InvalidInput, match=r"coast\.json, list paper-random: collision_rate is 0\.25, and driving"):
-        verify(row, tiny)
-    another = make_entry(tiny, "constant:3").model_copy(update={"agent": "coast"})
-    edited = another.model_copy(update={"entry_sha256": another.content_sha256()})
-    write_entry(kept / "other.json", edited)
-    (row,) = read_leaderboard([kept / "other.json"], tiny).rows
-    with pytest.raises(InvalidInput, match=r"other\.json, list paper-random: \w+ is .*, and driving again gives"):
-        verify(row, tiny)
-    named = coast.model_copy(update={"agent": "mine.py:make_agent"})
-    with pytest.raises(InvalidInput, match="its agent is code"):
-        verify(Row(Path("mine.json"), named), tiny)

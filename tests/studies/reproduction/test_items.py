@@ -8,7 +8,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.studies.reproduction.item import Item, Made, Settings
-from ethbrake_marl.studies.reproduction.items import ITEMS, choose_items, item_names
+from ethbrake_marl.studies.reproduction.items import ITEMS, choose_items
 from ethbrake_marl.studies.reproduction.register import GAPS
 
 PAPER = Path(__file__).resolve().parents[3] / "docs" / "paper.md"
@@ -24,7 +24,7 @@ def made_of(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
     return {item.name: item.make(settings) for item in ITEMS}
 
 
-@pytest.mark.parametrize("name", item_names())
+@pytest.mark.parametrize("name", [item.name for item in ITEMS])
 def test_item__has_verdicts_parameters_tables_and_data(made_of: dict[str, Made], name: str) -> None:
     made = made_of[name]
     assert made.verdicts and {verdict.outcome for verdict in made.verdicts} <= OUTCOMES
@@ -39,7 +39,7 @@ def test_item__has_verdicts_parameters_tables_and_data(made_of: dict[str, Made],
         assert made.figures
 
 
-@pytest.mark.parametrize("item", ITEMS, ids=item_names())
+@pytest.mark.parametrize("item", ITEMS, ids=[item.name for item in ITEMS])
 def test_item__labels_are_those_of_the_paper(item: Item) -> None:
     page = PAPER.read_text("utf-8")
     assert all(f"`{label}`" in page for label in item.labels)

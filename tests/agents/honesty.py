@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from ethbrake_marl.actions import command_to_action
-from ethbrake_marl.agents.protocol import Agent, check_agent
+from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import script_agents, set_others
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.physics.estimates import age_s, is_periodic, links_of
 from ethbrake_marl.physics.messages import KEY, LINK, TAKEN, TOLD_S, link_at, place_at, ring_at
@@ -30,31 +29,14 @@ def changed_decisions(
     Args:
         agent: any; it is left as it is.
         scenario: whose worlds.
-        vehicle: the driven one, from 0, beside which other learners brake fully; None: the scenario's learner.
+        vehicle: the driven one, from 0, beside which other learners brake fully; None: the scenario's only learner.
         n: number of worlds; more find rarer leaks.
         decisions: in each world.
         seed: of the list, and of the random numbers.
 
-    Raises ``InvalidInput`` for what is not an agent, several learners, or less than one world or decision.
-
-    >>> import ethbrake_marl as eb
-    >>> from ethbrake_marl.agents.honesty import changed_decisions
-    >>> blocked = eb.load_scenario("cooperation-2-blocked")
-    >>> [changed_decisions(eb.make_agent(name), blocked) > 0 for name in ("full_brake", "gentlest_front")]
-    [False, True]
-
     """
-    check_agent(agent, "honesty")
-    if not isinstance(scenario, Scenario):
-        raise InvalidInput(f"honesty: scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")
-    check_whole_number("honesty: n", n, 1)
-    check_whole_number("honesty: decisions", decisions, 1)
-    check_whole_number("honesty: seed", seed, 0)
     if vehicle is None:
-        learners = [scenario.vehicle_names[i] for i in scenario.learners]
-        check_one_learner(scenario.name, learners, "honesty needs exactly one learner; or give the vehicle")
-        vehicle = scenario.learners[0]
-    check_whole_number("honesty: vehicle", vehicle, 0, scenario.vehicles - 1)
+        (vehicle,) = scenario.learners
     scenario = scenario.with_learners([vehicle])
     rng, alert = np.random.default_rng(seed), scenario.sample(n, seed).worlds
     scripts = script_agents(scenario, except_for=vehicle)

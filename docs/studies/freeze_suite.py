@@ -1,4 +1,7 @@
-"""Freezing a suite: once, from scenarios and tables of the best known; a change is another suite."""
+"""Freezing a suite: once, from scenarios, seeds and tables of the best known; a change is another suite.
+
+docs/benchmark.md, "How v2 was made". Import it to freeze another: ``freeze_suite(NAME, [NewList(...), ...], FOLDER)``.
+"""
 
 from __future__ import annotations
 

@@ -1,0 +1,132 @@
+"""The price of not knowing: the tables and the figure of docs/baselines.md, "The price of not knowing".
+
+    .venv/bin/python docs/studies/price.py docs/figures/price-of-not-knowing.png
+
+Agents that see through a channel stand beside the same ones on what was received. The price is the harm of the second
+minus that of the first, paired by world.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.evaluation import Evaluation, evaluate
+from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, rate
+from ethbrake_marl.figures.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario.v2x import CHANNELS
+
+SCENARIO, WORLDS, SEED = "cooperation-2-paper", 1000, 7
+PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
+POLICY = "ppo@shipped/ppo"
+ALONE = ("full_brake", POLICY)  # who says nothing of ``believed``
+LIMITS = {  # who decides on what was received -> the same one that reads the line as it is
+    "e_v2x_bm:believed": "e_v2x_bm",
+    "planner:128:believed": "planner:128",
+    f"{POLICY}+step:believed": f"{POLICY}+step",
+    f"{POLICY}+robust:believed": f"{POLICY}+step",  # no robust shield knows all
+}
+COUNTS = ("first", "total")
+CAPTION = (
+    f"{SCENARIO} over each channel: {WORLDS:,} worlds of the list of seed {SEED}. Harm on what was received, minus that"
+    " of the same agent which reads the line as it is; 95 % intervals, paired by world."
+)
+
+
+def channels() -> dict[str, dict[str, str]]:
+    """The channels by name: each preset, and where it sends messages one by one also periodic."""
+    found = {}
+    for preset in PRESETS:
+        found[preset] = {"preset": preset}
+        if CHANNELS[preset].timing == "messages" and CHANNELS[preset].hears != "none":
+            found[f"{preset}, periodic"] = {"preset": preset, "persistence": "periodic"}
+    return found
+
+
+def drive(scenario: Scenario, n: int, lines: Mapping[str, dict[str, str]]) -> dict[str, Evaluation]:
+    """Every agent and its limit in the first ``n`` worlds of the list, over every channel."""
+    found = {}
+    for name, v2x in lines.items():
+        over = scenario.replace(v2x=v2x)
+        agents = {spec: make_agent(spec, scenario=over) for spec in (*ALONE, *LIMITS, *LIMITS.values())}
+        found[name] = evaluate(over.sample(n, SEED), agents, scenario=over, seed=SEED, aftermath=False).complete()
+    return found
+
+
+def price(over: Evaluation, agent: str, count: str) -> Estimate:
+    """The harm of the agent minus its limit's, over one channel."""
+    own, limit = (over.outcome(spec).ledger.world_harm(count) for spec in (agent, LIMITS[agent]))
+    return paired_difference(own, limit)
+
+
+def above(over: Evaluation, agent: str) -> Estimate | None:
+    """The share of worlds above what the agent's shield expected first; None: it has none."""
+    own = over.outcome(agent)
+    if "+" not in agent or own.predicted_harm is None:
+        return None
+    return rate(int((own.first_impact_harm > own.predicted_harm + 1e-6).sum()), len(own.total_harm))
+
+
+def tables(found: Mapping[str, Evaluation]) -> str:
+    """A Markdown table of those that are not compared, and one for every agent that is: a line per channel."""
+    head = ["channel", *(f"`{agent}`, {count}" for agent in ALONE for count in COUNTS)]
+    lines = [
+        [name, *(mean(over.outcome(agent).ledger.world_harm(count)).in_words() for agent in ALONE for count in COUNTS)]
+        for name, over in found.items()
+    ]
+    return "\n\n".join([markdown(head, lines), *(compared(found, agent) for agent in LIMITS)])
+
+
+def compared(found: Mapping[str, Evaluation], agent: str) -> str:
+    """The table of one agent beside its limit."""
+    words = (f"`{LIMITS[agent]}`", f"`{agent}`", "price")
+    head = ["channel", *(f"{word}, {count}" for count in COUNTS for word in words)]
+    lines = []
+    for name, over in found.items():
+        cells = [name]
+        for count in COUNTS:
+            harms = (over.outcome(spec).ledger.world_harm(count).mean() for spec in (LIMITS[agent], agent))
+            cells += [*(f"{harm:.2f}" for harm in harms), price(over, agent, count).in_words()]
+        share = above(over, agent)
+        lines.append(cells if share is None else [*cells, share.in_words(scale=100, unit=" %")])
+    return markdown(head if len(lines[0]) == len(head) else [*head, "above its bound"], lines)
+
+
+def markdown(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Rows of cells, all but the first to the right."""
+    rule = "| --- |" + " ---: |" * (len(head) - 1)
+    return "\n".join(["| " + " | ".join(head) + " |", rule, *("| " + " | ".join(cells) + " |" for cells in lines)])
+
+
+def draw(found: Mapping[str, Evaluation]) -> Figure:
+    """The price of every agent that is compared: a group of bars for every channel, a panel for each harm."""
+    units = ("price, first-impact harm (m²/s²)", "price, total harm (m²/s²)")
+    figure, at, width = new_figure(8.4, 7.2), np.arange(len(found)), 0.8 / len(LIMITS)
+    for axes, count, unit in zip(figure.subplots(2, sharex=True), COUNTS, units, strict=True):
+        style_axes(axes)
+        for number, agent in enumerate(LIMITS):
+            prices = [price(over, agent, count) for over in found.values()]
+            value = np.array([each.value for each in prices])
+            ends = np.array([each.interval or (each.value, each.value) for each in prices]).T
+            axes.bar(
+                at + (number - (len(LIMITS) - 1) / 2) * width, value, width, label=agent,
+                color=series_style(number)["color"], yerr=np.abs(ends - value),
+                error_kw={"ecolor": GREY, "elinewidth": 0.8},
+            )  # fmt: skip
+        axes.axhline(0.0, color="black", linewidth=0.8)
+        axes.set_ylabel(unit, fontsize=9)
+    axes.set_xticks(at, list(found), rotation=30, ha="right", fontsize=8.5)
+    figure.axes[0].legend(fontsize=8.5, frameon=False)
+    add_caption(figure, CAPTION)
+    return figure
+
+
+if __name__ == "__main__":
+    driven = drive(load_scenario(SCENARIO), WORLDS, channels())
+    write_picture(sys.argv[1], draw(driven), force=True)
+    print(tables(driven))

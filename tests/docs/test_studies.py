@@ -1,0 +1,170 @@
+"""The scripts of docs/studies: what they measure, and that the pages show what they print."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.figures.style import picture_bytes
+from ethbrake_marl.limits.shipped import best_known
+from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.scenario import Task, load_scenario
+from ethbrake_marl.studies.speed import Effort
+from tests.docs.site import DOCS, load
+
+sampling, price, equal_time, scaling = (
+    load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "scaling")
+)
+PAPER = load_scenario("paper-random")
+BASE = load_scenario("cooperation-2-paper")
+SHORT = Effort(1, 1e-6)
+PNG = b"\x89PNG"
+
+
+def test_chain_impact__is_one_that_moves_a_third_vehicle():
+    # Vehicles 1 and 2 touch at rest when Vehicle 3 comes; in the second world they stand 9 m apart.
+    worlds = make_worlds(
+        [[0.0, 4.0], [9.0, 4.0]],
+        [0.0, 0.0, 4.0],
+        braking_capacity_mps2=6.0,
+        driving_capacity_mps2=6.0,
+        latency_s=0.0,
+        mass_t=1.0,
+        restitution=0.0,
+    )
+    _, impacts = advance(worlds, [0.0, 0.0, 0.0], 1.5, record=True)
+    assert sampling.chain_impacts(worlds, impacts.rows).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("agent", sampling.CONTROLS)
+def test_sampling__the_table_in_the_docs_is_the_one_that_it_prints(agent):
+    page = (DOCS / "sampled.md").read_text("utf-8")
+    docs = re.sub(r"(?<=\w)\n(?=\w)", " ", page).splitlines()  # a sentence on one line, as it is printed
+    worlds = PAPER.sample(2000, 7).worlds
+    study = sampling.convergence(worlds, agent, steps_s=(0.2, 0.1, 0.05, 0.02))
+    printed = sampling.table(study).splitlines()
+    assert docs.count(printed[0]) == 1
+    at = docs.index(printed[0])
+    assert docs[at : at + 8] == printed[:-1]
+    assert picture_bytes(sampling.draw([study]), "study.png").startswith(PNG)
+
+
+def test_order__is_the_slope_of_the_error_up_to_a_tenth_of_a_second():
+    worlds = PAPER.sample(200, 7).worlds
+    study = sampling.convergence(worlds, "full_brake", steps_s=(0.2, 0.1, 0.05))
+    low, high = study.errors[[2, 1], 2]
+    assert study.order(2) == pytest.approx(math.log2(high / low))
+    assert sampling.convergence(worlds, "full_brake", steps_s=(0.2, 0.1)).order(2) is None
+
+
+def test_price__is_nothing_where_everything_is_known():
+    found = price.drive(BASE, 12, {"paper": {"preset": "paper"}})["paper"]
+    for count in price.COUNTS:
+        assert price.price(found, "e_v2x_bm:believed", count).value == pytest.approx(0.0, abs=1e-4)
+    assert price.above(found, "e_v2x_bm:believed") is None
+    assert price.above(found, f"{price.POLICY}+step:believed").value == 0.0
+
+
+def test_price__is_paired_by_world_and_told_of_both_counts():
+    channel = {"sensors-only": {"preset": "sensors-only"}}
+    found = price.drive(BASE, 30, channel)
+    over = BASE.replace(v2x="sensors-only")
+    harm = {
+        spec: drive(over.sample(30, 7).worlds, make_agent(spec, scenario=over), over, 1).ledger
+        for spec in ("e_v2x_bm", "e_v2x_bm:believed")
+    }
+    for count in price.COUNTS:
+        told = price.price(found["sensors-only"], "e_v2x_bm:believed", count)
+        difference = harm["e_v2x_bm:believed"].world_harm(count) - harm["e_v2x_bm"].world_harm(count)
+        assert told.value == pytest.approx(difference.mean(), abs=1e-9)
+        spread = 2.045 * difference.std(ddof=1) / 30**0.5  # t of 29 degrees of freedom
+        assert told.interval == pytest.approx((told.value - spread, told.value + spread), rel=1e-3)
+    heads = [line for line in price.tables(found).splitlines() if line.startswith("| channel")]
+    assert len(heads) == 5 and all(head in (DOCS / "baselines.md").read_text("utf-8") for head in heads)
+    assert picture_bytes(price.draw(found), "price.png").startswith(PNG)
+
+
+def test_price__the_page_shows_every_channel():
+    page = (DOCS / "baselines.md").read_text("utf-8")
+    assert [f"| {name} | " in page for name in price.channels()] == [True] * 10
+
+
+class Slow:
+    """Coasts, and takes 2 ms of processor time whenever an episode begins."""
+
+    name, knows = "slow", "own sensors"
+
+    def begin(self, worlds, vehicle, rows):
+        until = time.process_time() + 2e-3 * worlds.n
+        while time.process_time() < until:
+            pass
+
+    def act(self, worlds, vehicle):
+        return np.zeros(worlds.n)
+
+
+def test_equal_time__tells_the_harm_of_an_evaluation_and_the_time_it_took():
+    sample = PAPER.sample(20, 8)
+    agents = {"slow": Slow(), **make_lineup(["full_brake", "e_v2x_bm"], PAPER)}
+    driven = equal_time.drive(sample, agents, PAPER, repeats=2)
+    assert driven["slow"][0] > max(2.0, driven["full_brake"][0])
+    rows = {row[0]: row for row in equal_time.rows_of(driven, "full_brake")}
+    assert list(rows)[-1] == "`slow`" and rows["`e_v2x_bm`"][1] == "true model"
+    full, slow = (driven[name][1].first_impact_harm for name in ("full_brake", "slow"))
+    assert rows["`slow`"][3] == f"{slow.mean():.3f}" and rows["`full_brake`"][5] == ""
+    assert rows["`slow`"][5].startswith(f"{(slow - full).mean():+.3f} [")
+
+
+def test_equal_time__no_table_holds_its_worlds_and_the_page_has_its_columns():
+    worlds = PAPER.sample(equal_time.WORLDS, equal_time.SEED).worlds
+    assert not np.isfinite(best_known(worlds, Task(PAPER, PAPER.learners))["first"]).any()
+    assert f"| {' | '.join(equal_time.HEAD)} |" in (DOCS / "baselines.md").read_text("utf-8")
+
+
+@pytest.mark.slow
+def test_scaling__costs_are_per_world_step() -> None:
+    by_worlds = list(scaling.by_worlds(SHORT, (1, 3)))
+    assert [(cost.what, cost.worlds, cost.vehicles) for cost in by_worlds] == [
+        (scaling.EMERGENCY, 1, 3),
+        (scaling.ENGINE, 1, 3),
+        (scaling.EMERGENCY, 3, 3),
+        (scaling.ENGINE, 3, 3),
+    ]
+    by_vehicles = list(scaling.by_vehicles(SHORT, (2, 4)))
+    assert [(cost.what, cost.vehicles) for cost in by_vehicles] == [
+        (scaling.EMERGENCY, 2),
+        (scaling.APART, 2),
+        (scaling.EMERGENCY, 4),
+        (scaling.APART, 4),
+    ]
+    assert all(0.0 < cost.nanoseconds < math.inf for cost in by_worlds + by_vehicles)
+
+
+@pytest.mark.parametrize("vehicles", [2, 3, 50])
+def test_lines__are_the_same_every_time_and_apart_in_their_first_step(vehicles: int) -> None:
+    worlds, again = scaling.make_lines(40, vehicles), scaling.make_lines(40, vehicles)
+    assert worlds.speeds_mps.shape == (40, vehicles)
+    assert (worlds.gaps_m == again.gaps_m).all() and (worlds.speeds_mps == again.speeds_mps).all()
+    after, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, 0.1)
+    assert impacts.count.sum() == 0 and (after.gaps_m > 0.0).all()
+
+
+def test_scaling__draws_batches_left_and_single_worlds_right() -> None:
+    by_worlds = [scaling.Cost(scaling.EMERGENCY, n, 3, 50.0) for n in (1, 10, 100)]
+    by_vehicles = [scaling.Cost(scaling.APART, 256, N, 10.0 * N) for N in (2, 4)]
+    figure = scaling.draw(by_worlds, by_vehicles, "somewhere")
+    left, right = figure.axes
+    costs, proportional = left.get_lines()
+    assert costs.get_ydata() == pytest.approx([0.05, 0.5, 5.0]) and proportional.get_ydata() == pytest.approx(
+        [0.05, 0.5, 5.0]
+    )
+    assert right.get_lines()[0].get_ydata() == pytest.approx([20.0, 40.0])
+    assert "ns per vehicle-step" in str(by_worlds[0])
+    assert [text.get_text() for text in right.get_legend().get_texts()] == [scaling.APART, "proportional"]
