@@ -152,7 +152,9 @@ def test_worst__are_those_of_the_largest_regret(pair: Scenario) -> None:
     assert harm[rows].tolist() == sorted(harm, reverse=True)[:10]
 
 
-@pytest.mark.parametrize("first", range(0, len(HOSTILE), 24))
+@pytest.mark.parametrize(
+    "first", [pytest.param(k, marks=pytest.mark.slow if k else ()) for k in range(0, len(HOSTILE), 24)]
+)
 def test_report__hostile_names_are_text_everywhere(pair: Scenario, first: int, monkeypatch: pytest.MonkeyPatch) -> None:
     if first:  # one page with its figures is enough: these hold names as outlines only
         draw_nothing(monkeypatch)
