@@ -104,7 +104,7 @@ def walk(
             after, speed = contact(max(gap, 0.0), w, b)
             if after <= step and (speed > 0.0 or b > 0.0):
                 met_at, squared = now + after, speed * speed
-        if 0.0 < w < -b * step:
+        if b < 0.0 and 0.0 < w < -b * step:
             lowest = min(lowest, gap - w * w / (-2.0 * b))
         if step == math.inf:
             break
