@@ -30,8 +30,7 @@ def copy_repository(folder: Path) -> Path:
 def working_copy() -> Iterator[Path]:
     """A copy as the repository is now, for nobody else at the same time.
 
-    Its kernels stay for the next one: numba finds compiled code by the place of its source, so that a copy in a new
-    folder would compile everything again (minutes).
+    Its kernels stay for the next one, apart from the user's.
     """
     _KEPT.mkdir(parents=True, exist_ok=True)
     for number in itertools.count():
@@ -59,4 +58,4 @@ def mutated(folder: Path, file: str, source: str) -> Iterator[None]:
         shutil.copy2(ROOT / file, folder / file)
         if before is not None:
             for other in set(kernels.iterdir()) - before:
-                shutil.rmtree(other)
+                other.unlink(missing_ok=True)
