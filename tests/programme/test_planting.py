@@ -9,6 +9,7 @@ import pytest
 
 from tests.physics.programme import planted_bugs as of_physics
 from tests.programme import planted_bugs as elsewhere
+from tests.programme.copies import KERNELS, mutated
 from tests.programme.planting import Patch, misfits, plant
 from tests.programme.suites import ROOT
 from tests.shield import planted_bugs as of_shield
@@ -36,3 +37,15 @@ def test_misfit__is_named_with_its_file_and_count(tmp_path: Path) -> None:
         plant(tmp_path, (Patch("a.py", "one", "two"),))
     plant(tmp_path, (Patch("a.py", "one\none", "two"),))
     assert (tmp_path / "a.py").read_text() == "two\n"
+
+
+def test_mutated__leaves_the_source_and_the_kernels_that_were_there_before(tmp_path: Path) -> None:
+    source, kernels = tmp_path / "ethbrake_marl" / "harm.py", tmp_path / KERNELS / "ethbrake_marl"
+    for folder in (source.parent, kernels):
+        folder.mkdir(parents=True)
+    (kernels / "before.entry").touch()
+    with mutated(tmp_path, "ethbrake_marl/harm.py", "a bug"):
+        assert source.read_text() == "a bug"
+        (kernels / "of_the_bug.entry").touch()
+    assert source.read_text("utf-8") == (ROOT / "ethbrake_marl" / "harm.py").read_text("utf-8")
+    assert [each.name for each in kernels.iterdir()] == ["before.entry"]
