@@ -17,7 +17,7 @@ from ethbrake_marl.evaluation.shield_modes import (
     compare_modes,
     modes_tables,
 )
-from ethbrake_marl.evaluation.statistics import paired_difference
+from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.figures.shield import shield_modes_figure
 from ethbrake_marl.pages.evidence import ShieldEvidence, shield_section
 from ethbrake_marl.pages.frame import page
@@ -116,7 +116,7 @@ def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: list[Mo
         ledger = drive(worlds, team, PAIR).ledger
         harm, borne = ledger.world_harm("total"), ledger.vehicle_harm("total")
         assert team.shield is not None and team.shield.running is not None and team.shield.log is not None
-        assert row.harm.value == harm.mean() and row.against_none == paired_difference(harm, alone)
+        assert row.harm == mean(harm) and row.against_none == paired_difference(harm, alone)
         assert row.bound is not None and row.bound.value == team.predicted_harm.mean() and row.above_bound == 0
         decisions = team.shield.running.steps.sum()
         own = [sum(entry.vehicle == i for entry in team.shield.log) / decisions for i in (1, 2)]

@@ -132,7 +132,7 @@ def test_every_member__realises_at_most_the_bound_to_the_bit(N, harm_count, who)
     uncertainty = parse_uncertainty(ALL[N])
     members = uncertainty.members(worlds)
     M, tight = members.n // worlds.n, 0
-    for m in range(0, M, 10):
+    for m in range(0, M, 10 if N == 3 else 5):
         truth = members.take(np.arange(worlds.n) * M + m)
         shielded = StepShieldAgent(
             Adversary(who, m),
