@@ -42,28 +42,18 @@ class LearnedAgent:
     def __init__(self, policy: LearnedPolicy, name: str = "learned") -> None:
         self.policy = policy
         self.name = name
-        self._last = np.empty((0, 0), np.float32), np.empty(0)  # what it saw last, and did
 
     def begin(self, worlds: Worlds, vehicle: int, rows: NDArray[np.int64]) -> None:
         """Nothing to prepare: each action follows from the present state alone."""
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """Wanted signed acceleration [n], m/s2; world k's does not depend on the other worlds of the batch."""
-        seen, (before, action) = observe(worlds, vehicle, self.policy.observation), self._last
-        new, action = np.ones(worlds.n, np.bool_), action.copy()
-        if before.shape == seen.shape:  # where it sees the same as before it does the same: half of the worlds stand
-            new = (seen != before).any(axis=1)
-        else:
-            action = np.empty(worlds.n)
-        if new.any():
-            found = self.policy(seen[new]).astype(np.float64)
-            if found.shape != (new.sum(), 1):
-                raise InvalidInput(
-                    f"{self.name}: actions of shape {found.shape}; one per world is needed, ({new.sum()}, 1)"
-                )
-            action[new] = found[:, 0]
-        self._last = seen, action
-        return action_to_command(action, worlds.vehicles, vehicle)
+        action = self.policy(observe(worlds, vehicle, self.policy.observation)).astype(np.float64)
+        if action.shape != (worlds.n, 1):
+            raise InvalidInput(
+                f"{self.name}: actions of shape {action.shape}; one per world is needed, ({worlds.n}, 1)"
+            )
+        return action_to_command(action[:, 0], worlds.vehicles, vehicle)
 
     def take(self, rows: Ints) -> LearnedAgent:
         """The same agent: it remembers nothing."""

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -46,24 +44,6 @@ def test_act__does_not_depend_on_the_batch(policy: Policy) -> None:
     assert np.unique(together).size > 100
     for k in (0, 1, 77, 199):
         assert agent.act(worlds.take([k]), 1)[0] == together[k]
-
-
-def test_act__asks_again_only_where_something_else_is_seen(policy: Policy) -> None:
-    worlds, asked = load_scenario("paper-random").sample(200, 7).worlds, []
-
-    class Asked:
-        observation = policy.observation
-
-        def __call__(self, observation: Observations) -> Observations:
-            asked.append(len(observation))
-            return policy(observation)
-
-    agent = LearnedAgent(Asked())
-    agent.act(worlds, 1)
-    moved = replace(worlds, speeds_mps=worlds.speeds_mps * np.where(np.arange(200) < 3, 0.5, 1.0)[:, np.newaxis])
-    for then in (moved, moved, worlds.take(np.arange(200)[::-1]), moved.take([7])):
-        assert np.array_equal(agent.act(then, 1), LearnedAgent(policy).act(then, 1))
-    assert asked == [200, 3, 200, 1]
 
 
 def test_act__hands_the_policy_its_own_observation(policy: Policy) -> None:
