@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from ethbrake_marl.envs.parallel import raw_env as raw_env
     from ethbrake_marl.envs.sb3 import EthBrakeVecEnv as EthBrakeVecEnv
     from ethbrake_marl.envs.sb3 import make_sb3_vec_env as make_sb3_vec_env
-    from ethbrake_marl.envs.single import EthBrakeEnv as EthBrakeEnv
-    from ethbrake_marl.envs.vector import EthBrakeVectorEnv as EthBrakeVectorEnv
+    from ethbrake_marl.envs.gym import EthBrakeEnv as EthBrakeEnv
+    from ethbrake_marl.envs.gym import EthBrakeVectorEnv as EthBrakeVectorEnv
 
     # Scenarios, and the worlds drawn from them
     from ethbrake_marl.scenario import Sample as Sample
@@ -48,15 +48,15 @@ if TYPE_CHECKING:
     from ethbrake_marl.rewards import RewardParams as RewardParams
 
     # Agents, teams and policies
-    from ethbrake_marl.agents.learned import LearnedAgent as LearnedAgent
-    from ethbrake_marl.agents.policy_agent import policy_agent as policy_agent
+    from ethbrake_marl.agents.policy import LearnedAgent as LearnedAgent
+    from ethbrake_marl.agents.policy import policy_agent as policy_agent
     from ethbrake_marl.agents.protocol import Agent as Agent
     from ethbrake_marl.agents.registry import AgentSettings as AgentSettings
     from ethbrake_marl.agents.registry import agent_names as agent_names
     from ethbrake_marl.agents.registry import make_agent as make_agent
-    from ethbrake_marl.agents.team import Team as Team
-    from ethbrake_marl.policies.policy import Policy as Policy
-    from ethbrake_marl.policies.policy import load_policy as load_policy
+    from ethbrake_marl.agents.protocol import Team as Team
+    from ethbrake_marl.policies.bundle import Policy as Policy
+    from ethbrake_marl.policies.bundle import load_policy as load_policy
     from ethbrake_marl.policies.shipped import load_shipped as load_shipped
 
     # Shields, one for each interface
@@ -73,7 +73,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.learning.train import TrainResult as TrainResult
     from ethbrake_marl.learning.train import resume as resume
     from ethbrake_marl.learning.train import train as train
-    from ethbrake_marl.progress import Progress as Progress
+    from ethbrake_marl.errors import Progress as Progress
 
     # Evaluation
     from ethbrake_marl.evaluation import EpisodeRecord as EpisodeRecord
@@ -84,30 +84,30 @@ if TYPE_CHECKING:
     from ethbrake_marl.evaluation import evaluate as evaluate
     from ethbrake_marl.evaluation import record_episode as record_episode
     from ethbrake_marl.evaluation import summarise as summarise
-    from ethbrake_marl.evaluation.compare import compare_results as compare_results
-    from ethbrake_marl.evaluation.results_file import read_result as read_result
-    from ethbrake_marl.evaluation.dataset.write import write_dataset as write_dataset
-    from ethbrake_marl.evaluation.groups import summarise_by as summarise_by
+    from ethbrake_marl.evaluation.results import compare_results as compare_results
+    from ethbrake_marl.evaluation.results import read_result as read_result
+    from ethbrake_marl.evaluation.dataset import write_dataset as write_dataset
+    from ethbrake_marl.evaluation.summary import summarise_by as summarise_by
 
     # Figures: matplotlib's, which a notebook shows
-    from ethbrake_marl.evaluation.criticality import criticality_map as criticality_map
-    from ethbrake_marl.evaluation.deceleration import deceleration_curve as deceleration_curve
-    from ethbrake_marl.figures.criticality import criticality_figure as criticality_figure
-    from ethbrake_marl.figures.deceleration import deceleration_figure as deceleration_figure
-    from ethbrake_marl.figures.episode import trajectories as trajectories
-    from ethbrake_marl.figures.run import harm_against_total_gap as harm_against_total_gap
+    from ethbrake_marl.evaluation.curves import criticality_map as criticality_map
+    from ethbrake_marl.evaluation.curves import deceleration_curve as deceleration_curve
+    from ethbrake_marl.figures.evaluation import criticality_figure as criticality_figure
+    from ethbrake_marl.figures.evaluation import deceleration_figure as deceleration_figure
+    from ethbrake_marl.figures.evaluation import trajectories as trajectories
+    from ethbrake_marl.figures.evaluation import harm_against_total_gap as harm_against_total_gap
     from ethbrake_marl.figures.style import write_picture as write_picture
 
     # Registration of your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent
     from ethbrake_marl.evaluation.harm_metrics import register_harm_metric as register_harm_metric
     from ethbrake_marl.files.plugins import load_plugin as load_plugin
-    from ethbrake_marl.learning.registry import register_algorithm as register_algorithm
-    from ethbrake_marl.objectives import register_objective as register_objective
-    from ethbrake_marl.observations import register_feature as register_feature
+    from ethbrake_marl.learning.recipe import register_algorithm as register_algorithm
+    from ethbrake_marl.harm import register_objective as register_objective
+    from ethbrake_marl.scenario.features import register_feature as register_feature
     from ethbrake_marl.rewards import register_term as register_term
     from ethbrake_marl.scenario.catalogue import register_scenarios as register_scenarios
-    from ethbrake_marl.scenario.presets import register_preset as register_preset
+    from ethbrake_marl.scenario.catalogue import register_preset as register_preset
 
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError

@@ -5,16 +5,18 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.util import find_spec
 from numbers import Integral
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
 
 _NAMED = 5  # failed worlds that a message names one by one
 LINE_LIMIT = 1_500  # characters of a message; of a longer one the beginning and the end are shown
@@ -255,3 +257,59 @@ def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> No
         raise InvalidInput(
             f"scenario {scenario!r} has {len(learners)} learners ({', '.join(learners) or 'none'}); {advice}"
         )
+
+
+# Progress of a long piece of work, for those who asked to be told.
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """``done`` of ``total`` of the part called ``name``.
+
+    Of a training ``done`` counts decisions of learners, and ``total`` is what they come to in whole updates.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.Progress("full_brake", 500, 1000)
+    Progress(name='full_brake', done=500, total=1000, metrics={}, note='', updates=0, wall_s=0.0)
+
+    """
+
+    name: str  # "training", an agent that drives, "figures", ...
+    done: int  # worlds, or decisions of learners
+    total: int  # the same when it is done
+    metrics: Mapping[str, float] = field(default_factory=dict)  # of a policy while it is trained: its last evaluation
+    note: str = ""  # to be told once
+    updates: int = 0  # of a training
+    wall_s: float = 0.0  # of a training
+
+
+OnProgress = Callable[[Progress], None]
+
+Told = OnProgress | Literal["show"] | None
+"""Who is told how far a training is: a function, stderr (``show``), or nobody."""
+
+
+class ShownProgress:
+    """Shows on stderr how far a training is: on a terminal in one line, else one for each tenth and evaluation."""
+
+    def __init__(self) -> None:
+        self._terminal = sys.stderr.isatty()
+        self._last: tuple[float | None, int] | None = None  # harm and tenth of the last line
+
+    def __call__(self, progress: Progress) -> None:
+        """Show it, if it is news."""
+        ended, harm = progress.done >= progress.total, progress.metrics.get("first_impact_harm")
+        news = (harm, 10 * progress.done // max(progress.total, 1))
+        if not (self._terminal or progress.note or news != self._last):
+            return
+        self._last = news
+        text = f"{progress.name}: {progress.done:,} of {progress.total:,}"
+        text += "" if harm is None else f", first-impact harm {harm:.2f}"
+        text += f"; {progress.note}" if progress.note else ""
+        sys.stderr.write(f"\r{text}\x1b[K{chr(10) if ended else ''}" if self._terminal else f"{text}\n")
+        sys.stderr.flush()
+
+
+def listener(told: Told) -> OnProgress | None:
+    """The function to tell; for ``show`` one that writes on stderr."""
+    return ShownProgress() if told == "show" else told

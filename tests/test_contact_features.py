@@ -9,20 +9,14 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl import observations
+from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.observations import (
-    CONTACT_FEATURES,
-    ObservationSpec,
-    choose_observation,
-    contact,
-    observation_for,
-    observe,
-)
-from ethbrake_marl.observations.contact import FORECAST_S
+from ethbrake_marl.observations import FORECAST_S, ObservationSpec, choose_observation, observation_for, observe
 from ethbrake_marl.physics import advance, make_worlds
-from ethbrake_marl.policies.manifest import NetworkSpec, installed_versions, observation_schema
-from ethbrake_marl.policies.policy import make_policy
+from ethbrake_marl.policies.actor import NetworkSpec, installed_versions, observation_schema
+from ethbrake_marl.policies.bundle import make_policy
+from ethbrake_marl.scenario.features import CONTACT_FEATURES
 
 SCENARIO = eb.load_scenario("paper-random")
 STEP_S = 0.1
@@ -219,7 +213,7 @@ def test_contact__failed_forecast_names_its_world(monkeypatch):
     def fail(*arguments):
         arguments[-1][1] = True
 
-    monkeypatch.setattr(contact, "_observe_contacts", fail)
+    monkeypatch.setattr(observations, "_observe_contacts", fail)
     worlds = SCENARIO.sample(3, 1).worlds
     with pytest.raises(PhysicsError, match="world 1: a forecast of contacts could not look 10 s ahead"):
         observe(worlds, 1, CONTACT)

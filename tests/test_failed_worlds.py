@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
 from ethbrake_marl.errors import FailedWorld, PhysicsError
 from ethbrake_marl.physics import advance, concatenate, forecast, leaving_out_failed
-from ethbrake_marl.physics.rows import gap_at, speed_at
+from ethbrake_marl.physics.advance import gap_at, speed_at
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.search.problem import profile_problem
+from ethbrake_marl.search.profiles import profile_problem
 from ethbrake_marl.shield.certify import Backup, begin_running, certify
 from ethbrake_marl.shield.step_shield import StepShield
 from tests.failing_worlds import plant, planted_list, without

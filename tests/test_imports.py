@@ -89,13 +89,13 @@ def misplaced_matplotlib(found: list[Arrow]) -> list[str]:
 
 
 def misplaced_torch(found: list[Arrow]) -> list[str]:
-    """The arrows to torch from outside learning/ and agents/learned.py."""
+    """The arrows to torch from outside learning/ and agents/policy.py."""
     return [
         f"{arrow.where}: {arrow.target}"
         for arrow in found
         if any(arrow.target == name or arrow.target.startswith(f"{name}.") for name in TORCH)
         and arrow.room != "learning"
-        and not arrow.where.startswith("agents/learned.py:")
+        and not arrow.where.startswith("agents/policy.py:")
     ]
 
 
@@ -147,7 +147,7 @@ def test_matplotlib__is_imported_only_in_figures(tmp_path: Path) -> None:
         ("agents/constant.py", "from safetensors.numpy import load_file", False),
         ("engine/engine.py", "import torchlight", False),
         ("learning/ppo.py", "import torch", False),
-        ("agents/learned.py", "import torch.nn as nn", False),
+        ("agents/policy.py", "import torch.nn as nn", False),
     ],
 )
 def test_torch__a_planted_import_is_judged_by_its_place(

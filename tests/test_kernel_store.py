@@ -152,11 +152,11 @@ def digest_in(package: Path, name: str) -> str:
     ("kernel", "edited", "moves"),
     [
         ("physics/advance.py", "physics/advance.py", True),  # its own file
-        ("physics/advance.py", "physics/events.py", True),  # what it calls
-        ("shield/certify_kernel.py", "physics/impact.py", True),  # through several files
-        ("observations/observe.py", "scenario/features.py", True),  # constants, from a file without kernels
-        ("physics/advance.py", "search/moves.py", False),  # kernels that it does not call
-        ("physics/events.py", "physics/advance.py", False),  # its callers
+        ("physics/advance.py", "physics/kernel.py", True),  # what it calls
+        ("shield/certify_kernel.py", "physics/kernel.py", True),  # through several files
+        ("observations.py", "scenario/features.py", True),  # constants, from a file without kernels
+        ("physics/advance.py", "search/kernel.py", False),  # kernels that it does not call
+        ("physics/kernel.py", "physics/advance.py", False),  # its callers
         ("physics/advance.py", "physics/worlds.py", False),  # types
         ("physics/compiled.py", "kernel_store.py", False),  # where kernels are kept
     ],
@@ -174,13 +174,13 @@ def test_digest_of_sources__is_not_known_of_code_in_no_file_or_edited_since(copi
     assert digest_of_sources(Path("<stdin>")) == ""
     assert digest_in(copied, "physics/advance.py")
     since = (kernel_store._IMPORTED_S + time.time()) / 2
-    os.utime(copied / "physics" / "events.py", (since, since))
+    os.utime(copied / "physics" / "kernel.py", (since, since))
     assert digest_in(copied, "physics/advance.py") == ""
 
 
 def test_digest_of_sources__is_not_known_of_files_from_the_future_which_is_told(copied):
     ahead = time.time() + 3600.0
-    os.utime(copied / "physics" / "events.py", (ahead, ahead))
+    os.utime(copied / "physics" / "kernel.py", (ahead, ahead))
     with pytest.warns(UserWarning, match=f"{copied}: dates of files lie in the future.* touch"):
         assert digest_in(copied, "physics/advance.py") == ""
 
@@ -223,7 +223,7 @@ import os, time
 import numpy as np
 from pathlib import Path
 from numba.core import event
-from ethbrake_marl.physics.impact import GAP, IMPACT_ROWS, MASS, SPEED, pool
+from ethbrake_marl.physics.kernel import GAP, IMPACT_ROWS, MASS, SPEED, pool
 
 class Count(event.Listener):
     names = []
@@ -304,7 +304,7 @@ def test_kernels__of_a_moved_package_are_at_hand_and_one_damaged_or_an_edited_ca
     for file in cache_folder().iterdir():
         file.write_bytes(file.read_bytes()[:-1])
     assert run(copied) == COMPILED
-    with (copied / "physics" / "events.py").open("a") as file:
+    with (copied / "physics" / "kernel.py").open("a") as file:
         file.write("# a change\n")
     assert run(copied) == COMPILED
     assert run(PACKAGE) == SAME

@@ -11,8 +11,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import Ledger
-from ethbrake_marl.objectives import STANDARD, objective_harm, objectives_of, parse_objective, scored
+from ethbrake_marl.harm import STANDARD, Ledger, objective_harm, objectives_of, parse_objective, scored
 from ethbrake_marl.physics.advance import no_obstacle_harm
 from ethbrake_marl.rewards import RewardParams, reward_params
 from ethbrake_marl.scenario import Scenario, load_scenario

@@ -11,7 +11,7 @@ import pytest
 from ethbrake_marl.agents import optimise_pairwise
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.paper import HYBRID_TEST, PAPER_NOTE, PAPER_ROWS
+from ethbrake_marl.evaluation.outcome import HYBRID_TEST, PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.scenario import Scenario, load_scenario, worlds_from_table
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

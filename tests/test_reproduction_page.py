@@ -8,21 +8,21 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.studies.reproduction.folder import checked_result
-from ethbrake_marl.studies.reproduction.item import Settings
-from ethbrake_marl.studies.reproduction.items import ITEMS, choose_items
-from ethbrake_marl.studies.reproduction.markdown import FIGURES, PREFIX, docs_page
-from ethbrake_marl.studies.reproduction.measure import (
+from ethbrake_marl.studies.reproduction.folder import FIGURES, ITEMS, PREFIX, checked_result, choose_items, docs_page
+from ethbrake_marl.studies.reproduction.item import (
     FULL_BRAKE,
+    GAPS,
     NAMES,
+    PERCENT,
     READINGS,
+    Settings,
+    Verdict,
     collision_rate,
     drive_list,
     lineup,
     read_scenario,
+    summarise_verdicts,
 )
-from ethbrake_marl.studies.reproduction.register import GAPS
-from ethbrake_marl.studies.reproduction.verdicts import PERCENT, Verdict, summarise_verdicts
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGE = (DOCS / "reproduction.md").read_text("utf-8")

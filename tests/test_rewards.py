@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from ethbrake_marl import rewards as terms
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.envs.setup import make_engine
+from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.errors import InvalidInput, UnknownName, WithoutEffect
 from ethbrake_marl.physics import advance, forecast, make_worlds
 from ethbrake_marl.rewards import (
@@ -20,7 +21,6 @@ from ethbrake_marl.rewards import (
     potential,
     reward_params,
     reward_terms,
-    terms,
     weighted_sum,
 )
 from ethbrake_marl.scenario import load_scenario

@@ -35,24 +35,24 @@ REMAINS = {
     ("envs/drawing/frame.py", "math.cos"): PRINTED,
     ("envs/drawing/frame.py", "math.sin"): PRINTED,
     ("envs/drawing/scene.py", "**"): SQUARES,
-    ("evaluation/exact.py", "**"): SQUARES,
+    ("evaluation/statistics.py", "**"): SQUARES,
     ("evaluation/seed_statistics.py", "scipy.stats"): "resampling and sorting: sums and products alone",
-    ("evaluation/shards/tally.py", "**"): SQUARES,
+    ("evaluation/shards.py", "**"): SQUARES,
     (
         "evaluation/statistics.py",
         "scipy.special",
     ): "quantiles for the ends of an interval; the last bit of the t quantile"
     " differs for 1 in 1,000 counts where the processor has no FMA. Means and errors are exact sums",
-    ("figures/criticality.py", "**"): SQUARES,
+    ("figures/evaluation.py", "**"): SQUARES,
     ("learning/algorithms/counterfactual_model.py", "**"): TRAINED,
-    ("learning/algorithms/scout.py", "np.exp"): TRAINED,
+    ("learning/algorithms/networks.py", "np.exp"): TRAINED,
     ("learning/recipe.py", "math.cos"): TRAINED,
     ("pages/player.py", "**"): SQUARES,
-    ("studies/falsification/search.py", "**"): SEARCHED,
-    ("studies/falsification/search.py", "rng.standard_normal"): SEARCHED,
-    ("studies/falsification/search.py", "scipy.stats"): SEARCHED,
+    ("studies/falsification.py", "**"): SEARCHED,
+    ("studies/falsification.py", "rng.standard_normal"): SEARCHED,
+    ("studies/falsification.py", "scipy.stats"): SEARCHED,
     ("studies/reproduction/two_scenarios.py", "**"): SQUARES,
-    ("studies/tuning/plan.py", "**"): SEARCHED,
+    ("studies/tuning_file.py", "**"): SEARCHED,
 }
 
 

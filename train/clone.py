@@ -24,9 +24,9 @@ from torch import Tensor, nn
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.files.durable import new_folder
-from ethbrake_marl.policies.manifest import NetworkSpec, installed_versions, observation_schema
-from ethbrake_marl.policies.policy import Policy, make_policy, save_policy
+from ethbrake_marl.files.store import new_folder
+from ethbrake_marl.policies.actor import NetworkSpec, installed_versions, observation_schema
+from ethbrake_marl.policies.bundle import Policy, make_policy, save_policy
 
 HIDDEN = (128, 128)
 EPOCHS, BATCH, LEARNING_RATE = 20, 512, 1e-3

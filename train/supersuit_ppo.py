@@ -22,11 +22,11 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.files.durable import new_folder
+from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.learning.algorithms.networks import tensors_of
 from ethbrake_marl.learning.training import resolve
-from ethbrake_marl.policies.manifest import NetworkSpec, installed_versions, observation_schema
-from ethbrake_marl.policies.policy import Policy, make_policy, save_policy
+from ethbrake_marl.policies.actor import NetworkSpec, installed_versions, observation_schema
+from ethbrake_marl.policies.bundle import Policy, make_policy, save_policy
 from ethbrake_marl.rewards import reward_params
 
 # 1. What to train: the same settings as train/ppo.yaml, in smaller networks.

@@ -15,8 +15,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ethbrake_marl.agents.knowledge import knowledge_text
-from ethbrake_marl.agents.team import Driver
+from ethbrake_marl.agents.protocol import Driver, knowledge_text
 from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup

@@ -11,17 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation.identity import worlds_sha256
-from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.evaluation.inputs import make_lineup, worlds_sha256
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.files.durable import write_file
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.files.store import write_file
 from ethbrake_marl.limits.best_harm import world_identity
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, table_bytes
 from ethbrake_marl.scenario import Scenario, Task
-from ethbrake_marl.studies.benchmark.entry import REFERENCE
-from ethbrake_marl.studies.benchmark.suite import CONTENT, ListContent, Suite, SuiteContent, load_suite
+from ethbrake_marl.studies.benchmark import CONTENT, REFERENCE, ListContent, Suite, SuiteContent, load_suite
 
 
 @dataclass(frozen=True, slots=True)

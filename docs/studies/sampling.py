@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ethbrake_marl.agents.registry import make_single_agent
-from ethbrake_marl.evaluation.identity import identity_line
+from ethbrake_marl.evaluation.inputs import identity_line
 from ethbrake_marl.figures.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Impacts, Worlds, advance, advance_sampled

@@ -8,8 +8,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ethbrake_marl.policies.manifest import Manifest, tensor_table
-from ethbrake_marl.policies.policy import Policy, load_policy, make_policy, save_policy
+from ethbrake_marl.policies.actor import Manifest, tensor_table
+from ethbrake_marl.policies.bundle import Policy, load_policy, make_policy, save_policy
 
 
 def actor_only(policy: Policy) -> Policy:

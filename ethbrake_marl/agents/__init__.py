@@ -1,8 +1,7 @@
 """The agents that drive a vehicle: one protocol, scripts, baselines and the registry. See docs/baselines.md."""
 
-from ethbrake_marl.agents.e_v2x_bm.agent import EV2XBM
-from ethbrake_marl.agents.e_v2x_bm.coupled import CoupledOptimum, optimise_coupled
-from ethbrake_marl.agents.e_v2x_bm.pairwise import PairwiseOptimum, optimise_pairwise, pairwise_harm
+from ethbrake_marl.agents.e_v2x_bm import EV2XBM, CoupledOptimum, optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm_kernel import PairwiseOptimum, optimise_pairwise, pairwise_harm
 from ethbrake_marl.agents.protocol import Agent, PredictingAgent
 from ethbrake_marl.agents.registry import AgentSettings, agent_names, make_agent, register_agent
 

@@ -3,15 +3,68 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from enum import StrEnum
 from typing import ClassVar, Protocol, Self, TypeGuard, runtime_checkable
 
 import numpy as np
 
-from ethbrake_marl.agents.knowledge import Knowledge, Source, combine
 from ethbrake_marl.engine.stream import Script, ask_script, begin_script, is_state_free
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics import Floats, Ints, Worlds
+
+# The vocabulary in which every agent states what it knows of the line while it drives.
+#
+# An agent says it with an attribute ``knows``: one ``Source``, its name, or several where parts of it know different
+# things (a shield around a policy). A channel (``v2x``) hides things from the first three sources only.
+
+
+class Source(StrEnum):
+    """Where knowledge comes from, least first; each has what stands before it as well."""
+
+    SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
+    MESSAGES = "messages"  # the messages that have reached it
+    BELIEFS = "believed model"  # also what the scenario says of all lines: ranges, scripts, physics; nothing hidden
+    STATE = "true state"  # the others' states, capacities and latencies as they are, received or not
+    MODEL = "true model"  # also masses, restitution, every script: enough to roll the line forward in the same physics
+    UNSTATED = "not stated"  # of an agent that does not say
+
+
+Knowledge = tuple[Source, ...]  # in the order of the vocabulary, each once
+
+_SEES_THROUGH = frozenset({Source.STATE, Source.MODEL})
+
+
+def knowledge_of(agent: object) -> Knowledge:
+    """What an agent, or a team, says it knows; ``UNSTATED`` if it says nothing.
+
+    Raises ``InvalidInput`` for a word that is not in the vocabulary.
+    """
+    stated = getattr(agent, "knows", None)
+    words = (Source.UNSTATED,) if stated is None else (stated,) if isinstance(stated, str) else stated
+    try:
+        found = {Source(word) for word in words}
+    except (TypeError, ValueError):
+        name = getattr(agent, "name", type(agent).__name__)
+        right = ", ".join(repr(source.value) for source in Source)
+        raise InvalidInput(f"agent {name!r}: knows = {stated!r:.200}: must be one or several of {right}") from None
+    return tuple(source for source in Source if source in found)
+
+
+def combine(*agents: object, also: Source | None = None) -> Knowledge:
+    """What several agents know between them, and what a wrapper around them knows ``also``."""
+    known = {source for agent in agents for source in knowledge_of(agent)} | ({also} if also else set())
+    return tuple(source for source in Source if source in known)
+
+
+def sees_through(knowledge: Knowledge) -> bool:
+    """Whether it reads of the line what no channel brought."""
+    return not _SEES_THROUGH.isdisjoint(knowledge)
+
+
+def knowledge_text(knowledge: Knowledge) -> str:
+    """``messages + true model``; a dash for nothing, which is what a team of nobody knows."""
+    return " + ".join(knowledge) or "–"
 
 
 @runtime_checkable
@@ -173,3 +226,61 @@ def is_divisible(agent: Agent) -> TypeGuard[Divisible]:
     if isinstance(agent, AgentAround):
         return agent.divides_along is not None and is_divisible(agent.policy)
     return isinstance(agent, Divisible)
+
+
+# Teams: one agent for each of several vehicles.
+
+
+class Team:
+    """One agent for each driven vehicle (index, 0 = front). Each decides for its own vehicle, from what that one knows.
+
+    One object cannot drive two vehicles, because it may remember its episodes: ``copies`` makes a team of one agent.
+    Raises ``InvalidInput`` for what is not an agent, an index that is no whole number from 0, or one object twice.
+
+    >>> import ethbrake_marl as eb
+    >>> team = eb.Team({1: eb.make_agent("full_brake"), 2: eb.make_agent("copy_leader")}, "mixed")
+    >>> sorted(team.drivers)
+    [1, 2]
+
+    """
+
+    def __init__(self, drivers: Mapping[int, Agent], name: str) -> None:
+        for vehicle, agent in drivers.items():
+            if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not vehicle >= 0:
+                raise InvalidInput(f"team {name!r}: {vehicle!r}: must be the index of a vehicle, 0 or more")
+            if not isinstance(agent, Agent):
+                raise InvalidInput(f"team {name!r}: vehicle_{vehicle + 1} is driven by {agent!r}, which is no agent")
+        if len({id(agent) for agent in drivers.values()}) < len(drivers):
+            raise InvalidInput(
+                f"team {name!r}: one object drives two vehicles; Team.copies gives each vehicle its own copy"
+            )
+        self.drivers = {int(vehicle): drivers[vehicle] for vehicle in sorted(drivers)}
+        self.name = name
+
+    @property
+    def knows(self) -> Knowledge:
+        """What its drivers know between them; nothing where nobody is driven."""
+        return combine(*self.drivers.values())
+
+    @classmethod
+    def copies(cls, agent: Agent, vehicles: Collection[int]) -> Team:
+        """A team in which each of ``vehicles`` is driven by its own copy of ``agent``."""
+        return cls({vehicle: copy.deepcopy(agent) for vehicle in vehicles}, agent.name)
+
+
+Driver = Team | Agent  # an agent alone drives every learner, each by its own copy
+
+
+def team_of(driver: Driver, learners: Collection[int]) -> Team:
+    """Fresh copies, one for each of the ``learners``. Raises ``InvalidInput`` for a team of other vehicles."""
+    if not isinstance(driver, Team):
+        return Team.copies(driver, learners)
+    if set(driver.drivers) != set(learners):
+        raise InvalidInput(
+            f"team {driver.name!r} drives {_names(driver.drivers)}; the vehicles to drive are {_names(learners)}"
+        )
+    return copy.deepcopy(driver)
+
+
+def _names(vehicles: Collection[int]) -> str:
+    return ", ".join(f"vehicle_{i + 1}" for i in sorted(vehicles)) or "none"

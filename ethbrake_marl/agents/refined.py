@@ -3,20 +3,201 @@
 from __future__ import annotations
 
 import copy
+import re
+import time
+from typing import ClassVar
 
 import numpy as np
 
-from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place, recall
-from ethbrake_marl.agents.refined_again import RefinedAgain
-from ethbrake_marl.agents.refined_profile import RefinedProfile
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent, fixed_commands, place, recall
 from ethbrake_marl.agents.registry import AgentSettings
-from ethbrake_marl.agents.rollout import drive, script_agents, set_others
+from ethbrake_marl.agents.rollout import drive, record_commands, script_agents, set_others
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine.stream import ask_script, begin_script
-from ethbrake_marl.errors import check_whole_number, renumbered
-from ethbrake_marl.harm import HarmCount, check_harm_count
+from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
+from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.physics.episode import START, decision_at
 from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.search.profiles import ProfileProblem, profile_problem
+from ethbrake_marl.search.refine import Refinement, refine_commands
+
+# The compiled refinement of a policy: a search around its own episode at the alert, which then drives.
+
+CANDIDATES = 500  # per world, at the alert
+
+
+class RefinedProfile(AgentAround):
+    """Drives the commands that a search around the policy's episode found at the alert, step by step.
+
+    It knows the model of the line and the other vehicles' scripts, and does not react to what happens otherwise.
+    ``predicted_harm`` [n] (m2/s2) is never above the policy's own, and is realised to the bit if the others follow
+    their scripts. A world's commands do not depend on its batch. Raises ``InvalidInput`` for what is not an agent, a
+    number of candidates outside 1 to 1,000,000 and, when an episode begins, for another vehicle's script whose command
+    is not fixed at the alert.
+
+    Args:
+        policy: any agent.
+        scenario: in which it searches.
+        candidates: tried in each world.
+        harm_count: which harm is least, ``first`` or ``total``.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> refined = eb.make_agent("constant:5+refined:profile", scenario=scenario)
+    >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"refined": refined}, scenario=scenario).outcome("refined")
+    >>> bool((outcome.first_impact_harm == outcome.predicted_harm).all())
+    True
+
+    """
+
+    adds = Source.MODEL
+    divides_along: ClassVar[tuple[str, ...]] = ("_commands", "_start_s", "predicted_harm")
+
+    def __init__(
+        self, policy: Agent, scenario: Scenario, *, candidates: int = CANDIDATES, harm_count: HarmCount = "first"
+    ) -> None:
+        check_agent(policy, "refined")
+        check_whole_number("refined: candidates", candidates, 1, 1_000_000)
+        check_harm_count(harm_count)
+        super().__init__(policy, f"{policy.name}+refined:profile")
+        self.scenario, self.candidates = scenario, candidates
+        self.harm_count: HarmCount = harm_count
+        self.predicted_harm: Floats = np.empty(0)
+        steps = int(np.ceil(scenario.horizon_s / scenario.time_step_s)) + 1
+        self._commands: Floats = np.empty((0, steps))  # [n, steps] m/s2
+        self._start_s: Floats = np.empty(0)  # of the first decision
+        self._stage = copy.deepcopy(policy)
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Search for these rows; ``worlds`` holds those rows only, at the alert."""
+        scripts = script_agents(self.scenario, except_for=vehicle)
+        others = fixed_commands(scripts, worlds, f"agent {self.name!r}", vehicle=vehicle)
+        problem = self._problem(worlds, vehicle, others)
+        own = record_commands(self._stage, worlds, self.scenario, vehicle, int(problem.last_step.max()))
+        found = self._search(problem, own)
+        more = self._commands.shape[1] - own.shape[1]
+        commands = np.pad(found.commands_mps2, ((0, 0), (0, more)), mode="edge")
+        self._commands = place(self._commands, rows, commands)
+        self._start_s = place(self._start_s, rows, problem.clock[:, START])
+        harm = found.first_impact_harm if self.harm_count == "first" else found.total_harm
+        self.predicted_harm = place(self.predicted_harm, rows, harm)
+
+    def _problem(self, worlds: Worlds, vehicle: int, others_mps2: Floats) -> ProfileProblem:
+        return profile_problem(
+            worlds,
+            [vehicle],
+            harm_count=self.harm_count,
+            horizon_s=self.scenario.horizon_s,
+            time_step_s=self.scenario.time_step_s,
+            others_mps2=others_mps2,
+        )
+
+    def _search(self, problem: ProfileProblem, commands_mps2: Floats) -> Refinement:
+        """The best that is found around these commands."""
+        return refine_commands(problem, commands_mps2, budget=self.candidates)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The command of the step, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
+        start = recall(self._start_s, worlds.n, self.name)
+        step = decision_at(worlds.time_s, start, self.scenario.time_step_s)
+        at: Floats = self._commands[np.arange(worlds.n), np.clip(step, 0, self._commands.shape[1] - 1)]
+        return at
+
+
+# The compiled refinement once more at every decision, from the worlds as they are then.
+
+ROUND = 50  # candidates between two looks at the clock
+MOST_CANDIDATES, MOST_MICROSECONDS = 1_000_000, 60_000_000
+_ARGUMENT = re.compile(r"(?P<number>[1-9][0-9]{0,7})(?P<unit>us)?")
+
+
+class RefinedAgain(RefinedProfile):
+    """Drives the first command of a plan that begins as the policy's own episode and is searched around ever again.
+
+    Each decision begins with what is left of the last plan, from the worlds as they have become: where another vehicle
+    does not follow its script, the next plan knows. If all do, ``predicted_harm`` [n] (m2/s2) is what the plan at the
+    alert leads to, and the later ones lead to no more. Raises ``InvalidInput`` as ``RefinedProfile``.
+
+    Args:
+        policy: any agent.
+        scenario: in which it searches.
+        argument: candidates per world and decision (deterministic), or a time like ``200us`` for each (as many rounds
+            as fit, at least one; depends on the machine).
+        harm_count: which harm is least, ``first`` or ``total``.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> refined = eb.make_agent("constant:5+refined:20", scenario=scenario)
+    >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"refined": refined}, scenario=scenario).outcome("refined")
+    >>> bool((outcome.first_impact_harm <= outcome.predicted_harm).all())
+    True
+
+    """
+
+    divides_along: ClassVar[tuple[str, ...]] = (*RefinedProfile.divides_along, "_others_mps2", "_planned_s")
+
+    def __init__(self, policy: Agent, scenario: Scenario, argument: str, *, harm_count: HarmCount = "first") -> None:
+        candidates, self._microseconds = _budget(argument)
+        super().__init__(policy, scenario, candidates=candidates, harm_count=harm_count)
+        self.name = f"{policy.name}+refined:{argument}"
+        self._others_mps2: Floats = np.empty((0, scenario.vehicles))  # [n, N]
+        self._planned_s: Floats = np.empty(0)  # [n] when the plan was made
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Make the first plan of these rows' episodes."""
+        super().begin(worlds, vehicle, rows)
+        scripts = script_agents(self.scenario, except_for=vehicle)
+        others = fixed_commands(scripts, worlds, f"agent {self.name!r}", vehicle=vehicle)
+        self._others_mps2 = place(self._others_mps2, rows, others)
+        self._planned_s = place(self._planned_s, rows, self._start_s[rows])
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The first command of the new plans, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
+        planned = recall(self._planned_s, worlds.n, self.name)
+        moving = (worlds.speeds_mps != 0.0).any(axis=1)
+        rows = np.flatnonzero((worlds.time_s > planned) & (worlds.time_s < self.scenario.horizon_s) & moving)
+        if rows.size:
+            self._plan_again(worlds.take(rows), vehicle, rows)
+        return super().act(worlds, vehicle)
+
+    def _plan_again(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Search around what is left of the plans of ``rows``; ``worlds`` holds those rows only, as they are now."""
+        problem = self._problem(worlds, vehicle, self._others_mps2[rows])
+        step = decision_at(worlds.time_s, self._start_s[rows], self.scenario.time_step_s)
+        later = step[:, np.newaxis] + np.arange(int(problem.last_step.max()))
+        last = self._commands.shape[1] - 1
+        left = self._commands[rows[:, np.newaxis], np.minimum(later, last)]
+        found = self._search(problem, left).commands_mps2
+        inside = later <= last
+        self._commands[np.broadcast_to(rows[:, np.newaxis], later.shape)[inside], later[inside]] = found[inside]
+        self._planned_s[rows] = worlds.time_s
+
+    def _search(self, problem: ProfileProblem, commands_mps2: Floats) -> Refinement:
+        """The best that is found around these commands in the budget."""
+        stop = time.perf_counter() + 1e-6 * self._microseconds * problem.n
+        found, seed = refine_commands(problem, commands_mps2, budget=self.candidates), 0
+        while time.perf_counter() < stop:
+            seed += 1
+            found = refine_commands(problem, found.commands_mps2, budget=self.candidates, seed=seed)
+        return found
+
+
+def _budget(argument: str) -> tuple[int, int]:
+    """Candidates per decision or round, and microseconds (0: exactly one round)."""
+    match = _ARGUMENT.fullmatch(argument)
+    if match is not None:
+        number = int(match["number"])
+        if match["unit"] and number <= MOST_MICROSECONDS:
+            return ROUND, number
+        if not match["unit"] and number <= MOST_CANDIDATES:
+            return number, 0
+    raise InvalidInput(
+        f"+refined:{argument}: must be profile (one search at the alert), a number of candidates per decision, for"
+        f" instance 50 (at most {MOST_CANDIDATES:,}), or a time per decision, for instance 200us (at most"
+        f" {MOST_MICROSECONDS:,}us)"
+    )
+
 
 TRIES = 32  # deviations tried in each round
 ROUNDS = 6  # each starts from the best of the rounds before

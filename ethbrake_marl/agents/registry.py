@@ -6,20 +6,131 @@ shields, which stand above this folder, are in the same list without being impor
 
 from __future__ import annotations
 
+import inspect
+import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.knowledge import Knowledge, Source
-from ethbrake_marl.agents.protocol import Agent, check_agent
-from ethbrake_marl.agents.spelling import AgentSpec, is_around, parse_spec
-from ethbrake_marl.agents.team import Driver, Team
+from ethbrake_marl.agents.protocol import Agent, Driver, Knowledge, Source, Team, check_agent
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, describe_error, unknown_name
-from ethbrake_marl.harm import HarmCount, check_harm_count
+from ethbrake_marl.files.plugins import load_function, note_file
+from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario.lines import parse_agent_spec
+
+# The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
+#
+# ``+refined``, ``+refined:profile`` or, at every decision, ``+refined:50`` or ``+refined:200us`` comes first, then one
+# shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``, each also with ``:believed`` behind it. A name
+# may be a function of a Python file, ``my_file.py:make_agent``.
+
+REFINED = ("refined", "refined:profile")
+SHIELDS = ("episode", "episode:pairwise", "step", "robust", "robust:interior")
+BELIEVED = (  # on what was received
+    "episode:believed", "episode:pairwise:believed", "step:believed", "robust:believed", "robust:interior:believed",
+)  # fmt: skip
+AROUND = (*REFINED, *SHIELDS, *BELIEVED)  # in the order in which they are put around an agent
+
+_WITH_BUDGET = re.compile(r"refined:[0-9]+(us)?")
+_IN_FILE = re.compile(r"(?P<name>[^:]+\.py:[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
+_BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSpec:
+    """An agent as it is written, in its parts."""
+
+    name: str  # or FILE.py:FUNCTION
+    argument: str | None  # after the colon
+    policy: str | None  # after the @: a path, or "shipped"
+    around: tuple[str, ...]  # of AROUND, innermost first
+
+    @property
+    def core(self) -> str:
+        """The agent without what is around it."""
+        argument = "" if self.argument is None else f":{self.argument}"
+        return f"{self.name}{argument}" + ("" if self.policy is None else f"@{self.policy}")
+
+    @property
+    def file(self) -> tuple[str, str] | None:
+        """The Python file and its function that makes the agent, where the name is one of those."""
+        file, _, function = self.name.rpartition(":")
+        return (file, function) if file else None
+
+    @property
+    def shield(self) -> str | None:
+        """The shield around it, if there is one."""
+        return self.around[-1] if self.around and self.around[-1] in (*SHIELDS, *BELIEVED) else None
+
+    def __str__(self) -> str:
+        return "".join([self.core, *(f"+{each}" for each in self.around)])
+
+
+def parse_spec(spec: str) -> AgentSpec:
+    """The parts of a spec. A path may hold any character; one that ends like ``+step`` is written with a ``/`` behind.
+
+    Raises ``InvalidInput`` for what is not written so, and for two shields or another order; ``UnknownName`` for
+    something else behind a ``+``.
+    """
+    core, around = _split_around(spec)
+    if _BEGINS_WITH_FILE.fullmatch(core):
+        match = _IN_FILE.fullmatch(core)
+        if match is None:
+            raise InvalidInput(
+                f"agent {spec!r}: one from a file is FILE.py:FUNCTION, FILE.py:FUNCTION:ARGUMENT or"
+                " FILE.py:FUNCTION@POLICY, for instance my_file.py:make_agent"
+            )
+        return AgentSpec(match["name"], match["argument"], match["policy"], around)
+    head, at, path = core.partition("@")
+    name, argument = parse_agent_spec(head if at else core)
+    if at and not path:
+        raise InvalidInput(f"agent {spec!r}: a path is needed after '@'")
+    return AgentSpec(name, argument, path if at else None, around)
+
+
+def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
+    core, around = spec if isinstance(spec, str) else "", list[str]()
+    if not core:
+        parse_agent_spec(spec)  # says what is right
+    while True:
+        before, plus, last = core.rpartition("+")
+        if not plus or not is_around(last):
+            break
+        core, around = before, [last, *around]
+    if plus and _is_meant_around(before, core, last):
+        raise unknown_name("shield or refinement", last, AROUND)
+    shields = [each for each in around if each in (*SHIELDS, *BELIEVED)]
+    if len(shields) > 1 or any(each not in shields for each in around[1:]):
+        raise InvalidInput(
+            f"agent {spec!r}: +{REFINED[0]} comes first and once, then one shield of +{', +'.join(SHIELDS)}; for"
+            " instance ppo@shipped+refined+step"
+        )
+    return core, tuple(around)
+
+
+def is_around(word: str) -> bool:
+    """Whether this stands behind a ``+``: one of ``AROUND``, or a refinement with a budget for each decision."""
+    return word in AROUND or _WITH_BUDGET.fullmatch(word) is not None
+
+
+def _is_meant_around(before: str, core: str, last: str) -> bool:
+    """Whether a word behind a ``+`` that is none of ``AROUND`` is no part of an argument or path either."""
+    if ".py" in last or _IN_FILE.fullmatch(core):
+        return False  # the + is part of a file's path, or of its argument
+    if ":" not in before and "@" not in before:
+        return True
+    if "/" in last or "\\" in last:
+        return False  # the last part of a path
+    path = core.partition("@")[2]
+    return bool(get_close_matches(last, AROUND)) and not (path and os.path.lexists(path))
+
 
 HORIZON_S = 8.0  # until when an agent looks ahead that knows no scenario
 
@@ -77,8 +188,8 @@ class Entry:
         return getattr(import_module(f"ethbrake_marl.{module}"), function)
 
 
-_SCRIPTS, _POLICIES = "agents.scripts", "learning.driving:make_policy_agent"
-_FROM_FILE = "agents.user_file:make_from_file"
+_SCRIPTS, _POLICIES = "agents.scripts", "learning.team_file:make_policy_agent"
+_FROM_FILE = "agents.registry:make_from_file"
 _ENTRIES: dict[str, Entry] = {
     "coast": Entry("coast", "nothing at all", (Source.SENSORS,), f"{_SCRIPTS}:make_state_free"),
     "full_brake": Entry(
@@ -110,7 +221,7 @@ _ENTRIES: dict[str, Entry] = {
         "the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state;"
         " believed: on what was received, and the scenario's ranges for the rest",
         (Source.MODEL,),
-        "agents.e_v2x_bm.agent:make_e_v2x_bm",
+        "agents.e_v2x_bm:make_e_v2x_bm",
     ),
     "planner": Entry(
         "planner[:CANDIDATES|:20ms][:believed]",
@@ -122,7 +233,7 @@ _ENTRIES: dict[str, Entry] = {
         "best_harm[:CANDIDATES]",
         "the best profile known; a search at the alert where none is known",
         (Source.MODEL,),
-        "limits.shipped:make_best_harm",
+        "limits.best_harm:make_best_harm",
     ),
     "ppo": Entry("ppo@PATH", "a policy trained by PPO: a run, a bundle, or shipped", (Source.MESSAGES,), _POLICIES),
     "sac": Entry("sac@PATH", "a policy trained by SAC: a run, a bundle, or shipped", (Source.MESSAGES,), _POLICIES),
@@ -153,20 +264,20 @@ _WRAPPERS: dict[str, Entry] = {
         "+episode[:pairwise][:believed]",
         "behind Algorithm 1: it or E-V2X-BM drives the episode, whichever harms less; believed: as far as is received",
         (Source.MODEL,),
-        "shield.factories:shield_episodes",
+        "shield.agents:shield_episodes",
     ),
     "step": Entry(
         "+step[:believed]",
         "every action certified, or replaced; of a team together; believed: certified in the world that is believed",
         (Source.MODEL,),
-        "shield.factories:shield_steps",
+        "shield.agents:shield_steps",
     ),
     "robust": Entry(
         "+robust[:interior][:believed]",
         "the same where not everything is known: in the corners of an uncertainty, interior: in all of it;"
         " believed: against all that was not received",
         (Source.MODEL,),
-        "shield.factories:shield_steps_robustly",
+        "shield.agents:shield_steps_robustly",
     ),
 }
 
@@ -312,3 +423,33 @@ def _put_around(driver: Driver, around: str, settings: AgentSettings) -> Driver:
     name, _, argument = around.partition(":")
     wrapped: Driver = _WRAPPERS[name].load()(driver, argument or None, settings)
     return wrapped
+
+
+# An agent from a Python file of the user's: ``my_file.py:make_agent``, loaded only where a person names it.
+
+
+def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
+    """What the function of the file makes, from the argument (or None) and the settings, or from nothing.
+
+    A function without parameters takes neither argument nor policy: ``InvalidInput`` says so, and what is wrong with
+    the file.
+    """
+    named = parse_spec(settings.spec).file
+    assert named is not None
+    function = load_function(*named)
+    if settings.policy is not None:
+        note_file(settings.policy)
+    if not _takes_nothing(function):
+        made: Driver = function(argument, settings)
+        return made
+    if (argument, settings.policy) != (None, None):
+        raise InvalidInput(f"agent {settings.spec!r}: {named[1]} has no parameters, so it takes no argument")
+    made = function()
+    return made
+
+
+def _takes_nothing(function: Callable[..., Any]) -> bool:
+    try:
+        return not inspect.signature(function).parameters
+    except (TypeError, ValueError):  # of something built in
+        return False

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
-from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.protocol import Agent, place, recall
+from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
+from ethbrake_marl.agents.protocol import Agent, Source, place, recall
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.scenario.roles import constant_command, is_state_free
+from ethbrake_marl.scenario.lines import constant_command, is_state_free
 
 
 class StateFree:

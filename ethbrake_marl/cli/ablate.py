@@ -16,10 +16,10 @@ from ethbrake_marl.errors import InvalidInput
 
 if TYPE_CHECKING or LATE:
     from ethbrake_marl.evaluation.inputs import load_runnable
-    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.learning.recipe import read_settings
 
 if TYPE_CHECKING:
-    from ethbrake_marl.studies.ablation.plan import Plan
+    from ethbrake_marl.studies.ablation import Plan
 
 QUICK = {"seeds": 2, "steps_per_learner": 200_000, "episodes": 500, "search_episodes": 40, "budget": 2_000}
 FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_episodes": 600, "budget": 20_000}
@@ -67,9 +67,14 @@ def ablate_command(
     """
     with interruptible(KEPT):
         # torch takes seconds to load, and no other command needs it
-        from ethbrake_marl.studies.ablation.cost import cost_of
-        from ethbrake_marl.studies.ablation.plan import LADDER, STANDARD, check_settings, keep_settings
-        from ethbrake_marl.studies.ablation.run import check_finished
+        from ethbrake_marl.studies.ablation import (
+            LADDER,
+            STANDARD,
+            check_finished,
+            check_settings,
+            cost_of,
+            keep_settings,
+        )
 
         chosen = dict(QUICK if quick else FULL)
         given = {"seeds": seeds, "steps_per_learner": steps, "episodes": episodes, "search_episodes": search_episodes}
@@ -110,8 +115,7 @@ def generalise_command(
     They drive every follower, and Vehicle 1 where it learns in the scenario.
     """
     # scipy's statistics take a second to load
-    from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, drive_longer, load_runs
-    from ethbrake_marl.studies.ablation.report import lines_markdown
+    from ethbrake_marl.studies.ablation_report import LineQuestion, drive_longer, lines_markdown, load_runs
 
     lengths = _lengths(vehicles)
     if not episodes >= 1 or not 0 <= search_episodes <= episodes or not budget >= 1:
@@ -150,16 +154,8 @@ def _plan(
     shield: str | None,
     numbers: dict[str, int],
 ) -> Plan:
-    from ethbrake_marl.learning.recipe import load_recipe
-    from ethbrake_marl.learning.schemes import check_scheme, scheme_of
-    from ethbrake_marl.studies.ablation.plan import (
-        Plan,
-        check_folder,
-        check_plan,
-        common_worlds,
-        read_levels,
-        with_scheme,
-    )
+    from ethbrake_marl.learning.recipe import check_scheme, load_recipe, scheme_of
+    from ethbrake_marl.studies.ablation import Plan, check_folder, check_plan, common_worlds, read_levels, with_scheme
 
     chosen = None if scheme is None else check_scheme(scheme)
     loaded = [load_recipe(each.strip()) for each in recipes.split(",")]
@@ -182,8 +178,8 @@ def _plan(
 
 
 def _run(plan: Plan, jobs: int, as_json: bool) -> None:
-    from ethbrake_marl.studies.ablation.report import FIGURES, PAGE, TEXT, write_ablation
-    from ethbrake_marl.studies.ablation.run import measure, train_all
+    from ethbrake_marl.studies.ablation import measure, train_all
+    from ethbrake_marl.studies.ablation_report import FIGURES, PAGE, TEXT, write_ablation
 
     with progress_bars() as bars:
         if not train_all(list(plan.trainings()), jobs, bars.show_progress):

@@ -12,7 +12,7 @@ from ethbrake_marl.cli.options import JsonOption
 from ethbrake_marl.cli.terminal import result_console, show, write_json
 
 if TYPE_CHECKING or LATE:
-    from ethbrake_marl.agents.knowledge import knowledge_text, sees_through
+    from ethbrake_marl.agents.protocol import knowledge_text, sees_through
     from ethbrake_marl.agents.registry import agent_entries
 
 

@@ -14,11 +14,17 @@ from ethbrake_marl.errors import InvalidInput
 
 if TYPE_CHECKING or LATE:
     from ethbrake_marl.evaluation import check_target
-    from ethbrake_marl.evaluation.per_world import write_output
-    from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
-    from ethbrake_marl.studies.benchmark.leaderboard import Leaderboard, read_leaderboard
-    from ethbrake_marl.studies.benchmark.suite import load_suite
-    from ethbrake_marl.studies.benchmark.table import RANK, SCORE, leaderboard_markdown, leaderboard_table, list_table
+    from ethbrake_marl.evaluation.results import write_output
+    from ethbrake_marl.studies.benchmark import load_suite, make_entry, write_entry
+    from ethbrake_marl.studies.leaderboard import (
+        RANK,
+        SCORE,
+        Leaderboard,
+        leaderboard_markdown,
+        leaderboard_table,
+        list_table,
+        read_leaderboard,
+    )
 
 _PAGES = (".html", ".htm")
 _MARKDOWN = ".md"
@@ -93,7 +99,7 @@ def _as_file(found: Leaderboard, output: Path) -> str:
     if output.suffix.lower() == _MARKDOWN:
         return leaderboard_markdown(found)
     # Here: templates take time to load, and most commands write no page.
-    from ethbrake_marl.studies.benchmark.page import leaderboard_page
+    from ethbrake_marl.studies.leaderboard import leaderboard_page
 
     return leaderboard_page(found)
 

@@ -15,8 +15,7 @@ from ethbrake_marl.cli.options import JsonOption
 from ethbrake_marl.cli.terminal import result_console, say, write_json
 
 if TYPE_CHECKING or LATE:
-    from ethbrake_marl.evaluation.compare import Comparison, compare_results
-    from ethbrake_marl.evaluation.results_file import read_result
+    from ethbrake_marl.evaluation.results import Comparison, compare_results, read_result
 
 _FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield (--json) or run.")
 _HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", "harm": "Harm"}

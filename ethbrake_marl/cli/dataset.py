@@ -14,9 +14,9 @@ from ethbrake_marl.defaults import LIST_SEED, DatasetFormat, HarmCount
 from ethbrake_marl.errors import count_of
 
 if TYPE_CHECKING or LATE:
-    from ethbrake_marl.evaluation.dataset.write import DatasetSummary, check_dataset, write_dataset
+    from ethbrake_marl.evaluation.dataset import DatasetSummary, check_dataset, write_dataset
     from ethbrake_marl.evaluation.inputs import check_agents, load_evaluated, make_lineup
-    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.learning.recipe import read_settings
     from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING or LATE:
     from packaging.requirements import Requirement
     from packaging.version import Version
 
-    from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+    from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
     from ethbrake_marl.physics import Worlds, advance, make_worlds
     from ethbrake_marl.scenario import list_scenarios, scenario_folder
     from ethbrake_marl.scenario.catalogue import SHIPPED

@@ -31,8 +31,7 @@ from ethbrake_marl.defaults import EPISODES, LIST_SEED, HarmCount
 from ethbrake_marl.errors import InvalidInput, count_of
 
 if TYPE_CHECKING or LATE:
-    from ethbrake_marl.agents.protocol import Agent
-    from ethbrake_marl.agents.team import Team
+    from ethbrake_marl.agents.protocol import Agent, Team
     from ethbrake_marl.cli.report import check_page, write_evaluation_report
     from ethbrake_marl.cli.results import counted_without, picture_target, results_beside, tell_left_out, tell_results
     from ethbrake_marl.cli.shards import check_shards, evaluate_in_shards
@@ -45,8 +44,6 @@ if TYPE_CHECKING or LATE:
         horizon_note,
         summarise,
     )
-    from ethbrake_marl.evaluation.frame import check_per_world
-    from ethbrake_marl.evaluation.groups import check_group, summarise_by
     from ethbrake_marl.evaluation.inputs import (
         PROGRESS_EVERY,
         check_agents,
@@ -55,10 +52,12 @@ if TYPE_CHECKING or LATE:
         make_lineup,
         make_proposers,
     )
+    from ethbrake_marl.evaluation.results import check_per_world
     from ethbrake_marl.evaluation.shield_modes import NONE, ModeRow, compare_modes, modes_tables, modes_to_json
-    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.evaluation.summary import check_group, summarise_by
+    from ethbrake_marl.learning.recipe import read_settings
     from ethbrake_marl.scenario import Sample, Scenario, Task
-    from ethbrake_marl.scenario.sample import kind_columns
+    from ethbrake_marl.scenario.quantities import kind_columns
     from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 ReportOption = Annotated[
@@ -231,7 +230,7 @@ def picture_shield_modes(
     """Harm without a shield and in step mode beside episode mode, as ``ethbrake shield`` measures it."""
     target = picture_target(output, force=force)
     # Here: matplotlib takes a second to load, and most commands draw nothing.
-    from ethbrake_marl.figures.shield import shield_modes_figure
+    from ethbrake_marl.figures.evaluation import shield_modes_figure
     from ethbrake_marl.figures.style import write_picture
 
     chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)

@@ -16,7 +16,7 @@ from ethbrake_marl.errors import need
 
 if TYPE_CHECKING or LATE:
     from ethbrake_marl.evaluation.inputs import load_driven, make_lineup
-    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.learning.recipe import read_settings
 
 AGENTS = "full_brake,copy_leader,e_v2x_bm,ppo@shipped,ppo@shipped+step"
 

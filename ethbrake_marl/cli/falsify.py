@@ -22,25 +22,26 @@ from ethbrake_marl.errors import InvalidInput, count_of
 if TYPE_CHECKING or LATE:
     import numpy as np
 
-    from ethbrake_marl.agents.spelling import parse_spec
+    from ethbrake_marl.agents.registry import parse_spec
     from ethbrake_marl.evaluation import check_target
-    from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256
-    from ethbrake_marl.evaluation.inputs import check_agents, load_evaluated
-    from ethbrake_marl.evaluation.named_worlds import (
+    from ethbrake_marl.evaluation.inputs import (
         FORMAT,
         VERSION,
         NamedWorld,
         NamedWorlds,
+        check_agents,
+        load_evaluated,
         named_worlds_text,
         read_named_worlds,
+        result_versions,
+        scenario_sha256,
         states_of,
     )
-    from ethbrake_marl.evaluation.per_world import write_output
-    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.evaluation.results import write_output
+    from ethbrake_marl.learning.recipe import read_settings
     from ethbrake_marl.physics import Floats
     from ethbrake_marl.scenario import Sample, Scenario
-    from ethbrake_marl.studies.falsification.falsify import Falsified, falsify
-    from ethbrake_marl.studies.falsification.measures import Measure, make_measure
+    from ethbrake_marl.studies.falsification import Falsified, Measure, falsify, make_measure
 
 WORSE = 1  # exit status when a kept world is worse than it was
 ROUNDING = 1e-6  # m2/s2

@@ -24,8 +24,8 @@ def shown_parts() -> list[tuple[str, str]]:
 def part_names() -> list[tuple[str, str]]:
     """Kinds of parts, each with its names; what is registered is among them."""
     from ethbrake_marl.evaluation.harm_metrics import METRICS
-    from ethbrake_marl.learning.registry import algorithm_names
-    from ethbrake_marl.objectives import KINDS
+    from ethbrake_marl.harm import KINDS
+    from ethbrake_marl.learning.recipe import algorithm_names
     from ethbrake_marl.rewards import TERMS
     from ethbrake_marl.scenario.features import FEATURES
     from ethbrake_marl.scenario.v2x import CHANNELS

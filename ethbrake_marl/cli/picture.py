@@ -14,13 +14,17 @@ from ethbrake_marl.defaults import LIST_SEED, HarmCount
 from ethbrake_marl.errors import count_of
 
 if TYPE_CHECKING or LATE:
-    from ethbrake_marl.agents.team import Team
+    from ethbrake_marl.agents.protocol import Team
     from ethbrake_marl.cli.results import counted_without, picture_target, tell_left_out
-    from ethbrake_marl.evaluation.criticality import CELLS, criticality_map
-    from ethbrake_marl.evaluation.deceleration import deceleration_curve
-    from ethbrake_marl.evaluation.identity import result_identity
-    from ethbrake_marl.evaluation.inputs import load_driven, load_evaluated, make_agents, make_proposers
-    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.evaluation.curves import CELLS, criticality_map, deceleration_curve
+    from ethbrake_marl.evaluation.inputs import (
+        load_driven,
+        load_evaluated,
+        make_agents,
+        make_proposers,
+        result_identity,
+    )
+    from ethbrake_marl.learning.recipe import read_settings
     from ethbrake_marl.scenario import Task
     from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
@@ -58,7 +62,7 @@ def picture_criticality(
     """
     target = picture_target(output, force=force)
     # Here and below: matplotlib takes a second to load, and most commands draw nothing.
-    from ethbrake_marl.figures.criticality import criticality_figure
+    from ethbrake_marl.figures.evaluation import criticality_figure
     from ethbrake_marl.figures.style import write_picture
 
     chosen = load_driven(scenario, None, read_settings(settings).scenario)
@@ -90,7 +94,7 @@ def picture_deceleration(
 ) -> None:
     """Harm of one world against the constant deceleration of one vehicle: predicted, realised, and the best known."""
     target = picture_target(output, force=force)
-    from ethbrake_marl.figures.deceleration import deceleration_figure
+    from ethbrake_marl.figures.evaluation import deceleration_figure
     from ethbrake_marl.figures.style import write_picture
 
     chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
@@ -116,7 +120,7 @@ def picture_shield(
 ) -> None:
     """How often the step shield intervenes against the harm that remains, from no allowance to any."""
     target = picture_target(output, force=force)
-    from ethbrake_marl.figures.shield import operating_figure
+    from ethbrake_marl.figures.evaluation import operating_figure
     from ethbrake_marl.figures.style import write_picture
     from ethbrake_marl.shield.review import ALLOWANCES, operating_curves
 
@@ -166,9 +170,9 @@ def picture_robustness(
     Prints the figures, too.
     """
     target, intervals = picture_target(output, force=force), parse_uncertainty(uncertainty)
-    from ethbrake_marl.figures.shield import robustness_figure, robustness_table
+    from ethbrake_marl.figures.evaluation import robustness_figure, robustness_table
     from ethbrake_marl.figures.style import write_picture
-    from ethbrake_marl.shield.robustness import robustness
+    from ethbrake_marl.shield.review import robustness
 
     chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
     sample = chosen.sample(episodes, LIST_SEED)

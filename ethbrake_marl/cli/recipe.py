@@ -12,12 +12,16 @@ from ethbrake_marl.cli.options import ForceOption, JsonOption
 from ethbrake_marl.cli.terminal import say, show, write_json
 
 if TYPE_CHECKING or LATE:
-    from ethbrake_marl.evaluation.per_world import write_output
-    from ethbrake_marl.files.plain import read_plain
+    from ethbrake_marl.evaluation.results import write_output
+    from ethbrake_marl.files.store import read_plain
     from ethbrake_marl.files.yaml import SIZE_LIMIT
-    from ethbrake_marl.learning.recipe import load_recipe, recipe_path, shipped_recipes
-    from ethbrake_marl.learning.recipe_schema import recipe_json_schema
-    from ethbrake_marl.learning.recipe_text import new_recipe_text
+    from ethbrake_marl.learning.recipe import (
+        load_recipe,
+        new_recipe_text,
+        recipe_json_schema,
+        recipe_path,
+        shipped_recipes,
+    )
 
 recipe_app = typer.Typer(
     rich_markup_mode=None,

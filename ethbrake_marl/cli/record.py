@@ -14,9 +14,9 @@ from ethbrake_marl.defaults import LIST_SEED
 
 if TYPE_CHECKING or LATE:
     from ethbrake_marl.evaluation import check_target
-    from ethbrake_marl.evaluation.film import check_ending, check_number_of_films, film_bytes, film_scenes
+    from ethbrake_marl.evaluation.episodes import check_ending, check_number_of_films, film_bytes, film_scenes
     from ethbrake_marl.evaluation.inputs import load_evaluated, make_lineup
-    from ethbrake_marl.evaluation.per_world import write_output
+    from ethbrake_marl.evaluation.results import write_output
     from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.agents.team import Driver
+from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.cli.terminal import Bars, say
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, SummaryRow, check_target
-from ethbrake_marl.evaluation.conditions import parameter_line
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.evaluation.outcome import parameter_line
 
 
 def check_page(path: Path, *, force: bool = False) -> Path:
@@ -45,8 +45,7 @@ def write_evaluation_report(
 
     """
     # Here: matplotlib takes a second to load, and most evaluations draw nothing.
-    from ethbrake_marl.pages.evidence import shield_evidence
-    from ethbrake_marl.pages.report import Report, focus_of, play_for_report, write_report
+    from ethbrake_marl.pages.report import Report, focus_of, play_for_report, shield_evidence, write_report
 
     done: list[str] = []
 

@@ -51,11 +51,16 @@ def reproduce_command(
     """
     with interruptible(KEPT):
         # matplotlib and the statistics take seconds to load
-        from ethbrake_marl.studies.reproduction.folder import PAGE, ReproductionFolder
+        from ethbrake_marl.studies.reproduction.folder import (
+            PAGE,
+            ReproductionFolder,
+            check_docs,
+            choose_items,
+            reproduce,
+            tell_cost,
+            write_docs,
+        )
         from ethbrake_marl.studies.reproduction.item import FULL, QUICK, Mode, Settings
-        from ethbrake_marl.studies.reproduction.items import choose_items
-        from ethbrake_marl.studies.reproduction.markdown import check_docs, write_docs
-        from ethbrake_marl.studies.reproduction.run import reproduce, tell_cost
 
         chosen = choose_items(names or ())
         if listed:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ethbrake_marl.cli.terminal import result_console, say, write_json
-from ethbrake_marl.defaults import LIST_SEED
+from ethbrake_marl.defaults import LIST_SEED, HarmCount
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation import (
     Evaluation,
@@ -18,13 +18,10 @@ from ethbrake_marl.evaluation import (
     rescored_table,
     rich_table,
 )
-from ethbrake_marl.evaluation.frame import write_per_world
-from ethbrake_marl.evaluation.paper import TESTS
-from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.evaluation.results_file import results_to_json
-from ethbrake_marl.evaluation.text import left_out_line, metrics_table
+from ethbrake_marl.evaluation.outcome import TESTS
+from ethbrake_marl.evaluation.results import results_to_json, write_output, write_per_world
+from ethbrake_marl.evaluation.summary import left_out_line, metrics_table
 from ethbrake_marl.figures import picture_ending
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import LeftOutRows
 
 Groups = Mapping[str, Sequence[SummaryRow]]

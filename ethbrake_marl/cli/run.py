@@ -27,10 +27,8 @@ from ethbrake_marl.defaults import EPISODES, LIST_SEED
 if TYPE_CHECKING or LATE:
     from ethbrake_marl.cli.results import show_beside, show_rows
     from ethbrake_marl.evaluation.inputs import load_driven
-    from ethbrake_marl.evaluation.per_world import PER_WORLD
-    from ethbrake_marl.evaluation.results_file import results_to_json
-    from ethbrake_marl.learning.recipe import load_recipe
-    from ethbrake_marl.learning.settings import read_settings
+    from ethbrake_marl.evaluation.results import PER_WORLD, results_to_json
+    from ethbrake_marl.learning.recipe import load_recipe, read_settings
 
 
 def run_experiment_command(

@@ -13,12 +13,12 @@ from ethbrake_marl.cli.terminal import say, show, write_json
 from ethbrake_marl.defaults import LIST_SEED
 
 if TYPE_CHECKING or LATE:
+    from ethbrake_marl.agents.protocol import Team
     from ethbrake_marl.agents.registry import make_single_agent
     from ethbrake_marl.agents.rollout import drive
-    from ethbrake_marl.agents.team import Team
     from ethbrake_marl.evaluation.inputs import load_runnable
-    from ethbrake_marl.evaluation.per_world import write_output
-    from ethbrake_marl.files.plain import read_plain
+    from ethbrake_marl.evaluation.results import write_output
+    from ethbrake_marl.files.store import read_plain
     from ethbrake_marl.files.yaml import SIZE_LIMIT
     from ethbrake_marl.scenario import (
         list_scenarios,
@@ -28,8 +28,8 @@ if TYPE_CHECKING or LATE:
         scenario_path,
     )
     from ethbrake_marl.scenario.catalogue import SHIPPED
-    from ethbrake_marl.scenario.roles import LEARNER, is_state_free
-    from ethbrake_marl.scenario.sample import count_kinds
+    from ethbrake_marl.scenario.lines import LEARNER, is_state_free
+    from ethbrake_marl.scenario.quantities import count_kinds
 
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
 

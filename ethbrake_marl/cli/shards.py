@@ -10,17 +10,23 @@ from pathlib import Path
 
 from ethbrake_marl.cli.results import show_rows
 from ethbrake_marl.cli.terminal import interruptible, progress_bars, result_console, say, show, write_json
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, check_whole_number, need
 from ethbrake_marl.evaluation import horizon_note, rescored_table
 from ethbrake_marl.evaluation.inputs import check_agents, make_lineup
-from ethbrake_marl.evaluation.shards.question import Asked, Question, ask
-from ethbrake_marl.evaluation.shards.summary import rescore_shards, shards_to_json, summarise_shards
-from ethbrake_marl.evaluation.shards.tally import Tally
-from ethbrake_marl.files.durable import write_file
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.evaluation.shards import (
+    Asked,
+    Question,
+    Tally,
+    ask,
+    rescore_shards,
+    shards_to_json,
+    summarise_shards,
+)
+from ethbrake_marl.files.store import write_file
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
-from ethbrake_marl.studies.jobs.work import Workers
+from ethbrake_marl.studies.jobs import Workers
 from ethbrake_marl.studies.shards import MOST_JOBS, ShardFolder, evaluate_shards
 
 RESULTS = "results.json"
@@ -132,7 +138,7 @@ def _tell(asked: Asked, tally: Tally, output: Path | None, *, as_json: bool) -> 
 
 def _on_ray(address: str, jobs: int) -> Workers:
     """A Ray, with all its cores where ``jobs`` is 1, which says nothing."""
-    from ethbrake_marl.studies.jobs.cluster import LOCAL, RayWorkers
+    from ethbrake_marl.studies.cluster import LOCAL, RayWorkers
 
     most = None if jobs == 1 else jobs
     return RayWorkers(address, len(os.sched_getaffinity(0)) if address == LOCAL and most is None else most)

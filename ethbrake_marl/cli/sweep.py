@@ -14,9 +14,9 @@ from ethbrake_marl.cli.terminal import INTERRUPTED, Bars, interruptible, progres
 from ethbrake_marl.errors import InvalidInput, need
 
 if TYPE_CHECKING:
-    from ethbrake_marl.studies.jobs.work import Workers
-    from ethbrake_marl.studies.sweep.plan import SweepPlan
-    from ethbrake_marl.studies.sweep.run import SweepResult, SweepState
+    from ethbrake_marl.studies.jobs import Workers
+    from ethbrake_marl.studies.sweep import SweepResult, SweepState
+    from ethbrake_marl.studies.sweep_file import SweepPlan
 
 FAILED = 1  # exit status where some jobs failed
 KEPT = "the same command goes on with what is in the folder"
@@ -24,7 +24,7 @@ _MOST = 4096
 
 
 def _schema() -> dict[str, Any]:
-    from ethbrake_marl.studies.sweep.file import sweep_json_schema
+    from ethbrake_marl.studies.sweep_file import sweep_json_schema
 
     return sweep_json_schema()
 
@@ -55,9 +55,8 @@ def sweep_command(
     """
     with interruptible(KEPT):
         # torch takes seconds to load, and no other command needs it
-        from ethbrake_marl.studies.ablation.plan import check_folder
-        from ethbrake_marl.studies.sweep.file import read_sweep
-        from ethbrake_marl.studies.sweep.plan import plan_sweep
+        from ethbrake_marl.studies.ablation import check_folder
+        from ethbrake_marl.studies.sweep_file import plan_sweep, read_sweep
 
         number = len(os.sched_getaffinity(0)) if jobs is None else jobs
         if ray is not None:
@@ -79,16 +78,16 @@ def sweep_command(
 def workers_for(ray: str | None, jobs: int | None, number: int) -> Workers:
     """Where jobs run: ``number`` processes of this machine, or a Ray; of a cluster at most ``jobs`` at once."""
     if ray is None:
-        from ethbrake_marl.studies.jobs.local import LocalWorkers
+        from ethbrake_marl.studies.jobs import LocalWorkers
 
         return LocalWorkers(number)
-    from ethbrake_marl.studies.jobs.cluster import LOCAL, RayWorkers
+    from ethbrake_marl.studies.cluster import LOCAL, RayWorkers
 
     return RayWorkers(ray, number if ray == LOCAL else jobs)
 
 
 def _run(plan: SweepPlan, output: Path, workers: Workers, retries: int, form: Literal["csv", "parquet"]) -> SweepResult:
-    from ethbrake_marl.studies.sweep.run import run_sweep
+    from ethbrake_marl.studies.sweep import run_sweep
 
     with progress_bars() as bars:
 
@@ -111,7 +110,7 @@ def _coarse(seconds: float) -> str:
 
 
 def _show_plan(plan: SweepPlan, output: Path, number: int, as_json: bool) -> None:
-    from ethbrake_marl.studies.sweep.cost import cost_of, state_of
+    from ethbrake_marl.studies.sweep import cost_of, state_of
 
     cost = cost_of(plan, output, number)
     left = {row.identity for row in cost.rows}
@@ -126,7 +125,7 @@ def _show_plan(plan: SweepPlan, output: Path, number: int, as_json: bool) -> Non
 
 
 def _show_result(result: SweepResult, output: Path, as_json: bool) -> None:
-    from ethbrake_marl.studies.sweep.table import FAILURES
+    from ethbrake_marl.studies.sweep import FAILURES
 
     counts = {"jobs": result.jobs, "finished": result.finished, "failed": len(result.failures)}
     if as_json:

@@ -19,8 +19,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.segment import Segment
 
 from ethbrake_marl.errors import IncompleteTable, WithoutEffect, one_line, plain_text
+from ethbrake_marl.errors import Progress as PartProgress
 from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
-from ethbrake_marl.progress import Progress as PartProgress
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
 EVERY_S = 10.0  # between two signs of life where stderr is no terminal

@@ -24,17 +24,13 @@ from ethbrake_marl.cli.options import (
     TrainingSeedOption,
 )
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, write_json
-from ethbrake_marl.errors import check_one_learner
-from ethbrake_marl.progress import Progress
+from ethbrake_marl.errors import Progress, check_one_learner
 
 if TYPE_CHECKING or LATE:
     from ethbrake_marl.evaluation.inputs import load_runnable
-    from ethbrake_marl.evaluation.per_world import check_target, write_output
-    from ethbrake_marl.learning.recipe import load_recipe
-    from ethbrake_marl.learning.schemes import check_scheme, who_drives_what
-    from ethbrake_marl.learning.settings import read_settings
-    from ethbrake_marl.policies.onnx import onnx_model
-    from ethbrake_marl.policies.shipped import load_named_policy
+    from ethbrake_marl.evaluation.results import check_target, write_output
+    from ethbrake_marl.learning.recipe import check_scheme, load_recipe, read_settings, who_drives_what
+    from ethbrake_marl.policies.shipped import load_named_policy, onnx_model
 
 if TYPE_CHECKING:
     from ethbrake_marl.learning.train import TrainResult

@@ -14,14 +14,14 @@ from ethbrake_marl.cli.terminal import INTERRUPTED, Bars, interruptible, progres
 from ethbrake_marl.errors import InvalidInput, count_of, need
 
 if TYPE_CHECKING:
-    from ethbrake_marl.studies.tuning.plan import TuningPlan
-    from ethbrake_marl.studies.tuning.run import TuningResult, TuningState
+    from ethbrake_marl.studies.tuning import TuningResult, TuningState
+    from ethbrake_marl.studies.tuning_file import TuningPlan
 
 _MOST, _MOST_TRIALS = 4096, 100_000
 
 
 def _schema() -> dict[str, Any]:
-    from ethbrake_marl.studies.tuning.file import tuning_json_schema
+    from ethbrake_marl.studies.tuning_file import tuning_json_schema
 
     return tuning_json_schema()
 
@@ -61,10 +61,9 @@ def tune_command(
     need("optuna")
     with interruptible(KEPT):
         # torch takes seconds to load
-        from ethbrake_marl.studies.ablation.plan import check_folder
-        from ethbrake_marl.studies.tuning.file import read_tuning
-        from ethbrake_marl.studies.tuning.plan import plan_tuning
-        from ethbrake_marl.studies.tuning.run import check_tuning, run_tuning
+        from ethbrake_marl.studies.ablation import check_folder
+        from ethbrake_marl.studies.tuning import check_tuning, run_tuning
+        from ethbrake_marl.studies.tuning_file import plan_tuning, read_tuning
 
         _check_options(trials, jobs, retries, storage)
         if ray is not None:
@@ -98,8 +97,8 @@ def _check_options(trials: int, jobs: int, retries: int, storage: str | None) ->
 
 def _check_export(plan: TuningPlan, export: Path, force: bool) -> None:
     """Raise before the work begins what would be raised at its end."""
-    from ethbrake_marl.evaluation.per_world import check_target
-    from ethbrake_marl.studies.tuning.table import best_recipe
+    from ethbrake_marl.evaluation.results import check_target
+    from ethbrake_marl.studies.tuning import best_recipe
 
     if export.suffix != ".yaml":
         raise InvalidInput(f"export {export}: must end in .yaml, as recipes do")
@@ -109,7 +108,7 @@ def _check_export(plan: TuningPlan, export: Path, force: bool) -> None:
 
 def _is_an_export(plan: TuningPlan, export: Path) -> bool:
     """Whether this tuning wrote the file before: then the same command goes on, and replaces it."""
-    from ethbrake_marl.studies.tuning.table import export_head
+    from ethbrake_marl.studies.tuning import export_head
 
     head = export_head(plan, export).encode()
     if not export.is_file():
@@ -124,8 +123,8 @@ def _show_state(bars: Bars, state: TuningState) -> None:
 
 
 def _show_plan(plan: TuningPlan, trials: int, jobs: int, as_json: bool) -> None:
-    from ethbrake_marl.studies.jobs.cost import told_seconds
-    from ethbrake_marl.studies.tuning.cost import seconds_per_trial
+    from ethbrake_marl.studies.trainings import told_seconds
+    from ethbrake_marl.studies.tuning import seconds_per_trial
 
     per_trial = seconds_per_trial(plan)
     own = plan.own_values()
@@ -148,8 +147,8 @@ def _show_result(plan: TuningPlan, result: TuningResult, export: Path | None, fo
     best = result.best
     export = None if best is None or result.interrupted else export  # what goes on exports at its end
     if best is not None and export is not None:
-        from ethbrake_marl.evaluation.per_world import write_output
-        from ethbrake_marl.studies.tuning.table import best_recipe
+        from ethbrake_marl.evaluation.results import write_output
+        from ethbrake_marl.studies.tuning import best_recipe
 
         told = f"ethbrake tune: trial {best.number}, harm {best.harm!r} on the list of seed {plan.file.measure.seed}"
         write_output(export, best_recipe(plan, best.values, export, told).encode(), force=force)

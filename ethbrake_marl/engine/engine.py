@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import checked_action
-from ethbrake_marl.engine.running import RUNNING, Running
 from ethbrake_marl.engine.step import (
     BAD_ACTION,
     ENDED,
@@ -41,30 +40,223 @@ from ethbrake_marl.engine.stream import (
     is_state_free,
     within_capacity,
 )
-from ethbrake_marl.engine.terms import Terms
 from ethbrake_marl.errors import InvalidInput, renumbered
-from ethbrake_marl.observations import ObservationSpec, observation_for, plan_of
+from ethbrake_marl.harm import Ledger, objective_harm
+from ethbrake_marl.observations import Observations, ObservationSpec, Plan, observation_for, observe_packed, plan_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.episode import decision_s, number_of_decisions
-from ethbrake_marl.physics.failed import failure
-from ethbrake_marl.physics.messages import hear_rows
-from ethbrake_marl.physics.rows import (
+from ethbrake_marl.physics.advance import (
     NO_ROWS,
     TIME,
     Packed,
     command_at,
+    failure,
     gap_at,
     has_messages,
     has_news,
     has_obstacle,
+    ledger_columns,
+    obstacle_ledger_columns,
+    own_latency_and_news,
     pack,
     params_at,
     previous_at,
+    speed_at,
     unpack,
+    with_news_columns,
+    with_obstacle_columns,
 )
-from ethbrake_marl.physics.segment import DONE
-from ethbrake_marl.rewards import Reward, counted_terms
+from ethbrake_marl.physics.episode import decision_s, number_of_decisions
+from ethbrake_marl.physics.kernel import DONE
+from ethbrake_marl.physics.messages import hear_rows
+from ethbrake_marl.rewards import (
+    Reward,
+    StepOutcome,
+    counted_terms,
+    further_terms,
+    moving_terms_of,
+    own_terms,
+    potential,
+    registered_terms_of,
+    resolved_objective,
+    reward_params,
+    weighted_sum,
+)
 from ethbrake_marl.scenario import Scenario
+
+# The running episodes of a batch: their rows, and what can be read from them.
+
+RUNNING = ("_state", "_params", "_clock", "_wanted", "_potential")  # arrays of an engine that every step changes
+
+
+class Running:
+    """``n`` running episodes of one scenario, to be read; ``Engine`` moves them."""
+
+    scenario: Scenario  # of every episode
+    n: int  # worlds that are advanced together
+    roster: Roster  # who runs in which row, and which worlds failed
+    _state: Floats  # of the running episodes, as rows of ``physics.rows``
+    _params: Floats
+    _clock: Floats  # [n, CLOCK_WIDTH]
+    _wanted: Floats  # [n, N] m/s2
+    _potential: Floats  # [n, N]
+    _obstacle: bool  # the rows have columns of an obstacle
+    _by_link: bool  # ... of news by link
+    _plan: Plan  # of what a vehicle observes
+
+    @property
+    def packed(self) -> Packed:
+        """The running worlds themselves, as rows of ``physics.rows``: for kernels to read, not to be changed."""
+        return Packed(self._state, self._params)
+
+    @property
+    def wanted_mps2(self) -> Floats:
+        """What each vehicle wanted in the last step, [n, N]: for kernels to read, not to be changed."""
+        return self._wanted
+
+    @property
+    def worlds(self) -> Worlds:
+        """The worlds as they are now, in their own memory."""
+        return unpack(self.packed)
+
+    @property
+    def ledger(self) -> Ledger:
+        """Harm of the running episodes so far, in its own memory."""
+        vehicles = self.scenario.vehicles
+        first, total, count = ledger_columns(self._state, vehicles)
+        mass = self._params[:, params_at(3, vehicles) : params_at(4, vehicles)].copy()
+        return Ledger(first, total, count, *obstacle_ledger_columns(self._state, vehicles), mass)
+
+    @property
+    def known_from_s(self) -> Floats:
+        """From when on vehicle i acts on news of vehicle j, [n, N, N]: ``known_from_s`` of the worlds' vehicles."""
+        return own_latency_and_news(self._params, self.scenario.vehicles)[1]
+
+    @property
+    def ended(self) -> Bools:
+        """Episodes that have ended, [n]."""
+        ended: Bools = self._clock[:, ENDED] == 1.0
+        return ended
+
+    @property
+    def steps(self) -> Ints:
+        """Steps that the running episodes have taken, [n]."""
+        return self._clock[:, STEP].astype(np.int64)
+
+    def observe(self, vehicle: int) -> Observations:
+        """Current observation of one vehicle, [n, F]."""
+        if not 0 <= vehicle < self.scenario.vehicles:
+            raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{self.scenario.vehicles - 1}")
+        return self.observe_all(np.array([vehicle]))[:, 0]
+
+    def observe_all(self, vehicles: Ints, rows: Ints | None = None) -> Observations:
+        """Current observations of several vehicles, [n, len(vehicles), F]; only of the worlds ``rows`` if given."""
+        state, params = self._state, self._params
+        if rows is not None:
+            state, params = state.take(rows, axis=0), params.take(rows, axis=0)
+        if not self._plan.extras:
+            return observe_packed(state, params, vehicles, self._plan)
+        steps = self._clock[:, STEP] if rows is None else self._clock[rows, STEP]
+        return observe_packed(state, params, vehicles, self._plan, steps)
+
+    def _kept(self, packed: Packed) -> Packed:
+        """Rows as wide as they are kept: with columns of an obstacle, and of news by link, if the first had such."""
+        (state, params), N = packed, self.scenario.vehicles
+        return Packed(
+            with_obstacle_columns(state, N) if self._obstacle else state,
+            with_news_columns(params, N) if self._by_link else params,
+        )
+
+
+# Terms of the reward that the compiled step does not know: they need the motion, the future or an objective.
+
+
+class Terms:
+    """The reward of a batch, resolved: what is added to every step beside the terms that all vehicles share.
+
+    Args:
+        reward: a name, a mapping of settings, or ``RewardParams``.
+        scenario: whose objective holds where the reward names none.
+        learners: indices of the vehicles (0 = front) that learn.
+
+    """
+
+    def __init__(self, reward: Reward, scenario: Scenario, learners: Sequence[int]) -> None:
+        self.params, self._objectives = resolved_objective(reward_params(reward), scenario.objective, scenario.vehicles)
+        self._learners, self._learner_index = tuple(learners), np.array(learners, np.int64)
+        self._moving, self._own = moving_terms_of(self.params), registered_terms_of(self.params)
+        self._moves_reward = bool(self._moving or self._own)
+        self.by_objective = bool(self._objectives)  # each vehicle's harm by an objective
+        self.are_foreign = bool(self._own)  # one is code that somebody registered, and so may fail
+        self.add_something = self._moves_reward or self.params.shaping > 0.0 or self.by_objective
+
+    @property
+    def shared_harm(self) -> float:
+        """Weight of the harm of the whole line, which the compiled step counts: 0 where each has its objective."""
+        return 0.0 if self._objectives else self.params.harm
+
+    def objective_harm(self, running: Running) -> Floats:
+        """What the objective of each vehicle makes of the harm so far, [n, N]; only where there are objectives."""
+        return objective_harm(running.ledger, self.params.harm_count, self._objectives)
+
+    def add(self, step: Step, running: Running, before: Floats | None) -> None:
+        """Add what a step has brought to its reward; nothing for rows that stood still.
+
+        ``before``: ``objective_harm`` before the step, None without objectives.
+        """
+        if before is not None and self.params.harm > 0.0:
+            step.further["harm"] = before - self.objective_harm(running)
+        standing = running.ended & ~step.ended
+        if self._moves_reward:
+            outcome = self._outcome(step, running)
+            step.further.update(further_terms(self._moving, self.params, outcome))
+            if self._own:
+                counts = ~standing & (step.failed == 0)
+                step.further.update(own_terms(self._own, outcome, counts, running.steps))
+        if self.params.shaping > 0.0:
+            step.further["shaping"] = self._shaping(running, step.terminated)
+        extra = weighted_sum(self.params, step.further, step.reward.shape)
+        extra[standing] = 0.0
+        step.reward[:] += extra
+
+    def _outcome(self, step: Step, running: Running) -> StepOutcome:
+        """What terms are computed from: views of the running rows."""
+        vehicles, state, params = running.scenario.vehicles, running._state, running._params
+        gaps = gap_at(vehicles)
+        braking, driving, latency, mass = (
+            params[:, params_at(k, vehicles) : params_at(k + 1, vehicles)] for k in range(4)
+        )
+        return StepOutcome(
+            step.first_impact_harm,
+            step.total_harm,
+            step.safe_end,
+            state[:, gaps : gaps + vehicles - 1],
+            state[:, speed_at(vehicles) : command_at(vehicles)],
+            state[:, command_at(vehicles) : previous_at(vehicles)],
+            state[:, previous_at(vehicles) : gaps],
+            running.scenario.time_step_s,
+            state[:, TIME],
+            braking,
+            driving,
+            latency,
+            mass,
+            self._learner_index.view(),
+        )
+
+    def _shaping(self, running: Running, terminated: Bools) -> Floats:
+        """The shaping term [n, N] of this step; keeps the new potentials, which are 0 where an episode terminated."""
+        before = running._potential
+        running._potential = self.potentials(running.worlds, running.scenario)
+        running._potential[terminated] = 0.0
+        shaping: Floats = self.params.shaping_discount * running._potential - before
+        return shaping
+
+    def potentials(self, worlds: Worlds, scenario: Scenario) -> Floats:
+        """Potential of every learner, 0 for other vehicles, [n, N]."""
+        potentials = np.zeros(worlds.speeds_mps.shape)
+        shared = potential(self.params, worlds, self._learners, scenario.horizon_s)
+        potentials[:, self._learner_index] = shared[:, np.newaxis]
+        return potentials
+
 
 ROUNDING = 1e-9  # of a time step: moments that are so close are one
 Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]

@@ -12,11 +12,7 @@ import numpy as np
 
 from ethbrake_marl.actions import command_of
 from ethbrake_marl.physics import Bools, Floats, Ints
-from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.episode import command_in_force, onset_s, stands, step_end_s
-from ethbrake_marl.physics.impact import GAP, MASS, SPEED
-from ethbrake_marl.physics.obstacle import FAR_AWAY_M, place_obstacle
-from ethbrake_marl.physics.rows import (
+from ethbrake_marl.physics.advance import (
     RESTITUTION,
     TIME,
     command_at,
@@ -27,17 +23,24 @@ from ethbrake_marl.physics.rows import (
     speed_at,
     state_width,
 )
-from ethbrake_marl.physics.segment import (
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.episode import command_in_force, onset_s, stands, step_end_s
+from ethbrake_marl.physics.kernel import (
     COMMAND,
     COUNT,
     DONE,
+    FAR_AWAY_M,
     FIRST_HARM,
+    GAP,
     HIT,
     LIMIT,
+    MASS,
     ONSET,
+    SPEED,
     TABLE_ROWS,
     TOTAL_HARM,
     advance_table,
+    place_obstacle,
 )
 from ethbrake_marl.rewards import RewardParams, shared_terms
 

@@ -20,10 +20,9 @@ from ethbrake_marl.errors import (
     describe_error,
 )
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
+from ethbrake_marl.physics.advance import Packed, failure, harm_at, has_obstacle, pack, state_width
 from ethbrake_marl.physics.episode import first_decision_s, number_of_decisions
-from ethbrake_marl.physics.failed import failure
-from ethbrake_marl.physics.rows import Packed, harm_at, has_obstacle, pack, state_width
-from ethbrake_marl.physics.segment import DONE
+from ethbrake_marl.physics.kernel import DONE
 from ethbrake_marl.physics.worlds import read_only
 from ethbrake_marl.scenario import Scenario
 

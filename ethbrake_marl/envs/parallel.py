@@ -8,26 +8,59 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
+from ethbrake_marl.actions import checked_action
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.envs.drawing.viewer import CLASS_METADATA, Viewer, render_metadata
-from ethbrake_marl.envs.drawn import describe_world
-from ethbrake_marl.envs.infos import Report, plain_infos, report
-from ethbrake_marl.envs.setup import (
+from ethbrake_marl.envs.common import (
     AnyScenario,
+    Report,
     action_box,
+    describe_world,
     feature_box,
     fresh_seed,
     learner_columns,
     make_engine,
+    plain_infos,
+    report,
     restart,
 )
-from ethbrake_marl.envs.turns import in_turns
+from ethbrake_marl.envs.drawing.viewer import CLASS_METADATA, Viewer, render_metadata
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
-from ethbrake_marl.observations import Observation, Observations
-from ethbrake_marl.observations.state import full_state, state_features
+from ethbrake_marl.observations import Observation, Observations, full_state, state_features
 from ethbrake_marl.physics import Ints
 from ethbrake_marl.rewards import Reward
+
+# PettingZoo's interface with agents acting in turn (AEC), around a parallel one.
+
+
+class InTurns(parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
+    """As PettingZoo's, but an unusable action is refused in its agent's own turn, which stays: nothing is lost."""
+
+    def step(self, action: Any) -> None:
+        """Take the action of ``agent_selection``; the last one's advances all by one step.
+
+        Raises ``InvalidInput`` for an unusable action of a learner, and for any but None once its episode is over.
+        """
+        agent, engine = self.agent_selection, self.env.unwrapped.engine
+        assert isinstance(engine, Engine)
+        if self.terminations[agent] or self.truncations[agent]:
+            if action is not None:
+                raise InvalidInput(f"step: the episode of {agent} is over; only None may follow, or reset")
+        elif engine.scenario.vehicle_names.index(agent) in engine.learners:
+            left_out = action is None and agent in getattr(self.env, "shielded", ())  # a shield may choose alone
+            if not left_out:
+                checked_action(action, (1,), agent)
+        super().step(action)
+
+
+def in_turns(
+    env: ParallelEnv[str, Observations, NDArray[Any]],
+) -> AECEnv[str, Observations, NDArray[Any]]:
+    """The AEC environment of a parallel one of this package, whatever wraps it; order is enforced."""
+    return OrderEnforcingWrapper(InTurns(env))
+
 
 Infos = dict[str, dict[str, Any]]
 WhoIsAgent = Literal["all", "learners"]

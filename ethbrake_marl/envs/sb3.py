@@ -14,24 +14,24 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.snapshot import Arrays, engine_snapshot, restore_engine
 from ethbrake_marl.engine.step import Step
-from ethbrake_marl.envs.drawn import describe_worlds
-from ethbrake_marl.envs.infos import plain_infos, report
-from ethbrake_marl.envs.setup import (
+from ethbrake_marl.envs.common import (
     INITIAL_STATE,
     AnyScenario,
     action_box,
     check_seed,
+    describe_worlds,
     feature_box,
     fresh_seed,
     make_engine,
+    plain_infos,
+    report,
     restart_from,
     warn_of_unknown,
 )
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Observation, Observations
-from ethbrake_marl.observations.state import Appended, full_state, row_features
+from ethbrake_marl.observations import Appended, Observation, Observations, full_state, row_features
 from ethbrake_marl.physics import Bools, Ints, Worlds, concatenate
-from ethbrake_marl.physics.rows import Packed, unpack
+from ethbrake_marl.physics.advance import Packed, unpack
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import initial_state_worlds
 

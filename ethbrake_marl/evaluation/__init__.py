@@ -3,23 +3,23 @@
 ``figures``, ``trajectories`` and ``report`` load matplotlib and Jinja2; import those modules where they are used.
 """
 
-from ethbrake_marl.evaluation.conditions import parameter_line, parameters
-from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
-from ethbrake_marl.evaluation.per_world import check_target, write_per_world_csv
-from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
+from ethbrake_marl.evaluation.episodes import EpisodeRecord, record_episode
+from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome, parameter_line, parameters
+from ethbrake_marl.evaluation.results import check_target, write_per_world_csv
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import Estimate
-from ethbrake_marl.evaluation.table import (
+from ethbrake_marl.evaluation.summary import (
     Rescored,
     SummaryRow,
     SummaryTable,
     declared_objectives,
     horizon_note,
+    markdown_table,
     rescore,
     rescored_table,
+    rich_table,
     summarise,
 )
-from ethbrake_marl.evaluation.text import markdown_table, rich_table
 
 __all__ = [
     "EpisodeRecord",

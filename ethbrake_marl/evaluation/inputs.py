@@ -3,24 +3,253 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+import hashlib
+import json
+import platform
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from importlib.metadata import version
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.registry import make_agent, make_single_agent
+from ethbrake_marl.agents.policy import LearnedAgent, PolicyAgent
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Driver, Team, team_of
+from ethbrake_marl.agents.registry import make_agent, make_single_agent, parse_spec
 from ethbrake_marl.agents.rollout import script_agents, set_others
-from ethbrake_marl.agents.spelling import parse_spec
-from ethbrake_marl.agents.team import Driver, Team, team_of
-from ethbrake_marl.defaults import EPISODES, LIST_SEED, HarmCount
+from ethbrake_marl.defaults import EPISODES, LIST_SEED, MOST_NAMED_WORLDS, HarmCount
 from ethbrake_marl.engine.stream import ask_script, begin_script
 from ethbrake_marl.errors import InvalidInput, check_one_learner, naming_agent
-from ethbrake_marl.evaluation.named_worlds import read_named_worlds
-from ethbrake_marl.files.overrides import Override, changed_parts
-from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml
+from ethbrake_marl.files.plugins import files_run
+from ethbrake_marl.files.yaml import Override, changed_parts, flow_text
+from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.policies.bundle import Policy
+from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml, worlds_from_table
+from ethbrake_marl.scenario.quantities import QUANTITIES, quantity_columns
 from ethbrake_marl.shield.uncertainty import Uncertainty
+
+# The identity of a result: the worlds, the scenario and the policies that it is about, and what computed it.
+#
+# Two results can be compared where worlds and scenario have the same hashes. Versions are told, and no reason to
+# refuse.
+
+Kind = Literal[
+    "evaluate",
+    "evaluate-shards",
+    "shield",
+    "best-harm",
+    "ablate",
+    "generalise",
+    "learning-curves",
+    "robustness",
+]
+_PACKAGES = ("ethbrake-marl", "numba", "numpy")
+_WORDS = {"name", "title", "description", "source"}  # what a scenario is called changes nothing
+_BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that takes no memory
+
+
+def worlds_sha256(worlds: Worlds, index: Ints) -> str:
+    """SHA-256 of a list of worlds: of every array (little-endian, by name) and the worlds' numbers in the list."""
+    return _arrays_sha256({"index": index, **_arrays(worlds)})
+
+
+def content_sha256(*parts: Any) -> str:
+    """SHA-256 of every array of some dataclasses, one after the other."""
+    return _arrays_sha256(
+        {f"{k} {name}": array for k, part in enumerate(parts) for name, array in _arrays(part).items()}
+    )
+
+
+def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for name, array in arrays.items():
+        digest.update(f"{name} {array.dtype.kind} {array.shape}\n".encode())
+        for first in range(0, len(array), _BLOCK):
+            part = array[first : first + _BLOCK]
+            digest.update(np.ascontiguousarray(part, part.dtype.newbyteorder("<")).tobytes())
+    return digest.hexdigest()
+
+
+def _arrays(value: Any) -> dict[str, np.ndarray]:
+    """The arrays of a dataclass and of those inside it, by name; not one without columns: messages that none sends."""
+    found: dict[str, np.ndarray] = {}
+    for field in fields(value):
+        part = getattr(value, field.name)
+        found |= _arrays(part) if is_dataclass(part) else {} if part.shape[1:] == (0,) else {field.name: part}
+    return found
+
+
+def scenario_sha256(scenario: Scenario) -> str:
+    """SHA-256 of all that shapes an episode: every value of the scenario, defaults too, but neither name nor texts."""
+    content = scenario.content(without=_WORDS)
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def driving_policy(agent: object) -> object:
+    """What is inside everything that is around an agent: the policy that it drives by, or the agent itself."""
+    while isinstance(agent, AgentAround | LearnedAgent):
+        agent = agent.policy
+    return agent
+
+
+def policy_sha256(agent: object) -> str | None:
+    """The hash of the policy that an agent drives by, inside whatever is around it; None without one.
+
+    Of a bundle it is that in its manifest, which binds names, network and weights (``Manifest.manifest_sha256``); of
+    another library's, that of its weights (``agents.foreign.weights_sha256``).
+    """
+    agent = driving_policy(agent)
+    if isinstance(agent, PolicyAgent):
+        return agent.weights_sha256()
+    return agent.manifest.manifest_sha256 if isinstance(agent, Policy) else None
+
+
+def result_versions() -> dict[str, str]:
+    """Name -> version of Python and of every package that a result's numbers depend on.
+
+    Of the user's own files that this process ran (plug-ins, agents) the SHA-256 is told in its place.
+    """
+    versions = {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
+    return versions | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
+
+
+def identity_line(scenario: Scenario, sample: Sample) -> str:
+    """One line for results that are a text: the hashes of worlds and scenario, and versions."""
+    worlds, versions = worlds_sha256(sample.worlds, sample.index), result_versions()
+    told = ", ".join(f"{name} {number}" for name, number in versions.items())
+    return f"Worlds: SHA-256 {worlds}; scenario: SHA-256 {scenario_sha256(scenario)}; {told}."
+
+
+def policies_by_name(policies: Mapping[int, str], scenario: Scenario) -> dict[str, str]:
+    """Vehicle's name -> SHA-256 of its policy, from that by index."""
+    return {scenario.vehicle_names[vehicle]: sha256 for vehicle, sha256 in policies.items()}
+
+
+def result_identity(
+    kind: Kind, scenario: Scenario, sample: Sample | None, left_out: Collection[int] = ()
+) -> dict[str, Any]:
+    """What a results file of this kind says of itself: ``kind``, hashes of worlds and scenario, ``versions``.
+
+    ``left_out`` are rows of the sample that no figure counts. Without a sample nothing is said of worlds: they differ
+    inside the file, which says it there.
+    """
+    found: dict[str, Any] = {"kind": kind, "scenario_sha256": scenario_sha256(scenario), "versions": result_versions()}
+    if sample is not None:
+        worlds, index = sample.worlds, sample.index
+        if left_out:
+            rows = np.setdiff1d(np.arange(worlds.n), list(left_out))
+            worlds, index = worlds.take(rows), index[rows]
+        found["worlds_sha256"] = worlds_sha256(worlds, index)
+    return found
+
+
+# Files of named worlds: what a search has found, to be driven again for ever.
+#
+# A file says which scenario its worlds are of, by its content, what drove there, and what that was measured to be.
+
+FORMAT: Literal["ethbrake-worlds"] = "ethbrake-worlds"
+VERSION = 1
+SIZE_LIMIT = 8 << 20  # bytes of it: so many worlds of a long line
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+
+class NamedWorld(_Strict):
+    """One world: its name, its initial state by the columns of a table, and what was measured there (m2/s2)."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
+    score: Number
+    harm: Number
+    reference: Number | None = None
+    state: Annotated[dict[str, Number], Field(min_length=1, max_length=1000)]
+
+
+class NamedWorlds(_Strict):
+    """A file of named worlds."""
+
+    format: Literal["ethbrake-worlds"]
+    version: Annotated[int, Field(ge=VERSION, le=VERSION)]  # a literal would take true and 1.0, which equal 1
+    scenario: str
+    scenario_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    settings: list[str] = []  # what was set beside the scenario's name, as ``--set`` takes it
+    agent: str
+    measure: Literal["harm", "regret", "difference", "bound"]
+    against: str | None = None
+    harm_count: HarmCount
+    found_by: str  # the command
+    worlds: Annotated[list[NamedWorld], Field(min_length=1, max_length=MOST_NAMED_WORLDS)]
+
+    def worlds_of(self, scenario: Scenario, where: str) -> Worlds:
+        """The worlds at the alert; raises ``InvalidInput`` for another scenario than theirs."""
+        if scenario_sha256(scenario) != self.scenario_sha256:
+            raise InvalidInput(
+                f"{where}: its worlds were found in scenario {self.scenario!r}"
+                f"{''.join(f' with --set {each}' for each in self.settings)}, which {scenario.name!r} is not, or is no"
+                " longer: their contents differ; use that scenario, or search again (ethbrake falsify)"
+            )
+        columns = self.worlds[0].state.keys()
+        for k, world in enumerate(self.worlds):
+            if world.state.keys() != columns:
+                raise InvalidInput(f"{where}: worlds[{k}].state has other columns than worlds[0]; all need the same")
+        return worlds_from_table({name: [world.state[name] for world in self.worlds] for name in columns}, scenario)
+
+
+def read_named_worlds(path: str | Path) -> NamedWorlds:
+    """Read a file of named worlds; raises ``InvalidInput`` naming file, line and key."""
+    document = read_yaml(path, SIZE_LIMIT)
+    try:
+        found = NamedWorlds.model_validate(document.content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = tuple(first["loc"])
+        line = document.line_of(place) or document.line_of(place[:-1])
+        key = ".".join(map(str, place)) or "the file"
+        raise InvalidInput(f"{path}{f', line {line}' if line else ''}: {key}: {first['msg']}") from None
+    names = [world.name for world in found.worlds]
+    if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
+        raise InvalidInput(f"{path}: world {twice!r} is given twice; names must differ")
+    return found
+
+
+def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float]]:
+    """The initial state of each world: the columns that the scenario does not fix, and gaps and speeds."""
+    columns = {name: values for name, values in quantity_columns(worlds).items() if _needed(name, values, scenario)}
+    return [{name: float(values[k]) for name, values in columns.items()} for k in range(worlds.n)]
+
+
+def _needed(column: str, values: Floats, scenario: Scenario) -> bool:
+    if column.startswith(("gap_", "speed_")) and not column.startswith("speed_limit"):
+        return True
+    return column not in _fixed_columns(scenario)
+
+
+def _fixed_columns(scenario: Scenario) -> set[str]:
+    """Columns whose value the scenario fixes for every world."""
+    return {
+        rule.column_of(i)
+        for key, rule in QUANTITIES.items()
+        for i, (low, high) in enumerate(scenario.bounds(key))
+        if low == high
+    }
+
+
+def named_worlds_text(found: NamedWorlds) -> str:
+    """The file's text; reading it back gives the same worlds to the bit."""
+    head = found.model_dump(exclude={"worlds"}, exclude_none=True)
+    lines = [f"{key}: {flow_text(value)}" for key, value in head.items() if value != []]
+    lines.append("worlds:")
+    for world in found.worlds:
+        kept: Mapping[str, object] = world.model_dump(exclude_none=True)
+        entries: Sequence[str] = [f"{key}: {flow_text(value)}" for key, value in kept.items()]
+        lines += [f"  - {entries[0]}", *(f"    {entry}" for entry in entries[1:])]
+    return "\n".join(lines) + "\n"
+
 
 PROGRESS_EVERY = 2_500  # worlds between two signs of life
 TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only checked

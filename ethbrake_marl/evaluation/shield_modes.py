@@ -10,16 +10,16 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from ethbrake_marl.agents.protocol import Driver, Team, team_of
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.agents.team import Driver, Team, team_of
 from ethbrake_marl.errors import renumbered
-from ethbrake_marl.evaluation.identity import policies_by_name, policy_sha256, result_identity
+from ethbrake_marl.evaluation.inputs import policies_by_name, policy_sha256, result_identity
 from ethbrake_marl.evaluation.rollout import OnWorlds
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
 from ethbrake_marl.physics import Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Sample, Task
 from ethbrake_marl.shield import HybridAgent, ShieldedTeam, StepShieldAgent
-from ethbrake_marl.shield.behind import Shielded, drive_behind, join, put_shield
+from ethbrake_marl.shield.agents import Shielded, drive_behind, join, put_shield
 from ethbrake_marl.shield.review import SAME_HARM, VERDICTS, review
 
 NONE, EPISODE, STEP = "none", "episode", "step"

@@ -16,7 +16,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from ethbrake_marl.envs.drawing.scene import COLOURS as COLOURS  # one palette for figures and frames
 from ethbrake_marl.errors import plain_text
-from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.evaluation.results import write_output
 from ethbrake_marl.figures import picture_ending
 
 # Markers and dashes repeat the distinction of the colours.

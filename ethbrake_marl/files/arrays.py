@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.files.plain import parse_strict_json
+from ethbrake_marl.files.store import parse_strict_json
 
 HEADER_LIMIT_BYTES = 1 << 20  # of a safetensors file
 _NPY_HEADER_LIMIT_BYTES = 4096

@@ -17,7 +17,7 @@ from types import ModuleType
 from typing import Any
 
 from ethbrake_marl.errors import InvalidInput, describe_error, unknown_name
-from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.store import read_plain
 
 GROUP = "ethbrake_marl.plugins"  # of entry points
 _LIMIT_BYTES = 1 << 20

@@ -23,17 +23,14 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.modules import MultiAgentMLP
 
-from ethbrake_marl.envs.setup import feature_box, make_engine, resolve_scenario
+from ethbrake_marl.envs.common import feature_box, make_engine, resolve_scenario
 from ethbrake_marl.learning.algorithms.ppo import PpoRecipe
-from ethbrake_marl.learning.model_state import own_random_state
-from ethbrake_marl.learning.run_folder import create_run, write_status
+from ethbrake_marl.learning.progress import own_random_state
 from ethbrake_marl.learning.team_file import team_content
-from ethbrake_marl.learning.training import resolve
-from ethbrake_marl.observations import observation_for
-from ethbrake_marl.observations.state import full_state, state_features
-from ethbrake_marl.policies.actor import Float32s
-from ethbrake_marl.policies.manifest import NetworkSpec, installed_versions, observation_schema
-from ethbrake_marl.policies.policy import Policy, make_policy, save_policy
+from ethbrake_marl.learning.training import create_run, resolve, write_status
+from ethbrake_marl.observations import full_state, observation_for, state_features
+from ethbrake_marl.policies.actor import Float32s, NetworkSpec, installed_versions, observation_schema
+from ethbrake_marl.policies.bundle import Policy, make_policy, save_policy
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario
 

@@ -6,27 +6,144 @@ without objects, so reading one runs no code from it.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import safetensors.numpy
+import torch
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
+from typing_extensions import TypedDict
 
 from ethbrake_marl.engine.snapshot import Arrays
 from ethbrake_marl.errors import CorruptBundle, EthBrakeError
-from ethbrake_marl.files.arrays import map_npy, safetensors_headers
-from ethbrake_marl.files.durable import new_folder, remove_folder, write_file
-from ethbrake_marl.files.plain import open_plain, read_plain
-from ethbrake_marl.learning.checkpoint_schema import Listing, Numbers, check_json
-from ethbrake_marl.learning.run_log import parse_progress
-from ethbrake_marl.policies.team import Trained, read_trained, save_trained
+from ethbrake_marl.files.arrays import ArrayHeader, ArrayRow, check_arrays, map_npy, safetensors_headers
+from ethbrake_marl.files.store import new_folder, open_plain, parse_strict_json, read_plain, remove_folder, write_file
+from ethbrake_marl.files.yaml import first_mistake
+from ethbrake_marl.learning.algorithms.protocol import Algorithm
+from ethbrake_marl.learning.loop import EPISODE_COLUMNS
+from ethbrake_marl.learning.progress import REPLAY, Model, parse_progress
+from ethbrake_marl.policies.actor import Sha256
+from ethbrake_marl.policies.bundle import Policy, Trained, drivers_of, read_trained, save_trained
+
+# The schema of a checkpoint's JSON files: their keys, types and bounds.
+
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+Number = Annotated[int | float, Field(ge=-1e300, le=1e300)]
+Seconds = Annotated[float, Field(strict=False, ge=0.0, allow_inf_nan=False)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+
+class _ListedFile(_Part):
+    bytes: Count
+    sha256: Sha256
+
+
+class Listing(_Part):
+    """``checkpoint.json``: every other file of the checkpoint, and from where and when it is."""
+
+    format: Literal["ethbrake-checkpoint"]
+    format_version: Literal[1]
+    steps: Count
+    updates: Count
+    versions: dict[str, str]
+    files: dict[str, _ListedFile]
+
+
+# The names of Stable-Baselines3's own counters begin with an underscore.
+class _Counters(TypedDict):
+    num_timesteps: Count
+    _n_updates: Count
+    _episode_num: Count
+    _current_progress_remaining: Number
+    _total_timesteps: Count
+
+
+_Counters.__pydantic_config__ = ConfigDict(strict=True, extra="forbid")  # type: ignore[attr-defined]
+
+
+class _Words(_Part):
+    state: Annotated[int, Field(ge=0, lt=2**128)]
+    inc: Annotated[int, Field(ge=0, lt=2**128)]
+
+
+class _ActionGenerator(_Part):
+    bit_generator: Literal["PCG64"]
+    state: _Words
+    has_uint32: Literal[0, 1]
+    uinteger: Annotated[int, Field(ge=0, lt=2**32)]
+
+
+class _Generators(_Part):
+    numpy: tuple[Annotated[int, Field(ge=0, le=624)], Literal[0, 1], Number]
+    python: tuple[Literal[3], Number | None]
+    actions: _ActionGenerator
+
+
+class _Replay(_Part):
+    pos: Count | None = None
+    full: bool | None = None
+
+
+def _check_place(evaluation: dict[str, Number]) -> dict[str, Number]:
+    for key in ("steps", "updates"):
+        if not isinstance(evaluation.get(key), int):
+            raise ValueError(f"{key} is missing or no whole number")
+    return evaluation
+
+
+class _Course(_Part):
+    evaluations: list[Annotated[dict[str, Number], AfterValidator(_check_place)]]
+    alarms: list[str]
+    best_harm: Number | None
+    wall_s: Seconds
+
+
+def _every_column(ended: dict[str, list[Number]]) -> dict[str, list[Number]]:
+    if ended.keys() != EPISODE_COLUMNS.keys():
+        raise ValueError(f"the columns must be {', '.join(EPISODE_COLUMNS)}")
+    return ended
+
+
+class _Between(_Part):
+    updates: Count
+    ended: Annotated[dict[str, list[Number]], AfterValidator(_every_column)]
+    course: _Course
+
+
+class Numbers(_Part):
+    """``state.json``: what ``capture_model``, ``BetweenUpdates.state`` and the session keep of a training."""
+
+    training: Sha256  # which one, see ``Training.identity``
+    counters: _Counters
+    learning_rates: dict[str, Annotated[float, Field(strict=False, ge=0.0, le=1.0)]]
+    random: _Generators
+    log: dict[str, tuple[Number, Count, list[str]]]
+    between: _Between
+    replay: _Replay
+    events: dict[str, Count]
+
+
+def check_json(schema: type[Listing | Numbers], data: bytes) -> dict[str, Any]:
+    """The content of a JSON file of a checkpoint; raises ``ValueError``, in one line, unless ``schema`` fits it."""
+    content: dict[str, Any] = parse_strict_json(data)
+    try:
+        schema.model_validate_json(data)
+    except ValidationError as error:
+        raise ValueError(str(first_mistake(error))) from None
+    return content
+
 
 FORMAT_VERSION = 1
 LISTING = "checkpoint.json"
@@ -203,3 +320,155 @@ def _write_array(path: Path, array: NDArray[Any]) -> None:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# The check that a checkpoint belongs to a model: arrays, counters and policies as this model would write them.
+#
+# A listing whose hashes agree says that a checkpoint was not damaged, not that it is of this training.
+
+_ENGINE = "environment.engine."
+_SCRIPT = f"{_ENGINE}script."
+_MAY_BE_INFINITE = (f"{_ENGINE}state", f"{_ENGINE}params")  # no obstacle; news that never comes
+_STREAM = f"{_ENGINE}stream"
+_DRAWN_LIMIT = 1 << 53  # worlds
+
+
+def check_fits(folder: Path, state: TrainingState, model: Model, algorithm: Algorithm, policy: Trained) -> None:
+    """Raise ``CorruptBundle`` unless ``state`` is one of this freshly built ``model``, whose policy is ``policy``.
+
+    ``folder`` is where the checkpoints stand, for the message.
+
+    Resets the model's environment, which the state is going to replace.
+    """
+    try:
+        _check_arrays(state.arrays, model, algorithm)
+        _check_generators(state.arrays)
+        _check_numbers(state, tuple(algorithm.optimizers(model)))
+        _check_replay(state, model)
+        for name, trained in (("policy", state.policy), ("best", state.best)):
+            if trained is not None:
+                _check_policy(name, trained, policy)
+    except ValueError as error:
+        raise CorruptBundle(
+            f"{folder}: the checkpoint of step {state.steps} is not of this training: {error}; delete it to go on from"
+            " the one before"
+        ) from None
+
+
+def _check_arrays(arrays: Arrays, model: Model, algorithm: Algorithm) -> None:
+    environment: Any = model.env
+    environment.reset()
+    rows = [_row(f"policy.{name}", tensor.numpy()) for name, tensor in model.policy.state_dict().items()]
+    rows += [_row(name, tensor.numpy()) for name, tensor in algorithm.learned_beside(model).items()]
+    for name, optimizer in algorithm.optimizers(model).items():
+        rows += _optimizer_rows(f"optimizer.{name}.", optimizer, arrays)
+    fresh: Arrays = {f"environment.{name}": array for name, array in environment.snapshot().items()}
+    rows += [_environment_row(name, array) for name, array in fresh.items()]
+    last = np.empty((environment.num_envs, *environment.observation_space.shape), np.float32)
+    rows += [
+        _row("last.observations", last),
+        _row("last.episode_starts", np.empty(environment.num_envs, np.bool_)),
+        ArrayRow("random.torch", "|u1", torch.get_rng_state().numpy().shape),
+        ArrayRow("random.numpy", "<u4", (624,)),
+        ArrayRow("random.python", "<u8", (625,)),
+        ArrayRow("episodes.return", "<f8", ("episodes",)),
+        ArrayRow("episodes.steps", "<i8", ("episodes",)),
+    ]
+    check_arrays(_headers(arrays), rows)
+    (seed, drawn), (right, _) = arrays[_STREAM].tolist(), fresh[_STREAM].tolist()
+    if seed != right or drawn > _DRAWN_LIMIT:
+        raise ValueError(f"array {_STREAM!r} is [{seed}, {drawn}]; must be [{right}, worlds drawn so far]")
+    for name in sorted(arrays):
+        if not name.startswith(_SCRIPT) and arrays[name].dtype.kind == "f":
+            wrong = np.isnan(arrays[name]) if name in _MAY_BE_INFINITE else ~np.isfinite(arrays[name])
+            if wrong.any():
+                raise ValueError(f"array {name!r} holds a number that is not finite")
+
+
+def _optimizer_rows(prefix: str, optimizer: torch.optim.Optimizer, arrays: Arrays) -> Iterator[ArrayRow]:
+    """What this optimiser keeps of each parameter that has had a gradient, shown by one step of a copy of it."""
+    shown = copy.deepcopy(optimizer)  # its hooks are not copied
+    for parameter in shown.param_groups[0]["params"]:
+        parameter.grad = torch.zeros_like(parameter)
+    shown.step()
+    had = {name.removeprefix(prefix).partition(".")[0] for name in arrays if name.startswith(prefix)}
+    for index, kept in shown.state_dict()["state"].items():
+        if str(index) in had:
+            yield from (_row(f"{prefix}{index}.{key}", torch.as_tensor(value).numpy()) for key, value in kept.items())
+
+
+def _environment_row(name: str, array: NDArray[Any]) -> ArrayRow:
+    """The environment's arrays are known to the last axis, a script's memory only where it does not depend on worlds.
+
+    What a script keeps of a plan has as many columns as its longest plan.
+    """
+    if not name.startswith(_SCRIPT):
+        return _row(name, array)
+    record = name.rpartition(".")[0]
+    return ArrayRow(name, array.dtype.str, (*array.shape[:1], *(f"axis {k} of {record}" for k in range(1, array.ndim))))
+
+
+def _check_generators(arrays: Arrays) -> None:
+    numbers = arrays["random.python"]
+    if not ((numbers < 2**32).all() and numbers[-1] <= 624):
+        raise ValueError("array 'random.python' is no state of Python's generator")
+    try:
+        torch.Generator().set_state(torch.from_numpy(arrays["random.torch"].copy()))
+    except RuntimeError as error:
+        raise ValueError(f"array 'random.torch' is no state of torch's generator ({error})") from None
+
+
+def _check_numbers(state: TrainingState, optimizers: tuple[str, ...]) -> None:
+    """The counters agree with each other, and there is a learning rate for every optimiser."""
+    counters = state.numbers["counters"]
+    if counters["num_timesteps"] != state.steps or state.numbers["between"]["updates"] != state.updates:
+        raise ValueError("state.json: steps or updates are not those of the listing")
+    if counters["_total_timesteps"] < counters["num_timesteps"]:
+        raise ValueError("state.json: counters._total_timesteps is below the steps done")
+    if state.numbers["learning_rates"].keys() != set(optimizers):
+        raise ValueError(f"state.json: learning_rates must be of {', '.join(optimizers)}")
+
+
+def _check_replay(state: TrainingState, model: Model) -> None:
+    memory: Any = getattr(model, "replay_buffer", None)
+    place = state.numbers["replay"]
+    if memory is None:
+        if state.replay or place:
+            raise ValueError("it has a replay memory, and this algorithm has none")
+        return
+    rows = [ArrayRow(name, array.dtype.str, ("filled", *array.shape[1:])) for name, array in _replay_of(memory)]
+    filled = check_arrays(_headers(state.replay), rows)["filled"]
+    position = place.get("pos"), place.get("full")
+    if filled > memory.buffer_size or position not in ((filled, False), *_full_at(memory.buffer_size, filled, place)):
+        raise ValueError(f"state.json: replay = {place}: does not go with a memory of {filled} entries")
+
+
+def _full_at(size: int, filled: int, place: Mapping[str, Any]) -> list[tuple[Any, bool]]:
+    """Where a full memory may go on: anywhere in it."""
+    position = place.get("pos")
+    return [(position, True)] if filled == size and position is not None and position < size else []
+
+
+def _replay_of(memory: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    for name in REPLAY:
+        yield name, getattr(memory, name)
+
+
+def _check_policy(name: str, trained: Trained, policy: Trained) -> None:
+    learners = policy.manifest.learners if isinstance(policy, Policy) else tuple(policy.members)
+    right, found = drivers_of(policy, learners), drivers_of(trained, learners)
+    same = found.keys() == right.keys() and all(
+        (found[each].manifest.network, found[each].manifest.observation, found[each].manifest.learners)
+        == (right[each].manifest.network, right[each].manifest.observation, right[each].manifest.learners)
+        for each in right
+    )
+    if type(trained) is not type(policy) or not same:
+        raise ValueError(f"{name}: is not a policy of these learners and this network")
+
+
+def _row(name: str, array: NDArray[Any]) -> ArrayRow:
+    return ArrayRow(name, array.dtype.str, array.shape)
+
+
+def _headers(arrays: Arrays) -> dict[str, ArrayHeader]:
+    return {name: ArrayHeader(array.dtype.str, array.shape) for name, array in arrays.items()}

@@ -10,17 +10,19 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.agents.team import Driver, Team
+from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.agents.protocol import Driver, Team
+from ethbrake_marl.errors import OnProgress, Progress
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.harm import objective_harm
 from ethbrake_marl.learning.algorithms.protocol import Algorithm
-from ethbrake_marl.learning.model_state import Model
 from ethbrake_marl.learning.progress import (
     AT_HORIZON,
     OBJECTIVE,
     RETURN,
     Course,
+    Model,
     check_losses,
     check_rollout,
     check_step,
@@ -28,10 +30,7 @@ from ethbrake_marl.learning.progress import (
 )
 from ethbrake_marl.learning.recipe import TrainingRecipe
 from ethbrake_marl.learning.training import Training
-from ethbrake_marl.objectives import objective_harm
-from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.policies.team import Trained
-from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.policies.bundle import Policy, Trained
 from ethbrake_marl.rewards import resolved_objective
 from ethbrake_marl.scenario import Scenario
 

@@ -2,21 +2,198 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
+import os
+import random
+import re
 import time
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Space
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import KVWriter, filter_excluded_keys
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from tensorboard.compat.proto.event_pb2 import Event
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.record_writer import RecordWriter
 
+from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.engine.snapshot import Arrays
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.files.store import write_file
 from ethbrake_marl.learning.algorithms.protocol import Algorithm
-from ethbrake_marl.learning.model_state import Model
-from ethbrake_marl.policies.team import Trained
+from ethbrake_marl.policies.bundle import Trained
+
+# The random generators that a training uses: kept apart from the caller's, written down, and brought back.
+
+
+@contextmanager
+def own_random_state() -> Iterator[None]:
+    """Stable-Baselines3 seeds and uses the global generators: give them back as they were. One torch thread.
+
+    A second thread makes a network this small 3 to 15 times slower as soon as another process wants a core.
+    """
+    states = random.getstate(), np.random.get_state(), torch.get_rng_state(), torch.get_num_threads()  # noqa: NPY002
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        torch.set_rng_state(states[2])
+        torch.set_num_threads(states[3])
+
+
+def capture_random(actions: Space[Any]) -> tuple[Arrays, dict[str, Any]]:
+    """States of Python's, numpy's and torch's global generators, and of the generator of random actions.
+
+    The arrays are named ``random.*``; the rest is plain JSON.
+    """
+    numpy_state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
+    version, numbers, gauss = random.getstate()
+    arrays: Arrays = {
+        "random.torch": torch.get_rng_state().numpy().copy(),
+        "random.numpy": np.array(numpy_state["state"]["key"], np.uint32),
+        "random.python": np.array(numbers, np.uint64),
+    }
+    plain = {
+        "numpy": [int(numpy_state["state"]["pos"]), int(numpy_state["has_gauss"]), float(numpy_state["gauss"])],
+        "python": [version, gauss],
+        "actions": actions.np_random.bit_generator.state,
+    }
+    return arrays, plain
+
+
+def restore_random(actions: Space[Any], arrays: Mapping[str, NDArray[Any]], plain: Mapping[str, Any]) -> None:
+    """Bring the generators to the state of ``capture_random``."""
+    position, has_gauss, cached = plain["numpy"]
+    np.random.set_state(("MT19937", arrays["random.numpy"], position, has_gauss, cached))  # noqa: NPY002
+    version, gauss = plain["python"]
+    random.setstate((version, tuple(int(number) for number in arrays["random.python"]), gauss))
+    torch.set_rng_state(torch.from_numpy(arrays["random.torch"].copy()))
+    actions.np_random.bit_generator.state = plain["actions"]
+
+
+Model = BaseAlgorithm  # of Stable-Baselines3
+
+REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "_total_timesteps")
+
+
+def capture_model(model: Model, algorithm: Algorithm) -> tuple[Arrays, dict[str, Any]]:
+    """Weights, optimisers, environment, random generators and counters between two updates, replay memory aside."""
+    arrays: Arrays = {f"policy.{name}": _copy(tensor) for name, tensor in model.policy.state_dict().items()}
+    arrays |= {name: _copy(tensor) for name, tensor in algorithm.learned_beside(model).items()}
+    rates: dict[str, float] = {}
+    for name, optimizer in algorithm.optimizers(model).items():
+        content = optimizer.state_dict()
+        rates[name] = float(content["param_groups"][0]["lr"])
+        for index, entries in content["state"].items():
+            arrays |= {f"optimizer.{name}.{index}.{key}": _copy(value) for key, value in entries.items()}
+    environment: Any = model.env
+    arrays |= {f"environment.{name}": array for name, array in environment.snapshot().items()}
+    generators, random_plain = capture_random(model.action_space)
+    observations: Any = model._last_obs
+    episodes = list(model.ep_info_buffer or ())
+    arrays |= generators | {
+        "last.observations": observations.copy(),
+        "last.episode_starts": np.array(model._last_episode_starts, np.bool_),
+        "episodes.return": np.array([episode["r"] for episode in episodes], np.float64),
+        "episodes.steps": np.array([episode["l"] for episode in episodes], np.int64),
+    }
+    counters = {name: getattr(model, name) for name in _COUNTERS}
+    return arrays, {"counters": counters, "learning_rates": rates, "random": random_plain, "log": _pending_log(model)}
+
+
+def restore_model(
+    model: Model, algorithm: Algorithm, arrays: Mapping[str, NDArray[Any]], plain: Mapping[str, Any]
+) -> None:
+    """Bring a freshly built model of the same recipe to the state of ``capture_model``."""
+    model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in _group(arrays, "policy.").items()})
+    for name, tensor in algorithm.learned_beside(model).items():
+        tensor.data.copy_(torch.from_numpy(arrays[name]))
+    for name, optimizer in algorithm.optimizers(model).items():
+        _restore_optimizer(optimizer, _group(arrays, f"optimizer.{name}."), plain["learning_rates"][name])
+    environment: Any = model.env
+    environment.restore(_group(arrays, "environment."))
+    for name in _COUNTERS:
+        setattr(model, name, plain["counters"][name])
+    model._last_obs = arrays["last.observations"].copy()
+    model._last_episode_starts = arrays["last.episode_starts"].copy()
+    model.ep_info_buffer, model.ep_success_buffer = _deques(model)
+    for gained, steps in zip(arrays["episodes.return"].tolist(), arrays["episodes.steps"].tolist(), strict=True):
+        model.ep_info_buffer.append({"r": gained, "l": steps, "t": 0.0})
+    restore_random(model.action_space, arrays, plain["random"])
+
+
+def restore_log(model: Model, plain: Mapping[str, Any]) -> None:
+    """Give the model's logger what was recorded and not yet written."""
+    for name, (value, count, excluded) in plain["log"].items():
+        model.logger.name_to_value[name] = value
+        model.logger.name_to_count[name] = count
+        model.logger.name_to_excluded[name] = tuple(excluded)
+
+
+def replay_arrays(model: Model) -> tuple[Arrays, dict[str, Any]]:
+    """The filled part of the replay memory, as views, and where it goes on; nothing without one (PPO)."""
+    memory: Any = getattr(model, "replay_buffer", None)
+    if memory is None:
+        return {}, {}
+    return {name: getattr(memory, name)[: memory.size()] for name in REPLAY}, {"pos": memory.pos, "full": memory.full}
+
+
+def restore_replay(model: Model, arrays: Mapping[str, NDArray[Any]], plain: Mapping[str, Any]) -> None:
+    """Fill the replay memory of a fresh model."""
+    memory: Any = getattr(model, "replay_buffer", None)
+    if memory is None:
+        return
+    for name in REPLAY:
+        getattr(memory, name)[: len(arrays[name])] = arrays[name]
+    memory.pos, memory.full = plain["pos"], plain["full"]
+
+
+def _restore_optimizer(optimizer: torch.optim.Optimizer, arrays: Arrays, rate: float) -> None:
+    content = optimizer.state_dict()
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, array in arrays.items():
+        index, key = name.split(".")
+        state.setdefault(int(index), {})[key] = torch.from_numpy(array.copy())
+    for group in content["param_groups"]:
+        group["lr"] = rate
+    optimizer.load_state_dict({"state": state, "param_groups": content["param_groups"]})
+
+
+def _pending_log(model: Model) -> dict[str, Any]:
+    log = model.logger
+    pending = {}
+    for name, value in log.name_to_value.items():
+        number = value.item() if isinstance(value, np.generic | torch.Tensor) else value
+        pending[name] = [number, log.name_to_count[name], list(log.name_to_excluded[name] or ())]
+    return pending
+
+
+def _deques(model: Model) -> tuple[Any, Any]:
+    size = model._stats_window_size
+    return deque(maxlen=size), deque(maxlen=size)
+
+
+def _group(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
+def _copy(tensor: Any) -> NDArray[Any]:
+    return np.array(torch.as_tensor(tensor).detach().cpu().numpy())
+
 
 HARM_METRIC: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
 OBJECTIVE = "objective"  # mean over the learners of their objectives' harm, where one is another than total
@@ -242,3 +419,121 @@ def weights_are_finite(model: Model, algorithm: Algorithm) -> bool:
         return finite
     noise = torch.exp(logarithm)
     return finite and bool((torch.isfinite(noise) & (noise > 0.0)).all())
+
+
+# The logs of a run while it learns: ``progress.csv`` and TensorBoard's event files.
+#
+# ``progress.csv`` has one row per update, its columns in an order that is the same in every run.
+
+
+class ProgressTable(KVWriter):
+    """Writer for Stable-Baselines3's logger; its own CSV writer orders columns by the hash of their names."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._rows: list[dict[str, Any]] = []
+        self._columns: list[str] = []
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Add a row; when a column is new the table is written again, in one step, with that column."""
+        values = {"steps": step} | filter_excluded_keys(key_values, key_excluded, "csv")
+        row = {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
+        self._rows.append(row)
+        if row.keys() <= set(self._columns):
+            with self._path.open("a", newline="", encoding="utf-8") as file:
+                file.write(_lines([row], self._columns))
+            return
+        self._columns = ["steps", *sorted({name for row in self._rows for name in row} - {"steps"})]
+        heading = _lines([dict(zip(self._columns, self._columns, strict=True))], self._columns)
+        write_file(self._path, (heading + _lines(self._rows, self._columns)).encode())
+
+    def content(self) -> bytes:
+        """The file as it is; empty before the first row."""
+        return self._path.read_bytes() if self._rows else b""
+
+    def restore(self, content: bytes) -> None:
+        """Go back to an earlier ``content``, in the file too."""
+        self._columns, self._rows = parse_progress(content)
+        write_file(self._path, content)
+
+    def close(self) -> None:
+        """Nothing is held open between rows."""
+
+
+def parse_progress(content: bytes) -> tuple[list[str], list[dict[str, Any]]]:
+    """Columns and rows of a progress table, whose first column is ``steps``; what is empty is not there.
+
+    Raises ``ValueError`` for anything that no ``ProgressTable`` has written.
+    """
+    try:
+        lines = list(csv.reader(io.StringIO(content.decode("utf-8"), newline=""), strict=True))
+    except csv.Error as error:
+        raise ValueError(f"the progress table is no CSV ({error})") from None
+    columns, rows = (lines[0], lines[1:]) if lines else ([], [])
+    if columns and (columns[0] != "steps" or len(set(columns)) < len(columns)):
+        raise ValueError("the progress table must have the column steps first, and no column twice")
+    for number, row in enumerate(rows, start=1):
+        if len(row) != len(columns) or not row[0].isdecimal():
+            raise ValueError(f"row {number} of the progress table must have {len(columns)} values, the first one steps")
+    return columns, [{n: value for n, value in zip(columns, row, strict=True) if value != ""} for row in rows]
+
+
+def _lines(rows: list[dict[str, Any]], columns: list[str]) -> str:
+    text = io.StringIO()
+    csv.DictWriter(text, columns, restval="", lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+_PREFIX = "events.out.tfevents."
+_VERSION = "brain.Event:2"  # first record of every file
+
+
+class EventFile(KVWriter):
+    """Writer for Stable-Baselines3's logger: a new file of numbers, which TensorBoard reads after all that are there.
+
+    Its name ends in a number of ten digits, one more than the largest in the folder (files of TensorBoard's own writer
+    carry their second in that place); the first is 1. Every row is in the file when ``write`` returns.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        found = (re.match(rf"{re.escape(_PREFIX)}(\d{{10}})", path.name) for path in folder.iterdir())
+        number = max((int(match[1]) for match in found if match), default=0) + 1
+        self._file = (folder / f"{_PREFIX}{number:010d}").open("xb")
+        self._records = RecordWriter(self._file)
+        self._add(Event(wall_time=time.time(), file_version=_VERSION))
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Add one row of numbers."""
+        row = filter_excluded_keys(key_values, key_excluded, "tensorboard")
+        values = [Summary.Value(tag=name, simple_value=float(row[name])) for name in sorted(row)]
+        self._add(Event(wall_time=time.time(), step=step, summary=Summary(value=values)))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _add(self, event: Any) -> None:
+        self._records.write(event.SerializeToString())
+        self._file.flush()
+
+
+def event_sizes(folder: Path) -> dict[str, int]:
+    """Name -> bytes of the event files."""
+    return {path.name: path.stat().st_size for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+
+
+def cut_back(folder: Path, sizes: Mapping[str, int]) -> None:
+    """Drop what was written after ``event_sizes`` gave ``sizes``: later records, and later files.
+
+    Only plain files are cut; links and pipes in their place go, folders stay.
+    """
+    if not folder.is_dir():
+        return
+    for path in folder.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            continue  # nothing that a training wrote
+        if path.name not in sizes or path.is_symlink() or not path.is_file():
+            path.unlink()  # of a link the link alone
+        elif path.stat().st_size > sizes[path.name]:
+            os.truncate(path, sizes[path.name])

@@ -5,21 +5,21 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.agents.team import Team
+from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.agents.protocol import Driver, Team
+from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
-from ethbrake_marl.files.messages import Wording, explain
-from ethbrake_marl.files.plain import parse_strict_json, read_plain
-from ethbrake_marl.files.yaml import Document, YamlPath
-from ethbrake_marl.learning.recipe import Scheme
-from ethbrake_marl.learning.schemes import driver, drivers
-from ethbrake_marl.policies.policy import Policy, load_policy
+from ethbrake_marl.files.store import parse_strict_json, read_plain
+from ethbrake_marl.files.yaml import Document, Wording, YamlPath, explain
+from ethbrake_marl.learning.recipe import Scheme, driver, drivers
+from ethbrake_marl.policies.bundle import Policy, load_policy
+from ethbrake_marl.policies.shipped import SHIPPED, PolicyKind, load_named_policy
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.scenario.checks import refuse
+from ethbrake_marl.scenario.schema import refuse
 
 TEAM = "team.json"
 _LIMIT_BYTES = 1 << 20
@@ -125,3 +125,46 @@ def _read(file: Path) -> _TeamFile:
         raise CorruptBundle(str(explain(error, Document(str(file), content, {}), _TeamWording()))) from None
     except ValueError as error:
         raise CorruptBundle(f"{file}: is not JSON ({error}); {_RIGHT}") from None
+
+
+# Trained policies as agents: ``ppo@PATH``, ``policy@PATH``, whatever trained it, ``universal@shipped``, ``team@RUN``.
+#
+# Needs no torch.
+
+_KINDS: dict[str, PolicyKind] = {name: name for name in get_args(PolicyKind)} | {"team": "policy"}
+
+
+def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
+    """The policy of a run or a bundle, or the team of a run in which each learner has its own.
+
+    ``PATH`` may be ``shipped``, the policy that comes with the package for this scenario and harm count, or
+    ``shipped/NAME``; ``universal@shipped`` is for all scenarios, ``team@shipped`` is ``policy@shipped``. Raises
+    ``InvalidInput`` for a policy of another algorithm, and what loading it raises.
+    """
+    spec, path = settings.spec, settings.policy
+    name = spec.partition("@")[0]
+    if path is None:
+        raise InvalidInput(
+            f"agent {spec!r}: a policy is needed: {name}@PATH, where PATH is a run or a policy bundle, for instance"
+            f" {name}@runs/my-run, or {name}@{SHIPPED}"
+        )
+    ships = path.partition("/")[0] == SHIPPED  # one policy for all learners
+    if not ships and (name == "team" or (name != "universal" and is_team(path))):
+        scenario = settings.needed_scenario()
+        team = load_team(path, scenario, spec)
+        _check_algorithm(name, path, load_driver(path, scenario.vehicle_names[min(team.drivers)]))
+        return team
+    if name == "universal" and path != SHIPPED:
+        raise InvalidInput(f"agent {spec!r}: must be universal@{SHIPPED}; for another policy: ppo@PATH or sac@PATH")
+    policy = load_named_policy(path, _KINDS[name], settings.scenario, settings.harm_count)
+    _check_algorithm(name, path, policy)
+    return LearnedAgent(policy, name=spec)
+
+
+def _check_algorithm(name: str, path: str, policy: Policy) -> None:
+    """``ppo@PATH``, ``sac@PATH`` and ``counterfactual@PATH`` are for policies of that algorithm."""
+    trained_by = policy.manifest.algorithm
+    if name in ("ppo", "sac", "counterfactual") and name != trained_by:
+        raise InvalidInput(
+            f"agent '{name}@{path}': that policy was trained by {trained_by.upper()}: {trained_by}@{path}"
+        )

@@ -6,29 +6,212 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
+
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import BasePolicy
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.durable import remove_unfinished
-from ethbrake_marl.learning.checkpoint import TrainingState, newest_usable
-from ethbrake_marl.learning.checkpoint_fit import check_fits
-from ethbrake_marl.learning.interruption import stop_on_signal
-from ethbrake_marl.learning.loop import BetweenUpdates, Evaluate, StopAt, measure_on_list
-from ethbrake_marl.learning.model_state import own_random_state
-from ethbrake_marl.learning.models import make_model, policy_maker
-from ethbrake_marl.learning.progress import Course
-from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe
-from ethbrake_marl.learning.registry import algorithm_named
-from ethbrake_marl.learning.run_folder import RunDirectory, create_run, has_finished, only_process, open_run
-from ethbrake_marl.learning.session import Ended, Session
+from ethbrake_marl.errors import InvalidInput, OnProgress, Told, listener
+from ethbrake_marl.files.store import remove_folder, remove_unfinished
+from ethbrake_marl.learning.algorithms.networks import tensors_of
+from ethbrake_marl.learning.algorithms.protocol import Algorithm
+from ethbrake_marl.learning.checkpoint import TrainingState, check_fits, newest_usable, prune, write_checkpoint
+from ethbrake_marl.learning.loop import BetweenUpdates, Evaluate, StopAt, StopRequested, measure_on_list
+from ethbrake_marl.learning.progress import (
+    Course,
+    EventFile,
+    Model,
+    ProgressTable,
+    TrainingDiverged,
+    capture_model,
+    cut_back,
+    event_sizes,
+    own_random_state,
+    replay_arrays,
+    restore_log,
+    restore_model,
+    restore_replay,
+    watch_gradients,
+    weights_are_finite,
+)
+from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe, algorithm_named
 from ethbrake_marl.learning.team_file import team_content
-from ethbrake_marl.learning.training import Training, check_run_plugins, resolve, training_in
-from ethbrake_marl.observations.state import Appended
-from ethbrake_marl.policies.manifest import installed_versions
-from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.policies.team import Trained, drivers_of
-from ethbrake_marl.progress import OnProgress, Told, listener
+from ethbrake_marl.learning.training import (
+    RunDirectory,
+    RunRecord,
+    RunStatus,
+    Training,
+    check_run_plugins,
+    create_run,
+    has_finished,
+    only_process,
+    open_run,
+    resolve,
+    stop_on_signal,
+    training_in,
+)
+from ethbrake_marl.observations import Appended
+from ethbrake_marl.policies.actor import installed_versions, observation_schema
+from ethbrake_marl.policies.bundle import Policy, PolicyTeam, Trained, drivers_of, make_policy, save_trained, steps_of
 from ethbrake_marl.scenario import Scenario
+
+# From a training to its model, and from a model's present weights to policies.
+
+
+def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVecEnv) -> Model:
+    """The model of a training, whose optimisers refuse gradients that are not finite."""
+    model = algorithm.build(training, environment)
+    if getattr(model, "get_vec_normalize_env", lambda: None)() is not None:
+        raise InvalidInput(
+            f"algorithm {training.recipe.algorithm!r}: its model is trained under VecNormalize, whose statistics are no"
+            " part of a policy bundle; observations here are scaled already"
+        )
+    watch_gradients(model, algorithm)
+    return model
+
+
+def policy_maker(algorithm: Algorithm, training: Training) -> Callable[[Model], Trained]:
+    """How to make policies of a model's present weights: one for all learners, or one for each."""
+    recipe, scenario, observation = training.recipe, training.scenario, training.observation
+    network = recipe.network_spec(observation.size)
+    if training.scheme == "centralised":
+        network = network.model_copy(update={"value_hidden": ()})  # its critic sees what no vehicle sees
+    names = tuple(training.drivers)
+    fixed = {
+        "algorithm": recipe.algorithm,
+        "network": network,
+        "observation": observation_schema(observation),
+        "scenario": scenario.model_dump(mode="json"),
+        "reward": recipe.reward.model_dump(mode="json"),
+        "seeds": {"training": recipe.seed, "evaluation": recipe.evaluation.seed},
+        "versions": installed_versions(),
+    }
+
+    def make(actor: BasePolicy, learners: tuple[str, ...], steps: int) -> Policy:
+        return make_policy(tensors_of(actor, network), learners=learners, steps=steps, **fixed)
+
+    def policies(model: Model) -> Trained:
+        actors = algorithm.actors(model)
+        if training.scheme != "independent":
+            (actor,) = actors
+            return make(actor, names, model.num_timesteps)
+        members = zip(names, actors, strict=True)
+        return PolicyTeam({name: make(actor, (name,), model.num_timesteps) for name, actor in members})
+
+    return policies
+
+
+# One stretch of a training in one process: from a fresh model or a checkpoint, to the end or the next stop.
+
+Ended = Literal["finished", "interrupted"]
+
+
+class Session:
+    """Keeps the run's folder complete while a model learns in it."""
+
+    def __init__(self, run: RunDirectory, model: Model, algorithm: Algorithm, training: Training) -> None:
+        self._run, self._model, self._algorithm, self._training = run, model, algorithm, training
+        self._record = RunRecord(run)
+        self._table = ProgressTable(run.progress)
+        self._restored: TrainingState | None = None
+
+    def save(self, between: BetweenUpdates) -> None:
+        """Write a checkpoint of this moment, unless there is one, and delete those that are old."""
+        course, folder = between.course, self._run.checkpoint(between.course.steps)
+        if folder.exists():
+            return
+        assert course.policy is not None
+        arrays, numbers = capture_model(self._model, self._algorithm)
+        replay, replay_numbers = replay_arrays(self._model)
+        numbers |= {
+            "training": self._training.identity,
+            "between": between.state(),
+            "replay": replay_numbers,
+            "events": event_sizes(self._run.tensorboard),
+        }
+        state = TrainingState(
+            course.steps,
+            course.updates,
+            numbers,
+            arrays,
+            replay,
+            course.policy,
+            course.best,
+            self._table.content(),
+            installed_versions(),
+        )
+        write_checkpoint(folder, state)
+        prune(self._run.checkpoints)
+
+    def restore(self, between: BetweenUpdates, state: TrainingState | None) -> None:
+        """Bring model, callback, table and events back to ``state``; None: to the beginning."""
+        if state is None:
+            self._run.progress.unlink(missing_ok=True)
+            cut_back(self._run.tensorboard, {})
+            return
+        restore_model(self._model, self._algorithm, state.arrays, state.numbers)
+        restore_replay(self._model, state.replay, state.numbers["replay"])
+        between.restore(state.numbers["between"], state.steps, state.policy, state.best)
+        self._table.restore(state.table)
+        cut_back(self._run.tensorboard, state.numbers["events"])
+        self._restored = state
+
+    def learn(self, between: BetweenUpdates) -> Ended:
+        """Train to the end, and leave the folder complete whatever that end is."""
+        model, state = self._model, self._restored
+        logger = Logger(str(self._run.path), [self._table, EventFile(self._run.tensorboard)])
+        model.set_logger(logger)
+        if state is not None:
+            restore_log(model, state.numbers)
+        status: Ended = "finished"
+        reason: str | None = None
+        try:
+            steps = self._training.recipe.total_steps - model.num_timesteps
+            model.learn(steps, callback=between, log_interval=None, reset_num_timesteps=state is None)  # type: ignore[arg-type]
+        except StopRequested as stop:
+            status, reason = "interrupted", stop.reason
+        except BaseException as error:
+            cause = self._explain(error)
+            ended: RunStatus = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            self._close(between, ended, f"{type(cause).__name__}: {cause}")
+            if cause is error:
+                raise
+            raise cause from error
+        finally:
+            logger.close()
+        self._close(between, status, reason)
+        return status
+
+    def _close(self, between: BetweenUpdates, status: RunStatus, reason: str | None) -> None:
+        """Save the best and the last good policy, say how the run ended; a finished one needs no checkpoint."""
+        course = between.course
+        self._save_policy(course.kept, "policy")
+        self._save_policy(course.policy, "policy-last")
+        left: dict[str, Any] = {
+            "wall_s": round(course.wall_s, 3),
+            "steps": course.steps,
+            "updates": course.updates,
+            "policy_steps": None if course.kept is None else steps_of(course.kept),
+            "alarms": course.alarms,
+        }
+        self._record.end(status, reason, left)
+        if status == "finished" and self._run.checkpoints.is_dir():
+            remove_folder(self._run.checkpoints)
+
+    def _save_policy(self, policy: Trained | None, name: str) -> None:
+        if policy is not None:
+            save_trained(policy, self._run.path / name, replace=True)
+
+    def _explain(self, error: BaseException) -> BaseException:
+        """The error to report: torch's own when a distribution gets a NaN says little about a training."""
+        if isinstance(error, ValueError) and not weights_are_finite(self._model, self._algorithm):
+            return TrainingDiverged(
+                f"training: a weight or the exploration noise is not finite at step {self._model.num_timesteps};"
+                " try a smaller learning_rate"
+            )
+        return error
+
 
 _APPENDED: dict[Scheme, Appended] = {"independent": "number", "centralised": "state"}
 

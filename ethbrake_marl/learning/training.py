@@ -8,24 +8,215 @@ before they keep a finished training or go on with one, ``resume`` asks whether 
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
-from collections.abc import Mapping
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, Literal, get_args
 
+from filelock import FileLock, Timeout
 from pydantic import ValidationError
 
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.messages import first_mistake
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.plugins import check_plugins, noted_plugins
-from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe, load_recipe, recipe_of
-from ethbrake_marl.learning.run_folder import RunDirectory, read_object
-from ethbrake_marl.learning.schemes import drivers, scheme_of
+from ethbrake_marl.files.store import hold_lock, new_folder, parse_strict_json, read_plain, write_file
+from ethbrake_marl.files.yaml import first_mistake
+from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe, drivers, load_recipe, recipe_of, scheme_of
 from ethbrake_marl.observations import ObservationSpec, choose_observation, observation_for
-from ethbrake_marl.policies.manifest import installed_versions
+from ethbrake_marl.policies.actor import installed_versions
 from ethbrake_marl.scenario import Scenario, load_scenario
+
+# The folder of a run: its files, its configuration, how far it came, and who may train in it.
+
+_LIMIT_BYTES = 16 << 20  # of a JSON file
+_LOCK = "run.lock"
+
+RunStatus = Literal["running", "finished", "interrupted", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class RunDirectory:
+    """Names inside a run's folder."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        """What was asked for: recipe, scenario, seeds, versions."""
+        return self.path / "config.json"
+
+    @property
+    def status(self) -> Path:
+        """How far it came: ``running``, ``finished``, ``interrupted`` or ``failed``, steps, updates, wall time."""
+        return self.path / "run.json"
+
+    @property
+    def progress(self) -> Path:
+        """One row per update."""
+        return self.path / "progress.csv"
+
+    @property
+    def tensorboard(self) -> Path:
+        """The same numbers as TensorBoard events."""
+        return self.path / "tensorboard"
+
+    @property
+    def policy(self) -> Path:
+        """The bundle to use: the policy of least harm on the fixed list, or the last where no harm is measured."""
+        return self.path / "policy"
+
+    @property
+    def last_policy(self) -> Path:
+        """The bundle at the end of the run."""
+        return self.path / "policy-last"
+
+    @property
+    def team(self) -> Path:
+        """Which bundle drives which vehicle."""
+        return self.path / "team.json"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Where the training can go on; empty once it has finished."""
+        return self.path / "checkpoints"
+
+    def checkpoint(self, steps: int) -> Path:
+        """The checkpoint after ``steps`` decisions."""
+        return self.checkpoints / f"step_{steps:012d}"
+
+    def write_json(self, file: Path, content: Mapping[str, Any]) -> None:
+        """Replace ``file`` in one step."""
+        write_file(file, json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
+
+
+class RunRecord:
+    """Keeps ``run.json``: ``running`` from the moment it is made, something else from ``end`` on."""
+
+    def __init__(self, run: RunDirectory) -> None:
+        self._run = run
+        self._started = read_object(run.status).get("started_utc") or _now()
+        write_status(run, "running", {"started_utc": self._started})
+
+    def end(self, status: RunStatus, reason: str | None, left: Mapping[str, Any]) -> None:
+        """Say how the run ended, why if it failed, and what it leaves."""
+        policy = self._run.policy.name if self._run.policy.is_dir() else None
+        left_over = () if status == "finished" else self._run.checkpoints.glob("step_*")
+        checkpoints = sorted(path.name for path in left_over)
+        more = {"ended_utc": _now(), "reason": reason, **left, "policy": policy, "checkpoints": checkpoints}
+        write_status(self._run, status, {"started_utc": self._started, **more})
+
+
+def write_status(run: RunDirectory, status: RunStatus, more: Mapping[str, Any]) -> None:
+    """Replace ``run.json``."""
+    run.write_json(run.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **more})
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """The JSON object in a file of a run; raises ``InvalidInput`` naming the file and what is wrong with it."""
+    if not os.path.lexists(file):
+        raise InvalidInput(f"{file}: is missing; without it this training cannot go on")
+    data = read_plain(file, _LIMIT_BYTES)
+    try:
+        content = parse_strict_json(data)
+    except ValueError as error:
+        raise InvalidInput(f"{file}: is damaged: {error}") from None
+    if not isinstance(content, dict):
+        raise InvalidInput(f"{file}: is damaged: holds no JSON object")
+    return content
+
+
+RETURN = "rollout/ep_rew_mean"  # column of the table: mean over the last episodes, exploration included
+
+
+def progress_rows(path: Path) -> list[dict[str, str]]:
+    """The table of the run in ``path``, one row per update."""
+    return list(csv.DictReader(RunDirectory(path).progress.read_text("utf-8").splitlines()))
+
+
+def progress_column(table: Sequence[Mapping[str, str]], name: str) -> dict[int, float]:
+    """A column of such a table: step -> value, where there is one."""
+    return {int(row["steps"]): float(row[name]) for row in table if row.get(name)}
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def create_run(
+    path: Path, config: Mapping[str, Any], *, team: Mapping[str, Any] | None = None, force: bool = False
+) -> RunDirectory:
+    """Make the folder of a run with its configuration and its record, in one step: it can be resumed from then on.
+
+    ``team`` is the content of ``team.json``. Raises ``AlreadyExists`` when there is something; with ``force`` an
+    earlier run (a folder with a ``run.json``) or an empty folder is replaced, and anything else is still refused.
+    """
+    run = RunDirectory(path)
+    replace = force and path.is_dir() and not path.is_symlink() and (run.status.is_file() or not any(path.iterdir()))
+    if not replace and (path.exists() or path.is_symlink()):
+        if not run.status.is_file():
+            raise AlreadyExists(f"{path}: is there already, and is no run; give another name")
+        raise AlreadyExists(
+            f"{path}: is there already; give another name (--name), go on with it (ethbrake resume), or replace it with"
+            " force (--force; make run ARGS=--force)"
+        )
+    with new_folder(path, replace=replace) as partial:
+        new = RunDirectory(partial)
+        new.write_json(new.config, config)
+        if team is not None:
+            new.write_json(new.team, team)
+        write_status(new, "running", {"started_utc": _now()})
+    return run
+
+
+def open_run(path: Path) -> tuple[RunDirectory, dict[str, Any]]:
+    """The run in ``path`` and its configuration.
+
+    Raises ``InvalidInput`` when there is none, or naming the file of it that is damaged.
+    """
+    run = RunDirectory(path)
+    if not (os.path.lexists(run.status) or os.path.lexists(run.config)):
+        raise InvalidInput(f"{path}: holds no training; give the folder of a run, for instance runs/my-run")
+    for folder in (run.checkpoints, run.tensorboard):
+        if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+            raise InvalidInput(f"{folder}: is not a plain folder; a training deletes in it what it no longer needs")
+    status, config = read_object(run.status), read_object(run.config)
+    for key, right in (("format", ("ethbrake-run",)), ("status", get_args(RunStatus))):
+        if status.get(key) not in right:
+            raise InvalidInput(f"{run.status}: {key} = {status.get(key)!r:.60}: must be {' or '.join(right)}")
+    return run, config
+
+
+def has_finished(run: RunDirectory) -> bool:
+    """Whether the training in an open run has come to its end, though its report may not."""
+    status = read_object(run.status)
+    resumable = any(run.checkpoints.glob("step_*"))
+    return status.get("status") == "finished" or (status.get("stage") is not None and not resumable)
+
+
+def is_finished(path: Path) -> bool:
+    """Whether ``path`` holds a training that came to its end."""
+    run = RunDirectory(path)
+    return run.status.is_file() and read_object(run.status).get("status") == "finished"
+
+
+def wait_for_others(path: Path, longest_s: float) -> None:
+    """Wait until no other process trains in the folder, so long at most: one that was left alone ends by itself."""
+    with suppress(Timeout, OSError), FileLock(path / _LOCK, timeout=longest_s, mode=0o666):
+        pass
+
+
+def only_process(run: RunDirectory) -> AbstractContextManager[None]:
+    """Hold the run's lock; raises ``InvalidInput`` when another process trains in this folder."""
+    return hold_lock(run.path / _LOCK, "another process is training here")
+
 
 Content = dict[str, dict[str, Any]]
 
@@ -135,3 +326,36 @@ def training_content(recipe: TrainingRecipe, scenario: Scenario) -> Content:
 def training_identity(content: Content) -> str:
     """SHA-256 of such content, in hexadecimal digits."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+# Ctrl-C and SIGTERM as a question that is asked between two steps, in the place of an exception inside one.
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[Callable[[], bool]]:
+    """Give a function that says whether to stop; the second signal acts as if nobody listened.
+
+    Outside the main thread, where Python delivers no signals, the function always says no.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+
+    def listen(number: int, frame: FrameType | None) -> None:
+        asked.set()
+        restore()
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    try:
+        for number in _SIGNALS:
+            signal.signal(number, listen)
+        yield asked.is_set
+    finally:
+        restore()

@@ -5,39 +5,149 @@ What is found is realised harm: an upper bound of the true minimum, never below 
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.protocol import fixed_commands
-from ethbrake_marl.agents.rollout import script_agents
-from ethbrake_marl.defaults import SEARCH_BUDGET
-from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
-from ethbrake_marl.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.agents.planner import MOST_CANDIDATES, PROFILE_BUDGET, BestHarm
+from ethbrake_marl.agents.protocol import Agent, fixed_commands
+from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.rollout import record_commands, script_agents
+from ethbrake_marl.defaults import HARM_COUNTS, SEARCH_BUDGET, HarmCount
+from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError, check_one_learner
+from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.limits.avoidability import empty_plan
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, BestKnown, join_tables, load_table, save_table
-from ethbrake_marl.limits.extreme_profiles import extreme_profiles
 from ethbrake_marl.limits.lower_bound import onset_states
-from ethbrake_marl.physics import Floats, Ints, UInt64s, Worlds, advance, leaving_out_failed
-from ethbrake_marl.physics.episode import START
+from ethbrake_marl.limits.meetings import FRONT_FIRST, REAR_FIRST, meet_front, meet_rear
+from ethbrake_marl.physics import Bools, Floats, Ints, UInt64s, Worlds, advance, leaving_out_failed
+from ethbrake_marl.physics.compiled import compiled, compiled_apart
+from ethbrake_marl.physics.episode import LAST_STEP, START, TIME_STEP, follow_whole
 from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.search.kernel import MOST_PHASES
-from ethbrake_marl.search.problem import ProfileProblem, profile_problem
+from ethbrake_marl.search.kernel import MOST_PHASES, SearchWorld, allowed, copy_profile, copy_rows, largest
 from ethbrake_marl.search.profiles import (
+    ProfileProblem,
     Profiles,
     SearchResult,
     constant_profiles,
     even_grid,
     follow_profiles,
+    make_search_world,
     pad_profiles,
+    profile_problem,
     search_profiles,
 )
+
+# Profiles of full drive and full braking from which a search starts: drive, brake to the leader, drive; or the mirror.
+#
+# The proof of the lower bound says what the least harm looks like: the vehicle drives as hard as it can for a while,
+# then
+# brakes as hard as it can until it meets the leader; or it brakes, then drives until the rear one meets it. After that
+# it
+# goes the other way (docs/avoidability.md). A random search seldom finds such a narrow optimum.
+
+KEPT = 12  # profiles of each world
+_LATEST_S = 2.0  # of the first change of command, at first
+_TIMES = 24  # of it that are tried in each round
+_ROUNDS = 3  # each closer around the best one
+_PHASES = 5  # before the first change, its step, up to the second one, its step, after it
+
+
+def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools) -> Profiles:
+    """The ``KEPT`` best such profiles of each world [n * KEPT], world by world, of the one controlled vehicle.
+
+    ``states`` [n, WIDTH] is each world at the first decision (``limits.meetings``). It tells only when the two would
+    meet, so a neighbour that does not brake fully makes the profiles less good, not wrong. A neighbour that is not
+    there [n] is not met.
+    """
+    n, last = problem.n, problem.last_step
+    ends = np.repeat(last, KEPT * MOST_PHASES).reshape(n, KEPT, MOST_PHASES)
+    commands = np.zeros((n, KEPT, MOST_PHASES, 1))
+    no_random = np.zeros(1, np.uint64)
+    for k in range(n):
+        _fill_extremes(
+            problem.start[k], problem.clock[k], problem.bounds[k], problem.command[k], problem.latency[k],
+            problem.mass[k], problem.limit[k], problem.vehicles, no_random, states[k], has_front[k], has_rear[k],
+            ends[k], commands[k],
+        )  # fmt: skip
+    return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, MOST_PHASES, 1))
+
+
+@compiled
+def _fill_extremes(
+    start: Floats, clock: Floats, bounds: Floats, command: Floats, latency: Floats, mass: Floats, limit: Floats,
+    vehicles: Ints, no_random: UInt64s, at: Floats, has_front: bool, has_rear: bool, ends: Ints, commands: Floats,
+) -> None:  # fmt: skip
+    """Fill ``ends`` [KEPT, K] and ``commands`` [KEPT, K, 1] of one world."""
+    world = make_search_world(clock, bounds, command, latency, mass, limit, vehicles, no_random)
+    values = np.full(KEPT, math.inf)
+    for kind, there in ((FRONT_FIRST, has_front), (REAR_FIRST, has_rear)):
+        low, high = 0.0, _LATEST_S
+        for _ in range(_ROUNDS if there else 0):
+            best = try_changes(world, kind, at, start, low, high, ends, commands, values)
+            around = 1.5 * (high - low) / (_TIMES - 1)
+            low, high = max(best - around, 0.0), best + around
+
+
+@compiled_apart
+def try_changes(
+    world: SearchWorld, kind: int, at: Floats, start: Floats, low: float, high: float, ends: Ints, commands: Floats,
+    values: Floats,
+) -> float:  # fmt: skip
+    """Try first changes of command from ``low`` to ``high`` (s) and keep the best profiles; the best change."""
+    plan, other = empty_plan(), empty_plan()
+    states = np.zeros((_PHASES + 1, start.shape[0]))
+    copy_rows(start.reshape(1, -1), states, 1)
+    tried_ends, tried = np.zeros(_PHASES, np.int64), np.zeros((_PHASES, 1))
+    least, best = math.inf, low
+    for k in range(_TIMES):
+        change = low + (high - low) * k / (_TIMES - 1)
+        meeting = meet_front(at, change, plan, other) if kind == FRONT_FIRST else meet_rear(at, change, plan, other)
+        for early, share in ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5)):
+            fill_extreme(world, kind, change, meeting, early, share, tried_ends, tried)
+            value, reached = follow_whole(world.episode, tried_ends, tried, states, math.inf)
+            if reached < 0:
+                continue
+            if value < least:
+                least, best = value, change
+            worst = largest(values)
+            if value < values[worst]:
+                values[worst] = value
+                copy_profile(tried_ends, tried, ends[worst], commands[worst])
+                for phase in range(_PHASES, commands.shape[1]):
+                    commands[worst, phase, 0] = tried[_PHASES - 1, 0]
+    return best
+
+
+@compiled
+def fill_extreme(
+    world: SearchWorld, kind: int, change: float, meeting: float, early: int, share: float, ends: Ints, commands: Floats
+) -> None:
+    """One profile: from ``change`` to ``meeting`` (s) the other command; ``share`` of the first one in the step of it.
+
+    In the step of the change the command leads to the speed that the change would. ``early``: so many steps earlier.
+    """
+    low, high, step = world.bounds[0, 0], world.bounds[0, 1], world.episode.clock[TIME_STEP]
+    last = int(world.episode.clock[LAST_STEP])
+    first, second = (high, low) if kind == FRONT_FIRST else (low, high)
+    turn = min(int(change / step), last)
+    back = max(int(min(meeting / step, last)) - early, turn + 1)
+    commands[0, 0], commands[2, 0], commands[4, 0] = first, second, first
+    commands[1, 0] = second + (change / step - turn) * (first - second)
+    commands[3, 0] = second + share * (first - second)
+    ends[0], ends[1], ends[2], ends[3], ends[4] = turn, turn + 1, back, back + 1, last
+    for k in range(_PHASES):
+        ends[k] = min(ends[k], last)
+        commands[k, 0] = allowed(commands[k, 0], low, high)
+
 
 CHUNK = 200  # worlds between two reports of progress
 LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is in no row
@@ -291,3 +401,122 @@ def _joined(parts: list[Profiles], n: int) -> Profiles:
     shape = (n, -1, MOST_PHASES, parts[0].commands_mps2.shape[2])
     commands = np.concatenate([part.commands_mps2.reshape(shape) for part in parts], axis=1)
     return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, *shape[2:]))
+
+
+# Episodes that agents drive, as profiles: what one does better than the best known becomes the best known.
+
+LOWERED = "lowered_by"  # key of a table's header: agent -> count -> in how many worlds it did less harm
+
+
+def fold_agent(
+    table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
+) -> BestHarmTable:
+    """The table with the episodes of ``agents`` in it where they do less harm; its header says in how many worlds.
+
+    ``agents``: for each count, ``name`` made to minimise it. Each drives the scenario's learner through ``worlds`` (at
+    t = 0; those that are known to end without harm are left out), and either count takes from either episode. Harms are
+    those of the profiles, driven again. Where an agent cannot drive a world to its end, the table stays as it is.
+    Raises ``InvalidInput`` if the scenario has not exactly one learner.
+    """
+    learners = [scenario.vehicle_names[i] for i in scenario.learners]
+    check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")
+    task = Task(scenario, scenario.learners)
+    identity = world_identity(worlds, task)
+    known = np.max([table.harm(identity, harm_count) for harm_count in table.best], axis=0)
+    hard = np.flatnonzero(known > 0.0)
+    lowered = dict.fromkeys(table.best, 0)
+    if hard.size:
+        worlds, identity = worlds.take(hard), identity[hard]
+        problem = profile_problem(
+            worlds,
+            task.vehicles,
+            horizon_s=scenario.horizon_s,
+            time_step_s=scenario.time_step_s,
+            others_mps2=scripted_commands(worlds, task),
+        )
+        for agent in agents.values():
+            work = partial(_driven_in, agent, worlds, task, problem.last_step)
+            profiles, rows, _ = leaving_out_failed(work, np.arange(worlds.n))
+            if profiles is None:
+                continue
+            first, total = follow_profiles(problem.take(rows), profiles)
+            for harm_count in table.best:
+                table, better = table.improved(
+                    identity[rows], harm_count, first if harm_count == "first" else total, profiles
+                )
+                lowered[harm_count] += int(better.sum())
+    before = table.header.get(LOWERED, {})
+    return replace(table, header={**table.header, LOWERED: {**before, name: lowered}})
+
+
+def _driven_in(agent: Agent, every: Worlds, task: Task, last_step: Ints, rows: Ints) -> Profiles:
+    return driven_profiles(agent, every.take(rows), task, last_step[rows])
+
+
+def driven_profiles(agent: Agent, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
+    """What ``agent`` commands the vehicle in every step of its episodes, as profiles; equal neighbours are joined."""
+    commands = record_commands(agent, worlds, task.scenario, task.vehicle, int(last_step.max()))
+    return _phases_of(commands, last_step)
+
+
+def _phases_of(commands_mps2: Floats, last_step: Ints) -> Profiles:
+    """Step by step commands [n, steps] as profiles with one phase per change."""
+    steps = commands_mps2.shape[1]
+    ends = [np.append(np.flatnonzero(row[1:] != row[:-1]) + 1, steps) for row in commands_mps2]
+    width = max(len(each) for each in ends)
+    padded = np.array([np.append(each, np.full(width - len(each), steps)) for each in ends])
+    chosen = np.take_along_axis(commands_mps2, padded - 1, axis=1)
+    return Profiles(np.minimum(padded, last_step[:, np.newaxis]), chosen[:, :, np.newaxis])
+
+
+# The tables of best known harm that travel with the package, and the agent that drives their profiles.
+
+TABLES = Path(__file__).resolve().parents[1] / "_tables" / "best_harm"
+
+
+@cache
+def shipped_tables() -> tuple[BestHarmTable, ...]:
+    """Every shipped table, by name of its file."""
+    return tuple(load_table(path) for path in sorted(TABLES.glob("*.npz")))
+
+
+def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
+    """The least harm known in each world (at t = 0) under each count, [n] m2/s2; NaN where no shipped table holds it.
+
+    Worlds are recognised by everything their harm depends on: state, parameters, the others' scripts, time step,
+    horizon and the driven vehicles. Raises ``InvalidInput`` for a script whose command is not fixed at the alert, as no
+    search knows it.
+    """
+    identity = world_identity(worlds, task)
+    known = {harm_count: np.full(worlds.n, np.nan) for harm_count in HARM_COUNTS}
+    for table in shipped_tables():
+        known = {harm_count: np.fmin(harm, table.harm(identity, harm_count)) for harm_count, harm in known.items()}
+    return known
+
+
+def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Profiles, Bools]:
+    """Kept profiles of a problem with one controlled vehicle, [n], and where there is one, [n]."""
+    last_step = problem.last_step
+    profiles, known = Profiles(last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, 1))), np.zeros(problem.n, bool)
+    for table in shipped_tables():
+        kept, here = table.profiles(problem.identity, harm_count, last_step)
+        profiles, kept = pad_profiles([profiles, kept], 1)
+        profiles.ends[here] = kept.ends[here]
+        profiles.commands_mps2[here] = kept.commands_mps2[here]
+        known |= here
+    return profiles, known
+
+
+def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
+    """``best_harm[:candidates]``: the shipped profile, or a search with so many candidates where there is none."""
+    number = PROFILE_BUDGET if argument is None else parse_numeral(argument)
+    if number is None or (argument is not None and not argument.isdecimal()) or not 1 <= number <= MOST_CANDIDATES:
+        raise InvalidInput(
+            f"agent 'best_harm:{argument}': the argument must be a number of candidates, for instance {PROFILE_BUDGET},"
+            f" at most {MOST_CANDIDATES:,}"
+        )
+    budget = int(number) if settings.most_candidates is None else min(int(number), settings.most_candidates)
+    return BestHarm(
+        shipped_profiles, harm_count=settings.harm_count, horizon_s=settings.horizon_s, budget=budget,
+        time_step_s=settings.time_step_s,
+    )  # fmt: skip

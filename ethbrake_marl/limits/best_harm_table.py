@@ -14,15 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
-from ethbrake_marl.files.durable import write_file
-from ethbrake_marl.files.messages import first_mistake
-from ethbrake_marl.files.plain import parse_strict_json, read_plain
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.files.store import parse_strict_json, read_plain, write_file
+from ethbrake_marl.files.yaml import first_mistake
 from ethbrake_marl.physics import Bools, Floats, Ints, UInt64s
-from ethbrake_marl.search.problem import ProfileProblem
-from ethbrake_marl.search.profiles import Profiles, check_profiles, pad_profiles
+from ethbrake_marl.search.profiles import ProfileProblem, Profiles, check_profiles, pad_profiles
 
 TABLE_FORMAT = 1
 SIZE_LIMIT_BYTES = 64 << 20  # of a file

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.harm import HARM_COUNTS
+from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.limits.avoidability import avoidability
+from ethbrake_marl.limits.best_harm import best_known
 from ethbrake_marl.limits.lower_bound import lower_bound
-from ethbrake_marl.limits.shipped import best_known
 from ethbrake_marl.limits.team_bound import team_bound
 from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.physics.events import stopping_distances
+from ethbrake_marl.physics.kernel import stopping_distances
 from ethbrake_marl.scenario import Task
 
 _VEHICLES, _DRIVEN = 3, 1

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.envs.drawing.scene import BODY_M
-from ethbrake_marl.evaluation.conditions import quantities, quantity_line
-from ethbrake_marl.evaluation.motion import EpisodeMotion
-from ethbrake_marl.pages.frame import Part, render, shown
-from ethbrake_marl.pages.parts import data
+from ethbrake_marl.evaluation.episodes import EpisodeMotion
+from ethbrake_marl.evaluation.outcome import quantities, quantity_line
+from ethbrake_marl.pages.frame import Part, data, render, shown
 from ethbrake_marl.physics import Worlds
 
 _STYLES = ("player.css",)

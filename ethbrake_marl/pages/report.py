@@ -2,29 +2,344 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
-from ethbrake_marl.agents.team import Driver
+import numpy as np
+from markupsafe import Markup
+
+from ethbrake_marl.agents.protocol import Driver, team_of
+from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.cells import Line, filled_columns, our_lines, paper_blocks, table_columns, table_meanings
-from ethbrake_marl.evaluation.conditions import parameter_line
-from ethbrake_marl.evaluation.outcome import Evaluation
-from ethbrake_marl.evaluation.paper import PAPER_NOTE, PAPER_PARAMETERS
-from ethbrake_marl.evaluation.per_world import write_output
-from ethbrake_marl.evaluation.table import SummaryRow
-from ethbrake_marl.evaluation.text import identity_lines, knowledge_lines, left_out_lines, limit_lines, warning_lines
-from ethbrake_marl.figures.report import harm_by_agent
+from ethbrake_marl.evaluation.episodes import follow_episodes
+from ethbrake_marl.evaluation.inputs import policy_sha256
+from ethbrake_marl.evaluation.outcome import (
+    PAPER_NOTE,
+    PAPER_PARAMETERS,
+    Evaluation,
+    Outcome,
+    parameter_line,
+    parameters,
+)
+from ethbrake_marl.evaluation.passport import issue_passport
+from ethbrake_marl.evaluation.regret import Regrets, assess
+from ethbrake_marl.evaluation.results import write_output
+from ethbrake_marl.evaluation.shield_modes import ModeRow, are_teams, compare_behind_shields
+from ethbrake_marl.evaluation.statistics import Estimate, mean, rate
+from ethbrake_marl.evaluation.summary import (
+    BASELINE,
+    Line,
+    SummaryRow,
+    filled_columns,
+    identity_lines,
+    knowledge_lines,
+    left_out_lines,
+    limit_lines,
+    our_lines,
+    paper_blocks,
+    table_columns,
+    table_meanings,
+    warning_lines,
+)
+from ethbrake_marl.figures.evaluation import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.figures.style import Figure
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits.limits import Unproven
-from ethbrake_marl.pages.chosen import choose_shown, play_chosen
-from ethbrake_marl.pages.evidence import ShieldEvidence, avoidable_section, shield_section, worst_section
-from ethbrake_marl.pages.frame import Part, Section, page, paragraph
-from ethbrake_marl.pages.parts import Block, Cell, Row, facts, table
+from ethbrake_marl.pages.frame import Block, Cell, Part, Row, Section, facts, page, paragraph, table
 from ethbrake_marl.pages.player import Played, player
 from ethbrake_marl.pages.vector import drawing
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.scenario import Scenario, Task
+from ethbrake_marl.shield.review import VERDICTS
+
+# The worlds that a report shows: the worst, the typical, and some drawn at random; and every agent in each.
+
+MOST_WORLDS = 50
+WORST = 10
+_EACH = 5  # of the other kinds
+_RANDOM_SEED = 0
+
+
+class Chosen(NamedTuple):
+    """A world of an evaluation, and why it is shown."""
+
+    row: int
+    kind: str
+    why: str
+
+
+def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> list[Chosen]:
+    """Up to ``most`` worlds to look at, each once: where ``focus`` did worst, best against full braking, as usual."""
+    outcome = evaluation.outcome(focus)
+    found: dict[int, Chosen] = {}
+    total, first = outcome.total_harm, outcome.first_impact_harm
+
+    def add(kind: str, rows: Sequence[int] | Ints, most_of_kind: int) -> None:
+        fresh = [int(row) for row in rows if int(row) not in found][: min(most_of_kind, most - len(found))]
+        for row in fresh:
+            found[row] = Chosen(row, kind, f"{focus}: harm {first[row]:.2f} first-impact, {total[row]:.2f} total")
+
+    add(f"Where {focus} did worst", worst_rows(evaluation, focus), WORST)
+    regrets = assess(evaluation)
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    if avoidable is not None:
+        add(
+            f"Avoidable, and {focus} collided",
+            _largest(total, outcome.collided & avoidable),
+            _EACH,
+        )
+    if BASELINE in evaluation.outcomes and focus != BASELINE:
+        saved = evaluation.outcome(BASELINE).total_harm - total
+        add(f"Where {focus} saved most against {BASELINE}", _largest(saved, saved > 0.0), _EACH)
+        add(f"Where {focus} did more harm than {BASELINE}", _largest(-saved, saved < 0.0), _EACH)
+    order = np.argsort(total, kind="stable")
+    add(f"Typical of {focus}", [order[int(q * (len(order) - 1))] for q in (0.5, 0.6, 0.7, 0.8, 0.9)], _EACH)
+    add("Drawn at random", np.random.default_rng(_RANDOM_SEED).permutation(len(total))[: 2 * most], most)
+    return list(found.values())
+
+
+def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
+    """The ten worlds of the largest regret in total harm, or of the largest total harm where no best is known."""
+    outcome, regrets = evaluation.outcome(focus), assess(evaluation)
+    value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")
+    return _largest(value, value > 0.0)[:WORST]
+
+
+def _largest(value: Floats, among: Bools) -> Ints:
+    order = np.argsort(-value, kind="stable")
+    return order[among[order]]
+
+
+def play_chosen(
+    evaluation: Evaluation,
+    chosen: Sequence[Chosen],
+    agents: Mapping[str, Driver],
+    *,
+    spellings: Mapping[str, str] | None = None,
+    harm_count: HarmCount = "first",
+    on_agent: Callable[[str], None] | None = None,
+) -> list[Played]:
+    """Let every agent drive these worlds once more, and keep the motion and a passport of each episode.
+
+    Args:
+        evaluation: whose worlds they are.
+        chosen: at least one.
+        agents: that were evaluated, by name; they are left as they are.
+        spellings: how an agent is written on a command line, where that is not its name.
+        harm_count: that agents minimised.
+        on_agent: is told each agent that is done.
+
+    """
+    rows = np.array([each.row for each in chosen], np.int64)
+    worlds, numbers = evaluation.worlds.take(rows), evaluation.index[rows]
+    scenario = evaluation.scenario
+    if evaluation.vehicles != scenario.learners:
+        scenario = scenario.with_learners(evaluation.vehicles)
+    played = [Played(int(n), each.kind, each.why, {}, {}) for n, each in zip(numbers, chosen, strict=True)]
+    for name, agent in agents.items():
+        spelling = (spellings or {}).get(name, name)
+        drive_played(played, worlds, name, agent, scenario, spelling, seed=evaluation.seed, harm_count=harm_count)
+        if on_agent is not None:
+            on_agent(name)
+    return played
+
+
+def drive_played(
+    played: Sequence[Played],
+    worlds: Worlds,
+    name: str,
+    agent: Driver,
+    scenario: Scenario,
+    spelling: str,
+    *,
+    seed: int | None,
+    harm_count: HarmCount = "first",
+) -> None:
+    """Let one agent drive the worlds of ``played`` and keep each motion and passport there, by the agent's name.
+
+    Args:
+        played: one for each world.
+        worlds: at the alert, in the same order.
+        name: of the agent on the page.
+        agent: is left as it is.
+        scenario: of the worlds, with the vehicles that are driven as its learners.
+        spelling: how the agent is written on a command line.
+        seed: of the list of worlds; None: they came from a file.
+        harm_count: that the agent minimised.
+
+    """
+    drivers = team_of(agent, scenario.learners).drivers
+    policies = {i: sha for i, driver in drivers.items() if (sha := policy_sha256(driver)) is not None}
+    for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
+        passport = issue_passport(
+            motion, scenario, spelling, seed=seed, number=one.number, harm_count=harm_count, policies=policies
+        )
+        one.motions[name] = motion
+        one.passports[name] = str(passport)
+
+
+# Sections of a report: the worst worlds, what was avoidable, and what the shield was good for.
+
+SHIELD_WORLDS = 200  # in which what a shield replaced is simulated again
+_NONE = "–"
+
+
+def worst_section(evaluation: Evaluation, focus: str, watched: Collection[int]) -> Section:
+    """The ten worlds in which an agent did worst; those that the page plays have a button."""
+    regrets, outcome = assess(evaluation), evaluation.outcome(focus)
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    known = [] if regrets is None else ["Best known, first", "Best known, total"]
+    known += [] if avoidable is None else ["Contact"]
+    head = ["World", "First-impact harm", "Total harm", *known, "Impacts"]
+    rows: list[Row] = []
+    for k in worst_rows(evaluation, focus).tolist():
+        number = int(evaluation.index[k])
+        best: list[str] = []
+        if regrets is not None:
+            best += [f"{regrets.best(count)[k]:.2f}" for count in HARM_COUNTS]
+        if avoidable is not None:
+            best.append("avoidable" if avoidable[k] else "unavoidable")
+        button = Markup('{} <button type="button" data-watch="{}">Watch</button>').format(number, number)
+        harms = (f"{outcome.first_impact_harm[k]:.2f}", f"{outcome.total_harm[k]:.2f}")
+        world = button if number in watched else number
+        rows.append([world, *harms, *best, int(outcome.impacts[k])])
+    why = (
+        "by total harm, as nothing is proven of these worlds"
+        if regrets is None
+        else "by total harm above the best known"
+    )
+    if not rows:
+        return Section("Worst ten worlds", [f"{focus} did no harm above the best known in any of these worlds."])
+    return Section(
+        "Worst ten worlds", [f"Of {focus}, {why}. Harm in m²/s².", table(head, rows, caption=f"Worlds of {focus}")]
+    )
+
+
+def avoidable_section(evaluation: Evaluation) -> Section:
+    """Collisions and harm where contact could be avoided, and where nobody could; and the regret of each agent."""
+    regrets = assess(evaluation)
+    body: list[str | Part] = []
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    if regrets is None or avoidable is None:
+        told = "Nothing is proven of these worlds, so what was avoidable is not told apart."
+        if regrets is not None:
+            told = "Where contact can be avoided is not decided for these vehicles, so that is not told apart."
+        body.append(f"{told} Reason: {evaluation.limits.because}." if isinstance(evaluation.limits, Unproven) else told)
+    else:
+        share = rate(int(avoidable.sum()), len(avoidable)).in_words(digits=1, scale=100.0, unit=" %")
+        body.append(
+            f"Contact can be avoided in {share} of these worlds (proven, world by world); in the others no command can."
+        )
+        for where, among in (("Contact avoidable", avoidable), ("Contact unavoidable", ~avoidable)):
+            if among.any():
+                body.append(_split_table(evaluation, regrets, where, among))
+        body.append(
+            drawing(
+                harm_in_parts(evaluation),
+                "What the harm is made of",
+                "Mean harm per world as the least that is known, and what each agent did above it.",
+            )
+        )
+    title, words = "Harm world by world", "For each harm x, the share of the worlds in which an agent did more."
+    if regrets is not None:
+        title = "Regret world by world"
+        words = "For each regret x, the share of the worlds in which an agent did more than x above the best known."
+    body.append(drawing(regret_distribution(evaluation), title, words))
+    return Section("What was avoidable", body)
+
+
+def _split_table(evaluation: Evaluation, regrets: Regrets, where: str, among: Bools) -> Part:
+    head = ["Agent", "Collided", "First-impact harm", "Total harm", "Regret, first-impact", "Regret, total"]
+    rows = [[agent, *_split_cells(outcome, regrets, among)] for agent, outcome in evaluation.outcomes.items()]
+    return table(head, rows, caption=f"{where}: {count_of(int(among.sum()), 'world')}")
+
+
+def _split_cells(outcome: Outcome, regrets: Regrets, among: Bools) -> list[Cell]:
+    means = [
+        mean(values[among])
+        for values in (
+            outcome.first_impact_harm, outcome.total_harm,
+            regrets.regret(outcome, "first"), regrets.regret(outcome, "total"),
+        )
+    ]  # fmt: skip
+    collided = rate(int((outcome.collided & among).sum()), int(among.sum()))
+    return [_cell(collided, 100.0, 1, " %"), *(_cell(each) for each in means)]
+
+
+class ShieldEvidence(NamedTuple):
+    """The modes of the shield around some agents, measured."""
+
+    rows: Sequence[ModeRow]
+    conditions: str  # of the measurement
+
+
+def shield_evidence(
+    agents: Mapping[str, Driver], evaluation: Evaluation, harm_count: HarmCount = "first"
+) -> ShieldEvidence | None:
+    """What is behind a shield among these agents, alone and behind every mode, in the first worlds of an evaluation.
+
+    None where nobody has a shield.
+    """
+    worlds = evaluation.worlds.take(np.arange(min(evaluation.worlds.n, SHIELD_WORLDS)))
+    rows = compare_behind_shields(agents, worlds, Task(evaluation.scenario, evaluation.vehicles, harm_count))
+    if not rows:
+        return None
+    count = "first-impact" if harm_count == "first" else "total"
+    line = parameter_line({**parameters(evaluation), "count": worlds.n})
+    return ShieldEvidence(rows, f"{count.capitalize()} harm, which the shield bounds, in m²/s². {line}.")
+
+
+def shield_section(evidence: ShieldEvidence) -> Section:
+    """The modes of the shield on the same worlds, and what each intervention of step mode was good for."""
+    rows, teams = evidence.rows, are_teams(evidence.rows)
+    head = ["Agent, mode", "Harm", "Minus no shield" if teams else "Minus episode mode", "Decisions replaced"]
+    head += [*VERDICTS, "Worlds above the bound"]
+    lines: list[Row] = []
+    for row in rows:
+        shares = (None,) * len(VERDICTS) if row.verdicts is None else row.verdicts
+        replaced = [_NONE if share is None else f"{100.0 * share:.1f} %" for share in (row.replaced, *shares)]
+        above = _NONE if row.above_bound is None else row.above_bound
+        against = row.against_none if teams else row.against_episode
+        told_against = _NONE if against is None else _cell(against)
+        lines.append([f"{row.agent}, {row.mode}", _cell(row.harm), told_against, *replaced, above])
+    told = (
+        "Each agent alone and behind every mode of the shield. Each decision that step mode replaced was simulated"
+        " again without it: needed (harm would have been higher), harmless (the same), costly (lower)."
+    )
+    left_out = rows[0].left_out
+    notes = [paragraph(evidence.conditions, "quiet")]
+    if left_out:
+        told_of = count_of(len(left_out), "world")
+        notes.append(paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
+    borne = [_shares(rows)] if teams else []
+    return Section("Shield", [told, table(head, lines, caption="Modes of the shield"), *borne, *notes])
+
+
+def _shares(rows: Sequence[ModeRow]) -> Part:
+    """What each vehicle bears behind the shield of a team."""
+    head = ["Agent, mode, vehicle", "Decisions replaced", "Bears", "Under the baseline plan", "Worlds with more"]
+    lines: list[Row] = [
+        [
+            f"{row.agent}, {row.mode}, {each.vehicle}",
+            _NONE if each.replaced is None else f"{100.0 * each.replaced:.1f} %",
+            f"{each.harm:.2f}",
+            f"{each.baseline:.2f}",
+            f"{100.0 * each.above_baseline:.1f} %",
+        ]
+        for row in rows
+        for each in row.vehicles
+    ]
+    return table(head, lines, caption="What each vehicle bears")
+
+
+def _cell(estimate: Estimate, scale: float = 1.0, digits: int = 2, unit: str = "") -> Cell:
+    value = f"{scale * estimate.value:.{digits}f}{unit}".replace("-", "−")
+    if estimate.interval is None:
+        return Cell(value)
+    low, high = (f"{scale * end:.{digits}f}".replace("-", "−") for end in estimate.interval)
+    return Cell(value, f"{low}, {high}")
+
 
 _HEADLINE = (0, 1, 2, 6, 7, 9, 10)  # of the table's columns; those of registered harm metrics follow
 _OTHERS = (3, 4, 5, 8)

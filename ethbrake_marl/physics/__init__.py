@@ -1,7 +1,13 @@
 """Exact physics of a line of vehicles: compiled and pure. No YAML, no random numbers, no torch."""
 
-from ethbrake_marl.physics.advance import ImpactRows, Impacts, advance
-from ethbrake_marl.physics.failed import LeftOutRows, leaving_out_failed, measured_without_failed
+from ethbrake_marl.physics.advance import (
+    ImpactRows,
+    Impacts,
+    LeftOutRows,
+    advance,
+    leaving_out_failed,
+    measured_without_failed,
+)
 from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.sampled import advance_sampled
 from ethbrake_marl.physics.worlds import (

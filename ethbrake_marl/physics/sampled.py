@@ -39,8 +39,7 @@ from numpy.typing import ArrayLike
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.advance import Impacts, no_obstacle_harm
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.events import TOUCH_SPEED_MPS, solo_motion
-from ethbrake_marl.physics.obstacle import obstacle_ahead
+from ethbrake_marl.physics.kernel import TOUCH_SPEED_MPS, obstacle_ahead, solo_motion
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
 
 SHORTEST_STEP_S = 1e-6

@@ -10,18 +10,16 @@ from ethbrake_marl.scenario.catalogue import (
     scenario_folder,
     scenario_path,
 )
-from ethbrake_marl.scenario.distributions import Choice, LogUniform, Normal, Uniform
 from ethbrake_marl.scenario.initial_states import (
     initial_state_worlds,
     read_initial_states,
     table_columns,
     worlds_from_table,
 )
-from ethbrake_marl.scenario.roles import constant_command, is_state_free, parse_agent_spec
-from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.lines import constant_command, is_state_free, parse_agent_spec
+from ethbrake_marl.scenario.quantities import Choice, LogUniform, Normal, Sample, Uniform
 from ethbrake_marl.scenario.sampling import Channel
-from ethbrake_marl.scenario.schema import Scenario, scenario_json_schema
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.scenario.schema import Scenario, Task, scenario_json_schema
 
 __all__ = [
     "CatalogueEntry",

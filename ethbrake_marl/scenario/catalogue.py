@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
-from ethbrake_marl.files.json_schema import schema_lines
-from ethbrake_marl.files.yaml import Document, flow_text, read_yaml
-from ethbrake_marl.scenario.fields import NAME_PATTERN
-from ethbrake_marl.scenario.mixture import member_content
+from ethbrake_marl.files.yaml import Document, explain, flow_text, read_yaml, schema_lines
+from ethbrake_marl.scenario.lines import NAME_PATTERN
 from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED
-from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.schema import Scenario, ScenarioWording, member_content
+from ethbrake_marl.scenario.v2x import CHANNELS, V2X
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -281,3 +282,33 @@ def _value(value: object) -> str:
     if isinstance(value, dict) and all(isinstance(entry, str) for entry in value.values()):
         return "".join(f"\n  {key}: {flow_text(entry)}" for key, entry in value.items())
     return f" {flow_text(value)}"
+
+
+# Presets of the V2X channel that somebody registers.
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
+
+
+def register_preset(name: str, settings: Mapping[str, Any]) -> None:
+    """Make ``v2x: name`` known to every scenario.
+
+    Args:
+        name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
+        settings: what a scenario would say, a preset and what differs from it: ``{"preset": "nominal", "lost": 0.1}``.
+
+    Registering the same again changes nothing. Raises ``AlreadyExists`` for another channel under a name that is taken,
+    ``InvalidInput`` for a name that is none and for settings that are no channel.
+
+    """
+    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
+        raise InvalidInput(f"preset {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
+    if not isinstance(settings, Mapping):
+        raise InvalidInput(f"preset {name!r}: settings = {settings!r:.80}: must be a mapping such as {{'lost': 0.1}}")
+    try:
+        channel = V2X.model_validate(dict(settings)).channel
+    except ValidationError as error:
+        raise explain(
+            error, Document(f"preset {name!r}", dict(settings), {}), ScenarioWording(V2X.model_fields)
+        ) from None
+    if CHANNELS.setdefault(name, channel) != channel:
+        raise AlreadyExists(f"preset {name!r} is registered already; give another name")

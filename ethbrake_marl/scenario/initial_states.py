@@ -14,21 +14,32 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.messages import suggestion
-from ethbrake_marl.files.plain import read_plain
-from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.files.store import read_plain
+from ethbrake_marl.files.yaml import parse_numeral, suggestion
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds, make_worlds
-from ethbrake_marl.scenario.channel import with_fixed_news
-from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.quantities import (
     ALTERNATIVES,
+    BLOCK,
     DECLARED,
     OPTIONAL,
     QUANTITIES,
     QuantityRule,
+    Sample,
+    WithLoad,
+    support,
 )
-from ethbrake_marl.scenario.sampling import obstacle_gap
+from ethbrake_marl.scenario.sampling import (
+    OBSTACLE,
+    OBSTACLE_WIDTH,
+    PER_TYPE,
+    TYPES,
+    early_impact,
+    make_sample,
+    obstacle_gap,
+    world_quantities,
+)
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.v2x import with_fixed_news
 
 Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
 
@@ -250,3 +261,103 @@ def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
     if len(rows) == 1:
         raise InvalidInput(f"{file}: has a header but no rows; one row is one world")
     return [name.strip() for name in rows[0]], rows[1:], lines[1:]
+
+
+# The ranges of a scenario as a unit cube: one coordinate for each number that it draws.
+#
+# A search moves in the cube, where every point is as likely as any other and gives one world; a list is a random sample
+# of it.
+
+Place = tuple[tuple[int, ...], int]  # a stream of uniform numbers, and the column in it
+
+_UNUSED = 0.5  # in the place of numbers that change nothing
+
+
+@dataclass(frozen=True, slots=True)
+class Ranges:
+    """The numbers that a scenario draws: their names, and where each stands among a world's uniform numbers."""
+
+    scenario: Scenario
+    names: tuple[str, ...]
+    places: tuple[Place, ...]
+
+    def sample(self, points: Floats) -> tuple[Sample, Bools]:
+        """The worlds at ``points`` [n, coordinates] of [0, 1), and which of them the scenario would accept, [n].
+
+        A scenario that rejects early impacts does not accept worlds that have one.
+        """
+        n, vehicles = len(points), self.scenario.vehicles
+        widths = {(): BLOCK * vehicles, TYPES: PER_TYPE * vehicles, OBSTACLE: OBSTACLE_WIDTH}
+        streams = {of: np.full((n, width), _UNUSED) for of, width in widths.items()}
+        for (of, column), values in zip(self.places, points.T, strict=True):
+            streams[of][:, column] = values
+        found = make_sample(self.scenario, lambda _, of: streams[of], np.arange(n, dtype=np.int64))
+        if self.scenario.early_impacts == "keep" or not self.scenario.learners:
+            return found, np.ones(n, np.bool_)
+        return found, ~early_impact(self.scenario, found.worlds)
+
+
+def ranges_of(scenario: Scenario) -> Ranges:
+    """Every number that the scenario draws.
+
+    Raises ``InvalidInput`` for a scenario that draws nothing, a mixture, and a channel whose delays are drawn: worlds
+    of these cannot be given one by one.
+    """
+    if scenario.members:
+        members = ", ".join(member.name for member in scenario.members)
+        raise InvalidInput(f"scenario {scenario.name!r}: is a mixture; take one of its scenarios: {members}")
+    if scenario.v2x.by_link:
+        raise InvalidInput(
+            f"scenario {scenario.name!r}: v2x: draws delays and losses, which no table of worlds holds; give v2x: paper"
+            " (--set v2x=paper)"
+        )
+    found = {**_of_types(scenario), **_of_quantities(scenario)}
+    if not found:
+        raise InvalidInput(f"scenario {scenario.name!r}: draws nothing: all its worlds are the same")
+    return Ranges(scenario, tuple(found), tuple(found.values()))
+
+
+def _of_quantities(scenario: Scenario) -> dict[str, Place]:
+    """Name -> place of every quantity that is drawn."""
+    used: list[str] = []
+
+    def note(key: str) -> Floats:
+        used.append(key)
+        return np.ones((1, len(scenario.possible_quantities(key))))
+
+    world_quantities(scenario, note)
+    places: dict[str, Place] = {
+        _name(key, i): ((), DECLARED[key].place(i))
+        for key in used
+        for i, possible in enumerate(scenario.possible_quantities(key))
+        if any(not isinstance(entry, WithLoad) and _drawn(entry) for entry in possible.values())
+    }
+    for key in ("obstacle_gap_m", "obstacle_margin_m"):
+        if getattr(scenario, key) is not None and _drawn(scenario.quantities(key)[0]):
+            places[key] = (OBSTACLE, 0)
+    return places
+
+
+def _of_types(scenario: Scenario) -> dict[str, Place]:
+    """Name -> place of the type and the load of every vehicle that has several, or moves something with its load."""
+    if scenario.types_of_line is None:
+        return {}
+    places: dict[str, Place] = {}
+    keys = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s", "speed_limit_mps")
+    for i, vehicle in enumerate(scenario.vehicle_names):
+        possible = [scenario.possible_quantities(key)[i] for key in keys]
+        if any(len(each) > 1 for each in possible):
+            places[f"{vehicle} type"] = (TYPES, PER_TYPE * i)
+        if any(isinstance(entry, WithLoad) for each in possible for entry in each.values()):
+            places[f"{vehicle} load"] = (TYPES, PER_TYPE * i + 1)
+    return places
+
+
+def _drawn(entry: object) -> bool:
+    low, high = support(entry)  # type: ignore[arg-type]
+    return low != high
+
+
+def _name(key: str, index: int) -> str:
+    owner = DECLARED[key].owner(index)
+    return f"{key} of {owner}" if owner else key

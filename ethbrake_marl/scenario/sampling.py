@@ -13,15 +13,20 @@ import numpy as np
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.episode import first_decision_s
-from ethbrake_marl.physics.events import stopping_distances
+from ethbrake_marl.physics.kernel import stopping_distances
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, make_worlds
-from ethbrake_marl.scenario.channel import with_channel
-from ethbrake_marl.scenario.distributions import WithLoad, support, values
-from ethbrake_marl.scenario.fields import ScenarioFields
-from ethbrake_marl.scenario.quantities import BLOCK, DECLARED, QUANTITIES
-from ethbrake_marl.scenario.roles import constant_command
-from ethbrake_marl.scenario.sample import Sample, join_samples
-from ethbrake_marl.scenario.v2x import PER_LINK
+from ethbrake_marl.scenario.lines import ScenarioFields, constant_command
+from ethbrake_marl.scenario.quantities import (
+    BLOCK,
+    DECLARED,
+    QUANTITIES,
+    Sample,
+    WithLoad,
+    join_samples,
+    support,
+    values,
+)
+from ethbrake_marl.scenario.v2x import PER_LINK, with_channel
 
 
 def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]) -> dict[str, Floats]:

@@ -2,36 +2,462 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ValidationError, field_validator, model_validator
+from pydantic_core import ErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import ValidationInfo
 
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.html import html_table
-from ethbrake_marl.files.json_schema import FileSchema, publish
-from ethbrake_marl.files.messages import explain
-from ethbrake_marl.files.yaml import Document, flow_text
-from ethbrake_marl.scenario.checks import (
-    check_alternatives,
-    check_entries,
-    check_given,
-    check_objective,
-    check_observation,
-    check_roles,
-    check_whole,
-    refuse,
+from ethbrake_marl.files.yaml import Document, FileSchema, Wording, YamlPath, explain, flow_text, publish, suggestion
+from ethbrake_marl.harm import Declared, check_harm_count, objectives_of
+from ethbrake_marl.physics.messages import MOST_SAMPLES
+from ethbrake_marl.scenario.features import listed_features
+from ethbrake_marl.scenario.lines import (
+    LEARNER,
+    LEFT_OUT,
+    OF_EVERY_VEHICLE,
+    STATE_FREE,
+    TYPE_KEYS,
+    Member,
+    ScenarioFields,
+    VehicleType,
+    check_type_names,
+    check_types,
+    complete_roles,
+    constant_deceleration,
+    is_state_free,
+    missing_quantity,
+    parse_agent_spec,
 )
-from ethbrake_marl.scenario.fields import OF_EVERY_VEHICLE, ScenarioFields
-from ethbrake_marl.scenario.mixture import WORDS, build_members, changed_content, draw_mixture
-from ethbrake_marl.scenario.quantities import ALTERNATIVES, DECLARED, OPTIONAL
-from ethbrake_marl.scenario.roles import LEARNER, complete_roles
-from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.scenario.sampling import Channel, draw_list, quantity_bounds
-from ethbrake_marl.scenario.vehicle_types import check_type_names, check_types
-from ethbrake_marl.scenario.wording import ScenarioWording
+from ethbrake_marl.scenario.quantities import (
+    ALTERNATIVES,
+    DECLARED,
+    DISTRIBUTIONS,
+    OPTIONAL,
+    QUANTITIES,
+    Choice,
+    NormalShape,
+    QuantityRule,
+    Sample,
+    join_samples,
+    support,
+)
+from ethbrake_marl.scenario.sampling import (
+    Channel,
+    check_request,
+    draw_list,
+    draw_numbers,
+    farthest_obstacle_m,
+    quantity_bounds,
+    uniform_numbers,
+)
+from ethbrake_marl.scenario.v2x import V2X
+
+# Checks of a scenario that concern a whole field or several fields at once.
+#
+# Each raises pydantic's error for the first defect, with the path inside the field or file and the value.
+
+
+def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
+    """Raise the error for ``value`` at ``at`` (inside the field being checked): ``right`` says what would do."""
+    plain = value.model_dump(exclude_none=True) if isinstance(value, BaseModel) else value
+    raise PydanticCustomError("scenario", "{right}", {"right": right, "value": flow_text(plain, 60), "at": at})
+
+
+def check_entries(rule: QuantityRule, value: Any, vehicles: int | None) -> None:
+    """Every entry of a quantity is in range over its whole support, and a list has the right length."""
+    listed = isinstance(value, tuple)
+    if listed and vehicles is not None and len(value) != rule.count(vehicles):
+        per = "one per pair" if rule.per == "pair" else "one per vehicle"
+        right = f"has {len(value)} entries; {vehicles} vehicles need {rule.count(vehicles)} ({per}), or one for all"
+        raise PydanticCustomError("scenario", "{right}", {"right": right, "value": "", "at": ()})
+    for index, entry in enumerate(value if listed else (value,)):
+        low, high = support(entry)
+        if not rule.allows(low, high):
+            overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
+            refuse((index,) if listed else (), entry, f"must be {rule.interval}{overlap}")
+
+
+def check_roles(roles: Mapping[str, str], vehicles: int) -> None:
+    """Every key is a vehicle of this scenario and every value is ``learner`` or the syntax of a script."""
+    names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+    for name, role in roles.items():
+        if name not in names:
+            close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
+            refuse((name,), role, f"unknown vehicle; {hint}")
+        try:
+            is_state_free(role)
+        except InvalidInput as error:
+            refuse((name,), role, str(error))
+        if role.startswith(f"{LEARNER}:"):
+            refuse((name,), role, f"{LEARNER} takes no argument")
+
+
+def check_objective(declared: Declared, vehicles: int) -> None:
+    """The objective is a known one, and there is one for all vehicles or one for each."""
+    try:
+        objectives_of(declared, vehicles)
+    except InvalidInput as error:
+        refuse((), declared, str(error).removeprefix("objective: "))
+
+
+def check_observation(listed: object) -> None:
+    """An observation is a list of groups and features that are known, none of them twice."""
+    try:
+        listed_features(listed)
+    except InvalidInput as error:
+        refuse((), listed, str(error).removeprefix("observation: "))
+
+
+def check_given(key: str, value: Any, data: Mapping[str, Any]) -> Any:
+    """The value of a quantity that every vehicle needs; None where every type declares it, and nobody else has to.
+
+    ``data`` are the fields before it. Raises pydantic's error where it is missing, and where nobody would read it.
+    """
+    kinds = data.get("vehicle_types")
+    without = None if kinds is None else missing_quantity(kinds, key)
+    if value is LEFT_OUT:
+        if data.get("mixture") is not None or not {"vehicle_types", "mixture"} <= data.keys():
+            return None
+        if kinds is None:
+            raise PydanticCustomError("missing", "missing", {"at": ()})
+        if without is not None:
+            right = f"type {without} does not declare it: give it there, or here for every type that does not"
+            raise PydanticCustomError("scenario", "{right}", {"right": right, "value": "", "at": ()})
+        return None
+    if value is None:
+        refuse((), value, "must be a number or a distribution; a key that is not used is left out")
+    if kinds is not None and without is None:
+        refuse((), value, "every type declares it; leave it out")
+    return value
+
+
+def check_alternatives(scenario: ScenarioFields) -> None:
+    """Gaps and speeds are declared in one of two ways, an obstacle in one at most; deviations need a line speed."""
+    if "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None:
+        right = "needs line_speed_mps, the speed that it is added to"
+        refuse(("speed_deviations_mps",), _declared(scenario.speed_deviations_mps), right)
+    for usual, other in ALTERNATIVES.items():
+        given = [key for key in (usual, other) if getattr(scenario, key) is not None]
+        if not given and usual not in OPTIONAL:
+            raise PydanticCustomError("missing", "missing", {"at": (usual,)})
+        if len(given) == 2:
+            refuse((other,), _declared(getattr(scenario, other)), f"give either {usual} or {other}, not both")
+
+
+def check_whole(scenario: ScenarioFields) -> None:
+    """Fields that limit each other: time step, horizon, latency, speeds, gaps, constant scripts, rejection."""
+    if not scenario.time_step_s <= scenario.horizon_s:
+        refuse(("time_step_s",), scenario.time_step_s, f"must not be above horizon_s ({scenario.horizon_s:g} s)")
+    for i, latencies in enumerate(scenario.possible_quantities("latency_s")):
+        for kind, latency in latencies.items():
+            if not support(latency)[1] < scenario.horizon_s:
+                right = f"must be below horizon_s ({scenario.horizon_s:g} s), or the vehicle can never act"
+                refuse(_path(scenario, "latency_s", i, kind), latency, right)
+    _check_reactions(scenario)
+    _check_speeds(scenario)
+    if scenario.time_gaps_s is not None:
+        _check_time_gaps(scenario)
+    if scenario.obstacle_margin_m is not None:
+        _check_obstacle_margin(scenario)
+    _check_constant_scripts(scenario)
+    if 0 in scenario.learners and not scenario.has_obstacle:
+        right = (
+            "has nothing to lose without an obstacle ahead; give obstacle_gap_m too, for instance obstacle_gap_m: 42"
+        )
+        refuse(("roles", "vehicle_1"), LEARNER, right)
+    if scenario.early_impacts == "reject" and scenario.learners:
+        _check_rejection(scenario)
+
+
+def _check_reactions(scenario: ScenarioFields) -> None:
+    """However late the news is, every vehicle may act before the horizon."""
+    own = np.array([latest for _, latest in scenario.supports("latency_s")])
+    latest = scenario.v2x.latest_reaction_s(own)
+    if not (latest < scenario.horizon_s).all():
+        i = int(np.argmin(latest < scenario.horizon_s))
+        right = (
+            f"vehicle_{i + 1} may have no news until {latest[i]:g} s; it must be below horizon_s"
+            f" ({scenario.horizon_s:g} s), which may be raised"
+        )
+        refuse(("v2x",), scenario.v2x, right)
+    if not (samples := scenario.v2x.channel.samples(scenario.time_step_s)) <= MOST_SAMPLES:
+        right = f"a message is on its way for {samples - 3} time steps; at most {MOST_SAMPLES - 3} are possible"
+        refuse(("v2x",), scenario.v2x, right)
+
+
+def _check_speeds(scenario: ScenarioFields) -> None:
+    limits = scenario.possible_quantities("speed_limit_mps")
+    for i, (low, high) in enumerate(quantity_bounds(scenario, "speeds_mps")):
+        lowest = min(limits[i].values(), key=lambda quantity: support(quantity)[0])
+        if low >= 0.0 and high <= support(lowest)[0]:
+            continue
+        limit = f"speed_limit_mps of vehicle_{i + 1}, {flow_text(_declared(lowest))} m/s"
+        if scenario.line_speed_mps is None:
+            speed = scenario.quantities("speeds_mps")[i]
+            refuse(_path(scenario, "speeds_mps", i), speed, f"must not be above {limit}")
+        drives = f"vehicle_{i + 1} drives {low:g}" + ("" if low == high else f" to {high:g}")
+        deviates = "with speed_deviations_mps " if "speed_deviations_mps" in scenario.model_fields_set else ""
+        right = f"{deviates}{drives} m/s; must be 0 to {limit}"
+        refuse(("line_speed_mps",), scenario.line_speed_mps, right)
+
+
+def _check_time_gaps(scenario: ScenarioFields) -> None:
+    largest = QUANTITIES["gaps_m"].high
+    for pair, (_, high) in enumerate(quantity_bounds(scenario, "gaps_m")):
+        if not high <= largest:
+            right = f"is up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"
+            refuse(_path(scenario, "time_gaps_s", pair), scenario.quantities("time_gaps_s")[pair], right)
+
+
+def _check_obstacle_margin(scenario: ScenarioFields) -> None:
+    farthest = farthest_obstacle_m(scenario)
+    if not farthest <= OPTIONAL["obstacle_gap_m"].high:
+        right = (
+            f"puts the obstacle up to {farthest:g} m ahead of vehicle_1; that distance must not be above"
+            f" {OPTIONAL['obstacle_gap_m'].high:g} m"
+        )
+        refuse(("obstacle_margin_m",), scenario.obstacle_margin_m, right)
+
+
+def _check_constant_scripts(scenario: ScenarioFields) -> None:
+    for i, script in scenario.scripts.items():
+        deceleration = constant_deceleration(script) or 0.0
+        field = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
+        capacity = scenario.supports(field)[i][0]
+        if not abs(deceleration) <= capacity:
+            refuse(("roles", f"vehicle_{i + 1}"), script, f"is above this vehicle's {field}, {capacity:g} m/s2")
+
+
+def _check_rejection(scenario: ScenarioFields) -> None:
+    for i, script in scenario.scripts.items():
+        if not is_state_free(script):
+            close = get_close_matches(parse_agent_spec(script)[0], STATE_FREE, n=1)
+            hint = f"; did you mean {close[0]}?" if close else ""
+            right = f"with early_impacts: reject a script must be full_brake, coast or constant:a{hint}"
+            refuse(("roles", f"vehicle_{i + 1}"), script, right)
+
+
+def _path(scenario: ScenarioFields, field: str, index: int, kind: int = 0) -> YamlPath:
+    line = scenario.types_of_line
+    if line is not None and field in TYPE_KEYS and getattr(line.kinds[kind], field) is not None:
+        return ("vehicle_types", line.names[kind], field)
+    return (field, index) if isinstance(getattr(scenario, field), tuple) else (field,)
+
+
+def _declared(quantity: Any) -> Any:
+    return quantity.model_dump(exclude_none=True) if isinstance(quantity, BaseModel) else quantity
+
+
+# Mixtures of scenarios: each world is drawn from one member, by weight, and is then that member's own world.
+#
+# World k of a mixture is world k of its member under the same seed, bit for bit. So results on a mixture can be
+# compared
+# with results on its members, world by world.
+
+MIXTURE = (4,)  # the stream of what each world is drawn from
+MIXTURE_WIDTH = 4  # its numbers per world, of which the first is used
+
+WORDS = ("title", "description", "source")
+_OWN = {"name", *WORDS, "mixture"}  # of the mixture itself; every other key beside it holds for all members
+_ONE_FOR_ALL = ("vehicles", "time_step_s", "horizon_s", "roles", "objective", "observation")
+_SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # told of the mixture where all members agree
+
+AnyScenario = TypeVar("AnyScenario", bound=ScenarioFields)
+
+
+def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """What a scenario says, with other values under some keys; a new way to declare gaps takes the old one's place."""
+    old = {key for pair in ALTERNATIVES.items() for key in pair if changes.keys() & set(pair)}
+    if "speeds_mps" in changes:
+        old.add("speed_deviations_mps")
+    return {**{key: value for key, value in content.items() if key not in old}, **changes}
+
+
+def build_members(
+    document: Document, build: Callable[[Document], AnyScenario]
+) -> tuple[Document, tuple[AnyScenario, ...]]:
+    """The members that a document's ``mixture`` lists, and the document with what follows from them.
+
+    What stands beside ``mixture`` replaces what every member says. A list that is none stays for the schema to refuse.
+    Raises ``InvalidInput`` naming the member that is wrong, or the key in which two of them differ.
+    """
+    listed, content = document.content["mixture"], document.content
+    if not (isinstance(listed, list | tuple) and listed and all(_is_whole(entry) for entry in listed)):
+        return document, ()
+    fields = set(ScenarioFields.model_fields) - _OWN - {"vehicles"}
+    beside = {key: value for key, value in content.items() if key in fields}
+    members = tuple(build(_member_document(document, i, entry, beside)) for i, entry in enumerate(listed))
+    _check_members(document, members)
+    mixture = [{**entry, "scenario": member_content(member)} for entry, member in zip(listed, members, strict=True)]
+    own = {key: value for key, value in content.items() if key not in beside}
+    return Document(document.file, {**own, **_shared(members), "mixture": mixture}, document.lines), members
+
+
+def _is_whole(entry: Any) -> bool:
+    known = Member.model_fields.keys()  # else the schema names the key that is not
+    return isinstance(entry, dict) and isinstance(entry.get("scenario"), dict) and entry.keys() <= known
+
+
+def member_content(member: ScenarioFields) -> dict[str, Any]:
+    """What shapes a member's worlds, as plain data: what it says but its texts, and all that a batch has in common."""
+    declared = member.model_dump(mode="json", exclude_unset=True, exclude_none=True, exclude=set(WORDS))
+    return {**declared, **member.model_dump(mode="json", include=set(_SHARED), exclude_none=True)}
+
+
+def _member_document(document: Document, i: int, entry: Mapping[str, Any], beside: Mapping[str, Any]) -> Document:
+    """What one member says but its texts, with what stands beside the mixture, each on its line."""
+    own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}
+    inside = {path[3:]: line for path, line in document.lines.items() if path[:3] == ("mixture", i, "scenario")}
+    own = {**{key: document.content[key] for key in ("vehicles",) if key in document.content}, **own}
+    above = {path: line for path, line in document.lines.items() if path and path[0] in beside}
+    where = f"{document.file}: mixture[{i}] ({own.get('name', 'without a name')})"
+    return Document(where, changed_content(own, beside), {**inside, **above})
+
+
+def _check_members(document: Document, members: Sequence[ScenarioFields]) -> None:
+    """Refuse mixtures in mixtures, a name given twice, and members that cannot be one batch."""
+    where = f"{document.where(('mixture',))}: mixture"
+    first = members[0]
+    if (given := document.content.get("vehicles", first.vehicles)) != first.vehicles:
+        raise InvalidInput(
+            f"{where}: vehicles = {given}: its scenarios have {first.vehicles}, which nothing beside them can change"
+        )
+    for k, member in enumerate(members):
+        if member.members:
+            raise InvalidInput(f"{where}[{k}]: {member.name} is a mixture itself; list its scenarios here")
+        if member.name in [other.name for other in members[:k]]:
+            raise InvalidInput(f"{where}[{k}]: {member.name} is given twice; give it once, with the sum of the weights")
+        for key in _ONE_FOR_ALL:
+            one, other = (_told(each, key) for each in (first, member))
+            if one != other:
+                way = "" if key == "vehicles" else f"; give {key} beside mixture, and it holds for all"
+                raise InvalidInput(
+                    f"{where}: {key} must be the same in all: {first.name} has {one}, {member.name} has {other}{way}"
+                )
+        samples = [each.v2x.channel.samples(each.time_step_s) for each in (first, member)]
+        if samples[0] != samples[1]:
+            raise InvalidInput(
+                f"{where}: v2x.persistence must be the same in all, and so must the delay of periodic messages:"
+                f" {first.name} and {member.name} differ; give v2x beside mixture, and it holds for all"
+            )
+        if member.has_obstacle != first.has_obstacle:
+            one, other = ("one" if each.has_obstacle else "none" for each in (first, member))
+            raise InvalidInput(
+                f"{where}: an obstacle ahead must be there in all or in none: {first.name} has {one}, {member.name} has"
+                f" {other}"
+            )
+
+
+def _told(scenario: ScenarioFields, key: str) -> str:
+    value = getattr(scenario, key)
+    return "nothing" if value is None else flow_text(dict(value) if key == "roles" else value, 120)
+
+
+def _shared(members: Sequence[ScenarioFields]) -> dict[str, Any]:
+    """Plain values of the keys in which all members agree."""
+    told = [member.model_dump(mode="json", include=set(_SHARED), exclude_none=True) for member in members]
+    return {key: value for key, value in told[0].items() if all(each.get(key) == value for each in told)}
+
+
+def draw_mixture(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
+    """Worlds ``first`` to ``first + n - 1`` of a mixture's list, each drawn from one member; as ``draw_list``."""
+    check_request(n, seed, first, channel)
+    assert scenario.mixture is not None
+    cumulative = np.cumsum([member.weight for member in scenario.mixture])
+    u = uniform_numbers(int(seed), channel, 0, first, n, MIXTURE_WIDTH, of=MIXTURE)[:, 0]
+    chosen = np.searchsorted(cumulative / cumulative[-1], u, side="right")
+    typed = any(member.vehicle_types is not None for member in scenario.members)
+    parts = []
+    for k, member in enumerate(scenario.members):
+        index = first + np.flatnonzero(chosen == k)
+        if len(index):
+            drawn = draw_numbers(member, index, int(seed), channel)
+            no_type = np.full((len(index), scenario.vehicles), "") if typed and drawn.types is None else drawn.types
+            parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
+    return join_samples(parts, sum(part.rejected for part in parts))
+
+
+# The wording of messages about a scenario file: its keys, their places and their meanings.
+
+_DISTRIBUTION = (
+    "{uniform: [low, high]}, {loguniform: [low, high]}, {normal: {mean, sd, low, high}} or {choice: [a, b, ...]}"
+)
+_INSIDE = {
+    "uniform": ("uniform",),
+    "loguniform": ("loguniform",),
+    "normal": tuple(NormalShape.model_fields),
+    "choice": tuple(Choice.model_fields),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ScenarioWording(Wording):
+    """The ``Wording`` of a scenario; ``keys`` are its top-level keys."""
+
+    keys: Iterable[str]
+
+    def known(self, path: YamlPath) -> list[str]:
+        """The keys that may stand where ``path`` ends: at the top, in a distribution, in its parameters, in v2x."""
+        if len(path) == 1:
+            return list(self.keys)
+        if path[0] == "vehicle_types" and len(path) == 3:
+            return list(VehicleType.model_fields)
+        if path[0] == "mixture":
+            return list(Member.model_fields)
+        outer = str(path[-2])
+        if outer == "v2x":
+            return list(V2X.model_fields)
+        return list(_INSIDE[outer]) if outer == "normal" else sorted({*DISTRIBUTIONS, "weights"})
+
+    def instead(self, key: str) -> str:
+        """What the model has in place of friction: what each vehicle's brakes can on that road."""
+        if "friction" not in key and key != "mu":
+            return ""
+        return "the model has no friction; braking_capacity_mps2 is what brakes and road allow, about 9.81 x friction"
+
+    def needed(self, path: YamlPath) -> str:
+        """What is needed at ``path``, with an example."""
+        key = path[-1]
+        if path[0] == "mixture":
+            return "it is needed, for instance {scenario: paper-random, weight: 2}"
+        if isinstance(key, int):
+            return "two numbers [low, high] are needed"
+        rule = DECLARED.get(key)
+        if rule is None and len(path) > 1:
+            return "a number is needed, as in {normal: {mean: 20, sd: 1, low: 18, high: 22}}"
+        if rule is None:
+            return f"it is needed, for instance {key}: my-scenario"
+        other = f", or {ALTERNATIVES[key]}: {DECLARED[ALTERNATIVES[key]].example}" if key in ALTERNATIVES else ""
+        return f"the {rule.meaning} is needed, for instance {key}: {rule.example}{other}"
+
+    def owner(self, path: YamlPath) -> str:
+        """Whose value stands at ``path``: a vehicle or a pair; empty for anything else."""
+        rule = DECLARED.get(str(path[0])) if len(path) > 1 else None
+        return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
+
+    def right(self, detail: ErrorDetails) -> str:
+        """A number or a distribution, with what a misspelt one was meant to be; empty for what is no quantity."""
+        if detail["type"] == "quantity":
+            return f"must be a number, {_DISTRIBUTION}{_misspelt(detail['input'])}"
+        if detail["type"] == "float_type" and detail["loc"][-1] == "#number":
+            return f"must be a number or a distribution, {_DISTRIBUTION}"
+        if detail["loc"][:1] == ("mixture",) and detail["loc"][-1] == "scenario":
+            return "must be what a scenario says; names are read where they stand in a file (load_scenario)"
+        return ""
+
+
+def _misspelt(given: Any) -> str:
+    hints = [suggestion(key, DISTRIBUTIONS) for key in given if isinstance(key, str)] if isinstance(given, dict) else []
+    return "".join(f"; {hint}" for hint in hints if hint)
 
 
 class Scenario(ScenarioFields):
@@ -249,3 +675,38 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(entry) for key, entry in value.items()}
     return [_plain(entry) for entry in value] if isinstance(value, list | tuple) else value
+
+
+# The task of whoever drives: a scenario, the vehicles that are driven in it, and the harm that counts.
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """Drive these vehicles of a scenario; all others follow its scripts.
+
+    Raises ``InvalidInput`` for an index that the scenario has no vehicle for, one given twice, or an unknown count.
+    """
+
+    scenario: Scenario
+    vehicles: tuple[int, ...]  # indices (0 = front), in the order in which they are driven
+    harm_count: HarmCount = "first"  # harm that is minimised; what is told under both counts ignores it
+
+    def __post_init__(self) -> None:
+        check_harm_count(self.harm_count)
+        known = set(range(self.scenario.vehicles))
+        if len(set(self.vehicles)) != len(self.vehicles) or not set(self.vehicles) <= known:
+            raise InvalidInput(
+                f"task: vehicles {self.vehicles}: must be indices from 0 to {self.scenario.vehicles - 1}, each once"
+            )
+
+    @property
+    def vehicle(self) -> int:
+        """The vehicle that is driven; raises ``InvalidInput`` if it is not exactly one."""
+        if len(self.vehicles) != 1:
+            raise InvalidInput(f"scenario {self.scenario.name!r}: needs one driven vehicle; driven are: {self.names}")
+        return self.vehicles[0]
+
+    @property
+    def names(self) -> str:
+        """The driven vehicles by name, with commas between them; ``none`` where nobody is driven."""
+        return ", ".join(self.scenario.vehicle_names[i] for i in self.vehicles) or "none"

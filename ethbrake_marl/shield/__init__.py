@@ -1,11 +1,9 @@
 """Shields: what stands between a proposed action and the applied one."""
 
-from ethbrake_marl.shield.agents import HybridAgent, StepShieldAgent
+from ethbrake_marl.shield.agents import HybridAgent, ShieldedTeam, StepShieldAgent
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
-from ethbrake_marl.shield.engine_shield import MovingAtHorizon
-from ethbrake_marl.shield.options import ShieldOptions
+from ethbrake_marl.shield.guard import MovingAtHorizon, ShieldOptions
 from ethbrake_marl.shield.step_shield import Certified, StepShield
-from ethbrake_marl.shield.team_agent import ShieldedTeam
 from ethbrake_marl.shield.uncertainty import Interval, Uncertainty, parse_uncertainty
 from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 

@@ -10,34 +10,45 @@ independent, that does not hold: the pairwise figure is about half of what the s
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents.e_v2x_bm.agent import EV2XBM
-from ethbrake_marl.agents.knowledge import Source
-from ethbrake_marl.agents.protocol import Agent, AgentAround, check_agent, place, recall
+from ethbrake_marl.agents.believed import Believing, split_believed
+from ethbrake_marl.agents.e_v2x_bm import EV2XBM
+from ethbrake_marl.agents.protocol import (
+    Agent,
+    AgentAround,
+    Driver,
+    Knowledge,
+    Source,
+    Team,
+    check_agent,
+    combine,
+    place,
+    recall,
+    team_of,
+)
 from ethbrake_marl.agents.refined import Refined
+from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import drive, script_agents, set_others
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine.stream import ask_script, begin_script
-from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of
-from ethbrake_marl.harm import HarmCount
+from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of, renumbered
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.advance import TIME, Packed
 from ethbrake_marl.physics.episode import decision_s, first_decision_s
-from ethbrake_marl.physics.rows import TIME, Packed
-from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.problem import state_columns
-from ethbrake_marl.shield.alert import Cap
-from ethbrake_marl.shield.comparison import difference, seen_columns
-from ethbrake_marl.shield.interior import expects
-from ethbrake_marl.shield.rollouts import Proposer, proposed_actions
-from ethbrake_marl.shield.settings import check_scenario
-from ethbrake_marl.shield.step_shield import Certified, StepShield
-from ethbrake_marl.shield.told import by_vehicle
-from ethbrake_marl.shield.uncertainty import Uncertainty, checked_uncertainty
+from ethbrake_marl.physics.worlds import vehicles_at_once
+from ethbrake_marl.scenario import Scenario, Task
+from ethbrake_marl.search.profiles import state_columns
+from ethbrake_marl.shield.believed import BelievedShieldAgent
+from ethbrake_marl.shield.certify import Proposer, difference, proposed_actions, seen_columns
+from ethbrake_marl.shield.interior import CORNERS, checked_robust, expects
+from ethbrake_marl.shield.step_shield import Cap, Certified, StepShield, by_vehicle
+from ethbrake_marl.shield.uncertainty import Uncertainty, check_scenario, checked_uncertainty, mode_uncertainty
 
 Bound = Literal["coupled", "pairwise"]
 CLOCK = 1e-6  # of a time step: rounding of the clock of whoever asks
@@ -313,3 +324,248 @@ class StepShieldAgent(AgentAround):
 
     def _make(self, vehicle: int | tuple[int, ...]) -> StepShield:
         return StepShield(self.scenario, vehicle, **self._settings)  # type: ignore[arg-type]
+
+
+# A team behind one step shield: every proposal is known before any action is applied.
+
+
+class ShieldedTeam(Team):
+    """Every driver of a ``team`` proposes, and one ``StepShield`` certifies or replaces what they do together.
+
+    The settings are those of ``StepShieldAgent``. After ``begin``, ``predicted_harm`` [n] is the bound.
+    Raises ``InvalidInput`` for a learner of the scenario that the team does not drive, and what ``StepShield`` raises.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("cooperation-3-pair")
+    >>> team = eb.make_agent("full_brake+step", scenario=scenario)
+    >>> sorted(team.drivers), team.name
+    ([1, 2], 'full_brake+step')
+
+    """
+
+    def __init__(self, team: Team, scenario: Scenario, **settings: Any) -> None:
+        if undriven := [scenario.vehicle_names[i] for i in scenario.learners if i not in team.drivers]:
+            raise InvalidInput(
+                f"team {team.name!r}: does not drive {', '.join(undriven)}; beside a shielded vehicle every other one"
+                " is shielded too, or follows a script"
+            )
+        self.together = _Together(copy.deepcopy(team), scenario, settings)
+        super().__init__({i: _Member(self.together, i) for i in team.drivers}, f"{team.name}+step")
+
+    @property
+    def policy(self) -> Team:
+        """Who proposes: the team as it is without a shield."""
+        return Team(self.together.policies, self.name.removesuffix("+step"))
+
+    @property
+    def shield(self) -> StepShield | None:
+        """The shield as it is now; None before an episode began."""
+        return self.together.shield
+
+    @property
+    def predicted_harm(self) -> Floats:
+        """The bound at the alert, [n] m2/s2."""
+        return self.together.predicted_harm
+
+    @property
+    def chosen_policy(self) -> Bools:
+        """Where everything proposed was applied so far, [n]."""
+        return self.together.chosen_policy
+
+
+class _Together(StepShieldAgent):
+    """The shield of a team, and who proposes; what the first member is told, or asks, is done for all."""
+
+    def __init__(self, team: Team, scenario: Scenario, settings: dict[str, Any]) -> None:
+        self.policies = team.drivers
+        self.vehicles = tuple(team.drivers)  # front to rear
+        self._told: set[int] = set()  # members that know of the episodes that began last
+        super().__init__(team.drivers[self.vehicles[0]], scenario, **settings)
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Find the bound once for all members."""
+        if not self._told or vehicle in self._told:
+            self._told = set()
+            self.begin_all(worlds, self.vehicles, self.policies, rows)
+        self._told.add(vehicle)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The certified command of one member, [n] m/s2; all are decided when the first one asks."""
+        return self.act_all(worlds, self.vehicles, self.policies)[:, self.vehicles.index(vehicle)].copy()
+
+
+class _Member(AgentAround):
+    """One driver of a shielded team."""
+
+    adds = StepShieldAgent.adds
+
+    def __init__(self, together: _Together, vehicle: int) -> None:
+        policy = together.policies[vehicle]
+        super().__init__(policy, f"{policy.name}+step")
+        self.together = together
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """As all of them."""
+        self.together.begin(worlds, vehicle, rows)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Its own command, [n] m/s2."""
+        return self.together.act(worlds, vehicle)
+
+    def after_step(self, packed: Packed) -> None:
+        """Follow the engine; the first member that is told does it for all."""
+        self.together.after_step(packed)
+
+
+def shield_around(agent: Agent) -> StepShield | None:
+    """The step shield of an agent, or of the shielded team that it is a member of; None where there is none yet."""
+    if isinstance(agent, _Member):
+        return agent.together.shield
+    return agent.shield if isinstance(agent, StepShieldAgent) else None
+
+
+def drives_alone(driver: Driver) -> Agent | ShieldedTeam | None:
+    """Who may say something about a whole world: an agent, the only driver of a team, or a shielded team."""
+    if isinstance(driver, ShieldedTeam) or not isinstance(driver, Team):
+        return driver
+    return next(iter(driver.drivers.values())) if len(driver.drivers) == 1 else None
+
+
+# Drivers behind one step shield: what they did, and what the shield did to them, world by world.
+
+CHUNK = 500  # worlds advanced together: bounds memory, changes no result
+
+Behind = StepShieldAgent | ShieldedTeam
+
+
+class Shielded(NamedTuple):
+    """Episodes behind a step shield: n worlds (any axes before), N vehicles, K of them shielded."""
+
+    harm: Floats  # [n] of the count that is guarded (m2/s2)
+    vehicle_harm: Floats  # [n, N] what each vehicle bears of it
+    bound: Floats  # [n] that was told at the alert, with the allowance
+    baseline: Floats  # [n, N] what each vehicle bears under the baseline plan
+    replaced: Ints  # [n, K] decisions of each shielded vehicle that were replaced
+    decisions: Ints  # [n] of each of them
+    moving: Bools  # [n] the horizon cut the episode off
+
+
+def put_shield(driver: Driver, task: Task, **settings: Any) -> Behind:
+    """A copy of the ``driver`` behind one step shield: around one agent where one vehicle learns, else around a team.
+
+    The settings are those of ``StepShieldAgent`` and ``ShieldedTeam``. Raises what they raise.
+    """
+    team = team_of(driver, task.vehicles)
+    if len(task.vehicles) == 1:
+        return StepShieldAgent(team.drivers[task.vehicles[0]], task.scenario, harm_count=task.harm_count, **settings)
+    return ShieldedTeam(team, task.scenario, harm_count=task.harm_count, **settings)
+
+
+def drive_behind(behind: Behind, worlds: Worlds, task: Task) -> Shielded:
+    """Let what is behind a shield drive all worlds at once; it then holds the log of these episodes, if it keeps one.
+
+    Raises ``PhysicsError`` naming the worlds that could not be advanced.
+    """
+    alone = None if isinstance(behind, ShieldedTeam) else task.vehicle
+    episodes = drive(worlds, behind, task.scenario, alone)
+    shield = behind.shield
+    assert shield is not None and shield.running is not None
+    return Shielded(
+        episodes.ledger.world_harm(task.harm_count),
+        episodes.ledger.vehicle_harm(task.harm_count),
+        shield.first_bound + shield.allowance,
+        shield.baseline_shares,
+        shield.replaced.reshape(worlds.n, -1),
+        shield.running.steps.copy(),
+        ~episodes.at_rest,
+    )
+
+
+def drive_chunks(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
+    """Let a copy of the ``driver`` drive every world behind a step shield, ``CHUNK`` at a time; as ``put_shield``."""
+    parts = []
+    for first in range(0, worlds.n, CHUNK):
+        rows = np.arange(first, min(first + CHUNK, worlds.n))
+        with renumbered(rows):
+            parts.append(drive_behind(put_shield(driver, task, **settings), worlds.take(rows), task))
+    return join(parts)
+
+
+def join(parts: Sequence[Shielded]) -> Shielded:
+    """Consecutive worlds as one."""
+    return Shielded(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def stack(parts: Sequence[Shielded]) -> Shielded:
+    """Several drivers in the same worlds, on an axis in front."""
+    return Shielded(*(np.stack(columns) for columns in zip(*parts, strict=True)))
+
+
+def shield_of(behind: Behind) -> StepShield:
+    """The shield as it is now, after an episode began."""
+    assert behind.shield is not None
+    return behind.shield
+
+
+# Factories of what the registry puts around an agent: the shields, with and without ``:believed``.
+
+
+class BelievingHybrid(Believing):
+    """Algorithm 1 on what was received: at the first decision policy and E-V2X-BM are compared as is believed."""
+
+    policy: HybridAgent
+
+    @property
+    def knows(self) -> Knowledge:
+        """What the policy knows, which drives by what it observes, and what the comparison adds."""
+        return combine(self.policy.policy, also=Source.BELIEFS)
+
+    def _begin_policy(self, believed: Worlds, vehicle: int, rows: Ints) -> None:
+        """The comparison is a rollout, which begins at t = 0 without impacts: the same line, its clock put back."""
+        v, n = believed.vehicles, believed.n
+        latency = np.maximum(v.latency_s - believed.time_s[:, np.newaxis], 0.0)
+        vehicles = vehicles_at_once(
+            v.braking_capacity_mps2, v.driving_capacity_mps2, latency, v.mass_t, v.speed_limit_mps, v.restitution
+        )
+        line = replace(
+            believed, vehicles=vehicles, time_s=np.zeros(n), pair_hit=np.zeros_like(believed.pair_hit),
+            obstacle_hit=np.zeros(n, np.bool_),
+        )  # fmt: skip
+        super()._begin_policy(line, vehicle, rows)
+
+
+def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
+    """``+episode`` or ``+episode:pairwise`` around an agent, with ``:believed`` behind on what was received."""
+    pairwise, believes = split_believed(argument)
+    bound: Bound = "coupled" if pairwise is None else "pairwise"
+    scenario = settings.needed_scenario()
+    hybrid = HybridAgent(policy, scenario, bound=bound, harm_count=settings.harm_count)
+    if believes and isinstance(policy, Believing):
+        raise InvalidInput(f"agent {settings.spec!r}: {policy.name} decides on what was received itself; take +step")
+    return BelievingHybrid(hybrid, scenario) if believes else hybrid
+
+
+def shield_steps(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
+    """``+step`` around an agent or a team, where several vehicles learn around a copy for each; ``+step:believed``."""
+    scenario, harm_count, believes = settings.needed_scenario(), settings.harm_count, split_believed(argument)[1]
+    if not isinstance(policy, Team) and len(scenario.learners) <= 1:
+        make = BelievedShieldAgent if believes else StepShieldAgent
+        return make(policy, scenario, harm_count=harm_count)
+    if believes:
+        raise InvalidInput(f"agent {settings.spec!r}: :believed shields one learner, not several; take +step")
+    team = policy if isinstance(policy, Team) else Team.copies(policy, scenario.learners)
+    return ShieldedTeam(team, scenario, harm_count=harm_count)
+
+
+def shield_steps_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
+    """``+robust`` or ``+robust:interior``, against the uncertainty of the settings.
+
+    With ``:believed`` behind, against all that was not received, without one.
+    """
+    scenario, where, harm_count = settings.needed_scenario(), f"agent {settings.spec!r}", settings.harm_count
+    certainty, believes = split_believed(argument)
+    robust = checked_robust(certainty or CORNERS, where)
+    if believes:
+        return BelievedShieldAgent(policy, scenario, harm_count=harm_count, robust=robust)
+    uncertainty = mode_uncertainty("robust", settings.uncertainty, where)
+    return StepShieldAgent(policy, scenario, harm_count=harm_count, uncertainty=uncertainty, robust=robust)

@@ -18,21 +18,18 @@ from typing import cast
 import numpy as np
 
 from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents.believed import Foretold, Ranges, Told, believed_worlds, ranges_of, told_to
-from ethbrake_marl.agents.believing import SUFFIX, Odometer
-from ethbrake_marl.agents.protocol import Agent, place
-from ethbrake_marl.agents.rollout import script_agents
-from ethbrake_marl.engine.stream import Script
+from ethbrake_marl.agents.believed import SUFFIX, Foretold, Odometer, Ranges, Told, believed_worlds, ranges_of, told_to
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent, place
+from ethbrake_marl.agents.rollout import script_agents, set_others
+from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.engine.stream import Script, begin_script
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.problem import state_columns, worlds_at
-from ethbrake_marl.shield.certify import Decision
-from ethbrake_marl.shield.held import Held, held_in, hold_better
+from ethbrake_marl.search.profiles import state_columns, worlds_at
+from ethbrake_marl.shield.certify import Decision, Proposer, proposed_action
 from ethbrake_marl.shield.interior import CORNERS, INTERIOR, checked_robust
-from ethbrake_marl.shield.rollouts import Proposer
-from ethbrake_marl.shield.step_shield import StepShield
+from ethbrake_marl.shield.step_shield import Held, StepShield, held_in, hold_better
 from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty
 
 PER_WORLD = ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s")  # arrays [n, ...]
@@ -288,3 +285,46 @@ class BelievedShield:
                 )
             self._ranges = vehicle, ranges
         return self._ranges[1]
+
+
+# The agent that drives by a policy behind a shield over a believed world.
+
+
+class BelievedShieldAgent(AgentAround):
+    """Drives by ``policy`` as far as a ``BelievedShield`` certifies it: ``POLICY+step:believed``, ``+robust:believed``.
+
+    ``robust`` is None, ``corners`` or ``interior``. Raises ``InvalidInput`` for what is not an agent, and what
+    ``BelievedShield`` raises.
+    """
+
+    adds = Source.BELIEFS
+
+    def __init__(
+        self, policy: Agent, scenario: Scenario, *, harm_count: HarmCount = "first", robust: str | None = None
+    ) -> None:
+        check_agent(policy, SUFFIX)
+        mode = "step" if robust is None else "robust" if robust == CORNERS else f"robust:{robust}"
+        super().__init__(policy, f"{policy.name}+{mode}:{SUFFIX}")
+        self.scenario = scenario
+        self.believed = BelievedShield(scenario, harm_count=harm_count, robust=robust)
+
+    @property
+    def predicted_harm(self) -> Floats:
+        """The first bound, [n] m2/s2; NaN before the first decision."""
+        return self.believed.predicted_harm
+
+    @property
+    def interventions(self) -> Ints:
+        """How many proposals were replaced so far in the running episodes, [n]."""
+        return self.believed.interventions
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Remember where these episodes start; nothing has been received yet."""
+        self.believed.begin(worlds, vehicle, rows)
+        set_others(self.policy, vehicle, script_agents(self.scenario, except_for=vehicle))
+        begin_script(self.policy, worlds, vehicle, rows)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The certified command, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
+        policies = {vehicle: self.policy}
+        return self.believed.decide(worlds, vehicle, lambda: proposed_action(self.policy, worlds, vehicle), policies)

@@ -33,16 +33,46 @@ them, each member being advanced by the same actions: then the realised harm of 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.physics import Bools, Floats, Ints
-from ethbrake_marl.physics.episode import START, TIME_STEP, decision_s
-from ethbrake_marl.search.problem import ProfileProblem
-from ethbrake_marl.shield.certify_kernel import NO_CERTIFICATE, NOT_A_NUMBER, certify_worlds, harm_of_plans
+from ethbrake_marl.actions import action_to_command, command_to_action
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Team, is_divisible
+from ethbrake_marl.agents.rollout import drive, script_agents, set_others
+from ethbrake_marl.engine.stream import ask_script
+from ethbrake_marl.errors import InvalidInput, PhysicsError, renumbered
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.advance import Packed, command_at, gap_at, has_obstacle, speed_at, state_width, vehicles_in
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.episode import (
+    EPISODE_ROWS,
+    HARM_IS_TOTAL,
+    START,
+    TIME_STEP,
+    at_rest,
+    decision_at,
+    decision_s,
+)
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.search.profiles import ProfileProblem, worlds_at
+from ethbrake_marl.shield.certify_kernel import (
+    ENDED,
+    NO_CERTIFICATE,
+    NOT_A_NUMBER,
+    Members,
+    borne_by,
+    certify_worlds,
+    follow_plan,
+    gather,
+    harm_of_plans,
+    rows_of,
+)
 
 REASONS = (
     "same as plan",  # the proposal is the plan's action
@@ -223,3 +253,379 @@ def _check_plan(running: Running, plan: Floats) -> None:
     if not fits or plan.shape[0] != running.n or plan.shape[1] < most:
         wanted = f"({running.n}, at least {most}{'' if vehicles == 1 else f', {vehicles}'})"
         raise InvalidInput(f"shield: plan {plan.shape}; {wanted} is needed")
+
+
+# The comparison of what happened with what was predicted: to the last bit, the harm so far included.
+
+SLACK = 1e-9  # by more than this (m, m/s) a world lies outside what several members predict; one member is exact
+GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("total harm", " m2/s2"))  # of each pair
+
+
+def seen_columns(packed: Packed) -> Floats:
+    """Running worlds and their harm so far in the columns of ``Running.states``, [n, S]: to be compared with them.
+
+    Those are speeds, gaps, hit flags and both harms, with the obstacle first in each group where there is one. Raises
+    ``InvalidInput`` where only some of the worlds have one.
+    """
+    state = packed.state
+    N = vehicles_in(state)
+    speeds, first, pairs = state[:, speed_at(N) : command_at(N)], gap_at(N), N - 1
+    if has_obstacle(state, N) and (ahead := np.isfinite(state[:, state_width(N)])).any():
+        if not ahead.all():
+            raise InvalidInput("shield: only some of the worlds have an obstacle ahead (obstacle_gap_m), not all")
+        groups = [state[:, first + g * pairs : first + (g + 1) * pairs] for g in range(len(GROUPS))]
+        at = state_width(N)
+        whole = [part for g, group in enumerate(groups) for part in (state[:, at + g : at + g + 1], group)]
+        return np.concatenate([np.zeros((len(state), 1)), speeds, *whole], axis=1)
+    return np.concatenate([speeds, state[:, first : first + len(GROUPS) * pairs]], axis=1)
+
+
+def as_predicted(running: Running, seen: Floats) -> Bools:
+    """Where what is seen [n, columns] does not contradict the prediction, [n].
+
+    One member: where it is what was predicted, to the bit. Several: where it lies within the range of their
+    predictions, by column; once one of them has had an impact, worlds between the corners may leave that range, and any
+    finite numbers will do.
+    """
+    columns, N = seen.shape[1], (running.states.shape[1] + 4) // 5
+    predicted = running.states.reshape(running.n, running.members, -1)
+    slack = 0.0 if running.members == 1 else SLACK
+    low, high = predicted[:, :, :columns].min(axis=1) - slack, predicted[:, :, :columns].max(axis=1) + slack
+    within: Bools = ((seen >= low) & (seen <= high)).all(axis=1)
+    if running.members > 1:
+        had_impact = (predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2))
+        within |= had_impact & np.isfinite(seen).all(axis=1)
+    return within
+
+
+def difference(predicted: Floats, seen: Floats) -> str:
+    """The first number in which a world as seen [S] is not as predicted [S], in words; "nothing" where all are."""
+    vehicles = (len(predicted) + 4) // 5
+    for column in np.flatnonzero(~(seen == predicted)).tolist():
+        if column < vehicles:
+            what, unit = f"speed of vehicle {column + 1} of the line", " m/s"
+        else:
+            group, pair = divmod(column - vehicles, vehicles - 1)
+            what, unit = f"{GROUPS[group][0]} of pair {pair + 1}", GROUPS[group][1]
+        return f"{what} is {seen[column]:.17g}{unit}, certified was {predicted[column]:.17g}{unit}"
+    return "nothing"
+
+
+# The test whether a world comes to rest before the horizon, where every bound ends.
+
+
+def plan_rests(running: Running, plan: Floats) -> Bools:
+    """Where everything rests at the horizon if the plans are executed from here, in every member, [n]."""
+    problem, rests = running.problem, np.empty(running.n, np.bool_)
+    rests_after_plans(
+        running.states, running.steps, running.ended, problem.clock, problem.bounds, problem.command,
+        problem.latency, problem.mass, problem.limit, no_caps(problem.n), problem.vehicles,
+        np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(problem.vehicles)), rests,
+    )  # fmt: skip
+    return rests
+
+
+@compiled
+def rests_after_plans(
+    states: Floats, steps: Ints, ended: Bools, clock: Floats, bounds: Floats, command: Floats, latency: Floats,
+    mass: Floats, limit: Floats, caps: Floats, vehicles: Ints, plans: Floats, rests: Bools,
+) -> None:  # fmt: skip
+    """Fill ``rests`` [n]: under the plan every member of the world comes to rest before the horizon, and stays so."""
+    N, n = mass.shape[1], steps.shape[0]
+    table, critical = np.zeros((EPISODE_ROWS, N)), np.zeros(1, np.int64)
+    M = states.shape[0] // max(n, 1)
+    lines = np.empty((states.shape[0], rows_of(caps), N))
+    gather(lines, 0, command, latency, mass, limit, caps)
+    world = Members(table, clock, bounds, lines, vehicles, critical)
+    for k in range(n):
+        rests[k] = True
+        for m in range(k * M, k * M + M):
+            follow_plan(world, m, states[m], ended[m], steps[k], plans[k], math.inf)
+            rests[k] = rests[k] and at_rest(table)
+
+
+# Each vehicle's share under a plan: the harm of its pairs, split by mass as in the ledger, to the same bits.
+
+
+def borne_under(running: Running, plan: Floats) -> Floats:
+    """Harm of the whole episode that each vehicle bears if the plans are executed from here, [n * M, N] m2/s2.
+
+    With an obstacle ahead its column comes first, and is 0.
+    """
+    problem = running.problem
+    borne = np.empty(problem.mass.shape)
+    borne_under_plans(
+        running.states, running.steps, running.ended, problem.clock, problem.bounds, problem.command,
+        problem.latency, problem.mass, problem.limit, no_caps(problem.n), problem.vehicles,
+        np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(problem.vehicles)), borne,
+    )  # fmt: skip
+    return borne
+
+
+def keeps_caps(running: Running, plan: Floats) -> Bools:
+    """Where no vehicle bears more than it may if the plans are executed from here, [n]; everywhere without caps."""
+    if not running.caps.size:
+        return np.ones(running.n, np.bool_)
+    within = (borne_under(running, plan) <= running.caps).all(axis=1)
+    return np.asarray(within.reshape(running.n, -1).all(axis=1), np.bool_)
+
+
+@compiled
+def borne_under_plans(
+    states: Floats, steps: Ints, ended: Bools, clock: Floats, bounds: Floats, command: Floats, latency: Floats,
+    mass: Floats, limit: Floats, caps: Floats, vehicles: Ints, plans: Floats, borne: Floats,
+) -> None:  # fmt: skip
+    """Fill ``borne`` [n * M, N]."""
+    N, n = mass.shape[1], steps.shape[0]
+    table, critical = np.zeros((EPISODE_ROWS, N)), np.zeros(1, np.int64)
+    M = states.shape[0] // max(n, 1)
+    lines = np.empty((states.shape[0], rows_of(caps), N))
+    gather(lines, 0, command, latency, mass, limit, caps)
+    world = Members(table, clock, bounds, lines, vehicles, critical)
+    for k in range(n):
+        for m in range(k * M, k * M + M):
+            follow_plan(world, m, states[m], ended[m], steps[k], plans[k], math.inf)
+            for i in range(N):
+                borne[m, i] = borne_by(table, clock[m, HARM_IS_TOTAL], i)
+
+
+# The log of a step shield: every decision in which something else than the proposal was applied.
+
+
+class Intervention(NamedTuple):
+    """One decision in which something else than the proposal was applied."""
+
+    world: int  # row of the batch
+    vehicle: int  # index of the shielded vehicle, 0 = front
+    episode: int  # of that row, from 0
+    step: int  # number of the decision
+    time_s: float
+    proposed: float  # action, as it was given
+    applied: float  # action
+    reason: int  # place in REASONS
+    bound: float  # m2/s2, from now on
+    margin: float  # m2/s2; negative: what the proposal would have cost beyond the budget at least
+    state: Floats  # [S] at the decision
+    plan: Floats  # [L] that was held, of several vehicles [L, K]; before ``step`` what was applied
+
+
+def interventions(
+    now: Running, episode: Ints, vehicles: Sequence[int], proposed: Floats, decision: Decision, held: Backup
+) -> list[Intervention]:
+    """What a decision made from ``now`` replaced; ``episode`` [n] numbers the rows' episodes."""
+    times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))
+    columns = (proposed, decision.applied, decision.reason, decision.margin, decision.intervened)
+    given, applied, reason, margin, replaced = (np.reshape(column, shape) for column in columns)
+    return [
+        Intervention(
+            k, vehicles[c], int(episode[k]), int(now.steps[k]), float(times[k]), float(given[k, c]),
+            float(applied[k, c]), int(reason[k, c]), float(decision.bound[k]), float(margin[k, c]), states[k].copy(),
+            held.plan[k].copy(),
+        )
+        for k, c in np.argwhere(replaced).tolist()
+    ]  # fmt: skip
+
+
+def write_down(log: list[Intervention], found: list[Intervention], now: Running, episode: Ints) -> None:
+    """Add what was found at ``now`` to the log, in place of what an interrupted step may have left at its end."""
+    while log and _is_undone(log[-1], now, episode):
+        log.pop()
+    log.extend(found)
+
+
+def _is_undone(entry: Intervention, now: Running, episode: Ints) -> bool:
+    """Whether the running episodes have not come as far as this entry."""
+    k = entry.world
+    return k < now.n and entry.episode == episode[k] and entry.step >= now.steps[k]
+
+
+# Rollouts of the policies that propose: their actions from the alert, and from any later decision, as plans.
+#
+# What a rollout does is written down as a plan and certified like any other (``shield.certify.plan_harm``): a policy
+# that
+# would drive differently the second time costs interventions, never the bound.
+
+ROLLOUT = ENDED + 2  # a reason that the kernel does not know
+Number = TypeVar("Number", bound=np.generic)
+
+
+class Proposer(NamedTuple):
+    """Who proposes, and what they see now: enough to try, on copies, what they would do later."""
+
+    policies: Mapping[int, Agent]  # by shielded vehicle, front to rear; their memory is that of the running episodes,
+    # this decision's action included; never changed
+    worlds: Worlds  # [n] now
+
+
+def rolled_out(
+    worlds: Worlds,
+    policies: Mapping[int, Agent],
+    scenario: Scenario,
+    vehicle: int | tuple[int, ...],
+    problem: ProfileProblem,
+    width: int,
+) -> Floats:
+    """The actions [n, width] (several vehicles: [n, width, K]) of policies that drive unshielded from the alert.
+
+    Full braking beyond their episode's end.
+    """
+    recorders = {i: _Recorder(policy, problem, width) for i, policy in copy.deepcopy(dict(policies)).items()}
+    scripts = script_agents(scenario, except_for=list(recorders))
+    for i, recorder in recorders.items():
+        set_others(recorder.policy, i, scripts)
+    drive(worlds, Team(recorders, next(iter(policies.values())).name), scenario)
+    if isinstance(vehicle, int):
+        return recorders[vehicle].actions
+    return np.stack([recorders[i].actions for i in vehicle], axis=2)
+
+
+def certify_rollouts(
+    running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
+) -> Decision:
+    """Decide again in ``rows``, where the proposals found no certificate, with the policy itself as the later plan.
+
+    The plan that is tried is the proposal (clipped, a number), then what the policy does from the state after it. Where
+    it keeps the budget it becomes the backup, and the proposal is "what the plan says"; elsewhere the reason says that
+    something else must be applied. ``running``, ``proposed``, ``budget`` and the plans ``held`` are those of the
+    whole batch. Of several vehicles, who proposes no number keeps its planned action. Returns the decision of those
+    rows alone.
+    """
+    part, least, silent = running.take(rows), budget[rows], np.isnan(proposed[rows])
+    planned = held[rows, np.minimum(running.steps[rows], held.shape[1] - 1)]
+    first = np.where(silent, planned, np.clip(proposed[rows], -1.0, 1.0))
+    plan = _later_plan(running.nominal(), first, rows, budget, held, proposer)
+    with renumbered(rows):
+        harm = plan_harm(part, plan)
+        kept = (harm <= least) & keeps_caps(part, plan)
+        decision = certify(part, first, Backup(plan, harm, no_constants(plan)), np.maximum(least, harm))
+    each = kept.reshape(-1, *[1] * (first.ndim - 1))
+    told = np.where(silent, NOT_A_NUMBER, ROLLOUT)
+    margin = np.broadcast_to((least - harm).reshape(each.shape), first.shape)
+    return decision._replace(intervened=silent | ~each, margin=margin, reason=np.where(each, told, NO_CERTIFICATE))
+
+
+def _later_plan(
+    running: Running, first: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
+) -> Floats:
+    """The plans of ``rows``: what was applied, the ``first`` action ([m] or [m, K]), then the policies'.
+
+    Given up once above the budget.
+    """
+    policies, worlds = proposer
+    drivers, batch = _apart(policies, rows, worlds.n)
+    seen, wanted = worlds.take(batch), np.isin(batch, rows)
+    episodes, most = running.take(batch), budget[batch]
+    episodes = episodes._replace(ended=episodes.ended | ~wanted)
+    action = np.zeros((len(batch), *first.shape[1:]))
+    action[wanted] = first
+    plan, nothing = from_now(held[batch], -1.0, episodes.steps), np.zeros(len(batch))
+    while True:
+        going = np.flatnonzero(~episodes.ended)
+        plan[going, episodes.steps[going]] = action[going]
+        with renumbered(batch):
+            episodes = certify(episodes, action, Backup(plan, nothing, no_constants(plan)), nothing).after
+        episodes = episodes._replace(ended=episodes.ended | (harm_so_far(episodes) > most))
+        if episodes.ended.all():
+            return plan[wanted]
+        seen = _seen(seen, episodes, list(policies), action)
+        action = _or_braking(proposed_actions(drivers, seen, action.ndim == 1))
+
+
+def no_constants(plan: Floats) -> Floats:
+    """No constant action to replace the rest of a plan."""
+    return np.zeros((0, *plan.shape[2:]))
+
+
+def proposed_actions(policies: Mapping[int, Agent], worlds: Worlds, single: bool) -> Floats:
+    """What the policies propose, [n] of the only one where it is a ``single`` shield's, else [n, K]."""
+    columns = [proposed_action(policy, worlds, vehicle) for vehicle, policy in policies.items()]
+    return columns[0] if single else np.stack(columns, axis=1)
+
+
+def proposed_action(policy: Agent, worlds: Worlds, vehicle: int) -> Floats:
+    """What a policy proposes, as actions [n] in [-1, 1]; a command that is no number stays none."""
+    command = ask_script(policy, worlds, vehicle)
+    return np.where(np.isnan(command), np.nan, command_to_action(command, worlds.vehicles, vehicle))
+
+
+def _or_braking(action: Floats) -> Floats:
+    """In a rollout full braking stands for what is no number: the shield would not apply that either."""
+    return np.where(np.isnan(action), -1.0, action)
+
+
+def _apart(policies: Mapping[int, Agent], rows: Ints, n: int) -> tuple[dict[int, Agent], Ints]:
+    """Policies that go on without changing these, and the rows of the batch that they drive: all, if one must."""
+    parts = {i: policy.take(rows) for i, policy in policies.items() if is_divisible(policy)}
+    if len(parts) == len(policies):
+        return parts, rows
+    return copy.deepcopy(dict(policies)), np.arange(n)
+
+
+def harm_so_far(running: Running) -> Floats:
+    """Harm of the episodes up to now under the count that is guaranteed, [n] m2/s2."""
+    pairs = (running.states.shape[1] - 1) // 5  # the width is N + 4 (N - 1)
+    group = 1 if running.problem.clock[0, HARM_IS_TOTAL] == 1.0 else 0
+    last = running.states.shape[1] - (1 - group) * pairs
+    harm: Floats = running.states[:, last - pairs : last].sum(axis=1)
+    return harm
+
+
+def _seen(worlds: Worlds, running: Running, vehicles: list[int], action: Floats) -> Worlds:
+    """The worlds as a driver sees them at the decisions of ``running``, the last actions of ``vehicles`` in force."""
+    commands = running.problem.command[:, -worlds.N :].copy()  # without an obstacle ahead
+    for c, vehicle in enumerate(vehicles):
+        column = action if action.ndim == 1 else action[:, c]
+        commands[:, vehicle] = action_to_command(column, worlds.vehicles, vehicle)
+    time = running.time_s
+    return replace(
+        worlds_at(worlds, running.states),
+        time_s=time,
+        command_mps2=np.where(worlds.vehicles.latency_s <= time[:, np.newaxis], commands, 0.0),
+    )
+
+
+class _Recorder(AgentAround):
+    """A policy whose actions are written down, and applied as they are written."""
+
+    def __init__(self, policy: Agent, problem: ProfileProblem, width: int) -> None:
+        super().__init__(policy)
+        self.actions = np.full((problem.n, width), -1.0)
+        self._clock = problem.clock
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The policy's action, rounded as it is written."""
+        action = _or_braking(proposed_action(self.policy, worlds, vehicle))
+        step = decision_at(worlds.time_s, self._clock[:, START], self._clock[:, TIME_STEP])
+        rows = np.flatnonzero((step >= 0) & (step < self.actions.shape[1]))
+        self.actions[rows, step[rows]] = action[rows]
+        return action_to_command(action, worlds.vehicles, vehicle)
+
+
+def merged(decision: Decision, rows: Ints, found: Decision) -> Decision:
+    """A batch's decision with that of ``rows`` replaced where the policies' rollout kept the budget."""
+    margin = decision.margin.copy()
+    margin[rows] = np.maximum(margin[rows], found.margin)
+    kept = np.flatnonzero((found.reason != NO_CERTIFICATE).reshape(len(rows), -1).all(axis=1))
+    at, after, plan = rows[kept], found.after, found.backup.plan
+    assert (plan == from_now(decision.backup.plan[rows], plan, found.after.steps - 1)).all()  # one past
+    return Decision(
+        put(decision.applied, at, found.applied[kept]),
+        put(decision.intervened, at, found.intervened[kept]),
+        put(decision.reason, at, found.reason[kept]),
+        put(decision.bound, at, found.bound[kept]),
+        margin,
+        decision.after._replace(
+            states=put(decision.after.states, decision.after.rows_of(at), after.states[after.rows_of(kept)]),
+            ended=put(decision.after.ended, decision.after.rows_of(at), after.ended[after.rows_of(kept)]),
+        ),
+        decision.backup._replace(
+            plan=put(decision.backup.plan, at, plan[kept]), harm=put(decision.backup.harm, at, found.bound[kept])
+        ),
+    )
+
+
+def put(old: NDArray[Number], rows: Ints, new: NDArray[Number]) -> NDArray[Number]:
+    """A copy of ``old`` with ``new`` in these rows."""
+    placed = old.copy()
+    placed[rows] = new
+    return placed

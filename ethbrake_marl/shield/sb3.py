@@ -13,10 +13,8 @@ from ethbrake_marl.actions import checked_action
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, Rewards
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
-from ethbrake_marl.shield.engine_episode import attach
-from ethbrake_marl.shield.engine_shield import Proposing
-from ethbrake_marl.shield.options import read_options
-from ethbrake_marl.shield.settings import engine_of
+from ethbrake_marl.shield.guard import Proposing, attach, read_options
+from ethbrake_marl.shield.uncertainty import engine_of
 
 
 class ShieldedVecEnv(VecEnvWrapper):

@@ -5,29 +5,220 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.agents.protocol import Agent, fixed_commands
 from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
-from ethbrake_marl.harm import HarmCount, check_harm_count
+from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.episode import number_of_decisions
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.episode import EPISODE_ROWS, number_of_decisions
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.problem import PER_WORLD as OF_PROBLEM
+from ethbrake_marl.search.profiles import PER_WORLD as OF_PROBLEM
+from ethbrake_marl.search.profiles import ProfileProblem, profile_problem
 from ethbrake_marl.shield import interior
-from ethbrake_marl.shield.alert import CAPS, Cap, Settings, Start, start_of
-from ethbrake_marl.shield.certify import Backup, Decision, Running, certify, from_now, plan_harm
-from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE
-from ethbrake_marl.shield.interventions import Intervention, interventions, write_down
-from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts, merged, put
-from ethbrake_marl.shield.settings import check_amount, check_scenario, checked_vehicles, policies_of
-from ethbrake_marl.shield.shares import borne_under
-from ethbrake_marl.shield.uncertainty import Uncertainty
+from ethbrake_marl.shield.certify import (
+    CONSTANTS,
+    Backup,
+    Decision,
+    Intervention,
+    Proposer,
+    Running,
+    begin_running,
+    bettered_plan,
+    borne_under,
+    certify,
+    certify_rollouts,
+    from_now,
+    interventions,
+    merged,
+    no_caps,
+    plan_harm,
+    plan_rests,
+    put,
+    rolled_out,
+    write_down,
+)
+from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE, Members, gather, hold_constant, rows_of
+from ethbrake_marl.shield.uncertainty import Uncertainty, check_amount, check_scenario, checked_vehicles, policies_of
+
+# The plan that a shield starts with at the alert: constants of least harm, or what the policies do, if that is better.
+#
+# For one shielded vehicle the constant is the coupled optimum. For several it is the best of these: all brake fully,
+# one
+# of them takes its coupled optimum while the others brake fully, and what a descent finds from the best of those, one
+# vehicle after the other.
+
+LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions, for the bound at the alert where there are several members
+GRID = np.linspace(0.0, -1.0, 21)  # ... of the descent of several vehicles
+ROUNDS = 2  # of that descent
+LADDER = np.linspace(0.0, -1.0, 5)  # actions of the first and of the last vehicle in the constants of several
+
+Cap = Literal["baseline"]
+CAPS = ("baseline",)  # of whose plan a vehicle's harm is the most that it may bear
+
+
+class Settings(NamedTuple):
+    """What a shield is set to."""
+
+    scenario: Scenario
+    vehicle: int | tuple[int, ...]  # shielded: one, whose actions are [n], or several, [n, K]
+    harm_count: HarmCount
+    others: Mapping[int, Script]
+    uncertainty: Uncertainty | None
+    cap: Cap | None
+    width: int  # decisions of a plan
+
+    @property
+    def vehicles(self) -> tuple[int, ...]:
+        """Indices of the shielded vehicles."""
+        return (self.vehicle,) if isinstance(self.vehicle, int) else self.vehicle
+
+
+class Start(NamedTuple):
+    """What a shield knows at the alert, of n worlds."""
+
+    running: Running
+    backup: Backup
+    alone: Floats  # [n] harm of the policies, rolled out; infinity without (m2/s2)
+    settles: Bools  # [n] under the plan all rest at the horizon
+    baseline: Floats  # [n, N] what each vehicle bears under the best constant (m2/s2)
+
+
+def start_of(settings: Settings, worlds: Worlds, policies: Mapping[int, Agent] | None) -> Start:
+    """The plan to start with in each of these worlds, which are at the alert, as they are believed."""
+    possible = worlds if settings.uncertainty is None else settings.uncertainty.members(worlds)
+    members = possible.n // worlds.n
+    _check_latest(settings, possible, members)
+    running = begin_running(*_problem(settings, possible, members))
+    constants = joint_constants(len(settings.vehicles)) if len(settings.vehicles) > 1 else np.array(CONSTANTS)
+    plan = _baseline(settings, worlds, running)
+    if members > 1:
+        plan = bettered_plan(running, plan, LOOKED_AT)[0]
+    harm, alone = plan_harm(running, plan), np.full(worlds.n, np.inf)
+    borne = borne_under(running, plan)
+    if settings.cap is not None:
+        running = running._replace(caps=borne)
+    if policies is not None:
+        actions = rolled_out(
+            worlds, policies, settings.scenario, settings.vehicle, running.nominal().problem, settings.width
+        )
+        alone = plan_harm(running, actions)
+        better = alone <= harm
+        if settings.cap is not None:
+            better &= (borne_under(running, actions) <= borne).all(axis=1)
+        plan[better] = actions[better]
+        harm = np.where(better, alone, harm)
+    baseline = borne[::members, borne.shape[1] - worlds.N :]
+    return Start(running, Backup(plan, harm, constants), alone, plan_rests(running, plan), baseline)
+
+
+def joint_constants(vehicles: int) -> Floats:
+    """Constant actions [C, K] of several vehicles, front to rear: all alike, or evenly from one action to another."""
+    alike = np.repeat(np.array(CONSTANTS)[:, np.newaxis], vehicles, axis=1)
+    share = np.linspace(0.0, 1.0, vehicles)
+    ladders = [first + share * (last - first) for first in LADDER for last in LADDER if first != last]
+    return np.concatenate([alike, ladders])
+
+
+def _problem(settings: Settings, possible: Worlds, members: int) -> tuple[ProfileProblem, int]:
+    others = fixed_commands(settings.others, possible, "shield", vehicle=None)
+    with renumbered(np.repeat(np.arange(possible.n // members), members)):
+        problem = profile_problem(
+            possible, settings.vehicles, harm_count=settings.harm_count, horizon_s=settings.scenario.horizon_s,
+            time_step_s=settings.scenario.time_step_s, others_mps2=others,
+        )  # fmt: skip
+    return problem, members
+
+
+def _check_latest(settings: Settings, possible: Worlds, members: int) -> None:
+    latest = possible.vehicles.latency_s[:, list(settings.vehicles)].min(axis=1).max()
+    if members > 1 and not latest < settings.scenario.horizon_s:
+        raise InvalidInput(
+            f"uncertainty: {settings.uncertainty}: vehicle_{settings.vehicles[0] + 1} may decide first at {latest:g} s;"
+            f" must be before the horizon, {settings.scenario.horizon_s:g} s"
+        )
+
+
+def _baseline(settings: Settings, worlds: Worlds, running: Running) -> Floats:
+    """The plans [n, L] or [n, L, K] of the best constant actions found."""
+    vehicles, members = settings.vehicles, running.members
+    others = np.array(running.problem.command[::members, running.problem.command.shape[1] - worlds.N :])
+    others[:, list(vehicles)] = -worlds.vehicles.braking_capacity_mps2[:, list(vehicles)]
+
+    def alone(vehicle: int) -> Floats:
+        best = optimise_coupled(
+            worlds, vehicle, harm_count=settings.harm_count, horizon_s=settings.scenario.horizon_s, others_mps2=others
+        ).deceleration_mps2
+        return command_to_action(-best, worlds.vehicles, vehicle)
+
+    if isinstance(settings.vehicle, int):
+        return np.repeat(alone(settings.vehicle)[:, np.newaxis], settings.width, axis=1)
+    if members > 1:  # a team of one vehicle: no other team is shielded against uncertainty
+        return held(alone(vehicles[0])[:, np.newaxis], settings.width)
+    braking = np.full((worlds.n, len(vehicles)), -1.0)
+    best, least = braking, plan_harm(running, held(braking, settings.width))
+    for c, vehicle in enumerate(vehicles):
+        action = braking.copy()
+        action[:, c] = alone(vehicle)
+        best, least = _better(running, best, least, action, settings.width)
+    action = best.copy()
+    _descend(running, action)
+    best, _ = _better(running, best, least, action, settings.width)
+    return held(best, settings.width)
+
+
+def held(action: Floats, width: int) -> Floats:
+    """The plans [n, width, K] that hold these actions [n, K]."""
+    return np.repeat(action[:, np.newaxis], width, axis=1)
+
+
+def _better(running: Running, best: Floats, least: Floats, action: Floats, width: int) -> tuple[Floats, Floats]:
+    """The actions of less harm, decision by decision; and that harm."""
+    harm = plan_harm(running, held(action, width))
+    return np.where((harm < least)[:, np.newaxis], action, best), np.minimum(harm, least)
+
+
+def _descend(running: Running, action: Floats) -> None:
+    """Improve constant actions [n, K] in place, one vehicle after the other; of worlds with one member each."""
+    problem = running.problem
+    assert len(running.states) == len(action)  # the kernel does not look
+    descend_constants(
+        running.states, running.steps, running.ended, problem.clock, problem.bounds, problem.command, problem.latency,
+        problem.mass, problem.limit, no_caps(problem.n), problem.vehicles, GRID, ROUNDS, action,
+    )  # fmt: skip
+
+
+@compiled
+def descend_constants(
+    states: Floats, steps: Ints, ended: Bools, clock: Floats, bounds: Floats, command: Floats, latency: Floats,
+    mass: Floats, limit: Floats, caps: Floats, vehicles: Ints, grid: Floats, rounds: int, action: Floats,
+) -> None:  # fmt: skip
+    """Replace each vehicle's constant action [n, K] in turn by the best of the grid, by harm in one segment."""
+    table, critical = np.zeros((EPISODE_ROWS, mass.shape[1])), np.zeros(1, np.int64)
+    lines = np.empty((states.shape[0], rows_of(caps), mass.shape[1]))
+    gather(lines, 0, command, latency, mass, limit, caps)
+    world = Members(table, clock, bounds, lines, vehicles, critical)
+    for k in range(states.shape[0]):
+        least = hold_constant(world, k, states[k], ended[k], steps[k], action, k)
+        for turn in range(rounds * action.shape[1]):
+            c = turn % action.shape[1]
+            best = action[k, c]
+            for g in range(grid.shape[0]):
+                action[k, c] = grid[g]
+                value = hold_constant(world, k, states[k], ended[k], steps[k], action, k)
+                if value < least:
+                    best, least = grid[g], value
+            action[k, c] = best
+
 
 BROKEN = ENDED + 1  # a reason that the kernel does not know
 PER_WORLD = (  # a shield's arrays [n, ...]
@@ -297,3 +488,89 @@ def _harm_of(running: Running, plan: Floats, rows: Ints) -> Floats:
     """Harm of the plans in some of the worlds."""
     with renumbered(rows):
         return plan_harm(running.take(rows), plan[rows])
+
+
+# Infos of a shield: the keys, and their values before anything is decided.
+
+
+class SharesTold:
+    """What each vehicle bears under the plans of a shield, for infos: found once in each step, if anybody asks."""
+
+    def __init__(self) -> None:
+        self._last: tuple[StepShield, Floats] | None = None
+
+    def told(self, shield: StepShield, k: int, vehicle: int) -> dict[str, Any]:
+        """The keys of one vehicle in world ``k``."""
+        if self._last is None or self._last[0] is not shield:
+            self._last = shield, shield.shares()
+        return {
+            "own_harm": float(self._last[1][k, vehicle]),
+            "baseline_own_harm": float(shield.baseline_shares[k, vehicle]),
+        }
+
+
+def told_before(shield: StepShield, k: int) -> dict[str, Any]:
+    """What a shield says of world ``k`` where nothing is decided."""
+    assert shield.running is not None
+    return {
+        "mode": "step" if shield.uncertainty is None else "robust",
+        "proposed_action": 0.0,
+        "chosen_action": 0.0,
+        "intervened": False,
+        "reason": "",
+        "bound_harm": float(shield.bound[k]),
+        "margin": 0.0,
+        "trusted": not shield.distrusted[k],
+        "settles": bool(shield.settles[k]),
+        **({} if shield.uncertainty is None else {"members": shield.running.members}),
+    }
+
+
+def by_vehicle(columns: NDArray[Any], vehicles: Sequence[int]) -> NDArray[Any]:
+    """What is decided, [n] of one vehicle or [n, K], with the axis of vehicles: [n, K]."""
+    return columns.reshape(len(columns), len(vehicles))
+
+
+def columns_of(rows: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
+    """What is told of each row, one array per key."""
+    return {key: np.array([row[key] for row in rows]) for key in rows[0]}
+
+
+# Plans and members that a shield goes on with where it begins anew in the middle of an episode.
+
+
+class Held(NamedTuple):
+    """What a shield holds in some rows."""
+
+    rest: Floats  # [m, L] its plans from the present decision on; full braking after them
+    states: Floats  # [m, M, S] of its members now, their harm so far included
+
+
+def held_in(shield: StepShield, rows: Ints) -> Held:
+    """What it holds in some rows, from the present decision on."""
+    running = shield.running
+    assert running is not None
+    plan, done = shield.backup.plan[rows], running.steps[rows]
+    column, last = np.arange(plan.shape[1]) + done[:, np.newaxis], plan.shape[1] - 1
+    rest = np.take_along_axis(plan, np.minimum(column, last), axis=1)
+    states = running.states.reshape(running.n, running.members, -1)[rows]
+    return Held(np.where(column <= last, rest, -1.0), states)
+
+
+def hold_better(shield: StepShield, rows: Ints, old: Held, held_before: Bools) -> None:
+    """Count the members' harm so far, and hold what is left of the old plans where it harms no more than the new."""
+    running = shield.running
+    assert running is not None
+    if not held_before.any():
+        return
+    rows, states, at = rows[held_before], running.states.copy(), running.rows_of(rows[held_before])
+    pairs = (states.shape[1] - 1) // 5
+    states[at, -2 * pairs :] = old.states[held_before].reshape(len(at), -1)[:, -2 * pairs :]
+    shield.running = running._replace(states=states)
+    part, plan = shield.running.take(rows), shield.backup.plan[rows].copy()
+    harm, before = plan_harm(part, plan), plan_harm(part, old.rest[held_before])
+    kept = before <= harm
+    plan[kept] = old.rest[held_before][kept]
+    shield.backup = shield.backup._replace(
+        plan=put(shield.backup.plan, rows, plan), harm=put(shield.backup.harm, rows, np.where(kept, before, harm))
+    )

@@ -14,18 +14,16 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 
 from ethbrake_marl.actions import checked_action
-from ethbrake_marl.agents.learned import LearnedPolicy
+from ethbrake_marl.agents.policy import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.envs.turns import in_turns
-from ethbrake_marl.envs.vector import EthBrakeVectorEnv
+from ethbrake_marl.envs.gym import EthBrakeVectorEnv
+from ethbrake_marl.envs.parallel import in_turns
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.shield.agents import HybridAgent
-from ethbrake_marl.shield.engine_episode import AttachedHybrid, attach
-from ethbrake_marl.shield.engine_shield import Proposing
-from ethbrake_marl.shield.options import read_options
-from ethbrake_marl.shield.settings import engine_of, shielded_vehicles
+from ethbrake_marl.shield.guard import AttachedHybrid, Proposing, attach, read_options
+from ethbrake_marl.shield.uncertainty import engine_of, shielded_vehicles
 
 Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
 

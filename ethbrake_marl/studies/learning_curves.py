@@ -11,20 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.evaluation.identity import result_identity, worlds_sha256
-from ethbrake_marl.evaluation.per_world import write_output
+from ethbrake_marl.errors import InvalidInput, OnProgress, count_of
+from ethbrake_marl.evaluation.inputs import result_identity, worlds_sha256
+from ethbrake_marl.evaluation.results import write_output
 from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
-from ethbrake_marl.figures.curves import SeedCurve, at_common_steps, seed_curves
+from ethbrake_marl.figures.studies import SeedCurve, at_common_steps, seed_curves
 from ethbrake_marl.figures.style import Figure, write_picture
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.learning.run_folder import RETURN, RunDirectory, progress_column, progress_rows
-from ethbrake_marl.learning.training import check_same, resolve
-from ethbrake_marl.policies.policy import load_policy
-from ethbrake_marl.progress import OnProgress
+from ethbrake_marl.learning.training import RETURN, RunDirectory, check_same, progress_column, progress_rows, resolve
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.studies.jobs.training import TrainingJob, finish_trainings
+from ethbrake_marl.studies.trainings import TrainingJob, finish_trainings
 
 FIGURE, TABLE, SUMMARY = "learning_curves.png", "learning_curves.csv", "learning_curves.json"
 

@@ -13,15 +13,10 @@ from operator import add
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, check_whole_number
-from ethbrake_marl.evaluation.shards.question import BLOCK, LEAF, Asked, answer_shard, shard_bounds
-from ethbrake_marl.evaluation.shards.tally import Tally
-from ethbrake_marl.files.durable import hold_lock, remove_unfinished, write_file
-from ethbrake_marl.files.plain import parse_strict_json, read_plain
-from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.studies.jobs.local import LocalWorkers
-from ethbrake_marl.studies.jobs.run import Attempt, run_jobs
-from ethbrake_marl.studies.jobs.work import Workers, pack
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, OnProgress, Progress, check_whole_number
+from ethbrake_marl.evaluation.shards import BLOCK, LEAF, Asked, Tally, answer_shard, shard_bounds
+from ethbrake_marl.files.store import hold_lock, parse_strict_json, read_plain, remove_unfinished, write_file
+from ethbrake_marl.studies.jobs import Attempt, LocalWorkers, Workers, pack, run_jobs
 
 MOST_JOBS = 256
 _LIMIT_BYTES = 64 << 20  # of the file of a shard: worlds that were left out are named there

@@ -19,10 +19,10 @@ from functools import partial
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
+from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.envs.parallel import parallel_env
-from ethbrake_marl.envs.setup import make_engine
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import Floats, Worlds, advance, forecast
 from ethbrake_marl.physics.compiled import compiled

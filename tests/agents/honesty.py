@@ -12,8 +12,18 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import script_agents, set_others
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.physics.estimates import age_s, is_periodic, links_of
-from ethbrake_marl.physics.messages import KEY, LINK, TAKEN, TOLD_S, link_at, place_at, ring_at
+from ethbrake_marl.physics.messages import (
+    KEY,
+    LINK,
+    TAKEN,
+    TOLD_S,
+    age_s,
+    is_periodic,
+    link_at,
+    links_of,
+    place_at,
+    ring_at,
+)
 from ethbrake_marl.scenario import Scenario
 
 

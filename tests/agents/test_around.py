@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.knowledge import Source, knowledge_of
-from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.agents.protocol import AgentAround, is_divisible
+from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.agents.protocol import AgentAround, Source, is_divisible, knowledge_of
 from ethbrake_marl.agents.refined import Refined
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.believed import believed_worlds, ranges_of, told_to
-from ethbrake_marl.agents.believing import Odometer
+from ethbrake_marl.agents.believed import Odometer, believed_worlds, ranges_of, told_to
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.engine.engine import Engine

@@ -11,15 +11,12 @@ import pytest
 
 from ethbrake_marl.agents import believed, make_agent
 from ethbrake_marl.agents.believed import told_to
-from ethbrake_marl.agents.knowledge import Source, combine, knowledge_of, knowledge_text, sees_through
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.registry import agent_entries, find_entry
-from ethbrake_marl.agents.spelling import parse_spec
-from ethbrake_marl.agents.team import Team
+from ethbrake_marl.agents.protocol import Agent, Source, Team, combine, knowledge_of, knowledge_text, sees_through
+from ethbrake_marl.agents.registry import agent_entries, find_entry, parse_spec
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.physics.estimates import is_periodic
-from ethbrake_marl.policies.policy import save_policy
+from ethbrake_marl.physics.messages import is_periodic
+from ethbrake_marl.policies.bundle import save_policy
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.v2x import PRESETS, hidden_from
 from ethbrake_marl.shield.uncertainty import parse_uncertainty

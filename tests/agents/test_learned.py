@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations, ObservationSpec, observe
 from ethbrake_marl.physics import make_worlds
-from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.bundle import Policy
 from ethbrake_marl.scenario import load_scenario
 
 

@@ -6,8 +6,8 @@ import pytest
 from ethbrake_marl.agents import make_agent, optimise_coupled
 from ethbrake_marl.agents.planner import Planner
 from ethbrake_marl.agents.rollout import drive, script_agents
+from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
 

@@ -7,9 +7,10 @@ import pytest
 
 from ethbrake_marl.agents import refined
 from ethbrake_marl.agents.refined import HOLDS, SIZES, Refined, changes, deviate
+from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.inputs import make_agent, make_lineup
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import load_scenario
 
 SCENARIO = load_scenario("paper-random")

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.recorded import record_commands
-from ethbrake_marl.agents.refined_profile import RefinedProfile
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.refined import RefinedProfile
+from ethbrake_marl.agents.rollout import drive, record_commands
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import refine
-from ethbrake_marl.search.problem import profile_problem
+from ethbrake_marl.search.profiles import profile_problem
 from ethbrake_marl.search.refine import refine_commands
 
 SCENARIO = load_scenario("paper-random")

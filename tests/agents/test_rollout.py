@@ -6,17 +6,15 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents import registry
+from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent, register_agent
 from ethbrake_marl.agents.rollout import drive, script_agents
-from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.envs.setup import make_engine
+from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.dataset.recording import Task, record_episodes
-from ethbrake_marl.evaluation.film import film_scenes
-from ethbrake_marl.evaluation.motion import follow_episodes
-from ethbrake_marl.evaluation.record import record_episode
+from ethbrake_marl.evaluation.dataset import Task, record_episodes
+from ethbrake_marl.evaluation.episodes import film_scenes, follow_episodes, record_episode
 from ethbrake_marl.observations import observation_for, observe
 from ethbrake_marl.physics import advance
 from ethbrake_marl.rewards import RewardParams

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.agents.protocol import Team, team_of
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.agents.team import Team, team_of
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, summarise

@@ -9,7 +9,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.identity import worlds_sha256
+from ethbrake_marl.evaluation.inputs import worlds_sha256
 from ethbrake_marl.physics.worlds import read_only
 from ethbrake_marl.shield.agents import HybridAgent, StepShieldAgent
 

@@ -19,7 +19,7 @@ import yaml
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.per_world import write_per_world_csv
+from ethbrake_marl.evaluation.results import write_per_world_csv
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import train
 from ethbrake_marl.scenario import load_scenario

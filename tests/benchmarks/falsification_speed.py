@@ -16,8 +16,7 @@ import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.falsification.falsify import falsify
-from ethbrake_marl.studies.falsification.measures import Measure
+from ethbrake_marl.studies.falsification import Measure, falsify
 from tests.programme.copies import KERNELS, working_copy
 from tests.programme.planting import plant
 from tests.shield.planted_bugs import BUGS

@@ -19,9 +19,7 @@ from pathlib import Path
 
 import yaml
 
-from ethbrake_marl.studies.jobs.local import LocalWorkers
-from ethbrake_marl.studies.jobs.run import Attempt, run_jobs
-from ethbrake_marl.studies.jobs.work import pack
+from ethbrake_marl.studies.jobs import Attempt, LocalWorkers, pack, run_jobs
 
 NOTHING = ("0", "0", *["0.0"] * 6, "")
 
@@ -34,9 +32,8 @@ def no_work(row: tuple[str, ...]) -> tuple[str, ...]:
 def empty_jobs(folder: Path, jobs: int) -> None:
     """Plan and record so many jobs of no work."""
     # torch takes seconds to load, and the processes that load this file again need none
-    from ethbrake_marl.studies.sweep.file import read_sweep
-    from ethbrake_marl.studies.sweep.plan import Row, SweepPlan, plan_sweep
-    from ethbrake_marl.studies.sweep.run import run_sweep
+    from ethbrake_marl.studies.sweep import run_sweep
+    from ethbrake_marl.studies.sweep_file import Row, SweepPlan, plan_sweep, read_sweep
 
     grid = {"scenario": ["paper-random", "paper-distance"], "recipe": ["ppo", "sac"], "seed": {"count": jobs // 4}}
     file = folder / "sweep.yaml"

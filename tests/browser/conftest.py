@@ -70,7 +70,7 @@ def compared() -> Evaluation:
 @pytest.fixture(scope="session")
 def report_file(compared: Evaluation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of ``compared``."""
-    from ethbrake_marl.figures.run import harm_against_total_gap
+    from ethbrake_marl.figures.evaluation import harm_against_total_gap
 
     rows = summarise(compared)
     focus = focus_of(rows)

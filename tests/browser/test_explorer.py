@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from ethbrake_marl.defaults import LIST_SEED
 from ethbrake_marl.evaluation import Evaluation, evaluate
-from ethbrake_marl.evaluation.inputs import LIST_SEED, make_lineup
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario, read_initial_states
 
@@ -236,8 +237,7 @@ def test_profile__is_drawn_by_hand_and_beats_the_policy(open_explorer: Open, sce
     commands = page.evaluate(f"{EXPLORER}.editor.commands")
     assert len(commands) == 75 and len(set(commands[:30])) > 5 and min(commands) >= -7.0
     drawn = harms(page)["by hand"]
-    from ethbrake_marl.pages.explorer.answer import Explored, outcome
-    from ethbrake_marl.pages.explorer.hand import read_profile
+    from ethbrake_marl.pages.explorer.answer import Explored, outcome, read_profile
 
     world = scenario.sample(1, LIST_SEED, first=1).worlds
     explored = Explored(scenario, make_lineup(["full_brake"], scenario))

@@ -11,12 +11,11 @@ import pytest
 
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.figures.run import harm_against_total_gap
+from ethbrake_marl.figures.evaluation import harm_against_total_gap
 from ethbrake_marl.pages.report import Report, ReportFigure, focus_of, play_for_report, write_report
 from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.studies.reproduction.folder import choose_items, reproduce
 from ethbrake_marl.studies.reproduction.item import Settings
-from ethbrake_marl.studies.reproduction.items import choose_items
-from ethbrake_marl.studies.reproduction.run import reproduce
 from tests.browser.conftest import AGENTS
 from tests.pages.hostile import HOSTILE
 from tests.pages.test_frame import whole_page

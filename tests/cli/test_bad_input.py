@@ -94,7 +94,7 @@ def test_scenario__trying_a_search_has_a_budget(ethbrake, scenario_file, monkeyp
         return search_profiles(*args, budget=budget, **kwargs)
 
     monkeypatch.setattr("ethbrake_marl.agents.planner.search_profiles", watched)
-    monkeypatch.setattr("ethbrake_marl.agents.best_profile.search_profiles", watched)
+    monkeypatch.setattr("ethbrake_marl.agents.planner.search_profiles", watched)
     path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
     path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
     assert ethbrake("scenario", "validate", path).status == 0

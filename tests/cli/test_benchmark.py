@@ -9,7 +9,7 @@ import pytest
 
 from ethbrake_marl.limits.best_harm import search_list
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.benchmark import suite as suites
+from ethbrake_marl.studies import benchmark as suites
 from tests.docs.site import load
 
 freezing = load("../studies/freeze_suite")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.evaluation.named_worlds import named_worlds_text, read_named_worlds
+from ethbrake_marl.evaluation.inputs import named_worlds_text, read_named_worlds
 from tests.cli.conftest import Command
 
 FOUND = ("falsify", "--agent", "coast", "--against", "full_brake", "--budget", "300", "--keep", "4")

@@ -18,7 +18,7 @@ from ethbrake_marl.cli.plugins import accept_plugins
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files import plugins
 from ethbrake_marl.scenario import new_scenario_text
-from ethbrake_marl.studies.ablation.run import train_all
+from ethbrake_marl.studies.ablation import train_all
 from tests.cli.conftest import TINY_RECIPE
 from tests.extending.conftest import restore, tables
 
@@ -235,7 +235,7 @@ def test_changed_file__is_refused_in_the_same_process(ethbrake, parts):
 def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, monkeypatch):
     from ethbrake_marl.learning.recipe import load_recipe
     from ethbrake_marl.scenario import load_scenario
-    from ethbrake_marl.studies.ablation.plan import Level, Training
+    from ethbrake_marl.studies.ablation import Level, Training
 
     monkeypatch.setenv("PYTHONPATH", os.getcwd())
     plugins.load_plugin(parts)

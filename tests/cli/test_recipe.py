@@ -11,10 +11,8 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation.inputs import load_runnable
-from ethbrake_marl.files.overrides import changed_parts, parse_overrides
-from ethbrake_marl.learning.recipe import load_recipe, shipped_recipes
-from ethbrake_marl.learning.recipe_text import new_recipe_text
-from ethbrake_marl.learning.settings import read_settings
+from ethbrake_marl.files.yaml import changed_parts, parse_overrides
+from ethbrake_marl.learning.recipe import load_recipe, new_recipe_text, read_settings, shipped_recipes
 
 Run = Callable[..., Any]
 

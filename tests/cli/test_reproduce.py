@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from ethbrake_marl.studies.reproduction.items import ITEMS
+from ethbrake_marl.studies.reproduction.folder import ITEMS
 
 
 def test_reproduce__lists_every_item(ethbrake) -> None:

@@ -16,15 +16,15 @@ from typing import Any
 
 import pytest
 
-from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.cli.terminal import Bars
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.figures.run import learning_curve
-from ethbrake_marl.policies.policy import load_policy
+from ethbrake_marl.figures.evaluation import learning_curve
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies import results as results_folder
-from ethbrake_marl.studies.results import write_figures
+from ethbrake_marl.studies import experiment as results_folder
+from ethbrake_marl.studies.experiment import write_figures
 
 ROOT = Path(__file__).resolve().parents[2]
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo", "hybrid"]
@@ -295,7 +295,7 @@ def test_command_line__a_table_on_a_narrow_stdout_is_still_printed_and_needs_no_
         "try:\n    main()\n"
         "except SystemExit as end:\n    assert not end.code\n"
         "print('loaded:', *{'torch', 'stable_baselines3', 'matplotlib'} & set(sys.modules))\n"
-        "import ethbrake_marl.studies.reproduction.run, ethbrake_marl.studies.reproduction.items\n"
+        "import ethbrake_marl.studies.reproduction.folder, ethbrake_marl.studies.reproduction.folder\n"
         "print('with the items of the paper:', *{'torch'} & set(sys.modules))",
         PYTHONIOENCODING=encoding,
     )

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from ethbrake_marl.agents import registry
+from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import Entry, make_agent
-from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import Scenario, load_scenario

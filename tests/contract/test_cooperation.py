@@ -9,9 +9,10 @@ import pytest
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 
 from ethbrake_marl import ethbrake_v0
+from ethbrake_marl.defaults import HARM_COUNTS
+from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.envs.setup import make_engine
-from ethbrake_marl.harm import HARM_COUNTS, empty_ledger
+from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
 from tests.contract.interfaces import INTERFACES, actions, initial_state

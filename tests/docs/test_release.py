@@ -14,9 +14,7 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.learning.recipe import shipped_recipes
-from ethbrake_marl.learning.recipe_schema import recipe_json_schema
-from ethbrake_marl.learning.recipe_text import new_recipe_text
+from ethbrake_marl.learning.recipe import new_recipe_text, recipe_json_schema, shipped_recipes
 from ethbrake_marl.scenario import list_scenarios, new_scenario_text, scenario_json_schema
 from tests.docs.site import DOCS
 

@@ -13,7 +13,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.figures.style import picture_bytes
-from ethbrake_marl.limits.shipped import best_known
+from ethbrake_marl.limits.best_harm import best_known
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.studies.speed import Effort

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine import branches
-from ethbrake_marl.engine.branches import Offsets, branch, join_moments, moment_of, play_to_the_end
-from ethbrake_marl.envs.setup import make_engine
+from ethbrake_marl.engine import snapshot
+from ethbrake_marl.engine.snapshot import Offsets, branch, join_moments, moment_of, play_to_the_end
+from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.errors import InvalidInput
 
 PAIR = ["vehicle_2", "vehicle_3"]
@@ -135,7 +135,7 @@ def test_branch__ends_where_nothing_can_change_any_more(monkeypatch):
     taken = []
     for stop in (True, False):
         if not stop:
-            monkeypatch.setattr(branches, "_stands_for_good", lambda engine, before, rows: np.zeros(len(rows), bool))
+            monkeypatch.setattr(snapshot, "_stands_for_good", lambda engine, before, rows: np.zeros(len(rows), bool))
         new = branch(engine, moment_of(engine))
         taken.append((play_to_the_end(new, press, offsets, 1.0), new.steps.copy()))
     (early, some), (whole, every) = taken

@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.stream import Stream
-from ethbrake_marl.envs.setup import make_engine
+from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import advance, concatenate
 from ethbrake_marl.scenario import initial_state_worlds, load_scenario

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.setup import make_engine
-from ethbrake_marl.harm import HARM_COUNTS
+from ethbrake_marl.defaults import HARM_COUNTS
+from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.physics import advance, concatenate
 from ethbrake_marl.scenario import load_scenario
 

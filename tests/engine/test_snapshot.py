@@ -9,8 +9,8 @@ import pytest
 
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
+from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.envs.setup import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import Scenario, load_scenario

@@ -10,8 +10,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import NormalizeObservation
 
-from ethbrake_marl.envs.single import EthBrakeEnv
-from ethbrake_marl.envs.vector import EthBrakeVectorEnv
+from ethbrake_marl.envs.gym import EthBrakeEnv, EthBrakeVectorEnv
 from tests.contract.interfaces import PAPER, actions, initial_state
 
 MODES = ("NextStep", "SameStep")

@@ -11,9 +11,9 @@ import pytest
 
 import ethbrake_marl
 from ethbrake_marl import ethbrake_v0
+from ethbrake_marl.envs.gym import EthBrakeEnv
 from ethbrake_marl.envs.parallel import EthBrakeParallelEnv
 from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID, register_environments
-from ethbrake_marl.envs.single import EthBrakeEnv
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -16,8 +16,7 @@ from pettingzoo.test import api_test, parallel_api_test, render_test
 
 import ethbrake_marl as eb
 from ethbrake_marl.envs.drawing.frame import HEIGHT, WIDTH
-from ethbrake_marl.envs.drawing.scene import BODY_M, View, follow
-from ethbrake_marl.envs.drawing.trace import Trace, kept_motions, scenes
+from ethbrake_marl.envs.drawing.scene import BODY_M, Trace, View, follow, kept_motions, scenes
 from ethbrake_marl.envs.parallel import env, parallel_env
 from ethbrake_marl.errors import InvalidInput, MissingExtra
 from tests.envs.lines import CRASH, REST

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.exact import (
+from ethbrake_marl.evaluation.statistics import (
     PRODUCT_BITS,
     VALUE_BITS,
     Moments,

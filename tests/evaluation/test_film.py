@@ -14,8 +14,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.envs.drawing.frame import draw_frame
 from ethbrake_marl.errors import InvalidInput, MissingExtra
-from ethbrake_marl.evaluation import film
-from ethbrake_marl.evaluation.film import film_bytes, film_scenes
+from ethbrake_marl.evaluation import episodes
+from ethbrake_marl.evaluation.episodes import film_bytes, film_scenes
 from tests.envs.lines import CRASH
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -77,7 +77,7 @@ def test_film__as_mp4_plays_in_real_time(tmp_path: Path) -> None:
 def test_film__as_mp4_without_its_library_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(MissingExtra, match=r"pip install 'ethbrake-marl\[render\]'"):
-        film.check_ending(".mp4")
+        episodes.check_ending(".mp4")
 
 
 def test_film__as_svg_moves_every_vehicle_as_its_scenes_say() -> None:

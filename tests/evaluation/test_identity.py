@@ -13,7 +13,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.evaluation.identity import policy_sha256, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.inputs import policy_sha256, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.shield_modes import compare_modes, modes_to_json
 from ethbrake_marl.scenario import Task
 from tests.failing_worlds import plant
@@ -41,7 +41,7 @@ def test_worlds__how_they_lie_in_memory_does_not_count(monkeypatch: pytest.Monke
     own = worlds_sha256(worlds, index)
     copied = worlds.take(np.arange(60))  # the news of a world is a view here, and an array of its own there
     fortran = replace(copied, gaps_m=np.asfortranarray(copied.gaps_m))
-    monkeypatch.setattr("ethbrake_marl.evaluation.identity._BLOCK", 7)
+    monkeypatch.setattr("ethbrake_marl.evaluation.inputs._BLOCK", 7)
     assert worlds_sha256(fortran, index) == own
 
 

@@ -15,7 +15,7 @@ from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, rich_
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.pages.report import Report, render_report
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.results import results_csv
+from ethbrake_marl.studies.experiment import results_csv
 
 # Some of the few worlds of `cooperation-2-blocked` are those of a shipped table.
 pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.IncompleteTable")

@@ -3,11 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.agents.team import Team
 from ethbrake_marl.evaluation import Evaluation, record_episode
-from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes, state_at
+from ethbrake_marl.evaluation.episodes import EpisodeMotion, follow_episodes, state_at
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import ShieldedTeam

@@ -11,7 +11,7 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import Evaluation, check_target, evaluate, write_per_world_csv
-from ethbrake_marl.evaluation.per_world import REGRET_COLUMNS, write_output
+from ethbrake_marl.evaluation.results import REGRET_COLUMNS, write_output
 from ethbrake_marl.scenario import Scenario, worlds_from_table
 
 

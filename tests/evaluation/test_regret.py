@@ -21,7 +21,7 @@ from ethbrake_marl.evaluation import (
     write_per_world_csv,
 )
 from ethbrake_marl.evaluation.regret import assess, distance
-from ethbrake_marl.evaluation.table import SummaryTable
+from ethbrake_marl.evaluation.summary import SummaryTable
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.limits import limits as limits_module
 from ethbrake_marl.limits.limits import Unproven, known_limits, unproven_because

@@ -12,7 +12,7 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.evaluation import declared_objectives, evaluate, rescore, write_per_world_csv
-from ethbrake_marl.objectives import STANDARD
+from ethbrake_marl.harm import STANDARD
 from ethbrake_marl.scenario import Scenario
 
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.evaluation.shield_modes import (
     ModeRow,
@@ -18,9 +18,9 @@ from ethbrake_marl.evaluation.shield_modes import (
     modes_tables,
 )
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
-from ethbrake_marl.figures.shield import shield_modes_figure
-from ethbrake_marl.pages.evidence import ShieldEvidence, shield_section
+from ethbrake_marl.figures.evaluation import shield_modes_figure
 from ethbrake_marl.pages.frame import page
+from ethbrake_marl.pages.report import ShieldEvidence, shield_section
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.shield import HybridAgent, ShieldedTeam, StepShieldAgent
 from ethbrake_marl.shield.review import review

@@ -9,10 +9,9 @@ import pytest
 from rich.console import Console
 
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, rich_table, summarise
-from ethbrake_marl.evaluation.conditions import parameter_line, parameters
-from ethbrake_marl.evaluation.paper import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST
-from ethbrake_marl.harm import HARM_COUNTS
+from ethbrake_marl.evaluation.outcome import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST, parameter_line, parameters
 from ethbrake_marl.limits import limits
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
 

@@ -7,19 +7,19 @@ from typing import Any
 
 import pytest
 
-from ethbrake_marl import objectives
+from ethbrake_marl import harm
+from ethbrake_marl import rewards as terms
 from ethbrake_marl.agents import registry as agents
 from ethbrake_marl.evaluation import harm_metrics
 from ethbrake_marl.files import plugins
-from ethbrake_marl.learning import registry as algorithms
-from ethbrake_marl.rewards import registry as terms
+from ethbrake_marl.learning import recipe as algorithms
 from ethbrake_marl.scenario import catalogue, features, v2x
 
 TABLES = (
     (catalogue, "FOLDERS"),
     (features, "FEATURES"),
     (v2x, "CHANNELS"),
-    (objectives, "KINDS"),
+    (harm, "KINDS"),
     (agents, "_ENTRIES"),
     (algorithms, "_ENTRIES"),
     (terms, "TERMS"),
@@ -42,7 +42,7 @@ def restore(before: Tables) -> None:
     for table, entries in before:
         table.clear()
         table.update(entries)
-    objectives.parse_objective.cache_clear()
+    harm.parse_objective.cache_clear()
 
 
 @pytest.fixture(autouse=True)

@@ -15,13 +15,12 @@ import pytest
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
+from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, Progress, UnknownName
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.observations import observe
-from ethbrake_marl.policies.policy import load_policy
-from ethbrake_marl.progress import Progress
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.scenario import scenario_json_schema
 from ethbrake_marl.scenario.features import FEATURES
 from tests.learning.tiny import TINY_PPO

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation.table import declared_objectives, rescore
+from ethbrake_marl.evaluation.summary import declared_objectives, rescore
 from ethbrake_marl.learning.train import train
-from ethbrake_marl.policies.policy import load_policy
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.scenario import scenario_json_schema
 from ethbrake_marl.scenario.v2x import CHANNELS
 from tests.learning.tiny import TINY_PPO

@@ -14,10 +14,9 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
-from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.recipe_schema import recipe_json_schema
+from ethbrake_marl.learning.recipe import load_recipe, recipe_json_schema
 from ethbrake_marl.learning.train import train
-from ethbrake_marl.policies.policy import load_policy
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.rewards import TERMS, StepOutcome, reward_params
 from tests.learning.tiny import TINY_PPO
 

@@ -6,10 +6,10 @@ from matplotlib.figure import Figure
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import deceleration as module
+from ethbrake_marl.evaluation import curves as module
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.deceleration import deceleration_curve, regimes_of
-from ethbrake_marl.figures.deceleration import deceleration_figure
+from ethbrake_marl.evaluation.curves import deceleration_curve, regimes_of
+from ethbrake_marl.figures.evaluation import deceleration_figure
 from ethbrake_marl.figures.style import picture_bytes
 from ethbrake_marl.limits.limits import Limits, Proof
 from ethbrake_marl.physics import Worlds, make_worlds

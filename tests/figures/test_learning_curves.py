@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.figures.curves import SeedCurve, at_common_steps, seed_curves
+from ethbrake_marl.figures.studies import SeedCurve, at_common_steps, seed_curves
 
 
 def test_at_common_steps__keeps_the_steps_that_all_have() -> None:

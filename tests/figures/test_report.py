@@ -10,9 +10,14 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, evaluate, record_episode, summarise
 from ethbrake_marl.evaluation.regret import assess
-from ethbrake_marl.figures.episode import trajectories
-from ethbrake_marl.figures.report import harm_by_agent, harm_in_parts, regret_distribution
-from ethbrake_marl.figures.run import harm_against_total_gap, learning_curve
+from ethbrake_marl.figures.evaluation import (
+    harm_against_total_gap,
+    harm_by_agent,
+    harm_in_parts,
+    learning_curve,
+    regret_distribution,
+    trajectories,
+)
 from ethbrake_marl.figures.style import label_text, new_figure, picture_bytes
 from ethbrake_marl.scenario import Scenario
 

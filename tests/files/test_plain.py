@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
-from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.store import read_plain
 
 
 def test_plain_file__is_read_up_to_the_limit(tmp_path: Path) -> None:

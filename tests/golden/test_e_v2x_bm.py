@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
+from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise, pairwise_harm
 from ethbrake_marl.physics.worlds import Worlds, concatenate, make_worlds
 
 

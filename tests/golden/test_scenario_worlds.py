@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.evaluation.identity import worlds_sha256
+from ethbrake_marl.evaluation.inputs import worlds_sha256
 from ethbrake_marl.scenario import list_scenarios, load_scenario
 
 FILE = Path(__file__).with_name("scenario_worlds.json")

@@ -6,17 +6,16 @@ import random
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from ethbrake_marl.evaluation.identity import scenario_sha256
-from ethbrake_marl.evaluation.named_worlds import (
+from ethbrake_marl.evaluation.inputs import (
     NamedWorld,
     NamedWorlds,
     named_worlds_text,
     read_named_worlds,
+    scenario_sha256,
     states_of,
 )
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.sweep.file import read_sweep
-from ethbrake_marl.studies.sweep.plan import plan_sweep
+from ethbrake_marl.studies.sweep_file import plan_sweep, read_sweep
 from tests.hostile.case import NASTY, Case, damaged, write
 from tests.hostile.yaml_changes import CERTAIN, encoded
 from tests.hostile.yaml_parts import NOT_FINITE, quoted, replaced

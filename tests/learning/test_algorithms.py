@@ -15,16 +15,14 @@ import pytest
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning import registry
+from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.errors import InvalidInput, Progress
+from ethbrake_marl.learning import recipe as registry
 from ethbrake_marl.learning.algorithms.ppo import Ppo, PpoRecipe
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.learning.registry import algorithm_names, register_algorithm
+from ethbrake_marl.learning.recipe import TrainingRecipe, algorithm_names, load_recipe, register_algorithm
 from ethbrake_marl.learning.team_file import load_team
 from ethbrake_marl.learning.train import resume, train
-from ethbrake_marl.policies.policy import load_policy
-from ethbrake_marl.progress import Progress
+from ethbrake_marl.policies.bundle import load_policy
 from tests.learning.tiny import TINY_PPO
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "learning.md").read_text("utf-8")

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, Progress
 from ethbrake_marl.learning.algorithms.counterfactual import widened
 from ethbrake_marl.learning.algorithms.counterfactual_model import CounterfactualModel, Tried, trusted_targets
 from ethbrake_marl.learning.algorithms.networks import Adam
@@ -20,8 +20,7 @@ from ethbrake_marl.learning.progress import TrainingDiverged
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import resume, train
 from ethbrake_marl.learning.training import resolve
-from ethbrake_marl.policies.policy import load_policy
-from ethbrake_marl.progress import Progress
+from ethbrake_marl.policies.bundle import load_policy
 
 SCENARIO = eb.load_scenario("paper-random")
 SHIPPED = load_recipe("counterfactual")

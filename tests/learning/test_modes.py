@@ -11,20 +11,23 @@ import pytest
 from stable_baselines3.common.logger import Logger
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine.branches import Moment, branch, first_moments, visit
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.algorithms.mode_worlds import drive_from, explore, own_worlds, show_templates
-from ethbrake_marl.learning.algorithms.modes import ModesPlan, Stage, stages_of
-from ethbrake_marl.learning.algorithms.modes_model import ModesModel, NoOtherMode
-from ethbrake_marl.learning.models import make_model
-from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.registry import algorithm_named
-from ethbrake_marl.learning.train import TrainResult, _environment, resume, train
+from ethbrake_marl.engine.snapshot import Moment, branch, first_moments, visit
+from ethbrake_marl.errors import InvalidInput, Progress
+from ethbrake_marl.learning.algorithms.modes_model import (
+    ModesModel,
+    NoOtherMode,
+    drive_from,
+    explore,
+    own_worlds,
+    show_templates,
+)
+from ethbrake_marl.learning.algorithms.protocol import ModesPlan, Stage, stages_of
+from ethbrake_marl.learning.recipe import algorithm_named, load_recipe
+from ethbrake_marl.learning.train import TrainResult, _environment, make_model, resume, train
 from ethbrake_marl.learning.training import resolve
-from ethbrake_marl.policies.policy import load_policy
-from ethbrake_marl.progress import Progress
-from ethbrake_marl.search.problem import profile_problem
-from ethbrake_marl.search.templates import best_templates
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.search.profiles import profile_problem
+from ethbrake_marl.search.refine import best_templates
 
 SCENARIO = eb.load_scenario("paper-random")
 SHIPPED = load_recipe("modes")

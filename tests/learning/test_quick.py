@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.cli.run import run_experiment_command
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.learning.recipe import load_recipe

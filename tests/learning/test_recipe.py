@@ -7,7 +7,7 @@ import pytest
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.learning.algorithms.sac import SacRecipe
 from ethbrake_marl.learning.recipe import LearningRate, load_recipe, recipe_of, shipped_recipes
-from ethbrake_marl.policies.manifest import NetworkSpec
+from ethbrake_marl.policies.actor import NetworkSpec
 
 GOOD = """\
 name: mine

@@ -9,10 +9,14 @@ from jsonschema import Draft202012Validator
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import parse_yaml, read_yaml
-from ethbrake_marl.learning.recipe import load_recipe, shipped_recipes
-from ethbrake_marl.learning.recipe_schema import recipe_json_schema
-from ethbrake_marl.learning.recipe_text import new_recipe_text
-from ethbrake_marl.learning.registry import algorithm_names, recipe_class
+from ethbrake_marl.learning.recipe import (
+    algorithm_names,
+    load_recipe,
+    new_recipe_text,
+    recipe_class,
+    recipe_json_schema,
+    shipped_recipes,
+)
 
 
 def _marked(content: Any) -> set[str]:

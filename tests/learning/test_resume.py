@@ -20,10 +20,9 @@ from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning import train as train_module
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.run_folder import create_run
 from ethbrake_marl.learning.train import TrainResult, resume, train
-from ethbrake_marl.learning.training import Training
-from ethbrake_marl.policies.policy import Policy, load_policy
+from ethbrake_marl.learning.training import Training, create_run
+from ethbrake_marl.policies.bundle import Policy, load_policy
 from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_PPO
 

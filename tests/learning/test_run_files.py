@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.durable import hold_lock, new_folder, write_file
-from ethbrake_marl.learning.run_folder import create_run
-from ethbrake_marl.learning.run_log import ProgressTable
+from ethbrake_marl.files.store import hold_lock, new_folder, write_file
+from ethbrake_marl.learning.progress import ProgressTable
+from ethbrake_marl.learning.training import create_run
 
 
 def test_write_file__replaces_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,8 +11,7 @@ from ethbrake_marl.learning.algorithms.networks import tensors_of
 from ethbrake_marl.learning.algorithms.ppo import ppo_arguments
 from ethbrake_marl.learning.algorithms.sac import sac_arguments
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.policies.actor import Actor
-from ethbrake_marl.policies.manifest import NetworkSpec
+from ethbrake_marl.policies.actor import Actor, NetworkSpec
 
 SHAPE = load_recipe("ppo-paper").network
 

@@ -10,11 +10,10 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.algorithms.scout import Scout, choose_rows, draw_rows
+from ethbrake_marl.errors import InvalidInput, Progress
+from ethbrake_marl.learning.algorithms.networks import Scout, choose_rows, draw_rows
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import resume, train
-from ethbrake_marl.progress import Progress
 
 SCENARIO = eb.load_scenario("paper-random")
 TINY = load_recipe("modes").replace(

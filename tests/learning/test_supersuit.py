@@ -11,8 +11,8 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.learned import LearnedAgent
-from ethbrake_marl.policies.policy import load_policy
+from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.policies.bundle import load_policy
 
 SCRIPT = Path(__file__).resolve().parents[2] / "train" / "supersuit_ppo.py"
 PAIR = eb.load_scenario("cooperation-3-pair")

@@ -20,15 +20,19 @@ import ethbrake_marl as eb
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, UnknownName
 from ethbrake_marl.learning import train as train_module
-from ethbrake_marl.learning.models import make_model
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.learning.registry import algorithm_named
-from ethbrake_marl.learning.schemes import check_scheme, drivers, scheme_of, who_drives_what
+from ethbrake_marl.learning.recipe import (
+    TrainingRecipe,
+    algorithm_named,
+    check_scheme,
+    drivers,
+    load_recipe,
+    scheme_of,
+    who_drives_what,
+)
 from ethbrake_marl.learning.team_file import is_team, load_team
-from ethbrake_marl.learning.train import resume, train
+from ethbrake_marl.learning.train import make_model, resume, train
 from ethbrake_marl.learning.training import resolve
-from ethbrake_marl.policies.policy import load_policy
-from ethbrake_marl.policies.team import PolicyTeam
+from ethbrake_marl.policies.bundle import PolicyTeam, load_policy
 from tests.learning.tiny import TINY_PPO
 
 PAIR = eb.load_scenario("cooperation-3-pair")

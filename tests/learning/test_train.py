@@ -14,17 +14,16 @@ import numpy as np
 import pytest
 import torch
 
-from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
-from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, Progress
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation import outcome as outcome_module
+from ethbrake_marl.harm import objective_harm, objectives_of
 from ethbrake_marl.learning import train as train_module
 from ethbrake_marl.learning.progress import TrainingDiverged
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of, shipped_recipes
-from ethbrake_marl.objectives import objective_harm, objectives_of
-from ethbrake_marl.policies.policy import Policy, load_policy
-from ethbrake_marl.progress import Progress
+from ethbrake_marl.policies.bundle import Policy, load_policy
 from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_PPO
 

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.run_folder import create_run
-from ethbrake_marl.learning.training import check_same, resolve
+from ethbrake_marl.learning.training import check_same, create_run, resolve
 from ethbrake_marl.scenario import Scenario, load_scenario
 from tests.learning.tiny import TINY_PPO
 

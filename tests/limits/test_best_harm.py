@@ -7,18 +7,33 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents import make_agent, optimise_coupled
-from ethbrake_marl.agents.best_profile import BestHarm
+from ethbrake_marl.agents.planner import BestHarm
 from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
-from ethbrake_marl.evaluation.paper import TESTS
-from ethbrake_marl.harm import HARM_COUNTS
-from ethbrake_marl.limits.best_harm import LEFT_OUT, best_harm, realised_harm, search_list, world_identity
+from ethbrake_marl.evaluation.outcome import TESTS
+from ethbrake_marl.limits.best_harm import (
+    LEFT_OUT,
+    TABLES,
+    best_harm,
+    best_known,
+    realised_harm,
+    search_list,
+    shipped_profiles,
+    shipped_tables,
+    world_identity,
+)
 from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table, save_table
-from ethbrake_marl.limits.shipped import TABLES, best_known, shipped_profiles, shipped_tables
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
-from ethbrake_marl.search.problem import profile_problem
-from ethbrake_marl.search.profiles import Profiles, constant_profiles, even_grid, follow_profiles, search_profiles
+from ethbrake_marl.search.profiles import (
+    Profiles,
+    constant_profiles,
+    even_grid,
+    follow_profiles,
+    profile_problem,
+    search_profiles,
+)
 from tests.failing_worlds import planted_list, without
 
 BUDGET = 800

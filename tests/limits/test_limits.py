@@ -15,12 +15,12 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, outcome, parameters, rollout, summarise, write_per_world_csv
 from ethbrake_marl.evaluation.regret import assess
-from ethbrake_marl.evaluation.text import limit_lines
-from ethbrake_marl.figures.report import harm_in_parts
+from ethbrake_marl.evaluation.summary import limit_lines
+from ethbrake_marl.figures.evaluation import harm_in_parts
 from ethbrake_marl.limits import limits, lower_bound
 from ethbrake_marl.limits.limits import Limits, Proof, Unproven, known_limits, prove
 from ethbrake_marl.limits.team_bound import team_bound
-from ethbrake_marl.pages.evidence import avoidable_section, worst_section
+from ethbrake_marl.pages.report import avoidable_section, worst_section
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from tests.cli.conftest import TINY_RECIPE

@@ -10,8 +10,8 @@ import pytest
 from ethbrake_marl import load_scenario
 from ethbrake_marl.agents import optimise_coupled
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.limits.aftermath import after
-from ethbrake_marl.limits.avoidability import avoidability
+from ethbrake_marl.limits.avoidability import avoidability, empty_plan
+from ethbrake_marl.limits.best_harm import best_known
 from ethbrake_marl.limits.lower_bound import lower_bound, rounding
 from ethbrake_marl.limits.meetings import (
     A_F,
@@ -33,14 +33,13 @@ from ethbrake_marl.limits.meetings import (
     V_L,
     V_R,
     WIDTH,
+    after,
     follower,
     gentlest,
     leader,
     meet_front,
     meet_rear,
 )
-from ethbrake_marl.limits.shipped import best_known
-from ethbrake_marl.limits.walk import empty_plan
 from ethbrake_marl.physics import concatenate, make_worlds
 from ethbrake_marl.scenario import Task
 from tests.limits.avoidability_worlds import moved_profiles, random_profiles, wide_worlds

@@ -8,12 +8,25 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.limits import meetings
-from ethbrake_marl.limits.aftermath import after_front, after_rear, held_by_leader, obstacle_harm, slowed_by_rear
-from ethbrake_marl.limits.first_meeting import CELL_WIDTH, CELLS, lacking
-from ethbrake_marl.limits.flights import lead, widest_flight
-from ethbrake_marl.limits.lower_bound_kernel import LARGE, front_first, last_soft, rear_first
-from ethbrake_marl.limits.meetings import FRONT_FIRST, OBSTACLE, REAR_FIRST, WIDTH, gentlest_front
-from ethbrake_marl.limits.walk import empty_plan
+from ethbrake_marl.limits.avoidability import empty_plan
+from ethbrake_marl.limits.lower_bound import LARGE, front_first, last_soft, rear_first
+from ethbrake_marl.limits.meetings import (
+    CELL_WIDTH,
+    CELLS,
+    FRONT_FIRST,
+    OBSTACLE,
+    REAR_FIRST,
+    WIDTH,
+    after_front,
+    after_rear,
+    gentlest_front,
+    held_by_leader,
+    lacking,
+    lead,
+    obstacle_harm,
+    slowed_by_rear,
+    widest_flight,
+)
 
 
 def state(**given):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ethbrake_marl.limits.meetings import A_F, A_R, GAP_R, LIMIT_F, ONSET_R, U_F, V_F, V_R, WIDTH
-from ethbrake_marl.limits.meetings_behind import behind_full_braking, gained, soft_behind
+from ethbrake_marl.limits.team_bound import behind_full_braking, gained, soft_behind
 from ethbrake_marl.physics import advance, make_worlds
 
 STEP_S, FAR_M = 0.2, 1e4

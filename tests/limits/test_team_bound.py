@@ -14,8 +14,14 @@ from ethbrake_marl.limits.lower_bound import lower_bound
 from ethbrake_marl.limits.team_bound import team_bound
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search.problem import profile_problem
-from ethbrake_marl.search.profiles import Profiles, constant_profiles, even_grid, follow_profiles, search_profiles
+from ethbrake_marl.search.profiles import (
+    Profiles,
+    constant_profiles,
+    even_grid,
+    follow_profiles,
+    profile_problem,
+    search_profiles,
+)
 from tests.limits.team_worlds import REGIONS, worlds_of
 
 HORIZON_S = 60.0

@@ -10,8 +10,19 @@ from matplotlib.figure import Figure
 
 from ethbrake_marl.errors import plain_text
 from ethbrake_marl.figures.style import COLOURS, add_caption, new_figure
-from ethbrake_marl.pages.frame import Section, page, paragraph, read_file
-from ethbrake_marl.pages.parts import Block, Cell, data, facts, heading, opened, table
+from ethbrake_marl.pages.frame import (
+    Block,
+    Cell,
+    Section,
+    data,
+    facts,
+    heading,
+    opened,
+    page,
+    paragraph,
+    read_file,
+    table,
+)
 from ethbrake_marl.pages.vector import drawing, inline_svg
 from tests.pages.hostile import HOSTILE, UNSEEN, Page
 

@@ -11,14 +11,15 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.evaluation import Evaluation, evaluate, summarise
 from ethbrake_marl.figures.style import new_figure
-from ethbrake_marl.pages.chosen import choose_shown, worst_rows
 from ethbrake_marl.pages.report import (
     Report,
     ReportFigure,
     ReportTest,
+    choose_shown,
     focus_of,
     play_for_report,
     render_report,
+    worst_rows,
     write_report,
 )
 from ethbrake_marl.physics import Ints, Worlds

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ethbrake_marl.physics import Floats, Impacts, Worlds
-from ethbrake_marl.physics.events import PLASTIC_SPEED_MPS
+from ethbrake_marl.physics.kernel import PLASTIC_SPEED_MPS
 from tests.reference.tolerances import EPS
 
 Wide = np.longdouble

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, make_worlds
-from ethbrake_marl.physics.events import TOUCH_SPEED_MPS
+from ethbrake_marl.physics.kernel import TOUCH_SPEED_MPS
 from tests.physics.exact_simulator import Outcome, line_of, simulate
 from tests.reference.tolerances import DISCRIMINANT_EPS, END_EPS, EPS, GAP_M
 

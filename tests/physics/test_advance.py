@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.physics import Worlds, advance, make_worlds, segment
+from ethbrake_marl.physics import Worlds, advance, kernel, make_worlds
 from ethbrake_marl.physics.compiled import by_parts
 
 
@@ -220,7 +220,7 @@ def test_overlap__that_no_advance_could_have_left_is_reported():
 def test_bounces__more_than_any_segment_holds_are_reported(monkeypatch):
     # e = 1 and a push of 10 m/s2 against a heavy wall: a bounce of 0.2 m/s every 0.04 s for 50,000 s
     if numba.config.DISABLE_JIT:  # a million events would take long
-        monkeypatch.setattr(segment, "MOST_EVENTS", 50)
+        monkeypatch.setattr(kernel, "MOST_EVENTS", 50)
     wall = line([0.0], [0.0, 0.2], mass=[2.0**60, 1.0], e=1.0)
     with pytest.raises(PhysicsError, match="world 0: more than 1000000 events between 0 s and 50000 s"):
         advance(wall, [-10.0, 10.0], 50_000.0)

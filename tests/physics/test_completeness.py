@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.physics import advance, make_worlds
-from ethbrake_marl.physics.events import contact
+from ethbrake_marl.physics.kernel import contact
 from tests.physics.exact_simulator import square_root
 from tests.physics.segments import Scan, Segments, meetings, random_segments, scan
 from tests.reference.tolerances import BORDERLINE_SHARE, CONTACT_TIME_EPS, EPS

@@ -10,13 +10,13 @@ import pytest
 from ethbrake_marl.agents.protocol import fixed_commands
 from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.engine import step as engine_step
-from ethbrake_marl.physics import episode, segment
+from ethbrake_marl.physics import episode, kernel
 from ethbrake_marl.physics.episode import decision_at, first_decision_s, number_of_decisions
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import kernel as search_kernel
-from ethbrake_marl.search.problem import profile_problem
-from ethbrake_marl.search.profiles import Profiles, follow_profiles
-from ethbrake_marl.shield import certify_kernel, members
+from ethbrake_marl.search.profiles import Profiles, follow_profiles, profile_problem
+from ethbrake_marl.shield import certify_kernel
+from ethbrake_marl.shield import certify_kernel as members
 
 RULES = ("step_end_s", "onset_s", "command_in_force", "stands")
 PAPER = load_scenario("paper-random")
@@ -44,7 +44,7 @@ class Phases:
 def test_rules__are_the_same_objects_in_engine_search_and_shield():
     used = engine_step.step_worlds.py_func.__globals__
     assert all(used[name] is getattr(episode, name) for name in RULES)
-    assert used["advance_table"] is segment.advance_table
+    assert used["advance_table"] is kernel.advance_table
     assert used["advance_table"] is episode.step_episode.py_func.__globals__["advance_table"]
     assert members.step_again is episode.step_again
     assert episode.follow.py_func.__globals__["step_again"] is episode.step_again

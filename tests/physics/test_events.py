@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from ethbrake_marl.physics.events import contact, drift, force_range, settle, solo_motion, speed_event
+from ethbrake_marl.physics.kernel import contact, drift, force_range, settle, solo_motion, speed_event
 
 NEVER = (math.inf, 0.0)
 CHANGES = math.nan  # an acceleration that is not constant all along

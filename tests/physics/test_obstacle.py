@@ -11,7 +11,7 @@ import pytest
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import Worlds, advance, advance_sampled, concatenate, forecast, make_worlds
-from ethbrake_marl.physics.obstacle import obstacle_ahead, with_obstacle
+from ethbrake_marl.physics.kernel import obstacle_ahead, with_obstacle
 from tests.physics.exact_simulator import line_of, simulate
 from tests.physics.random_worlds import Batch, Draws, driving_lines, touching_lines
 from tests.physics.runs import HARMS, HORIZON_S, state_bytes

@@ -8,9 +8,23 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.physics import advance, make_worlds
-from ethbrake_marl.physics import rows as packed
-from ethbrake_marl.physics.rows import Packed, has_news, ledger_columns, pack, unpack, with_news_columns
-from ethbrake_marl.physics.segment import ROW_WIDTH
+from ethbrake_marl.physics.advance import (
+    NO_ROWS,
+    Packed,
+    command_at,
+    gap_at,
+    harm_at,
+    has_news,
+    ledger_columns,
+    pack,
+    params_at,
+    previous_at,
+    speed_at,
+    state_width,
+    unpack,
+    with_news_columns,
+)
+from ethbrake_marl.physics.kernel import ROW_WIDTH
 
 
 def worlds(n, vehicles):
@@ -70,10 +84,10 @@ def test_ledger_columns__are_in_their_own_memory():
 
 def test_columns__follow_each_other_without_a_hole():
     # 3 vehicles, 2 pairs: time | speeds 3 | commands 3 | before 3 | gaps 2 | hit 2 | first 2 | total 2 | count 2
-    at = [packed.speed_at(3), packed.command_at(3), packed.previous_at(3), packed.gap_at(3), packed.harm_at(3)]
-    assert at == [1, 4, 7, 10, 14] and packed.state_width(3) == 20
-    assert [packed.params_at(group, 3) for group in range(7)] == [1, 4, 7, 10, 13, 16, 19]
-    assert packed.pack(worlds(1, 3)).state.shape == (1, 20) and packed.NO_ROWS.shape == (0, ROW_WIDTH)
+    at = [speed_at(3), command_at(3), previous_at(3), gap_at(3), harm_at(3)]
+    assert at == [1, 4, 7, 10, 14] and state_width(3) == 20
+    assert [params_at(group, 3) for group in range(7)] == [1, 4, 7, 10, 13, 16, 19]
+    assert pack(worlds(1, 3)).state.shape == (1, 20) and NO_ROWS.shape == (0, ROW_WIDTH)
 
 
 def test_ledger_columns__are_those_of_the_harm():

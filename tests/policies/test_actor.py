@@ -9,8 +9,7 @@ from torch import nn
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.policies.actor import Actor, dense, squash
-from ethbrake_marl.policies.manifest import NetworkSpec, tensor_table
+from ethbrake_marl.policies.actor import Actor, NetworkSpec, dense, squash, tensor_table
 
 Tensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 

@@ -10,9 +10,9 @@ import onnxruntime
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.policies.manifest import NetworkSpec, tensor_table
-from ethbrake_marl.policies.onnx import onnx_model
-from ethbrake_marl.policies.policy import Policy, load_policy, make_policy, save_policy
+from ethbrake_marl.policies.actor import NetworkSpec, tensor_table
+from ethbrake_marl.policies.bundle import Policy, load_policy, make_policy, save_policy
+from ethbrake_marl.policies.shipped import onnx_model
 
 SCENARIO = eb.load_scenario("paper-random")
 

@@ -6,13 +6,13 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import MissingExtra
 from ethbrake_marl.observations import observe
 from ethbrake_marl.physics import advance
-from ethbrake_marl.policies.manifest import NetworkSpec, tensor_table
-from ethbrake_marl.policies.onnx import onnx_model
-from ethbrake_marl.policies.policy import Policy, make_policy
+from ethbrake_marl.policies.actor import NetworkSpec, tensor_table
+from ethbrake_marl.policies.bundle import Policy, make_policy
+from ethbrake_marl.policies.shipped import onnx_model
 from ethbrake_marl.scenario import load_scenario
 
 STATES = 10_000

@@ -17,9 +17,9 @@ import pytest
 import safetensors.numpy
 
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
-from ethbrake_marl.policies import policy as bundle
-from ethbrake_marl.policies.manifest import content_sha256
-from ethbrake_marl.policies.policy import Policy, load_policy, make_policy, save_policy
+from ethbrake_marl.policies import bundle
+from ethbrake_marl.policies.actor import content_sha256
+from ethbrake_marl.policies.bundle import Policy, load_policy, make_policy, save_policy
 from tests.docs.site import load
 
 Spoil = Callable[[Path], None]
@@ -352,7 +352,7 @@ def test_load_policy__refuses_a_linked_folder(policy: Policy, tmp_path: Path) ->
 _WATCHED_LOADS = """
 import json, sys
 from ethbrake_marl.errors import CorruptBundle
-from ethbrake_marl.policies.policy import load_policy
+from ethbrake_marl.policies.bundle import load_policy
 
 root, names = sys.argv[1], json.loads(sys.argv[2])
 load_policy(f"{root}/good")

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.paper import TESTS
-from ethbrake_marl.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.evaluation.outcome import TESTS
 from ethbrake_marl.policies import shipped
-from ethbrake_marl.policies.policy import Policy, save_policy
+from ethbrake_marl.policies.bundle import Policy, save_policy
 from ethbrake_marl.policies.shipped import load_named_policy, shipped_name, shipped_policies
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent

@@ -49,9 +49,9 @@ def digest(*columns: Any) -> str:
 
 
 def lists() -> dict[str, str]:
-    from ethbrake_marl.evaluation.identity import worlds_sha256
+    from ethbrake_marl.evaluation.inputs import worlds_sha256
     from ethbrake_marl.scenario import list_scenarios, load_scenario
-    from ethbrake_marl.studies.benchmark.suite import load_suite, suite_names
+    from ethbrake_marl.studies.benchmark import load_suite, suite_names
 
     found = {}
     for entry in list_scenarios():
@@ -88,7 +88,7 @@ def episodes() -> dict[str, str]:
 
 
 def searches() -> dict[str, str]:
-    from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+    from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
     from ethbrake_marl.limits.best_harm import best_harm
     from ethbrake_marl.limits.lower_bound import lower_bound
     from ethbrake_marl.scenario import load_scenario
@@ -113,7 +113,7 @@ def shields() -> dict[str, str]:
 
 def tallies() -> dict[str, str]:
     from ethbrake_marl.evaluation.seed_statistics import paired_over_seeds
-    from ethbrake_marl.evaluation.shards.question import Question, answer_shard, ask
+    from ethbrake_marl.evaluation.shards import Question, answer_shard, ask
     from ethbrake_marl.harm import injury_probability
     from ethbrake_marl.scenario import load_scenario
 

@@ -21,24 +21,24 @@ from tests.programme.planting import Patch, first_red, misfits
 from tests.programme.suites import ROOT
 
 REWARDS, V2X, ENGINE, TERMS, STEPPING, STARTS, OBJECTIVES = (
-    "ethbrake_marl/rewards/terms.py",
+    "ethbrake_marl/rewards.py",
     "ethbrake_marl/scenario/v2x.py",
     "ethbrake_marl/engine/engine.py",
-    "ethbrake_marl/engine/terms.py",
+    "ethbrake_marl/engine/engine.py",
     "ethbrake_marl/engine/step.py",
     "ethbrake_marl/engine/stream.py",
-    "ethbrake_marl/objectives.py",
+    "ethbrake_marl/harm.py",
 )  # fmt: skip
 SB3 = "ethbrake_marl/envs/sb3.py"
 COMPARISON, OPTIMUM, PLAN = (
-    "ethbrake_marl/studies/ablation/comparison.py",
-    "ethbrake_marl/studies/ablation/joint_optimum.py",
-    "ethbrake_marl/studies/ablation/plan.py",
+    "ethbrake_marl/studies/ablation.py",
+    "ethbrake_marl/studies/ablation.py",
+    "ethbrake_marl/studies/ablation.py",
 )
 EXACT, SEEDS, TABLE, REGRET, ROLLOUT = (
-    "ethbrake_marl/evaluation/exact.py",
+    "ethbrake_marl/evaluation/statistics.py",
     "ethbrake_marl/evaluation/seed_statistics.py",
-    "ethbrake_marl/evaluation/table.py",
+    "ethbrake_marl/evaluation/summary.py",
     "ethbrake_marl/evaluation/regret.py",
     "ethbrake_marl/evaluation/rollout.py",
 )
@@ -46,16 +46,16 @@ SHARDS = "ethbrake_marl/studies/shards.py"
 COURSE, LOOP, EVENTS, KEPT, INDEPENDENT, RECIPE = (
     "ethbrake_marl/learning/progress.py",
     "ethbrake_marl/learning/loop.py",
-    "ethbrake_marl/learning/run_log.py",
+    "ethbrake_marl/learning/progress.py",
     "ethbrake_marl/learning/training.py",
-    "ethbrake_marl/learning/algorithms/independent_ppo.py",
+    "ethbrake_marl/learning/algorithms/networks.py",
     "ethbrake_marl/learning/recipe.py",
 )
 
 
 SAMPLING, MIXTURE = (
     "ethbrake_marl/scenario/sampling.py",
-    "ethbrake_marl/scenario/mixture.py",
+    "ethbrake_marl/scenario/schema.py",
 )
 
 

@@ -39,7 +39,7 @@ class Suite(NamedTuple):
 
 
 def below_package(file: str) -> str:
-    """``ethbrake_marl/physics/impact.py`` -> ``physics/impact.py``."""
+    """``ethbrake_marl/physics/kernel.py`` -> ``physics/kernel.py``."""
     return str(Path(file).relative_to(PACKAGE.name))
 
 
@@ -52,23 +52,37 @@ PHYSICS = Suite(
     files=("physics/*.py", "harm.py"),
     quick={
         "physics/worlds.py": ("tests/physics/test_worlds.py", "tests/physics/test_advance.py"),
-        "physics/obstacle.py": ("tests/physics/test_obstacle.py", "tests/engine/test_obstacle.py"),
-        "physics/rows.py": (
-            "tests/physics/test_rows.py", "tests/engine/test_engine.py", "tests/engine/test_obstacle.py",
+        'physics/kernel.py': (
+            'tests/physics/test_obstacle.py',
+            'tests/engine/test_obstacle.py',
+            'tests/physics/test_events.py',
+            'tests/physics/test_advance.py',
+            'tests/physics/test_ties.py',
+            'tests/golden/test_physics_hash.py',
+            'tests/physics/test_completeness.py',
+            'tests/physics/test_manufactured.py',
+            'tests/physics/test_clusters.py',
+            'tests/physics/test_against_exact.py',
+            'tests/physics/test_segment.py',
+        ),
+        'physics/advance.py': (
+            'tests/physics/test_rows.py',
+            'tests/engine/test_engine.py',
+            'tests/engine/test_obstacle.py',
+            'tests/physics/test_advance.py',
+            'tests/golden/test_physics_hash.py',
+            'tests/physics/test_parallel.py',
+            'tests/physics/test_manufactured.py',
+            'tests/physics/test_ties.py',
+            'tests/physics/test_obstacle.py',
         ),
         "physics/compiled.py": ("tests/physics/test_compiled.py", "tests/physics/test_parallel.py"),
         "physics/sampled.py": (
             "tests/physics/test_sampled_edges.py", "tests/physics/test_sampled.py",
             "tests/physics/test_sampled_input.py", "tests/physics/test_obstacle.py",
         ),
-        "physics/events.py": ("tests/physics/test_events.py", *KERNEL),
-        "physics/segment.py": (*KERNEL[:3], "tests/physics/test_segment.py", *KERNEL[3:]),
         "physics/forecast.py": ("tests/physics/test_forecast.py", "tests/physics/test_obstacle.py"),
         "harm.py": ("tests/test_harm.py", "tests/physics/test_ledger.py", "tests/physics/test_obstacle.py"),
-        "physics/advance.py": (
-            "tests/physics/test_advance.py", "tests/golden/test_physics_hash.py", "tests/physics/test_parallel.py",
-            "tests/physics/test_manufactured.py", "tests/physics/test_ties.py", "tests/physics/test_obstacle.py",
-        ),
     },
     otherwise=KERNEL,
     whole=("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py"),
@@ -76,8 +90,8 @@ PHYSICS = Suite(
 )  # fmt: skip
 
 REWARDS = Suite(
-    files=("rewards/params.py", "rewards/terms.py", "objectives.py"),
-    quick={"objectives.py": ("tests/test_objectives.py",)},
+    files=("rewards.py", "rewards.py", "harm.py"),
+    quick={"harm.py": ("tests/test_objectives.py",)},
     otherwise=("tests/test_rewards.py", "tests/test_objectives.py"),
     whole=("tests/test_rewards.py", "tests/test_objectives.py", "tests/envs", "tests/contract"),
     preloaded=SCIENCE,
@@ -100,8 +114,8 @@ STEPS = (
 ENGINE = Suite(
     files=(
         "engine/engine.py",
-        "engine/running.py",
-        "engine/terms.py",
+        "engine/engine.py",
+        "engine/engine.py",
         "engine/stream.py",
         "engine/step.py",
         "actions.py",
@@ -127,13 +141,14 @@ ENGINE = Suite(
 ABLATION = Suite(
     files=("studies/ablation/*.py",),
     quick={
-        "studies/ablation/plan.py": ("tests/studies/ablation/test_levels.py",),
-        "studies/ablation/comparison.py": ("tests/studies/ablation/test_comparison.py",),
-        "studies/ablation/joint_optimum.py": ("tests/studies/ablation/test_joint_optimum.py",),
-        "studies/ablation/longer_lines.py": ("tests/studies/ablation/test_longer_lines.py",),
-        "studies/ablation/report.py": ("tests/studies/ablation/test_comparison.py",),
-        "studies/ablation/run.py": (
+        "studies/ablation.py": (
+            "tests/studies/ablation/test_levels.py",
+            "tests/studies/ablation/test_comparison.py",
+            "tests/studies/ablation/test_joint_optimum.py",
             "tests/studies/ablation/test_measurement.py",
+        ),
+        "studies/ablation_report.py": (
+            "tests/studies/ablation/test_longer_lines.py",
             "tests/studies/ablation/test_comparison.py",
         ),
     },
@@ -146,16 +161,20 @@ OF_ITEMS = ("tests/studies/reproduction/test_items.py",)
 REPRODUCTION = Suite(
     files=("studies/reproduction/*.py",),
     quick={
-        "studies/reproduction/verdicts.py": ("tests/studies/reproduction/test_verdicts.py",),
-        "studies/reproduction/printed.py": ("tests/studies/reproduction/test_printed.py",),
-        "studies/reproduction/folder.py": ("tests/studies/reproduction/test_folder.py",),
-        "studies/reproduction/item.py": ("tests/studies/reproduction/test_folder.py", *OF_ITEMS),
-        "studies/reproduction/run.py": (
+        "studies/reproduction/item.py": (
+            "tests/studies/reproduction/test_verdicts.py",
+            "tests/studies/reproduction/test_printed.py",
+            "tests/studies/reproduction/test_folder.py",
+            "tests/studies/reproduction/test_items.py",
+        ),
+        "studies/reproduction/folder.py": (
             "tests/studies/reproduction/test_folder.py",
             "tests/studies/reproduction/test_full.py",
         ),
-        "studies/reproduction/curves.py": ("tests/studies/reproduction/test_full.py", *OF_ITEMS),
-        "studies/reproduction/trainings.py": ("tests/studies/reproduction/test_full.py",),
+        "studies/reproduction/trainings.py": (
+            "tests/studies/reproduction/test_full.py",
+            "tests/studies/reproduction/test_items.py",
+        ),
     },
     otherwise=OF_ITEMS,
     whole=("tests/studies/reproduction", "tests/test_reproduction_page.py", "tests/cli/test_reproduce.py"),
@@ -166,24 +185,21 @@ REPRODUCTION = Suite(
 TABLES = ("tests/evaluation/test_table.py", "tests/evaluation/test_rollout.py")
 EVALUATION = Suite(
     files=(
-        "evaluation/*.py", "figures/curves.py", "figures/criticality.py", "figures/deceleration.py",
+        "evaluation/*.py", "figures/studies.py", "figures/evaluation.py", "figures/evaluation.py",
     ),
     quick={
         "evaluation/statistics.py": ("tests/evaluation/test_statistics.py",),
         "evaluation/seed_statistics.py": ("tests/evaluation/test_seed_statistics.py",),
-        "figures/curves.py": ("tests/figures/test_learning_curves.py",),
+        "figures/studies.py": ("tests/figures/test_learning_curves.py",),
         "evaluation/rollout.py": ("tests/evaluation/test_rollout.py", "tests/agents/test_team.py"),
         "evaluation/outcome.py": ("tests/evaluation/test_rollout.py", "tests/evaluation/test_left_out.py"),
         "evaluation/regret.py": ("tests/evaluation/test_regret.py",),
-        "evaluation/record.py": ("tests/evaluation/test_record.py",),
-        "evaluation/film.py": ("tests/evaluation/test_film.py",),
-        "evaluation/table.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
-        "evaluation/criticality.py": ("tests/figures/test_criticality.py",),
-        "evaluation/deceleration.py": ("tests/figures/test_deceleration.py",),
-        "figures/criticality.py": ("tests/figures/test_criticality.py",),
-        "figures/deceleration.py": ("tests/figures/test_deceleration.py",),
+        'evaluation/episodes.py': ('tests/evaluation/test_record.py', 'tests/evaluation/test_film.py',),
+        "evaluation/summary.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
+        'evaluation/curves.py': ('tests/figures/test_criticality.py', 'tests/figures/test_deceleration.py',),
+        'figures/evaluation.py': ('tests/figures/test_criticality.py', 'tests/figures/test_deceleration.py',),
         "evaluation/shield_modes.py": ("tests/evaluation/test_shield_modes.py",),
-        "evaluation/per_world.py": ("tests/evaluation/test_report.py", "tests/evaluation/test_per_world.py"),
+        "evaluation/results.py": ("tests/evaluation/test_report.py", "tests/evaluation/test_per_world.py"),
     },
     otherwise=TABLES,
     whole=("tests/evaluation", "tests/cli/test_commands.py"),
@@ -195,30 +211,52 @@ EVALUATION = Suite(
 
 TRAINED = ("tests/learning/test_train.py", "tests/learning/test_teams.py", "tests/learning/test_resume.py")
 LEARNING = Suite(
-    files=("learning/*.py", "learning/algorithms/*.py", "policies/*.py", "files/plain.py"),
+    files=("learning/*.py", "learning/algorithms/*.py", "policies/*.py", "files/store.py"),
     quick={
-        "learning/progress.py": ("tests/learning/test_progress.py",),
-        "learning/recipe.py": ("tests/learning/test_recipe.py",),
-        "policies/policy.py": ("tests/policies/test_policy.py",),
-        "policies/manifest.py": ("tests/policies/test_policy.py", "tests/policies/test_actor.py"),
-        "policies/actor.py": ("tests/policies/test_actor.py",),
-        "files/plain.py": (
+        "learning/progress.py": (
+            "tests/learning/test_progress.py",
+            "tests/learning/test_run_files.py",
+            "tests/learning/test_event_files.py",
+            "tests/learning/test_train.py",
+            "tests/learning/test_teams.py",
+            "tests/learning/test_resume.py",
+        ),
+        "learning/recipe.py": (
+            "tests/learning/test_recipe.py",
+            "tests/learning/test_algorithms.py",
+            "tests/learning/test_teams.py",
+        ),
+        "policies/bundle.py": (
+            "tests/policies/test_policy.py",
+            "tests/learning/test_teams.py",
+        ),
+        "policies/actor.py": (
+            "tests/policies/test_policy.py",
+            "tests/policies/test_actor.py",
+        ),
+        "files/store.py": (
             "tests/files/test_plain.py",
             "tests/policies/test_policy.py",
             "tests/learning/test_run_files.py",
         ),
-        "learning/training.py": ("tests/learning/test_training.py", "tests/learning/test_teams.py"),
-        "learning/run_folder.py": ("tests/learning/test_run_files.py", "tests/learning/test_event_files.py", *TRAINED),
-        "learning/run_log.py": ("tests/learning/test_run_files.py", "tests/learning/test_event_files.py", *TRAINED),
-        "learning/algorithms/independent_ppo.py": ("tests/learning/test_teams.py",),
-        "learning/registry.py": ("tests/learning/test_algorithms.py",),
-        "learning/schemes.py": ("tests/learning/test_teams.py", "tests/learning/test_recipe.py"),
+        "learning/training.py": (
+            "tests/learning/test_training.py",
+            "tests/learning/test_teams.py",
+            "tests/learning/test_run_files.py",
+            "tests/learning/test_event_files.py",
+            "tests/learning/test_train.py",
+            "tests/learning/test_resume.py",
+        ),
+        "learning/algorithms/networks.py": ("tests/learning/test_teams.py",),
         "learning/team_file.py": ("tests/learning/test_teams.py",),
-        "policies/team.py": ("tests/learning/test_teams.py",),
-        "learning/models.py": ("tests/learning/test_sb3_policy.py", *TRAINED),
+        "learning/train.py": (
+            "tests/learning/test_sb3_policy.py",
+            "tests/learning/test_train.py",
+            "tests/learning/test_teams.py",
+            "tests/learning/test_resume.py",
+        ),
         "policies/shipped.py": ("tests/policies/test_shipped.py",),
         "learning/checkpoint.py": ("tests/learning/test_resume.py",),
-        "learning/session.py": ("tests/learning/test_resume.py",),
     },
     otherwise=TRAINED,
     whole=("tests/learning", "tests/cli/test_training_commands.py"),

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import NamedTuple
 
-from ethbrake_marl.physics import events, impact
+from ethbrake_marl.physics import kernel
 from ethbrake_marl.shield import certify_kernel
 from tests.proofs import statements
 from tests.proofs.statements import Statement
@@ -27,24 +27,24 @@ class Bug(NamedTuple):
 
 BUGS = {
     "the earlier root of a contact": Bug(
-        events, "contact", "return (speed - closing) / pressing, speed", "return -closing / pressing, speed",
+        kernel, "contact", "return (speed - closing) / pressing, speed", "return -closing / pressing, speed",
         statements.contact,
     ),
     "a contact missed where the gap opens first": Bug(
-        events, "contact", "if pressing > 0.0:", "if pressing > 0.0 and gap < 1.0:", statements.contact
+        kernel, "contact", "if pressing > 0.0:", "if pressing > 0.0 and gap < 1.0:", statements.contact
     ),
     "the way while nothing is in force is forgotten": Bug(
-        events, "solo_motion", "way = speed * onset", "way = 0.0", statements.stopping
+        kernel, "solo_motion", "way = speed * onset", "way = 0.0", statements.stopping
     ),
     "restitution of what moves, not of what is left over": Bug(
-        impact, "resolve_cluster", "pooled + bounce * (pooled - table[SPEED, i])",
+        kernel, "resolve_cluster", "pooled + bounce * (pooled - table[SPEED, i])",
         "pooled + bounce * (pooled + table[SPEED, i])", statements.two,
     ),
     "blocks pooled without their masses": Bug(
-        impact, "pool", "table[BLOCK_LOW, count] / mass", "table[BLOCK_LOW, count] / 2.0", statements.energy
+        kernel, "pool", "table[BLOCK_LOW, count] / mass", "table[BLOCK_LOW, count] / 2.0", statements.energy
     ),
     "a plastic impact is not put in order": Bug(
-        impact, "resolve_cluster", "bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0",
+        kernel, "resolve_cluster", "bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0",
         "bounce = restitution", statements.plastic,
     ),
     "the budget may rise": Bug(
@@ -69,12 +69,12 @@ BUGS = {
         statements.decision,
     ),
     "a vehicle that never moves": Bug(
-        events, "solo_motion", "    way = 0.0\n    steady",
+        kernel, "solo_motion", "    way = 0.0\n    steady",
         "    return speed, 0.0, math.nan\n    way = 0.0\n    steady",
         statements.stopping,
     ),
     "half the time": Bug(
-        events, "solo_motion", "    way = 0.0\n    steady", "    duration = duration / 2.0\n    way = 0.0\n    steady",
+        kernel, "solo_motion", "    way = 0.0\n    steady", "    duration = duration / 2.0\n    way = 0.0\n    steady",
         statements.stopping,
     ),
     "the plan that was certified with a proposal is not kept": Bug(

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import z3
 
-from ethbrake_marl.physics import events, impact
+from ethbrake_marl.physics import kernel
 from ethbrake_marl.shield import certify_kernel
 from tests.proofs.paths import Condition, Ended, Symbol, SymbolicMath, exact, holds_always, is_infinite, paths, symbols
 
@@ -49,8 +49,8 @@ def prove(end: Ended, statement: Any, what: str, *assumed: Any) -> None:
 def contact() -> int:
     """``events.contact`` against ``events.drift``, the gap as a function of time."""
     gap, closing, pressing, when = symbols("gap closing pressing when")
-    found = list(_run(events, lambda: events.contact(gap, closing, pressing), [exact(gap) >= 0]))
-    after = exact(events.drift(gap, closing, pressing, when))
+    found = list(_run(kernel, lambda: kernel.contact(gap, closing, pressing), [exact(gap) >= 0]))
+    after = exact(kernel.drift(gap, closing, pressing, when))
     for end in found:
         time, speed = end.result
         if isinstance(time, float):
@@ -58,7 +58,7 @@ def contact() -> int:
             prove(end, after >= 0, "never closes", exact(when) >= 0)
             continue
         prove(end, exact(time) >= 0, "not in the past")
-        prove(end, exact(events.drift(gap, closing, pressing, time)) == 0, "the gap is closed then")
+        prove(end, exact(kernel.drift(gap, closing, pressing, time)) == 0, "the gap is closed then")
         prove(end, after > 0, "it is open before", exact(when) > 0, exact(when) < exact(time))
         prove(end, exact(speed) == exact(closing + pressing * time), "the speed is the one then")
         prove(end, exact(speed) >= 0, "and it approaches")
@@ -70,7 +70,7 @@ def stopping() -> int:
     """``events.solo_motion`` against ``events.stopping_distance``."""
     speed, capacity, latency, limit, time = symbols("speed capacity latency limit time")
     known = [exact(speed) >= 0, exact(capacity) > 0, exact(latency) >= 0, exact(time) >= 0, exact(limit) >= 0]
-    found = list(_run(events, lambda: events.solo_motion(speed, -capacity, latency, limit, time), known))
+    found = list(_run(kernel, lambda: kernel.solo_motion(speed, -capacity, latency, limit, time), known))
     whole = exact(speed * latency + speed * speed / (2.0 * capacity))
     for end in found:
         after, way, _ = end.result
@@ -92,13 +92,13 @@ def _cluster(vehicles: int, closing: float) -> tuple[list[Symbol], list[Symbol],
     known = [exact(m) > 0 for m in mass] + [exact(restitution) >= 0, exact(restitution) <= 1]
 
     def resolve() -> list[Symbol]:
-        table = np.zeros((impact.IMPACT_ROWS, vehicles), dtype=object)
-        table[impact.MASS], table[impact.SPEED] = mass, speed
-        table[impact.CLOSING, : vehicles - 1] = closing
-        impact.resolve_cluster(table, restitution, 0, vehicles - 1)
-        return list(table[impact.SPEED])
+        table = np.zeros((kernel.IMPACT_ROWS, vehicles), dtype=object)
+        table[kernel.MASS], table[kernel.SPEED] = mass, speed
+        table[kernel.CLOSING, : vehicles - 1] = closing
+        kernel.resolve_cluster(table, restitution, 0, vehicles - 1)
+        return list(table[kernel.SPEED])
 
-    return mass, speed, restitution, list(_run(impact, resolve, known))
+    return mass, speed, restitution, list(_run(kernel, resolve, known))
 
 
 def _sum(*columns: list[Symbol]) -> Any:
@@ -156,7 +156,7 @@ def plastic() -> int:
 def settling() -> int:
     """``events.settle`` on any range of forces."""
     low, high, other = symbols("low high other")
-    found = list(_run(events, lambda: events.settle(low, high), [exact(low) <= exact(high)]))
+    found = list(_run(kernel, lambda: kernel.settle(low, high), [exact(low) <= exact(high)]))
     for end in found:
         value = exact(end.result)
         prove(end, z3.And(value >= exact(low), value <= exact(high)), "within the range")

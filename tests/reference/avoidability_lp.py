@@ -23,7 +23,7 @@ from scipy.optimize import linprog
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.physics.events import solo_motion
+from ethbrake_marl.physics.kernel import solo_motion
 
 
 class LinearVerdict(NamedTuple):

@@ -13,7 +13,7 @@ from scipy import stats
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.inputs import scenario_sha256, worlds_sha256
 from ethbrake_marl.learning.training import resolve
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario, read_scenario

@@ -14,10 +14,9 @@ from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.identity import worlds_sha256
+from ethbrake_marl.evaluation.inputs import worlds_sha256
 from ethbrake_marl.observations import choose_observation
-from ethbrake_marl.physics.estimates import age_s, is_periodic, links_of
-from ethbrake_marl.physics.messages import KEY, TOLD_PLACE, TOLD_S, TOLD_SPEED, chance
+from ethbrake_marl.physics.messages import KEY, TOLD_PLACE, TOLD_S, TOLD_SPEED, age_s, chance, is_periodic, links_of
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.v2x import CHANNELS
 

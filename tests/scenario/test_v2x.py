@@ -13,11 +13,10 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import observation_for, observe
-from ethbrake_marl.observations.state import full_state, state_features
+from ethbrake_marl.observations import full_state, observation_for, observe, state_features
 from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.physics.advance import Packed, pack, unpack, with_news_columns
 from ethbrake_marl.physics.episode import CLOCK_WIDTH
-from ethbrake_marl.physics.rows import Packed, pack, unpack, with_news_columns
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
 from ethbrake_marl.scenario.v2x import (
     CHANNELS,
@@ -29,7 +28,7 @@ from ethbrake_marl.scenario.v2x import (
     link_delays,
     with_news,
 )
-from ethbrake_marl.search.problem import identities
+from ethbrake_marl.search.profiles import identities
 
 PAPER = load_scenario("paper-random")
 MESSAGES = [name for name in PRESETS if CHANNELS[name].timing == "messages"]

@@ -12,7 +12,7 @@ import numpy as np
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield.believed_agent import BelievedShieldAgent
+from ethbrake_marl.shield.believed import BelievedShieldAgent
 
 WAYS = ("coast", "drive", "chance")
 ABOVE = 1e-6  # m2/s2; what is told is moved on with rounding

@@ -14,12 +14,20 @@ import numpy as np
 from ethbrake_marl.agents.protocol import fixed_commands
 from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.physics import Worlds, advance
-from ethbrake_marl.shield.enclosure import go_on, may_meet_unseen, meet
-from ethbrake_marl.shield.enclosure_impact import new_stack
-from ethbrake_marl.shield.enclosure_motion import CLOSING, OPENING, TOUCHES, WIDE, Path, move_alone, new_motion
-from ethbrake_marl.shield.enclosure_touch import backwards, stray
-from ethbrake_marl.shield.forms import high
-from ethbrake_marl.shield.interior_kernel import Known, cell_of, wait
+from ethbrake_marl.shield.enclosure import go_on, may_meet_unseen, meet, new_stack
+from ethbrake_marl.shield.enclosure_motion import (
+    CLOSING,
+    OPENING,
+    TOUCHES,
+    WIDE,
+    Path,
+    backwards,
+    high,
+    move_alone,
+    new_motion,
+    stray,
+)
+from ethbrake_marl.shield.interior import Known, cell_of, wait
 
 ROOM = 1e-7  # for what two ways to compute a state differ by
 MOST = 20_000  # states of paths

@@ -10,8 +10,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.certify import certify
-from ethbrake_marl.shield.engine_shield import AttachedShield
-from ethbrake_marl.shield.options import ShieldOptions
+from ethbrake_marl.shield.guard import AttachedShield, ShieldOptions
 from tests.shield.trained import trained
 
 _ROLES = {

@@ -43,22 +43,22 @@ WHOLE = tuple(
 )
 KERNEL, MEMBERS, CERTIFY, ALERT, GUARD, ROLLOUTS, ATTACHED, COMPARISON, TEAM = (
     "ethbrake_marl/shield/certify_kernel.py",
-    "ethbrake_marl/shield/members.py",
+    "ethbrake_marl/shield/certify_kernel.py",
     "ethbrake_marl/shield/certify.py",
-    "ethbrake_marl/shield/alert.py",
     "ethbrake_marl/shield/step_shield.py",
-    "ethbrake_marl/shield/rollouts.py",
-    "ethbrake_marl/shield/engine_shield.py",
-    "ethbrake_marl/shield/comparison.py",
-    "ethbrake_marl/shield/team_agent.py",
+    "ethbrake_marl/shield/step_shield.py",
+    "ethbrake_marl/shield/certify.py",
+    "ethbrake_marl/shield/guard.py",
+    "ethbrake_marl/shield/certify.py",
+    "ethbrake_marl/shield/agents.py",
 )  # fmt: skip
 FORMS, INSIDE, WAIT, MOTION, TOUCH, ROUGH = (
-    "ethbrake_marl/shield/forms.py",
-    "ethbrake_marl/shield/interior.py",
-    "ethbrake_marl/shield/interior_kernel.py",
     "ethbrake_marl/shield/enclosure_motion.py",
-    "ethbrake_marl/shield/enclosure_touch.py",
-    "ethbrake_marl/shield/enclosure_rough.py",
+    "ethbrake_marl/shield/interior.py",
+    "ethbrake_marl/shield/interior.py",
+    "ethbrake_marl/shield/enclosure_motion.py",
+    "ethbrake_marl/shield/enclosure_motion.py",
+    "ethbrake_marl/shield/enclosure_motion.py",
 )
 
 BUGS: dict[str, tuple[Patch, ...]] = {
@@ -89,7 +89,7 @@ BUGS: dict[str, tuple[Patch, ...]] = {
         Patch(
             MEMBERS, "    save(world.table, after)\n", "    world.table[HIT, 0] = 0.0\n    save(world.table, after)\n"
         ),
-        Patch(MEMBERS, "import COMMAND, LIMIT\n", "import COMMAND, HIT, LIMIT\n"),
+        Patch(MEMBERS, "import COMMAND, LIMIT, MASS\n", "import COMMAND, HIT, LIMIT, MASS\n"),
     ),
     "harm so far forgotten": (
         Patch(MEMBERS, "    save(world.table, after)\n", "    world.table[-2:] = 0.0\n    save(world.table, after)\n"),

@@ -10,9 +10,9 @@ import numpy as np
 from pettingzoo.utils import BaseParallelWrapper
 
 from ethbrake_marl.agents.rollout import episode_engine
+from ethbrake_marl.envs.gym import EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import EthBrakeParallelEnv, parallel_env
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
-from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, StepShieldAgent, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.shield.lines import line

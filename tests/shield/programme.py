@@ -34,7 +34,7 @@ import numpy as np
 
 from ethbrake_marl.agents.rollout import episode_engine
 from ethbrake_marl.evaluation.inputs import make_agents
-from ethbrake_marl.files.durable import write_file
+from ethbrake_marl.files.store import write_file
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import StepShieldAgent
 from ethbrake_marl.shield.certify import certify

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.agents.team import Team
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.shield import ShieldedTeam, StepShieldAgent
-from ethbrake_marl.shield import behind as behind_module
-from ethbrake_marl.shield.behind import drive_chunks, put_shield, stack
+from ethbrake_marl.shield import agents as behind_module
+from ethbrake_marl.shield.agents import drive_chunks, put_shield, stack
 
 PAIR, PAPER = (load_scenario(name) for name in ("cooperation-3-pair", "paper-random"))
 

@@ -12,8 +12,7 @@ from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import interior
-from ethbrake_marl.shield.believed import BelievedShield
-from ethbrake_marl.shield.believed_agent import BelievedShieldAgent
+from ethbrake_marl.shield.believed import BelievedShield, BelievedShieldAgent
 from ethbrake_marl.shield.interior import Boxes, boxes_of
 from tests.shield import corners
 from tests.shield.corners import ABOVE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded

@@ -12,10 +12,9 @@ from pettingzoo.test import parallel_api_test
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.envs.gym import EthBrakeEnv, EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.envs.single import EthBrakeEnv
-from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec

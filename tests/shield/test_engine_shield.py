@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import Autoreset
 
+from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.step import STEP
+from ethbrake_marl.envs.gym import EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.physics import advance
-from ethbrake_marl.physics.rows import harm_at, speed_at
+from ethbrake_marl.physics.advance import harm_at, speed_at
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
     HybridShield,
@@ -33,8 +33,8 @@ from ethbrake_marl.shield import (
     StepShield,
     StepShieldAgent,
 )
+from ethbrake_marl.shield.agents import ShieldedTeam
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from ethbrake_marl.shield.team_agent import ShieldedTeam
 from tests.shield.beyond_horizon import above_later
 
 PAPER = load_scenario("paper-random")

@@ -16,11 +16,10 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.envs.gym import EthBrakeEnv, EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import env as aec_env
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.envs.single import EthBrakeEnv
-from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
@@ -260,7 +259,7 @@ def test_infos__hold_the_bound_after_a_reset_already_with_the_keys_of_a_step(opt
 
 
 @pytest.mark.parametrize("name", INTERFACES)
-@pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.engine_shield.MovingAtHorizon")
+@pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.guard.MovingAtHorizon")
 def test_attack__through_every_interface_stays_within_the_bound_at_the_alert(name):
     realised, bound, _ = INTERFACES[name](24, 5)  # make test-shield: 10,000
     assert len(realised) == len(bound) >= 24

@@ -12,11 +12,17 @@ from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics.episode import number_of_decisions
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search.problem import profile_problem
-from ethbrake_marl.shield import HybridShield, ShieldOptions, StepShield, StepShieldAgent, forms, parse_uncertainty
+from ethbrake_marl.search.profiles import profile_problem
+from ethbrake_marl.shield import (
+    HybridShield,
+    ShieldOptions,
+    StepShield,
+    StepShieldAgent,
+    enclosure_motion,
+    parse_uncertainty,
+)
 from ethbrake_marl.shield.certify import begin_running, plan_harm
-from ethbrake_marl.shield.interior import bound_plans, boxes_of
-from ethbrake_marl.shield.interior_kernel import Known, cell_of, wait
+from ethbrake_marl.shield.interior import Known, bound_plans, boxes_of, cell_of, wait
 from tests.shield.enclosed import outside
 from tests.shield.lines import line
 from tests.shield.test_certify import STEPS, two
@@ -58,12 +64,12 @@ def width(scenario):
 
 
 OPERATIONS = {
-    "product": (lambda x, y: forms.product(x, y), lambda a, b: a * b),
-    "square": (lambda x, y: forms.square(x), lambda a, b: a * a),
-    "square_root": (lambda x, y: forms.square_root(x), lambda a, b: np.sqrt(a)),
-    "reciprocal": (lambda x, y: forms.reciprocal(x), lambda a, b: 1.0 / a),
-    "positive_part": (lambda x, y: forms.positive_part(y), lambda a, b: np.maximum(b, 0.0)),
-    "difference": (lambda x, y: forms.difference(x, y), lambda a, b: a - b),
+    "product": (lambda x, y: enclosure_motion.product(x, y), lambda a, b: a * b),
+    "square": (lambda x, y: enclosure_motion.square(x), lambda a, b: a * a),
+    "square_root": (lambda x, y: enclosure_motion.square_root(x), lambda a, b: np.sqrt(a)),
+    "reciprocal": (lambda x, y: enclosure_motion.reciprocal(x), lambda a, b: 1.0 / a),
+    "positive_part": (lambda x, y: enclosure_motion.positive_part(y), lambda a, b: np.maximum(b, 0.0)),
+    "difference": (lambda x, y: enclosure_motion.difference(x, y), lambda a, b: a - b),
 }
 
 

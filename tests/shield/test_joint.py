@@ -5,21 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.agents.team import Team
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.search.problem import profile_problem
+from ethbrake_marl.search.profiles import profile_problem
 from ethbrake_marl.shield import HybridShield, ShieldedTeam, StepShield, shielded_aec
-from ethbrake_marl.shield.alert import joint_constants
-from ethbrake_marl.shield.certify import REASONS, Backup, begin_running, certify, plan_harm
+from ethbrake_marl.shield.certify import REASONS, Backup, begin_running, borne_under, certify, plan_harm
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from ethbrake_marl.shield.shares import borne_under
+from ethbrake_marl.shield.step_shield import joint_constants
 from tests.shield.joint_attack import ADVERSARIES, joint_attack, scenario_of
 
 STEPS = 81

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.envs.gym import EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, ShieldOptions

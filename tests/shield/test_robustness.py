@@ -7,10 +7,10 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.figures.shield import robustness_figure, robustness_table
+from ethbrake_marl.figures.evaluation import robustness_figure, robustness_table
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.robustness import MODES, TRUTHS, robustness
+from ethbrake_marl.scenario.schema import Task
+from ethbrake_marl.shield.review import MODES, TRUTHS, robustness
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.failing_worlds import plant, without
 
@@ -72,7 +72,7 @@ def test_interior__keeps_its_bound_inside_and_is_refused_for_what_it_cannot_cert
 
 def test_same_case__is_driven_once(monkeypatch):
     drives = []
-    monkeypatch.setattr("ethbrake_marl.shield.robustness.drive", lambda *given: drives.append(given) or drive(*given))
+    monkeypatch.setattr("ethbrake_marl.shield.review.drive", lambda *given: drives.append(given) or drive(*given))
     robustness(WORLDS.take([0]), make_agent("full_brake"), TASK, INTERVALS, widths=(0.0, 1.0))
     assert len(drives) == 1 + 5  # nothing differs at width 0, nor for step mode where the world is as told
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.learned import LearnedAgent
+from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.agents.refined import Refined
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
@@ -14,8 +14,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import HybridShield, StepShield, StepShieldAgent, parse_uncertainty
-from ethbrake_marl.shield.certify import REASONS, Backup
-from ethbrake_marl.shield.rollouts import Proposer
+from ethbrake_marl.shield.certify import REASONS, Backup, Proposer
 
 PAPER = load_scenario("paper-random")
 WORLDS = PAPER.sample(120, 3).worlds

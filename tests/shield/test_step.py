@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.figures.shield import operating_figure
+from ethbrake_marl.figures.evaluation import operating_figure
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.scenario.task import Task
+from ethbrake_marl.scenario.schema import Task
 from ethbrake_marl.shield import HybridAgent, StepShield, StepShieldAgent, parse_uncertainty
 from ethbrake_marl.shield.certify import REASONS
 from ethbrake_marl.shield.review import operating_curves, review

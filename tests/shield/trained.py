@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.shield.engine_shield import AttachedShield
+from ethbrake_marl.shield.guard import AttachedShield
 
 STEPS, WORLDS, HIDDEN = 200_000, 64, (64, 64)
 FOLDER = Path(__file__).resolve().parent

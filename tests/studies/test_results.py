@@ -9,7 +9,7 @@ import pytest
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.results import results_csv, telling_world
+from ethbrake_marl.studies.experiment import results_csv, telling_world
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation.shards.question import Asked, Question, ask
-from ethbrake_marl.evaluation.shards.tally import Tally
+from ethbrake_marl.evaluation.shards import Asked, Question, Tally, ask
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies import shards as studied
-from ethbrake_marl.studies.jobs.local import LocalWorkers
+from ethbrake_marl.studies.jobs import LocalWorkers
 from ethbrake_marl.studies.shards import ShardFolder, evaluate_shards
 
 N = 4_500

@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from xml.sax.saxutils import escape
 
-from ethbrake_marl.envs.drawing.scene import BODY_M, Scene, Struck, vehicle_colour
-from ethbrake_marl.envs.drawing.text import pair_words, speed_words
+from ethbrake_marl.envs.drawing.scene import BODY_M, Scene, Struck, pair_words, speed_words, vehicle_colour
 from ethbrake_marl.errors import plain_text
 
 WIDTH = 800

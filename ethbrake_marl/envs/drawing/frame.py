@@ -10,8 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from ethbrake_marl.envs.drawing.scene import BODY_M, Scene, Struck, vehicle_colour
-from ethbrake_marl.envs.drawing.text import command_words, pair_words, shield_words, speed_words
+from ethbrake_marl.envs.drawing.scene import (
+    BODY_M,
+    Scene,
+    Struck,
+    command_words,
+    pair_words,
+    shield_words,
+    speed_words,
+    vehicle_colour,
+)
 from ethbrake_marl.errors import plain_text
 
 Frame = NDArray[np.uint8]  # [HEIGHT, WIDTH, 3]

@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.envs.drawing.scene import Scene
-from ethbrake_marl.envs.drawing.trace import Trace, kept_motions, moments, scenes
+from ethbrake_marl.envs.drawing.scene import Scene, Trace, kept_motions, moments, scenes
 from ethbrake_marl.errors import InvalidInput, check_whole_number, need
 
 if TYPE_CHECKING:
@@ -103,7 +102,7 @@ class Viewer:
 
     def _drawn(self) -> Callable[[Scene], Any]:
         if self.mode == "ansi":
-            from ethbrake_marl.envs.drawing.text import scene_text
+            from ethbrake_marl.envs.drawing.scene import scene_text
 
             return scene_text
         return draw

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.algorithms.modes import ModesPlan
-from ethbrake_marl.learning.algorithms.protocol import Algorithm
+from ethbrake_marl.learning.algorithms.protocol import Algorithm, ModesPlan
 from ethbrake_marl.learning.recipe import ActorShape, Fraction, OffsetRange, Positive, Rate, TrainingRecipe
 from ethbrake_marl.learning.training import Training
-from ethbrake_marl.policies.manifest import NetworkSpec
-from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.actor import NetworkSpec
+from ethbrake_marl.policies.bundle import Policy
 from ethbrake_marl.policies.shipped import PolicyKind, load_named_policy
-from ethbrake_marl.scenario.checks import refuse
+from ethbrake_marl.scenario.schema import refuse
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -106,7 +105,7 @@ class Counterfactual(Algorithm):
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> CounterfactualModel:
         """The model, from the policy of ``start`` if the recipe names one."""
-        from ethbrake_marl.engine.branches import branch, moment_of
+        from ethbrake_marl.engine.snapshot import branch, moment_of
         from ethbrake_marl.learning.algorithms.counterfactual_model import CounterfactualModel, TryingOut
         from ethbrake_marl.learning.algorithms.modes_model import ModesModel
 

@@ -17,15 +17,13 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import MaybeCallback, PyTorchObs, Schedule
 from torch import Tensor, nn
 
-from ethbrake_marl.engine.branches import Act, Moment, Offsets, branch, join_moments, moment_of, play_to_the_end
+from ethbrake_marl.engine.snapshot import Act, Moment, Offsets, branch, join_moments, moment_of, play_to_the_end
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS, Adam
-from ethbrake_marl.learning.algorithms.scout import Scout, choose_rows
+from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS, Adam, Scout, choose_rows
 from ethbrake_marl.learning.recipe import ActorShape
 from ethbrake_marl.physics import Bools, Floats, Ints
-from ethbrake_marl.physics.rows import command_at, speed_at
-from ethbrake_marl.policies.actor import Float32s
-from ethbrake_marl.policies.manifest import tensor_table
+from ethbrake_marl.physics.advance import command_at, speed_at
+from ethbrake_marl.policies.actor import Float32s, tensor_table
 
 LOG_NOISE = -3.0  # of the bundle: the actor itself never explores
 

@@ -3,23 +3,36 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Space
+from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import update_learning_rate
 from torch import Tensor, nn
 from torch.nn.functional import mse_loss, softplus
 
-from ethbrake_marl.engine.branches import Act, Moment, branch, visit
+from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine.snapshot import (
+    Act,
+    Moment,
+    branch,
+    first_moments,
+    no_offsets,
+    play_on,
+    play_to_the_end,
+    visit,
+)
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.learning.algorithms.averaged_gate import AveragedGate
 from ethbrake_marl.learning.algorithms.counterfactual_model import (
     AveragedActor,
     CounterfactualModel,
@@ -27,13 +40,165 @@ from ethbrake_marl.learning.algorithms.counterfactual_model import (
     TryingOut,
     moving_rows,
 )
-from ethbrake_marl.learning.algorithms.mode_worlds import Shown, drive_from, explore, own_worlds, show_templates
-from ethbrake_marl.learning.algorithms.modes import ModesPlan, Stage, stages_of
-from ethbrake_marl.learning.algorithms.networks import Adam
-from ethbrake_marl.learning.algorithms.scout import Scout, choose_rows
+from ethbrake_marl.learning.algorithms.networks import ACTIVATIONS, Adam, Scout, choose_rows
+from ethbrake_marl.learning.algorithms.protocol import ModesPlan, Stage, stages_of
 from ethbrake_marl.learning.recipe import ActorShape
-from ethbrake_marl.physics import Floats
+from ethbrake_marl.observations import Observations
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.policies.actor import Float32s
+from ethbrake_marl.search.profiles import profile_problem
+from ethbrake_marl.search.refine import best_templates
+
+# The gate between several networks: what it has learned, the average that decides, and what it remembers.
+
+
+class AveragedGate(nn.Module):
+    """A gate that learns (``learning``), and the running average of its weights (``average``), which decides.
+
+    It remembers the last decisions at which networks were compared: what was seen, and how much more than the best one
+    each of them costs.
+    """
+
+    seen: Tensor  # [M, F]
+    more: Tensor  # [M, K]
+    compared: Tensor  # [1] so far; the newest take the places of the oldest
+
+    def __init__(self, inputs: int, plan: ModesPlan, shape: ActorShape, rate: Schedule, focus: float = 0.0) -> None:
+        super().__init__()
+        networks = plan.networks
+        layers = create_mlp(inputs, networks, list(plan.gate), ACTIVATIONS[shape.activation])
+        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, the first network acts
+        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]
+        self.average = nn.Sequential(*layers)
+        self.learning = copy.deepcopy(self.average)
+        self.scout = Scout(inputs) if focus > 0.0 else None
+        learned = [*self.learning.parameters(), *(self.scout.parameters() if self.scout is not None else ())]
+        self.optimizer = Adam(learned, lr=rate(1.0), eps=1e-5)
+        self.register_buffer("seen", torch.zeros(plan.gate_memory, inputs))
+        self.register_buffer("more", torch.zeros(plan.gate_memory, networks))
+        self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
+
+    def remember(self, seen: Float32s, more: Float32s) -> None:
+        """Keep compared decisions."""
+        M, before = len(self.seen), int(self.compared)
+        places = torch.arange(before, before + len(seen)) % M
+        self.seen[places], self.more[places] = torch.from_numpy(seen), torch.from_numpy(more)
+        self.compared += len(seen)
+
+    def recall(self, count: int) -> tuple[Tensor, Tensor]:
+        """Some of the kept ones, [count, F] and [count, K]."""
+        some = torch.randint(min(int(self.compared), len(self.seen)), (count,))
+        return self.seen[some], self.more[some]
+
+    def choose(self, observation: Float32s) -> NDArray[np.int64]:
+        """Which network acts on each of the observations [rows, F], [rows]."""
+        with torch.no_grad():
+            chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
+        return chosen
+
+    def expect(self, observation: Float32s) -> Floats:
+        """How much its scout expects to depend on the choice, [rows]."""
+        assert self.scout is not None
+        return self.scout.expect(observation)
+
+    def follow(self, keep: float) -> None:
+        """Move the average towards the weights that learn, keeping this share of what it was."""
+        with torch.no_grad():
+            for mean, learns in zip(self.average.parameters(), self.learning.parameters(), strict=True):
+                mean.lerp_(learns, 1.0 - keep)
+
+
+# The worlds of another mode: where random templates of a whole episode do better than every network so far.
+
+NO_DIFFERENCE = 1e-2  # of returns: two networks that differ by less do the same
+
+
+class Explored(NamedTuple):
+    """Worlds of the training, and the best that networks do in them."""
+
+    alert: Worlds
+    start: Moment  # at the first decision
+    gained: Floats  # [n] the highest return
+    harm: Floats  # [n] the least harm (m2/s2)
+
+
+class Shown(NamedTuple):
+    """What templates did at each decision, to be imitated."""
+
+    seen: Float32s  # [m, F]
+    action: Float32s  # [m]
+
+
+def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) -> Explored:
+    """The first worlds of the training, each driven by every network from its start to its end."""
+    alert, start = first_moments(engine, plan.worlds)
+    gained, harm = np.full(plan.worlds, -np.inf), np.full(plan.worlds, np.inf)
+    for act in acts:
+        its_gain, its_harm = drive_from(engine, start, act, gamma)
+        gained, harm = np.fmax(gained, its_gain), np.fmin(harm, its_harm)
+    return Explored(alert, start, gained, harm)
+
+
+def drive_from(
+    engine: Engine, start: Moment, act: Act, gamma: float, count: HarmCount | None = None
+) -> tuple[Floats, Floats]:
+    """Return of the first learner [n], NaN for a row that could not be advanced, and harm of the world [n] (m2/s2).
+
+    The harm is of the reward's count unless another one is given.
+    """
+    rows = branch(engine, start)
+    gained, _ = play_to_the_end(rows, act, no_offsets(rows.n), gamma)
+    return gained, rows.ledger.world_harm(engine.reward.harm_count if count is None else count)
+
+
+def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: float, seed: int) -> Shown:
+    """What the best template does in each world in which it gains more, by ``plan.gain``, than every network."""
+    (vehicle,) = engine.learners
+    problem = profile_problem(
+        found.alert,
+        [vehicle],
+        harm_count=engine.reward.harm_count,
+        horizon_s=engine.scenario.horizon_s,
+        time_step_s=engine.scenario.time_step_s,
+        others_mps2=found.start.wanted,
+    )
+    commands, steps = best_templates(problem, found.harm, number=plan.templates, seed=seed)
+    rows = np.flatnonzero(steps > 0)
+    actions = _actions_of(commands[rows], found.alert.take(rows), vehicle)
+    seen_then: list[Observations] = []
+    where: list[Ints] = []
+
+    def decide(seen: Observations, some: Ints, number: int) -> Floats:
+        seen_then.append(seen[:, 0])
+        where.append(some)
+        wanted: Floats = actions[some, number][:, np.newaxis]
+        return wanted
+
+    gained = play_on(branch(engine, found.start.take(rows)), decide, gamma)[:, 0]
+    better: Bools = gained > found.gained[rows] + plan.gain
+    if not where:
+        return Shown(np.zeros((0, engine.observation.size), np.float32), np.zeros(0, np.float32))
+    wanted = np.concatenate([actions[some, number] for number, some in enumerate(where)]).astype(np.float32)
+    kept = better[np.concatenate(where)]
+    return Shown(np.concatenate(seen_then)[kept], wanted[kept])
+
+
+def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma: float) -> Moment:
+    """The starts of the worlds in which ``act`` is at most ``plan.margin`` worse than the networks before it.
+
+    Those where it makes no difference are left out, and those where the networks before do no harm: they teach nothing.
+    """
+    gained, _ = drive_from(engine, found.start, act, gamma)
+    more = gained - found.gained
+    rows = np.flatnonzero((more > -plan.margin) & (np.abs(more) > NO_DIFFERENCE) & (found.harm > 0.0))
+    return found.start.take(rows)
+
+
+def _actions_of(commands_mps2: Floats, worlds: Worlds, vehicle: int) -> Floats:
+    """Actions [n, T] for commands [n, T]."""
+    each = [command_to_action(commands_mps2[:, t], worlds.vehicles, vehicle) for t in range(commands_mps2.shape[1])]
+    return np.stack(each, axis=1)
+
 
 OTHER_COUNT: dict[HarmCount, HarmCount] = {"first": "total", "total": "first"}
 SAME_COST = 1e-9

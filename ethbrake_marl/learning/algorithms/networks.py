@@ -9,16 +9,24 @@ sees both: the state, and whose place it judges.
 from __future__ import annotations
 
 import inspect
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box, Space
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
-from ethbrake_marl.policies.actor import Float32s
-from ethbrake_marl.policies.manifest import Activation, NetworkSpec, tensor_table
+from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.policies.actor import Activation, Float32s, NetworkSpec, tensor_table
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
 
@@ -59,3 +67,203 @@ def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
     """Copy the policy's weights under the names of our table."""
     state = policy.state_dict()
     return {row.name: state[row.sb3_name].detach().cpu().numpy().astype(np.float32) for row in tensor_table(spec)}
+
+
+# Independent learners: one PPO each, with a network, an optimiser and a buffer of its own, in the same worlds.
+#
+# A row of the environment ends with its learner's number (``make_sb3_vec_env(..., appended="number")``). Rollouts are
+# collected for all of them together; then each learns from its own part, by Stable-Baselines3's own ``PPO.train``.
+
+
+class SeparatePolicies(BasePolicy):
+    """An actor, a critic and an optimiser for each learner; a row's last number says which of them sees the rest.
+
+    ``resting`` learners do not explore: they act by their mean.
+    """
+
+    def __init__(
+        self,
+        observation_space: Space[Any],
+        action_space: Any,
+        lr_schedule: Schedule,
+        use_sde: bool = False,
+        *,
+        learners: int,
+        **network: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space)
+        assert isinstance(observation_space, Box)
+        own = Box(observation_space.low[:-1], observation_space.high[:-1], dtype=observation_space.dtype.type)
+        self.members = nn.ModuleList(
+            ActorCriticPolicy(own, action_space, lr_schedule, use_sde=use_sde, **network) for _ in range(learners)
+        )
+        self.resting: frozenset[int] = frozenset()
+
+    @property
+    def log_std(self) -> Tensor:
+        """Exploration noise of all learners, one after the other."""
+        return torch.cat([member.log_std for member in self.policies])
+
+    @property
+    def policies(self) -> list[ActorCriticPolicy]:
+        """The learners' policies, front to rear."""
+        return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
+
+    def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Actions [n, 1], values [n, 1] and log-probabilities [n] of rows [n, F + 1]."""
+        count = len(observation)
+        actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
+        for number, policy, rows in self._by_learner(observation):
+            still = deterministic or number in self.resting
+            actions[rows], values[rows], likelihood[rows] = policy(observation[rows, :-1], still)
+        return actions, values, likelihood
+
+    def predict_values(self, observation: PyTorchObs) -> Tensor:
+        """Values [n, 1] of rows [n, F + 1]."""
+        assert isinstance(observation, Tensor)
+        values = torch.empty(len(observation), 1)
+        for _, policy, rows in self._by_learner(observation):
+            values[rows] = policy.predict_values(observation[rows, :-1])
+        return values
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
+        assert isinstance(observation, Tensor)
+        return self.forward(observation, deterministic)[0]
+
+    def _by_learner(self, observation: Tensor) -> Iterator[tuple[int, ActorCriticPolicy, Tensor]]:
+        numbers = observation[:, -1]
+        for number, policy in enumerate(self.policies):
+            rows = (numbers == number).nonzero()[:, 0]
+            if len(rows):
+                yield number, policy, rows
+
+
+class IndependentPPO(PPO):
+    """A PPO for each of the ``names`` (learners, front to rear), all at once, or in ``turns``: N rounds, one by one.
+
+    In a turn the others drive by their means and do not learn; the turns divide the training's updates evenly. What
+    is logged of the learning of ``vehicle_2`` is called ``vehicle_2/loss`` and so on.
+    """
+
+    policy: SeparatePolicies  # type: ignore[assignment]  # of an actor-critic it has what PPO asks for
+
+    def __init__(self, env: VecEnv, names: Sequence[str], turns: int | None, **settings: Any) -> None:
+        self.names, self.turns = tuple(names), turns
+        arguments = {**settings.pop("policy_kwargs"), "learners": len(names)}
+        super().__init__(SeparatePolicies, env, policy_kwargs=arguments, **settings)  # type: ignore[arg-type]
+        self._learning: tuple[int, ...] = ()
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """Collect as PPO does, those whose turn it is not without exploration."""
+        everyone = range(len(self.names))
+        self._learning = tuple(everyone) if self.turns is None else (self._whose_turn(self.turns),)
+        self.policy.resting = frozenset(everyone) - frozenset(self._learning)
+        return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+
+    def train(self) -> None:
+        """Let each learner whose turn it is learn from its own rows, with its own optimiser."""
+        joint, buffer, log, updates = self.policy, self.rollout_buffer, self._logger, self._n_updates
+        parts = {number: self._part(buffer, number) for number in self._learning}
+        try:
+            for number, part in parts.items():
+                self.policy, self.rollout_buffer = joint.policies[number], part  # type: ignore[assignment]
+                self._logger, self._n_updates = Logger(None, []), updates
+                super().train()
+                for name, value in self._logger.name_to_value.items():
+                    excluded = self._logger.name_to_excluded[name]
+                    log.record(name.replace("train", self.names[number], 1), value, excluded)
+        finally:
+            self.policy, self.rollout_buffer, self._logger = joint, buffer, log
+
+    def _whose_turn(self, turns: int) -> int:
+        """The learner of the update that begins; a function of the steps done, so a resumed training asks nothing."""
+        rollout = self.n_envs * self.n_steps
+        planned = -(-self._total_timesteps // rollout)
+        stretch = self.num_timesteps // rollout * turns * len(self.names) // planned
+        return stretch % len(self.names)
+
+    def _part(self, buffer: RolloutBuffer, number: int) -> RolloutBuffer:
+        """What one learner has lived through, in a buffer of its own."""
+        own = self.policy.policies[number].observation_space
+        count = len(self.names)
+        part = RolloutBuffer(
+            buffer.buffer_size,
+            own,
+            self.action_space,
+            self.device,
+            gae_lambda=self.gae_lambda,
+            gamma=self.gamma,
+            n_envs=self.n_envs // count,
+        )
+        for name in ("actions", "rewards", "episode_starts", "values", "log_probs", "returns", "advantages"):
+            setattr(part, name, getattr(buffer, name)[:, number::count].copy())
+        part.observations = buffer.observations[:, number::count, :-1].copy()
+        part.pos, part.full = buffer.buffer_size, True
+        return part
+
+
+# A scout: it learns at which decisions a difference is to be expected, so that most are tried where there is one.
+#
+# Where nothing depends on what is done, a counterfactual says 0 and costs as much as any other. Decisions are drawn
+# with
+# unequal chances, and each counts the less, the likelier it was drawn: what is learned is the same on average.
+
+WIDTH = 64  # of its hidden layer
+HIGHEST = 20.0  # logarithm of what it expects at most
+
+
+class Drawn(NamedTuple):
+    """Rows that were drawn, and what each counts."""
+
+    rows: Ints  # [B], the same one several times where a difference is expected
+    importance: Float32s  # [B] 1 / (chance of the row x number of rows); their mean is 1 on average
+
+
+class Scout(nn.Module):
+    """A small network for the size of the difference that is to be expected of an observation."""
+
+    def __init__(self, inputs: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(inputs, WIDTH), nn.ReLU(), nn.Linear(WIDTH, 1))
+        last = self.layers[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)  # until it learns, it expects the same everywhere
+        nn.init.zeros_(last.bias)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """The logarithm of what is to be expected [rows] of observations [rows, F]."""
+        found: Tensor = self.layers(observation)[:, 0].clamp(max=HIGHEST)
+        return found
+
+    def expect(self, observation: Float32s) -> Floats:
+        """What is to be expected [rows], above 0."""
+        with torch.no_grad():
+            found: Floats = np.exp(self(torch.from_numpy(observation)).numpy().astype(np.float64))
+        return found
+
+    def loss(self, observation: Tensor, size: Tensor, importance: Tensor) -> Tensor:
+        """Least where it expects the mean size; of sizes [rows] >= 0, whose largest do not rule it as in a square."""
+        logarithm = self(observation)
+        found: Tensor = (importance * (logarithm.exp() - size * logarithm)).mean()
+        return found
+
+
+def draw_rows(expected: Floats, count: int, focus: float) -> Drawn:
+    """Draw ``count`` of the rows: the share ``focus`` in proportion to ``expected`` [n] > 0, the others evenly."""
+    n = len(expected)
+    chance = (1.0 - focus) / n + focus * (expected / expected.sum())
+    rows = torch.multinomial(torch.from_numpy(chance), count, replacement=True).numpy()
+    return Drawn(rows, (1.0 / (n * chance[rows])).astype(np.float32))
+
+
+def choose_rows(
+    observed: Float32s, rows: Ints, count: int, focus: float, expect: Callable[[Float32s], Floats]
+) -> Drawn:
+    """Draw ``count`` of ``rows``: evenly and each once, or mostly where ``expect`` says that there is a difference."""
+    if focus == 0.0 or len(rows) == 0:
+        some = rows[torch.randperm(len(rows))[:count].numpy()]
+        return Drawn(some, np.ones(len(some), np.float32))
+    drawn = draw_rows(expect(observed[rows]), count, focus)
+    return Drawn(rows[drawn.rows], drawn.importance)

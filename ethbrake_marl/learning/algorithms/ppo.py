@@ -20,8 +20,8 @@ from ethbrake_marl.learning.recipe import (
     TrainingRecipe,
 )
 from ethbrake_marl.learning.training import Training
-from ethbrake_marl.policies.manifest import NetworkSpec
-from ethbrake_marl.scenario.checks import refuse
+from ethbrake_marl.policies.actor import NetworkSpec
+from ethbrake_marl.scenario.schema import refuse
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
@@ -94,8 +94,7 @@ class Ppo(Algorithm):
         """The model of the training's scheme."""
         from stable_baselines3 import PPO
 
-        from ethbrake_marl.learning.algorithms.independent_ppo import IndependentPPO
-        from ethbrake_marl.learning.algorithms.networks import CentralCriticPolicy
+        from ethbrake_marl.learning.algorithms.networks import CentralCriticPolicy, IndependentPPO
 
         recipe = training.recipe
         assert isinstance(recipe, PpoRecipe)
@@ -109,13 +108,13 @@ class Ppo(Algorithm):
 
     def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
         """The model's policy, or the one of each independent learner."""
-        from ethbrake_marl.learning.algorithms.independent_ppo import IndependentPPO
+        from ethbrake_marl.learning.algorithms.networks import IndependentPPO
 
         return tuple(model.policy.policies) if isinstance(model, IndependentPPO) else (model.policy,)
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
         """The optimiser of the model's policy, or the one of each independent learner by the vehicle's name."""
-        from ethbrake_marl.learning.algorithms.independent_ppo import IndependentPPO
+        from ethbrake_marl.learning.algorithms.networks import IndependentPPO
 
         if isinstance(model, IndependentPPO):
             return dict(zip(model.names, (member.optimizer for member in model.policy.policies), strict=True))

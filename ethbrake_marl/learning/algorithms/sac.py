@@ -12,8 +12,8 @@ from pydantic import Field, field_validator, model_validator
 from ethbrake_marl.learning.algorithms.protocol import Algorithm
 from ethbrake_marl.learning.recipe import Positive, Rate, SquashedShape, TrainingRecipe
 from ethbrake_marl.learning.training import Training
-from ethbrake_marl.policies.manifest import NetworkSpec
-from ethbrake_marl.scenario.checks import refuse
+from ethbrake_marl.policies.actor import NetworkSpec
+from ethbrake_marl.scenario.schema import refuse
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC

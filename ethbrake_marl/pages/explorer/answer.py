@@ -6,26 +6,187 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.team import Driver, Team
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.agents.protocol import Agent, Driver, Source, Team
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes
-from ethbrake_marl.harm import HarmCount
-from ethbrake_marl.limits.best_harm import scripted_commands
-from ethbrake_marl.limits.driven_profiles import driven_profiles
+from ethbrake_marl.evaluation.episodes import EpisodeMotion, follow_episodes
+from ethbrake_marl.evaluation.outcome import quantities
+from ethbrake_marl.files.yaml import suggestion
+from ethbrake_marl.limits.best_harm import driven_profiles, scripted_commands
 from ethbrake_marl.limits.limits import Unproven, prove
-from ethbrake_marl.pages.explorer.hand import HandDriven, decision_grid
 from ethbrake_marl.pages.frame import shown
 from ethbrake_marl.pages.player import played_episode, played_world
-from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.physics.episode import decision_at, first_decision_s, number_of_decisions
 from ethbrake_marl.scenario import Scenario, Task
-from ethbrake_marl.search.problem import ProfileProblem, profile_problem
-from ethbrake_marl.search.profiles import Profiles, constant_profiles, even_grid, search_profiles
+from ethbrake_marl.scenario.initial_states import initial_state_worlds
+from ethbrake_marl.scenario.quantities import OPTIONAL, QUANTITIES, SYMBOLS, QuantityRule
+from ethbrake_marl.search.profiles import (
+    ProfileProblem,
+    Profiles,
+    constant_profiles,
+    even_grid,
+    profile_problem,
+    search_profiles,
+)
+
+# The state that the sliders set: its sliders, and the strict reading of what a page sends.
+#
+# A state is plain data: a quantity of every vehicle or pair is a list, one of the whole world a number.
+
+State = dict[str, Any]
+
+
+class Group(NamedTuple):
+    """The sliders of one quantity."""
+
+    field: str  # key in a state
+    title: str
+    unit: str  # "" for a plain number
+    low: float
+    high: float  # sliders end here, the numbers beside them at ``most``
+    step: float
+    most: float
+    names: tuple[str, ...]  # of each slider: vehicle, pair or world
+    usual: bool  # shown at once; the others open
+
+
+# title, least, greatest and step of a slider, and whether it is shown at once
+_SLIDERS: dict[str, tuple[str, float, float, float, bool]] = {
+    "gaps_m": ("Gap", 0.0, 30.0, 0.1, True),
+    "speeds_mps": ("Speed", 0.0, 40.0, 0.1, True),
+    "latency_s": ("Delay until it may act", 0.0, 2.0, 0.05, True),
+    "braking_capacity_mps2": ("Braking capacity", 0.5, 12.0, 0.1, True),
+    "driving_capacity_mps2": ("Driving capacity", 0.0, 12.0, 0.1, False),
+    "mass_t": ("Mass", 0.5, 40.0, 0.1, False),
+    "restitution": ("Restitution", 0.0, 1.0, 0.01, False),
+    "obstacle_gap_m": ("Obstacle ahead of Vehicle 1 at", 1.0, 150.0, 0.5, True),
+    "speed_limit_mps": ("Speed limit of driving", 1.0, 60.0, 0.5, False),
+}
+
+
+def slider_groups(scenario: Scenario, state: State) -> list[Group]:
+    """The sliders of a scenario's worlds; they reach as far as the scenario draws, and as the state is."""
+    found = []
+    for field, (title, low, high, step, usual) in _SLIDERS.items():
+        if field not in state:
+            continue
+        rule = _rules()[field]
+        values = state[field] if isinstance(state[field], list) else [state[field]]
+        bounds = [] if field in OPTIONAL else scenario.bounds(field)
+        reach = max(high, *values, *(most for _, most in bounds))
+        unit = SYMBOLS.get(rule.unit, rule.unit).replace("2", "²")
+        names = tuple(_owner(rule, i) for i in range(rule.count(scenario.vehicles)))
+        least = min(low, *values, *(least for least, _ in bounds))
+        found.append(Group(field, title, unit, least, min(reach, rule.high), step, rule.high, names, usual))
+    return found
+
+
+def state_of(world: Worlds) -> State:
+    """The state of one world (n = 1)."""
+    return quantities(world)
+
+
+def read_state(given: object, scenario: Scenario) -> Worlds:
+    """The world (n = 1) that a page asks for; every quantity must be there.
+
+    Raises ``InvalidInput`` for an unknown or missing key, what is no number, and what ``initial_state_worlds`` refuses.
+    """
+    if not isinstance(given, Mapping):
+        raise InvalidInput("world: must be an object such as {'gaps_m': [7, 7], ...}")
+    known = {**QUANTITIES, **OPTIONAL} if scenario.has_obstacle else QUANTITIES
+    for key in given:
+        if key not in known:
+            hint = suggestion(str(key), known) or f"known: {', '.join(known)}"
+            raise InvalidInput(f"world: unknown key {key!r:.60}; {hint}")
+    if missing := [key for key in known if key not in given]:
+        raise InvalidInput(f"world: {missing[0]} is missing; every quantity must be given")
+    for key, value in given.items():
+        if known[key].per == "world":
+            read_number(value, f"world: {key}")
+        elif not isinstance(value, list):
+            raise InvalidInput(f"world: {key}: must be a list of {known[key].count(scenario.vehicles)} numbers")
+        else:
+            for i, each in enumerate(value):
+                read_number(each, f"world: {key}[{i}]")
+    return initial_state_worlds(given, scenario)
+
+
+def read_number(value: object, what: str) -> float:
+    """A finite number of JSON; raises ``InvalidInput`` for anything else, truth values too."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e15:
+        raise InvalidInput(f"{what} = {value!r:.60}: must be a number")
+    return float(value)
+
+
+def _rules() -> dict[str, QuantityRule]:
+    return {**QUANTITIES, **OPTIONAL}
+
+
+def _owner(rule: QuantityRule, index: int) -> str:
+    names = {"vehicle": f"Vehicle {index + 1}", "pair": f"{index + 1} to {index + 2}", "world": ""}
+    return names[rule.per]
+
+
+# A profile that somebody draws: commands of one vehicle on the grid of decisions, and the agent that drives it.
+
+MOST_COMMANDS = 2_000
+
+
+class Grid(NamedTuple):
+    """Where the commands of a profile fall, and which are possible."""
+
+    first_s: float
+    step_s: float
+    steps: int
+    low_mps2: float
+    high_mps2: float
+
+
+def decision_grid(world: Worlds, scenario: Scenario, vehicle: int) -> Grid:
+    """The decisions of a vehicle in one world (n = 1)."""
+    first = first_decision_s(world, [vehicle])
+    steps = int(number_of_decisions(first, scenario.time_step_s, scenario.horizon_s)[0])
+    v = world.vehicles
+    low, high = -float(v.braking_capacity_mps2[0, vehicle]), float(v.driving_capacity_mps2[0, vehicle])
+    return Grid(float(first[0]), scenario.time_step_s, steps, low, high)
+
+
+def read_profile(given: object) -> Floats:
+    """Commands (m/s2) that a page sends, one per decision; raises ``InvalidInput``."""
+    if not isinstance(given, list) or not 1 <= len(given) <= MOST_COMMANDS:
+        raise InvalidInput(f"profile: must be a list of 1 to {MOST_COMMANDS} commands in m/s2")
+    return np.array([read_number(value, f"profile[{k}]") for k, value in enumerate(given)])
+
+
+class HandDriven:
+    """Drives a profile in every world; the last command goes on, and one beyond a capacity asks for the capacity."""
+
+    knows = Source.UNSTATED
+
+    def __init__(self, commands_mps2: Floats, time_step_s: float, name: str = "by hand") -> None:
+        self.name = name
+        self.commands_mps2 = commands_mps2
+        self._time_step_s = time_step_s
+        self._start_s: Floats = np.empty(0)
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Note when the decisions of these episodes fall."""
+        self._start_s = first_decision_s(worlds, [vehicle])
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The command of the decision at hand, [n] m/s2."""
+        step = decision_at(worlds.time_s, self._start_s[: worlds.n], self._time_step_s)
+        command = self.commands_mps2[np.clip(step, 0, len(self.commands_mps2) - 1)]
+        v = worlds.vehicles
+        bounded: Floats = np.clip(command, -v.braking_capacity_mps2[:, vehicle], v.driving_capacity_mps2[:, vehicle])
+        return bounded
+
 
 SLICE = 4_000  # candidates between two looks at the clock
 CONSTANTS = 29  # from which a search starts, beside E-V2X-BM's

@@ -10,41 +10,46 @@ import numpy as np
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.evaluation import Evaluation, evaluate
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
-from ethbrake_marl.evaluation.paper import PAPER_ROWS, RANDOM_TEST
+from ethbrake_marl.evaluation.outcome import PAPER_ROWS, RANDOM_TEST
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, unpaired_difference
-from ethbrake_marl.figures.reproduction import changes_figure
+from ethbrake_marl.figures.studies import changes_figure
 from ethbrake_marl.figures.style import Figure
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.run_folder import progress_column, progress_rows
+from ethbrake_marl.learning.training import progress_column, progress_rows
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies.shipped import load_shipped
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.studies.reproduction.item import (
+    ABOUT_POLICIES,
+    AGREES,
+    COUPLED,
+    DIFFERS,
     FULL,
+    FULL_BRAKE,
+    GAPS,
+    HARM,
     LIST_SEED,
+    NAMES,
+    NOT_RUN,
+    PAIRWISE,
+    PERCENT,
+    PPO,
+    Alternative,
     Drawn,
+    Gap,
     Made,
     Parameter,
     Settings,
     Table,
+    Verdict,
+    collision_rate,
+    compare_number,
     csv_text,
+    lineup,
     list_parameter,
     scenario_parameters,
 )
-from ethbrake_marl.studies.reproduction.measure import (
-    ABOUT_POLICIES,
-    COUPLED,
-    FULL_BRAKE,
-    NAMES,
-    PAIRWISE,
-    PPO,
-    collision_rate,
-    lineup,
-)
-from ethbrake_marl.studies.reproduction.policies import hybrid
-from ethbrake_marl.studies.reproduction.register import GAPS, Alternative, Gap
-from ethbrake_marl.studies.reproduction.trainings import OPEN, PPO_PAPER, TRAINED_HARM, finished, group_named
-from ethbrake_marl.studies.reproduction.verdicts import AGREES, DIFFERS, HARM, NOT_RUN, PERCENT, Verdict, compare_number
+from ethbrake_marl.studies.reproduction.trainings import OPEN, PPO_PAPER, TRAINED_HARM, finished, group_named, hybrid
 
 SCENARIO = "paper-random"
 _WORLDS = 2_000

@@ -9,36 +9,49 @@ import numpy as np
 
 from ethbrake_marl.evaluation import EpisodeRecord, record_episode
 from ethbrake_marl.evaluation.inputs import make_agents
-from ethbrake_marl.evaluation.statistics import Estimate
-from ethbrake_marl.figures.episode import trajectories
-from ethbrake_marl.figures.reproduction import profiles_figure, road_figure
-from ethbrake_marl.pages.chosen import drive_played
+from ethbrake_marl.evaluation.statistics import Estimate, mean, unpaired_difference
+from ethbrake_marl.figures.evaluation import trajectories
+from ethbrake_marl.figures.studies import bars_figure, lines_figure, profiles_figure, road_figure
 from ethbrake_marl.pages.player import Played, player_content
+from ethbrake_marl.pages.report import drive_played
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.studies.reproduction.item import (
-    LIST_SEED,
-    Drawn,
-    Made,
-    Parameter,
-    Settings,
-    Table,
-    csv_text,
-    scenario_parameters,
-)
-from ethbrake_marl.studies.reproduction.measure import (
+    ABOUT_BASELINE,
     ABOUT_POLICIES,
     AS_STATED,
     COUPLED,
+    FOUR,
     FULL_BRAKE,
+    HARM,
+    LIST_SEED,
     NAMES,
+    PAIRWISE,
     PPO,
+    PREDICTED,
+    PROVEN,
     READINGS,
     SAC,
+    Drawn,
+    Grouped,
+    Less,
+    Made,
+    Parameter,
     Reading,
+    Settings,
+    Show,
+    Table,
+    Verdict,
+    csv_text,
+    drive_list,
+    group_by_distance,
+    harms,
+    judge_statement,
+    less_in,
     lineup,
+    list_parameter,
     read_scenario,
+    scenario_parameters,
 )
-from ethbrake_marl.studies.reproduction.verdicts import Less, Show, Verdict, judge_statement
 
 _AGENTS = (PPO, SAC, COUPLED, FULL_BRAKE)
 _POLICIES = (NAMES[PPO], NAMES[SAC])
@@ -255,3 +268,192 @@ def _csv(records: Mapping[tuple[Reading, int, str], EpisodeRecord]) -> str:
     head = ["reading", "scenario", "strategy", "time_s", *(f"position_{i}_m" for i in every)]
     head += [*(f"speed_{i}_mps" for i in every), "gap_1_m", "gap_2_m", *(f"command_{i}_mps2" for i in every)]
     return csv_text(head, rows)
+
+
+# The paper's figure of harm at three communication delays (``Fig:harm-delay``).
+
+_DELAYS = ("low", "middle", "high")
+_STATE = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}  # of the figure: one world at each delay
+_WORLDS = 2_000
+_ONE, _LIST = "d = 7, 7 m; v = 20, 18, 20 m/s", "d = 5-10 m; v = 18-22 m/s"
+_NOTE = f"First-impact harm, m²/s²; one world has no interval. {ABOUT_BASELINE}"
+
+Found = dict[tuple[str, Reading], dict[str, dict[str, Floats]]]  # worlds and reading -> delay -> strategy -> harm
+
+
+def reproduce_delays(settings: Settings) -> Made:
+    """Harm of the four strategies at low, middle and high delay, in the figure's world and in a list of worlds."""
+    episodes = settings.worlds(_WORLDS)
+    found: Found = {}
+    for reading in READINGS:
+        for worlds, state, count in ((_ONE, _STATE, 1), (_LIST, {}, episodes)):
+            found[worlds, reading] = {}
+            for delay in _DELAYS:
+                scenario = read_scenario(f"paper-delay-{delay}", reading).replace(**state)
+                evaluation = drive_list(scenario, lineup(FOUR, scenario), count, settings)
+                found[worlds, reading][_name(delay, reading)] = harms(evaluation)
+    return Made(
+        tuple(verdict for (worlds, reading), harm in found.items() for verdict in _judge(worlds, reading, harm)),
+        _delay_parameters(episodes),
+        tuple(_table(f"{worlds}, {reading.name}", harm) for (worlds, reading), harm in found.items()),
+        tuple(_figure(k, worlds, found) for k, worlds in enumerate((_ONE, _LIST))),
+        {"harm-delays": _delay_csv(found)},
+    )
+
+
+def _name(delay: str, reading: Reading) -> str:
+    """A delay with its latencies."""
+    _, middle, rear = read_scenario(f"paper-delay-{delay}", reading).model_dump()["latency_s"]
+    return f"{delay} ({middle:g}, {rear:g} s)"
+
+
+def _delay_parameters(episodes: int) -> tuple[Parameter, ...]:
+    scenario = read_scenario("paper-delay-low", AS_STATED).replace(**_STATE)
+    delays = "; ".join(_name(delay, AS_STATED) for delay in _DELAYS)
+    return (
+        *(each for each in scenario_parameters(scenario) if not each.name.startswith("latencies")),
+        Parameter("delays (Vehicle 2, 3)", delays, ""),
+        Parameter("policies", f"{ABOUT_POLICIES}; not the paper's, and not trained at these delays", ""),
+        Parameter("worlds of the figure", "one at each delay", "text to Fig:harm-delay"),
+        Parameter("list beside it", f"{_LIST}; {list_parameter(episodes).value} (seed {LIST_SEED})", ""),
+    )
+
+
+def _judge(worlds: str, reading: Reading, found: Mapping[str, Mapping[str, Floats]]) -> list[Verdict]:
+    """Whether "both SAC and PPO consistently achieve the lowest harm values across all tested delay setting"."""
+    others = (NAMES[FULL_BRAKE], NAMES[PAIRWISE], NAMES[COUPLED], PREDICTED)
+    return [
+        judge_statement(
+            f"{NAMES[policy]} harms less than non-ethical and E-V2X-BM at every delay ({worlds}; {reading.name})",
+            [
+                less_in(f"{delay}, {other}", harm, NAMES[policy], other)
+                for delay, harm in found.items()
+                for other in others
+            ],
+        )
+        for policy in (SAC, PPO)
+    ]
+
+
+def _table(title: str, found: Mapping[str, Mapping[str, Floats]]) -> Table:
+    strategies = next(iter(found.values()))
+    rows = tuple((name, *(HARM.estimate(mean(harm[name])) for harm in found.values())) for name in strategies)
+    return Table(title, ("Strategy", *found), rows, _NOTE)
+
+
+def _figure(number: int, worlds: str, found: Found) -> Drawn:
+    panels = {
+        reading.name: {
+            name: [mean(found[worlds, reading][delay][name]) for delay in found[worlds, reading]]
+            for name in next(iter(found[worlds, reading].values()))
+        }
+        for reading in READINGS
+    }
+    caption = f"{worlds}. Low, middle, high: τ3 = 0.3, 0.6, 1.2 s; left τ2 = 0.1, 0.3, 0.8 s. Bars: 95 % intervals."
+    figure = bars_figure(panels, groups=_DELAYS, y_label="First-impact harm (m²/s²)", caption=caption)
+    text = f"Harm of each strategy at three delays, {worlds}."
+    return Drawn(f"harm-delays-{('world', 'list')[number]}", "Harm at three delays", text, figure)
+
+
+def _delay_csv(found: Found) -> str:
+    rows = []
+    for (worlds, reading), delays in found.items():
+        for delay, harm in delays.items():
+            for name, values in harm.items():
+                estimate = mean(values)
+                low, high = estimate.interval or ("", "")
+                rows.append([worlds, reading.name, delay, name, len(values), estimate.value, low, high])
+    return csv_text(("worlds", "reading", "delay", "strategy", "count", "first_impact_harm", "low", "high"), rows)
+
+
+# The paper's figure of harm over total distance (``Fig:Harm-ivds``).
+
+_SCENARIO, _DISTANCE_WORLDS = "paper-distance", 5_000
+X_LABEL, Y_LABEL = "Total distance d1 + d2 at the alert (m)", "First-impact harm (m²/s²)"
+
+
+def reproduce_distance(settings: Settings) -> Made:
+    """Harm of the four strategies over the total distance."""
+    episodes = settings.worlds(_DISTANCE_WORLDS)
+    found = {}
+    for reading in READINGS:
+        scenario = read_scenario(_SCENARIO, reading)
+        found[reading] = group_by_distance(drive_list(scenario, lineup(FOUR, scenario), episodes, settings))
+    verdicts = [each for reading, grouped in found.items() for each in _judge_distance(reading, grouped)]
+    parameters = (
+        *scenario_parameters(read_scenario(_SCENARIO, READINGS[0]), gaps_m="5 to 10 m, text to Table:hybrid"),
+        Parameter("distances", "each gap drawn on its own, then grouped by the sum", ""),
+        Parameter("harm", "each pair's first impact", "sec:result, Experimental Set-Up"),
+        Parameter("policies", f"{ABOUT_POLICIES}; not the paper's", ""),
+        list_parameter(episodes),
+    )
+    return Made(
+        tuple(verdicts),
+        parameters,
+        tuple(distance_table(reading.name, grouped) for reading, grouped in found.items()),
+        (distance_figure("harm-distance", found, [*(NAMES[spec] for spec in FOUR), PREDICTED, PROVEN], episodes),),
+        {"harm-distance": distance_csv(found)},
+    )
+
+
+def distance_figure(stem: str, found: dict[Reading, Grouped], strategies: list[str], episodes: int) -> Drawn:
+    """One panel per reading, one line per strategy."""
+    panels = {reading.name: {name: grouped.line(name) for name in strategies} for reading, grouped in found.items()}
+    caption = f"Means over {episodes:,} worlds in groups of 2 m; bands: 95 % intervals."
+    figure = lines_figure(panels, x_label=X_LABEL, y_label=Y_LABEL, caption=caption)
+    text = "Mean harm of each strategy against the sum of both gaps; left as the paper states it, right with Vehicle 2"
+    return Drawn(stem, "Harm over total distance", f"{text} acting at 0.2 s.", figure)
+
+
+def distance_table(title: str, grouped: Grouped) -> Table:
+    """Harm with its interval: one row per strategy, one column per group."""
+    rows = tuple(
+        (name, *(HARM.estimate(grouped.estimate(name, k)) for k in range(len(grouped.groups)))) for name in grouped.harm
+    )
+    note = f"First-impact harm, m²/s², with 95 % intervals. {ABOUT_BASELINE}"
+    return Table(f"Harm by total distance, {title}", ("Strategy", *grouped.groups), rows, note)
+
+
+def distance_csv(found: dict[Reading, Grouped]) -> str:
+    """One row per reading, strategy and group."""
+    rows = []
+    for reading, grouped in found.items():
+        for name in grouped.harm:
+            for k, group in enumerate(grouped.groups):
+                estimate = grouped.estimate(name, k)
+                low, high = estimate.interval or ("", "")
+                count = int(grouped.rows[k].sum())
+                rows.append([reading.name, name, group, grouped.at_m[k], count, estimate.value, low, high])
+    head = ("reading", "strategy", "total_distance", "mean_distance_m", "worlds", "first_impact_harm", "low", "high")
+    return csv_text(head, rows)
+
+
+def _judge_distance(reading: Reading, grouped: Grouped) -> list[Verdict]:
+    """The paper's statements about the figure."""
+
+    def judge(statement: str, parts: list[Less]) -> Verdict:
+        return judge_statement(f"{statement} ({reading.name})", parts)
+
+    braking = NAMES[FULL_BRAKE]
+    baselines = (NAMES[PAIRWISE], NAMES[COUPLED], PREDICTED)
+    rising = [
+        Less(
+            f"{grouped.groups[k]} to {grouped.groups[k + 1]}",
+            unpaired_difference(
+                grouped.estimate(braking, k),
+                int(grouped.rows[k].sum()),
+                grouped.estimate(braking, k + 1),
+                int(grouped.rows[k + 1].sum()),
+            ),
+        )
+        for k in range(len(grouped.groups) - 1)
+    ]
+    return [
+        judge("non-ethical: the larger the distance, the larger the harm", rising),
+        *(judge(f"{name} harms less than non-ethical", grouped.less(name, braking)) for name in baselines),
+        *(
+            judge(f"{NAMES[policy]} harms less than {name} over the whole range", grouped.less(NAMES[policy], name))
+            for policy in (SAC, PPO)
+            for name in baselines
+        ),
+    ]

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ethbrake_marl.agents.e_v2x_bm.coupled import CoupledOptimum, optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm import CoupledOptimum, optimise_coupled
 from ethbrake_marl.physics import Worlds, advance, make_worlds
 from ethbrake_marl.scenario import load_scenario
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm import coupled
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
+from ethbrake_marl.agents import e_v2x_bm
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, forecast, make_worlds
 from ethbrake_marl.scenario import load_scenario
@@ -102,11 +102,11 @@ def test_coupled__a_world_alone_gives_the_same_bits():
 
 def test_coupled__threads_and_what_was_searched_before_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     worlds, searches = load_scenario("paper-random").sample(600, 7).worlds, []
-    search = coupled._search_worlds
-    monkeypatch.setattr(coupled, "_search_worlds", lambda *given: searches.append(1) or search(*given))
+    search = e_v2x_bm._search_worlds
+    monkeypatch.setattr(e_v2x_bm, "_search_worlds", lambda *given: searches.append(1) or search(*given))
     found = {}
     for cores in (1, 3):
-        monkeypatch.setattr(coupled, "_FOUND", {})
+        monkeypatch.setattr(e_v2x_bm, "_FOUND", {})
         monkeypatch.setattr("os.cpu_count", lambda cores=cores: cores)
         found[cores] = optimise_coupled(worlds, 1)
         assert len(searches) == cores

@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.e_v2x_bm.pair import closing_speed_squared, least_to_spare_front, most_to_spare_rear
-from ethbrake_marl.agents.e_v2x_bm.pairwise import CANDIDATES, optimise_pairwise, pairwise_breakpoints, pairwise_harm
+from ethbrake_marl.agents.e_v2x_bm_kernel import (
+    CANDIDATES,
+    closing_speed_squared,
+    least_to_spare_front,
+    most_to_spare_rear,
+    optimise_pairwise,
+    pairwise_breakpoints,
+    pairwise_harm,
+)
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Worlds, advance, make_worlds
 

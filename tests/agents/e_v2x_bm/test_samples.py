@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm.samples import (
+from ethbrake_marl.agents.e_v2x_bm_kernel import (
+    MINIMA,
     Samples,
     bound_cells,
     choose,
@@ -14,7 +15,6 @@ from ethbrake_marl.agents.e_v2x_bm.samples import (
     merge,
     put_in_order,
 )
-from ethbrake_marl.agents.e_v2x_bm.search import MINIMA
 
 
 def samples(at, harm, other=None) -> Samples:

@@ -8,12 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm.samples import Samples
-from ethbrake_marl.agents.e_v2x_bm.simulate import Line, make_line, share_start, simulate, will_stay_apart
+from ethbrake_marl.agents.e_v2x_bm_kernel import Line, Samples, make_line, share_start, simulate, will_stay_apart
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.impact import GAP, SPEED
-from ethbrake_marl.physics.segment import ACTIVE, COMMAND, DONE
+from ethbrake_marl.physics.kernel import ACTIVE, COMMAND, DONE, GAP, SPEED
 from tests.agents.e_v2x_bm.recorded import line_worlds
 
 HORIZON_S = 7.0

@@ -11,8 +11,8 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, MissingExtra, PhysicsError
-from ethbrake_marl.evaluation.dataset import write
-from ethbrake_marl.evaluation.dataset.recording import Recording
+from ethbrake_marl.evaluation import dataset
+from ethbrake_marl.evaluation.dataset import Recording
 from tests.contract.interfaces import PAPER
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
@@ -22,7 +22,7 @@ NOBODY = PAPER.replace(roles={f"vehicle_{i}": "full_brake" for i in (1, 2, 3)})
 
 @pytest.fixture(autouse=True)
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(write, "need", lambda package: None)
+    monkeypatch.setattr(dataset, "need", lambda package: None)
 
 
 @pytest.mark.parametrize(
@@ -60,10 +60,10 @@ def test_check__replaces_nothing_unasked_and_only_datasets_when_asked(tmp_path: 
     (tmp_path / "a-v0").mkdir()
     for name in ("a.parquet", "a-v0"):
         with pytest.raises(AlreadyExists, match=r"use force \(--force\)"):
-            write.check_dataset(tmp_path / name, PAPER)
-    assert write.check_dataset(tmp_path / "a.parquet", PAPER, force=True) == "parquet"
+            dataset.check_dataset(tmp_path / name, PAPER)
+    assert dataset.check_dataset(tmp_path / "a.parquet", PAPER, force=True) == "parquet"
     with pytest.raises(InvalidInput, match="is no dataset of Minari, and is not replaced"):
-        write.check_dataset(tmp_path / "a-v0", PAPER, force=True)
+        dataset.check_dataset(tmp_path / "a-v0", PAPER, force=True)
 
 
 def test_write__without_the_extra_names_the_line_that_installs_it(
@@ -82,7 +82,7 @@ def test_write__without_the_extra_names_the_line_that_installs_it(
 
 def test_work__leaves_a_failed_world_out_and_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     recorded: list[Recording] = []
-    real = write.record_episodes
+    real = dataset.record_episodes
 
     def failing(sample: Any, *rest: Any) -> Recording:
         bad = {row: "planted" for row, number in enumerate(sample.index) if number == 4}
@@ -90,11 +90,11 @@ def test_work__leaves_a_failed_world_out_and_names_it(monkeypatch: pytest.Monkey
             raise PhysicsError(bad)
         return real(sample, *rest)
 
-    monkeypatch.setattr(write, "record_episodes", failing)
-    monkeypatch.setattr(write, "BATCH", 3)
-    task = write.Task(PAPER, 7, write.reward_params("harm"), eb.observation_for(PAPER))
+    monkeypatch.setattr(dataset, "record_episodes", failing)
+    monkeypatch.setattr(dataset, "BATCH", 3)
+    task = dataset.Task(PAPER, 7, dataset.reward_params("harm"), eb.observation_for(PAPER))
     seen: list[tuple[str, int]] = []
-    work = write._Work(task, 7, lambda name, done: seen.append((name, done)), {})
+    work = dataset._Work(task, 7, lambda name, done: seen.append((name, done)), {})
     work.record("full_brake", BRAKE["full_brake"], recorded.append)
     assert [each.index.tolist() for each in recorded] == [[0, 1, 2], [3, 5], [6]]
     assert seen == [("full_brake", 3), ("full_brake", 6), ("full_brake", 7)]

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from ethbrake_marl.evaluation.shards.question import Question, answer_shard, ask
+from ethbrake_marl.evaluation.shards import Question, answer_shard, ask
 from ethbrake_marl.scenario import load_scenario
 
 AGENTS = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")

@@ -13,9 +13,16 @@ import pytest
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.evaluation import evaluate, rescore, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.shards.question import Question, answer_shard, ask, shard_bounds
-from ethbrake_marl.evaluation.shards.summary import rescore_shards, shards_to_json, summarise_shards
-from ethbrake_marl.evaluation.shards.tally import Tally
+from ethbrake_marl.evaluation.shards import (
+    Question,
+    Tally,
+    answer_shard,
+    ask,
+    rescore_shards,
+    shard_bounds,
+    shards_to_json,
+    summarise_shards,
+)
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.studies.shards import evaluate_shards
 

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from ethbrake_marl.evaluation.inputs import LIST_SEED, make_lineup
-from ethbrake_marl.pages.explorer.answer import Explored
-from ethbrake_marl.pages.explorer.state import state_of
+from ethbrake_marl.defaults import LIST_SEED
+from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.pages.explorer.answer import Explored, state_of
 from ethbrake_marl.scenario import Scenario, load_scenario
 
 TOKEN, PORT = "the-token-of-this-test", 4711

@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm.coupled import optimise_coupled
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.defaults import LIST_SEED
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.inputs import LIST_SEED, make_lineup
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.limits.limits import Proof, prove
-from ethbrake_marl.pages.explorer.answer import Explored
-from ethbrake_marl.pages.explorer.page import explorer_page
-from ethbrake_marl.pages.explorer.saving import save_state
-from ethbrake_marl.pages.explorer.state import read_state, state_of
+from ethbrake_marl.pages.explorer.answer import Explored, read_state, state_of
+from ethbrake_marl.pages.explorer.server import explorer_page, save_state
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario, read_initial_states
 from tests.pages.explorer.conftest import AGENTS, Client
 

@@ -12,7 +12,7 @@ import pytest
 
 uvicorn = pytest.importorskip("uvicorn", reason="no uvicorn: pip install 'ethbrake-marl[explore]'")
 
-from ethbrake_marl.pages.explorer.connection import patient_connection  # noqa: E402
+from ethbrake_marl.pages.explorer.server import patient_connection  # noqa: E402
 
 PATIENCE_S, SLOW_S = 0.4, 1.2
 ASK = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"

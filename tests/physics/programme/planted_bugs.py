@@ -30,14 +30,14 @@ QUICK = (
 WHOLE = ("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py")
 
 EVENTS, IMPACT, SEGMENT, ADVANCE = (
-    "ethbrake_marl/physics/events.py",
-    "ethbrake_marl/physics/impact.py",
-    "ethbrake_marl/physics/segment.py",
+    "ethbrake_marl/physics/kernel.py",
+    "ethbrake_marl/physics/kernel.py",
+    "ethbrake_marl/physics/kernel.py",
     "ethbrake_marl/physics/advance.py",
 )
-HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/obstacle.py"
+HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/kernel.py"
 FLIGHTS, LOWER_BOUND = (
-    "ethbrake_marl/limits/flights.py",
+    "ethbrake_marl/limits/meetings.py",
     "ethbrake_marl/limits/lower_bound.py",
 )
 PROFILES = "ethbrake_marl/search/profiles.py"

@@ -14,12 +14,11 @@ import pytest
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.passport import parse_passport
-from ethbrake_marl.evaluation.replay import Given, replay
+from ethbrake_marl.evaluation.passport import Given, parse_passport, replay
 from ethbrake_marl.learning import train as learning_train
 from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe, load_recipe
-from ethbrake_marl.studies.ablation.plan import Plan, Training, read_levels, with_scheme
-from ethbrake_marl.studies.jobs import training as trainings
+from ethbrake_marl.studies import trainings
+from ethbrake_marl.studies.ablation import Plan, Training, read_levels, with_scheme
 from tests.fixtures.pictures import draw_nothing
 
 LEVELS = "cooperation-0-sensors,cooperation-3-pair,cooperation-3-congested"

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.learning.schemes import SCHEMES
-from ethbrake_marl.objectives import KINDS, scored
+from ethbrake_marl.harm import KINDS, scored
+from ethbrake_marl.learning.recipe import SCHEMES
 from ethbrake_marl.physics.worlds import is_known_at_once
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario, parse_yaml
 from ethbrake_marl.scenario.v2x import CHANNELS, PRESETS, V2X

@@ -7,16 +7,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.team import Team
+from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.limits.best_harm import best_harm
-from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.ablation.cost import Cost
-from ethbrake_marl.studies.ablation.joint_optimum import LevelOptimum, best_known, parts_left, questions, search_all
-from ethbrake_marl.studies.ablation.plan import Level, Plan, common_worlds, read_levels, with_scheme
+from ethbrake_marl.studies.ablation import (
+    Cost,
+    Level,
+    LevelOptimum,
+    Plan,
+    best_known,
+    common_worlds,
+    parts_left,
+    questions,
+    read_levels,
+    search_all,
+    with_scheme,
+)
 
 WORLDS = 30
 NAMES = ("cooperation-1-front", "cooperation-2-paper", "cooperation-3-pair", "cooperation-4-all")

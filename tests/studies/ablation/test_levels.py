@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.scenario import load_scenario, scenario_path
-from ethbrake_marl.studies.ablation.plan import LADDER, STANDARD, Level, common_worlds, read_levels
+from ethbrake_marl.studies.ablation import LADDER, STANDARD, Level, common_worlds, read_levels
 
 
 def test_read_levels__the_standard_set_is_a_ladder_and_its_worse_channels():

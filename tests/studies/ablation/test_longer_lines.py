@@ -15,11 +15,11 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.policies.manifest import Manifest
-from ethbrake_marl.policies.policy import load_policy, make_policy, save_policy
+from ethbrake_marl.policies.actor import Manifest
+from ethbrake_marl.policies.bundle import load_policy, make_policy, save_policy
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.ablation import longer_lines
-from ethbrake_marl.studies.ablation.longer_lines import LineQuestion, drive_longer, lengthen
+from ethbrake_marl.studies import ablation_report
+from ethbrake_marl.studies.ablation_report import LineQuestion, drive_longer, lengthen
 
 PAIR = load_scenario("cooperation-3-pair")
 
@@ -66,7 +66,7 @@ def test_drive_longer__in_two_processes_finds_the_same():
 
 def test_drive_longer__all_lines_are_made_before_one_is_driven(monkeypatch):
     driven = []
-    monkeypatch.setattr(longer_lines, "evaluate", lambda *_, **__: driven.append(1))
+    monkeypatch.setattr(ablation_report, "evaluate", lambda *_, **__: driven.append(1))
     weighted = PAIR.replace(name="mine", objective="weighted:1,2,3")
     question = LineQuestion(weighted, (3, 4), 20, 7, "total", 0, 50)
     with pytest.raises(InvalidInput, match="mine-n4"):

@@ -9,8 +9,7 @@ import numpy as np
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.ablation.plan import Level, Plan
-from ethbrake_marl.studies.ablation.run import measure
+from ethbrake_marl.studies.ablation import Level, Plan, measure
 
 
 def test_measure__all_brake_fully_whatever_their_roles():

@@ -8,8 +8,7 @@ import pytest
 
 from ethbrake_marl.limits.best_harm import search_list
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
-from ethbrake_marl.studies.benchmark.suite import Suite, load_suite
+from ethbrake_marl.studies.benchmark import Suite, load_suite, make_entry, write_entry
 from tests.docs.site import load
 
 freezing = load("../studies/freeze_suite")

@@ -10,11 +10,9 @@ import re
 import sys
 from pathlib import Path
 
-from ethbrake_marl.progress import ShownProgress
-from ethbrake_marl.studies.benchmark.entry import make_entry, write_entry
-from ethbrake_marl.studies.benchmark.leaderboard import read_leaderboard
-from ethbrake_marl.studies.benchmark.suite import Suite, load_suite
-from ethbrake_marl.studies.benchmark.table import leaderboard_markdown
+from ethbrake_marl.errors import ShownProgress
+from ethbrake_marl.studies.benchmark import Suite, load_suite, make_entry, write_entry
+from ethbrake_marl.studies.leaderboard import leaderboard_markdown, read_leaderboard
 
 ROWS = (
     "full_brake", "e_v2x_bm", "ppo@shipped", "policy@shipped", "universal@shipped", "policy@shipped+step",

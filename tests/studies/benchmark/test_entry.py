@@ -13,12 +13,18 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.statistics import Estimate
-from ethbrake_marl.policies.manifest import content_sha256
-from ethbrake_marl.policies.policy import load_policy
+from ethbrake_marl.policies.actor import content_sha256
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.shipped import shipped_policies
-from ethbrake_marl.studies.benchmark.entry import NotDriven, make_entry, read_entry
-from ethbrake_marl.studies.benchmark.score import mean_of_lists, realised_share, worst_mean
-from ethbrake_marl.studies.benchmark.suite import load_suite
+from ethbrake_marl.studies.benchmark import (
+    NotDriven,
+    load_suite,
+    make_entry,
+    mean_of_lists,
+    read_entry,
+    realised_share,
+    worst_mean,
+)
 from tests.docs.site import load
 
 

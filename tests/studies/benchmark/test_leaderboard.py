@@ -12,10 +12,8 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.studies.benchmark.leaderboard import read_leaderboard
-from ethbrake_marl.studies.benchmark.page import leaderboard_page
-from ethbrake_marl.studies.benchmark.suite import plain_sha256
-from ethbrake_marl.studies.benchmark.table import leaderboard_markdown
+from ethbrake_marl.studies.benchmark import plain_sha256
+from ethbrake_marl.studies.leaderboard import leaderboard_markdown, leaderboard_page, read_leaderboard
 
 NAMES = ("full_brake", "coast", "full_brake+episode")
 

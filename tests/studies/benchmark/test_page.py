@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from ethbrake_marl.studies.benchmark.entry import read_entry
+from ethbrake_marl.studies.benchmark import read_entry
 from tests.studies.benchmark.rows import ENTRIES, PAGE, page_tables
 
 TEXT = PAGE.read_text("utf-8")

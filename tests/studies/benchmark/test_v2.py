@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from ethbrake_marl.defaults import LIST_SEED
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.inputs import LIST_SEED, make_lineup
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.limits.best_harm import realised_harm
 from ethbrake_marl.limits.best_harm_table import load_table
-from ethbrake_marl.studies.benchmark.suite import load_suite, suite_names
+from ethbrake_marl.studies.benchmark import load_suite, suite_names
 
 V2 = load_suite("v2")
 SHA256 = "ab2cae246cc6f27760b83dd3ce2e14f2e3e2cef4040ac7b1793a0409abcd4f28"  # a change of the suite is v3

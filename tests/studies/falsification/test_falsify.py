@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.defaults import HARM_COUNTS, MeasureName
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.scenario.ranges import ranges_of
-from ethbrake_marl.studies.falsification.falsify import falsify
-from ethbrake_marl.studies.falsification.measures import Measure, MeasureName, make_measure
+from ethbrake_marl.scenario.initial_states import ranges_of
+from ethbrake_marl.studies.falsification import Measure, falsify, make_measure
 from tests.studies.falsification.holed import Holed, in_hole
 
 SCENARIO = load_scenario("paper-random")

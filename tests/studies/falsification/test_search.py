@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.studies.falsification.search import APART, Scored, far_apart, search
+from ethbrake_marl.studies.falsification import APART, Scored, far_apart, search
 
 
 def _peak(points: Floats) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ethbrake_marl.studies.jobs.work import Answer, answer
+from ethbrake_marl.studies.jobs import Answer, answer
 
 
 class Inside:

@@ -11,9 +11,7 @@ from contextlib import closing
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.studies.jobs.local import LocalWorkers, WorkerLost
-from ethbrake_marl.studies.jobs.run import Attempt, run_jobs
-from ethbrake_marl.studies.jobs.work import Answer, answer, pack
+from ethbrake_marl.studies.jobs import Answer, Attempt, LocalWorkers, WorkerLost, answer, pack, run_jobs
 
 
 class Pretended:

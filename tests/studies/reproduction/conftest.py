@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.studies.reproduction.item import Drawn, Item, Made, Parameter, Settings, Table
-from ethbrake_marl.studies.reproduction.verdicts import Verdict
+from ethbrake_marl.studies.reproduction.item import Drawn, Item, Made, Parameter, Settings, Table, Verdict
 
 HOSTILE = "<script>alert('x')</script>\"|*_\u202e"
 

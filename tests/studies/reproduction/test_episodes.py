@@ -10,13 +10,10 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.passport import parse_passport
-from ethbrake_marl.evaluation.replay import Given, replay
-from ethbrake_marl.files.overrides import parse_overrides
-from ethbrake_marl.studies.reproduction.episodes import EPISODES, kept_player
+from ethbrake_marl.evaluation.passport import Given, parse_passport, replay
+from ethbrake_marl.files.yaml import parse_overrides
+from ethbrake_marl.studies.reproduction.folder import EPISODES, choose_items, kept_player, reproduce
 from ethbrake_marl.studies.reproduction.item import Settings
-from ethbrake_marl.studies.reproduction.items import choose_items
-from ethbrake_marl.studies.reproduction.run import reproduce
 from tests.pages.hostile import Page
 
 from .conftest import made, planted

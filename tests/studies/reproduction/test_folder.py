@@ -11,12 +11,17 @@ import pytest
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.statistics import Estimate
-from ethbrake_marl.figures.reproduction import Line, lines_figure
-from ethbrake_marl.studies.reproduction.folder import ReproductionFolder, open_folder, read_results
+from ethbrake_marl.figures.studies import Line, lines_figure
+from ethbrake_marl.studies.reproduction.folder import (
+    ReproductionFolder,
+    docs_page,
+    open_folder,
+    read_results,
+    render_page,
+    reproduce,
+    write_docs,
+)
 from ethbrake_marl.studies.reproduction.item import Drawn, Settings, Table
-from ethbrake_marl.studies.reproduction.markdown import docs_page, write_docs
-from ethbrake_marl.studies.reproduction.page import render_page
-from ethbrake_marl.studies.reproduction.run import reproduce
 from tests.pages.hostile import Page
 
 from .conftest import HOSTILE, made, planted

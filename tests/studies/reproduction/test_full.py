@@ -8,14 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ethbrake_marl.figures.curves import SeedCurve
+from ethbrake_marl.figures.studies import SeedCurve
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.studies.reproduction import curves, run, trainings
-from ethbrake_marl.studies.reproduction.curves import Course, read_courses
+from ethbrake_marl.studies.reproduction import folder as run
+from ethbrake_marl.studies.reproduction import trainings
+from ethbrake_marl.studies.reproduction import trainings as curves
+from ethbrake_marl.studies.reproduction.folder import ITEMS, choose_items, reproduce, tell_cost
 from ethbrake_marl.studies.reproduction.item import Settings
-from ethbrake_marl.studies.reproduction.items import ITEMS, choose_items
-from ethbrake_marl.studies.reproduction.run import reproduce, tell_cost
-from ethbrake_marl.studies.reproduction.trainings import Group, TrainedRecipe, seconds_left, trained_names
+from ethbrake_marl.studies.reproduction.trainings import (
+    Course,
+    Group,
+    TrainedRecipe,
+    read_courses,
+    seconds_left,
+    trained_names,
+)
 from tests.learning.tiny import TINY_PPO
 
 from .conftest import made, planted

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.studies.reproduction.item import Item, Made, Settings
-from ethbrake_marl.studies.reproduction.items import ITEMS, choose_items
-from ethbrake_marl.studies.reproduction.register import GAPS
+from ethbrake_marl.studies.reproduction.folder import ITEMS, choose_items
+from ethbrake_marl.studies.reproduction.item import GAPS, Item, Made, Settings
 
 PAPER = Path(__file__).resolve().parents[3] / "docs" / "paper.md"
 

@@ -7,14 +7,19 @@ from dataclasses import replace
 import pytest
 
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.paper import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST, PaperRow
-from ethbrake_marl.studies.reproduction.measure import AS_STATED, AT_200_MS, FULL_BRAKE, NAMES, lineup, read_scenario
-from ethbrake_marl.studies.reproduction.printed import (
+from ethbrake_marl.evaluation.outcome import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST, PaperRow
+from ethbrake_marl.studies.reproduction.item import (
+    AS_STATED,
+    AT_200_MS,
+    FULL_BRAKE,
+    NAMES,
     NOBODY,
     RATE,
     Beside,
     compare_rows,
     decrease_verdict,
+    lineup,
+    read_scenario,
     rows_table,
     selection_verdict,
 )

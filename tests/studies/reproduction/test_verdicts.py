@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from ethbrake_marl.evaluation.statistics import Estimate, rate
-from ethbrake_marl.studies.reproduction.verdicts import (
+from ethbrake_marl.studies.reproduction.item import (
     PERCENT,
     Bound,
     Less,

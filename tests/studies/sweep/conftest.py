@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.studies.jobs import local
+from ethbrake_marl.studies import jobs
 from tests.learning.tiny import TINY_PPO
 from tests.studies.jobs.inside import Inside
 
@@ -53,6 +53,6 @@ def finished_sweep(tmp_path_factory: pytest.TempPathFactory, small: dict[str, An
     folder = tmp_path_factory.mktemp("sweep")
     (folder / "sweep.yaml").write_text(yaml.safe_dump(small))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(local, "LocalWorkers", Inside)
+        patch.setattr(jobs, "LocalWorkers", Inside)
         assert run_command(["sweep", str(folder / "sweep.yaml"), "--output", str(folder / "out"), "--jobs", "1"]) == 0
     return folder / "out"

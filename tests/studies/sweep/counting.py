@@ -41,12 +41,10 @@ def count(folder: Path, seed: int, steps: int, sleep_s: float) -> tuple[str, ...
 
 
 def main() -> int:
-    from ethbrake_marl.studies.jobs.cluster import RayWorkers
-    from ethbrake_marl.studies.jobs.local import LocalWorkers
-    from ethbrake_marl.studies.jobs.work import pack
-    from ethbrake_marl.studies.sweep.file import read_sweep
-    from ethbrake_marl.studies.sweep.plan import Row, SweepPlan, plan_sweep
-    from ethbrake_marl.studies.sweep.run import RUNS, run_sweep
+    from ethbrake_marl.studies.cluster import RayWorkers
+    from ethbrake_marl.studies.jobs import LocalWorkers, pack
+    from ethbrake_marl.studies.sweep import RUNS, run_sweep
+    from ethbrake_marl.studies.sweep_file import Row, SweepPlan, plan_sweep, read_sweep
     from tests.studies.sweep.counting import count as job  # by a name that workers know, not of __main__
 
     parser = argparse.ArgumentParser(description=__doc__)

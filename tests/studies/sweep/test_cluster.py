@@ -13,10 +13,8 @@ import pytest
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.studies.jobs import cluster
-from ethbrake_marl.studies.jobs.local import WorkerLost
-from ethbrake_marl.studies.jobs.run import Attempt, run_jobs
-from ethbrake_marl.studies.jobs.work import pack
+from ethbrake_marl.studies import cluster
+from ethbrake_marl.studies.jobs import Attempt, WorkerLost, pack, run_jobs
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -25,9 +23,9 @@ LISTENING = """
 import os
 from contextlib import closing
 from pathlib import Path
-from ethbrake_marl.studies.jobs.cluster import RayWorkers
-from ethbrake_marl.studies.jobs.run import run_jobs
-from ethbrake_marl.studies.jobs.work import pack
+from ethbrake_marl.studies.cluster import RayWorkers
+from ethbrake_marl.studies.jobs import run_jobs
+from ethbrake_marl.studies.jobs import pack
 
 before = {line.split()[9] for kind in ("tcp", "tcp6") for line in Path("/proc/net", kind).read_text().splitlines()[1:]}
 found = []

@@ -19,8 +19,8 @@ import yaml
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import train
-from ethbrake_marl.policies.policy import load_policy
-from ethbrake_marl.studies.jobs import local
+from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.studies import jobs
 from tests.studies.jobs.inside import Inside
 from tests.studies.sweep.disturbing import PROGRAM, holders, journal, parent
 
@@ -65,7 +65,7 @@ def test_job__is_the_training_that_train_makes(finished_sweep, tiny, tmp_path):
 def test_finished_jobs__are_not_repeated_and_the_table_is_the_same(
     finished_sweep, small, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(local, "LocalWorkers", Inside)
+    monkeypatch.setattr(jobs, "LocalWorkers", Inside)
     folder, file = tmp_path / "again", tmp_path / "sweep.yaml"
     shutil.copytree(finished_sweep, folder)
     file.write_text(yaml.safe_dump(small))

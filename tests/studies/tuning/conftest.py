@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.studies.jobs import local
+from ethbrake_marl.studies import jobs
 from tests.studies.jobs.inside import Inside
 from tests.studies.sweep.conftest import RECIPE
 
@@ -54,6 +54,6 @@ def finished_tuning(tmp_path_factory: pytest.TempPathFactory, small: dict[str, A
     (folder / "tuning.yaml").write_text(yaml.safe_dump(small))
     command = ["tune", str(folder / "tuning.yaml"), "--output", str(folder / "out"), "--trials", str(TRIALS)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(local, "LocalWorkers", Inside)
+        patch.setattr(jobs, "LocalWorkers", Inside)
         assert run_command([*command, "--export", str(folder / "best.yaml")]) == 0
     return folder / "out"

@@ -18,11 +18,9 @@ import yaml
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import train
-from ethbrake_marl.studies.jobs.local import LocalWorkers
-from ethbrake_marl.studies.tuning.file import read_tuning
-from ethbrake_marl.studies.tuning.plan import plan_tuning
-from ethbrake_marl.studies.tuning.run import place_of, run_tuning
-from ethbrake_marl.studies.tuning.study import TuningStudy
+from ethbrake_marl.studies.jobs import LocalWorkers
+from ethbrake_marl.studies.tuning import TuningStudy, place_of, run_tuning
+from ethbrake_marl.studies.tuning_file import plan_tuning, read_tuning
 from tests.studies.sweep.disturbing import PROGRAM
 from tests.studies.tuning.conftest import TRIALS
 

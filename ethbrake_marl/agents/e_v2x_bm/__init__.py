@@ -1,1 +1,0 @@
-"""E-V2X-BM, the analytic baseline: closed form of a pair, pairwise and coupled optimum, the agent."""

@@ -1,0 +1,526 @@
+"""A policy of any library as an agent: a function, a Stable-Baselines3 model, a torch module, an ONNX model.
+
+The model is shared: a copy of the agent has its own memory of the running episodes, and the same model.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import os
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+import numpy as np
+from gymnasium.wrappers import NormalizeObservation, RescaleObservation
+from numpy.typing import NDArray
+
+from ethbrake_marl.actions import LARGEST, action_to_command
+from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, describe_error, naming_extras
+from ethbrake_marl.observations import (
+    Appended,
+    Observation,
+    Observations,
+    ObservationSpec,
+    appending,
+    choose_observation,
+    observation_for,
+    observe,
+    row_features,
+)
+from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.scenario import Scenario
+
+# Policies of other libraries, each as one function: ``(observation, state) -> (action, state)``.
+
+State = Any  # arrays whose first axis is the world, or tuples, lists and mappings of such
+Infer = Callable[[Observations, State], tuple[Any, State]]
+Begin = Callable[[int], State]  # the memory of n episodes that begin
+
+_KINDS = (
+    "a function of observations, an object with predict, a torch module, an ONNX session or the path of an .onnx file"
+)
+
+
+def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | None) -> tuple[Infer, Begin | None]:
+    """The policy as such a function, and what makes its memory; raises ``InvalidInput`` for what is none."""
+    if isinstance(policy, str | os.PathLike):
+        policy = _open_onnx(Path(policy), name)
+    if not (hasattr(policy, "run") and hasattr(policy, "get_inputs")) and not hasattr(policy, "predict"):
+        if _is_torch_module(policy):
+            return _ask_torch(policy, name, initial_state is not None), initial_state
+        if callable(policy):
+            call = policy if initial_state else lambda seen, _: (_without_memory(policy(seen)), None)
+            return call, initial_state
+        raise InvalidInput(f"agent {name!r}: a {type(policy).__name__} is no policy; must be {_KINDS}")
+    if initial_state is not None:
+        raise InvalidInput(
+            f"agent {name!r}: initial_state is for a function (observation, state) -> (action, state); write one"
+            " around this model"
+        )
+    return (_ask_onnx(policy), None) if hasattr(policy, "run") else _ask_model(policy, name, features)
+
+
+def _without_memory(action: Any) -> Any:
+    if isinstance(action, tuple):
+        raise InvalidInput(
+            f"gave a tuple of {len(action)} in place of an action; a policy with a memory gives (action, state), and"
+            " needs initial_state"
+        )
+    return action
+
+
+def map_state(function: Callable[..., Any], state: State, *others: State) -> State:
+    """The function of every array of a memory, together with those in its place in the others."""
+    if state is None:
+        return None
+    if isinstance(state, Mapping):
+        return {key: map_state(function, value, *(other[key] for other in others)) for key, value in state.items()}
+    if isinstance(state, tuple | list):
+        return tuple(map_state(function, *parts) for parts in zip(state, *others, strict=True))
+    return function(state, *others)
+
+
+def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | None]:
+    """A model with ``predict``; where that gives a state, too (sb3-contrib's recurrent ones), the agent keeps it.
+
+    Which axis of the state is that of the worlds is found by asking for two worlds and for three.
+    """
+
+    def predict(seen: Observations, **memory: Any) -> tuple[Any, State]:
+        statistics = _statistics(model)
+        given = seen if statistics is None else statistics.normalize_obs(seen)
+        found = model.predict(given, deterministic=True, **memory)
+        return found if isinstance(found, tuple) else (found, None)
+
+    def world_axis(two: Any, three: Any) -> int:
+        shapes = np.shape(two), np.shape(three)
+        found = [axis for axis, sizes in enumerate(zip(*shapes, strict=True)) if sizes == (2, 3)]
+        if len(found) != 1:
+            raise InvalidInput(f"its state has arrays of shape {shapes[0]} for two worlds and {shapes[1]} for three")
+        return found[0]
+
+    try:
+        like, of_three = (predict(np.zeros((n, features), np.float32))[1] for n in (2, 3))
+        axes = map_state(world_axis, like, of_three)
+    except Exception as error:
+        raise InvalidInput(f"agent {name!r}: predict on {features} features: {describe_error(error)}") from error
+    if like is None:
+        return lambda seen, _: (predict(seen)[0], None), None
+
+    def infer(seen: Observations, state: State) -> tuple[Any, State]:
+        begins, memory = state
+        kept = None if begins.all() else map_state(lambda array, axis: np.moveaxis(array, 0, axis), memory, axes)
+        action, memory = predict(seen, state=kept, episode_start=begins)
+        after = map_state(lambda array, axis: np.moveaxis(to_array(array), axis, 0), memory, axes)
+        return action, (np.zeros(len(seen), np.bool_), after)
+
+    def begin(n: int) -> State:
+        shaped = map_state(lambda array, axis: np.moveaxis(to_array(array), axis, 0), like, axes)
+        return np.ones(n, np.bool_), map_state(lambda array: np.zeros((n, *array.shape[1:]), array.dtype), shaped)
+
+    return infer, begin
+
+
+def training_environment(model: Any, name: str) -> Any:
+    """The environment of this package in which a Stable-Baselines3 model is trained, inside whatever wraps it.
+
+    None where that is not known. Raises ``InvalidInput`` where Gymnasium's own wrappers change what it observes.
+    """
+    env = getattr(model, "get_env", lambda: None)()
+    if env is None:
+        return None
+    for wrapper in (NormalizeObservation, RescaleObservation):
+        if any(env.env_is_wrapped(wrapper)):
+            raise InvalidInput(
+                f"agent {name!r}: the model is trained under {wrapper.__name__}, which this agent knows nothing of;"
+                " write a function around it that does the same, or train under Stable-Baselines3's VecNormalize"
+            )
+    try:
+        return env.get_attr("unwrapped")[0] if env.get_attr("engine") else None
+    except AttributeError:  # another library's
+        return None
+
+
+def _statistics(model: Any) -> Any:
+    """Stable-Baselines3's ``VecNormalize`` that the model is trained under, as it counts now; None without one."""
+    find = getattr(model, "get_vec_normalize_env", None)
+    return None if find is None else find()
+
+
+def _ask_onnx(session: Any) -> Infer:
+    given = session.get_inputs()[0].name
+    names = [output.name for output in session.get_outputs()]
+    wanted = "action" if "action" in names else names[0]
+    return lambda seen, _: (session.run([wanted], {given: seen})[0], None)
+
+
+def _ask_torch(module: Any, name: str, with_state: bool) -> Infer:
+    torch = sys.modules["torch"]
+    for layer in module.modules():
+        if layer.training and isinstance(
+            layer, torch.nn.modules.dropout._DropoutNd | torch.nn.modules.batchnorm._NormBase
+        ):
+            raise InvalidInput(
+                f"agent {name!r}: {type(layer).__name__} is in training mode, where it draws, or mixes the worlds of a"
+                " batch; call eval() of the module first"
+            )
+
+    def call(seen: Observations, state: State) -> tuple[Any, State]:
+        parameter = next(iter(module.parameters()), None)
+        with torch.no_grad():
+            given = torch.from_numpy(np.array(seen)).to("cpu" if parameter is None else parameter.device)
+            return module(given, state) if with_state else (module(given), None)
+
+    return call
+
+
+def _is_torch_module(policy: Any) -> bool:
+    """Never imports torch: whoever has a module has it already."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(policy, torch.nn.Module)
+
+
+def _open_onnx(path: Path, name: str) -> Any:
+    if path.suffix != ".onnx" or not path.is_file():
+        what = (
+            "there is no such file" if path.suffix == ".onnx" else f"a path must be that of an .onnx file, not {path}"
+        )
+        raise InvalidInput(f"agent {name!r}: policy {str(path)!r}: {what}")
+    with naming_extras():
+        import onnxruntime
+    return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+
+def weights_sha256(policy: Any) -> str | None:
+    """SHA-256 of an .onnx file, or of the weights of a torch module or a Stable-Baselines3 model as they are now.
+
+    What a ``VecNormalize`` has counted belongs to the weights. None for anything else, whose weights nobody can find.
+    """
+    if isinstance(policy, str | os.PathLike):
+        return hashlib.sha256(Path(policy).read_bytes()).hexdigest() if Path(policy).is_file() else None
+    module: Any = policy if _is_torch_module(policy) else getattr(policy, "policy", None)
+    if not _is_torch_module(module):
+        return None
+    arrays, statistics = dict(module.state_dict()), _statistics(policy)
+    if statistics is not None and statistics.norm_obs:
+        counted = statistics.obs_rms
+        arrays |= {"mean": counted.mean, "var": counted.var, "clip": statistics.clip_obs, "eps": statistics.epsilon}
+    digest = hashlib.sha256()
+    for name, tensor in arrays.items():
+        array = to_array(tensor)
+        digest.update(f"{name} {array.dtype} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def to_array(value: Any) -> NDArray[Any]:
+    """An array, of a tensor too; what is masked is no number."""
+    if isinstance(value, np.ma.MaskedArray):
+        return np.ma.filled(value.astype(np.float64), np.nan)
+    return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
+
+
+def policy_agent(
+    policy: Any,
+    *,
+    name: str | None = None,
+    scenario: Scenario | None = None,
+    observation: Observation | None = None,
+    initial_state: Callable[[int], State] | None = None,
+    clip: bool = False,
+    appended: Appended | None = None,
+) -> PolicyAgent:
+    """An agent that drives by a policy of any library: observations [n, F] float32 -> actions [n, 1] in [-1, 1].
+
+    A policy with a memory is a function ``(observation, state) -> (action, state)`` with an ``initial_state``, or a
+    model whose ``predict`` gives a state.
+
+    Args:
+        policy: a function, a model with ``predict`` (Stable-Baselines3; asked deterministically, its state kept world
+            by world, its observations normalised by its ``VecNormalize``), a torch module (called as it is, without
+            gradients), an ONNX session, or the path of an ``.onnx`` file. Copies share it.
+        name: in tables and messages; None: the name of the function or class.
+        scenario: the policy observes what learners of it do.
+        observation: what it observes instead, as ``choose_observation`` reads it; None: that of the scenario, or of the
+            policy itself, or of the environment that a Stable-Baselines3 model has, or the usual one.
+        initial_state: makes the memory of ``n`` episodes that begin: an array whose first axis is the world, or tuples
+            and mappings of such. None: a function has no memory.
+        clip: actions beyond -1 and 1 mean -1 and 1; otherwise they are refused.
+        appended: ``number`` or ``state`` of ``make_sb3_vec_env``, where the policy was trained on such rows; needs the
+            scenario with its learners. None: as in the environment that the model has. Who sees the ``state`` knows
+            the true state of the line.
+
+    Raises ``InvalidInput`` for what is no such policy, or one for another number of features.
+
+    >>> import ethbrake_marl as eb
+    >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> eb.evaluate(scenario.sample(5, 7), {"mine": agent}, scenario=scenario).worlds.n
+    5
+
+    """
+    named = name or _name_of(policy)
+    trained = training_environment(policy, named)
+    spec = _observation_of(policy, scenario, observation, trained)
+    if appended is None and (appended := getattr(trained, "appended", None)) is not None:
+        scenario = trained.engine.scenario if scenario is None else scenario
+    if appended is not None and scenario is None:
+        raise InvalidInput(f"agent {named!r}: appended = {appended!r} needs the scenario that it was trained in")
+    size = spec.size if scenario is None else len(row_features(spec.features, appended, scenario))
+    shape = getattr(getattr(policy, "observation_space", None), "shape", None)
+    if shape not in (None, (size,)):
+        raise InvalidInput(
+            f"agent {named!r}: the policy takes observations of shape {shape}, here are {size} features;"
+            " give what it was trained on: scenario, observation, or appended (number or state, of make_sb3_vec_env)"
+        )
+    if trained is not None and [f.name for f in spec.features] != [f.name for f in trained.engine.observation.features]:
+        raise InvalidInput(
+            f"agent {named!r}: the model is trained on other features than {spec}: {trained.engine.observation}; leave"
+            " observation out, and give the scenario it was trained in, or none"
+        )
+    actions = getattr(policy, "action_space", None)
+    ends = getattr(actions, "low", -1.0), getattr(actions, "high", 1.0)
+    if not (clip or (np.all(ends[0] == -1.0) and np.all(ends[1] == 1.0))):
+        raise InvalidInput(
+            f"agent {named!r}: the policy gives actions in {actions}, here they mean [-1, 1]; write a function around"
+            " it that says what they mean"
+        )
+    infer, begin = adapt_policy(policy, named, size, initial_state)
+    more = None if appended is None or scenario is None else appending(appended, scenario)
+    agent = PolicyAgent(infer, named, spec, begin, clip, lambda: weights_sha256(policy), more)
+    if appended == "state":
+        agent.knows = Source.STATE
+    return agent
+
+
+def _observation_of(policy: Any, scenario: Scenario | None, given: Observation | None, trained: Any) -> ObservationSpec:
+    if given is not None:
+        return choose_observation(given, None if scenario is None else scenario.time_step_s)
+    if scenario is not None:
+        return observation_for(scenario)
+    own = getattr(policy, "observation", None) if trained is None else trained.engine.observation
+    return own if isinstance(own, ObservationSpec) else ObservationSpec()
+
+
+def _name_of(policy: Any) -> str:
+    """Of the file, the function or the class."""
+    if isinstance(policy, str | os.PathLike):
+        return Path(policy).stem
+    return str(getattr(policy, "__name__", type(policy).__name__))
+
+
+class PolicyAgent:
+    """Drives one vehicle by a policy of any library; made by ``policy_agent``."""
+
+    knows = Source.MESSAGES
+
+    def __init__(
+        self,
+        infer: Infer,
+        name: str,
+        observation: ObservationSpec,
+        initial_state: Callable[[int], State] | None,
+        clip: bool,
+        weights_sha256: Callable[[], str | None],
+        more: Callable[[Worlds, int], Observations] | None = None,
+    ) -> None:
+        self.name = name
+        self.weights_sha256 = weights_sha256  # of the policy as it is now; None where nobody can find its weights
+        self.observation = observation
+        self._infer, self._initial_state, self._clip = infer, initial_state, clip
+        self.remembers = initial_state is not None
+        self._more = more  # what stands behind the own observation
+        self._steps: Ints = np.zeros(0, np.int64)  # [n] decisions of the running episodes
+        self._rows: Ints = np.zeros(0, np.int64)  # [n] their rows in the batch that began
+        self._state: State = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Own memory, the same model."""
+        return self.take(np.arange(len(self._steps)))
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Forget the episodes in these rows."""
+        size = max(len(self._steps), int(rows.max(initial=-1)) + 1)
+        old = np.arange(len(self._steps))
+        if self._initial_state is not None:
+            everywhere = self._begun(size)
+            if len(old):
+                everywhere = _put(everywhere, old, self._state)
+            self._state = _put(everywhere, rows, self._begun(len(rows)))
+        steps = np.zeros(size, np.int64)
+        steps[old] = self._steps
+        steps[rows] = 0
+        self._steps, self._rows = steps, np.arange(size)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Wanted signed acceleration [n], m/s2.
+
+        Raises ``AgentFailed`` naming world and step where the policy raises, or gives another shape, no number, or one
+        that is not in [-1, 1].
+        """
+        if len(self._steps) < worlds.n:
+            raise InvalidInput(
+                f"agent {self.name!r}: act on {count_of(worlds.n, 'world')}, but begin was not called for each of them"
+            )
+        if len(self._steps) > worlds.n:  # a smaller batch has begun
+            self.__dict__.update(self.take(np.arange(worlds.n)).__dict__)
+        seen = observe(worlds, vehicle, self.observation).astype(np.float32, copy=False)
+        if self._more is not None:
+            seen = np.concatenate([seen, self._more(worlds, vehicle)], axis=1, dtype=np.float32)
+        action, state = self._ask(seen, worlds)
+        values = self._checked(action, seen, worlds)
+        self._state, self._steps = state, self._steps + 1
+        return action_to_command(values, worlds.vehicles, vehicle)
+
+    def take(self, rows: Ints) -> Self:
+        """A copy that drives on in some rows of its batch only."""
+        part = copy.copy(self)
+        part._steps, part._rows = self._steps[rows], self._rows[rows]
+        part._state = _take(self._state, rows)
+        return part
+
+    def _begun(self, n: int) -> State:
+        assert self._initial_state is not None
+        try:
+            return _take(_checked_state(self._initial_state(n), n), np.arange(n))
+        except Exception as error:
+            raise AgentFailed(self.name, None, f"initial_state({n}): {describe_error(error)}") from error
+
+    def _ask(self, seen: Observations, worlds: Worlds) -> tuple[NDArray[Any], State]:
+        try:
+            return self._answer(seen, np.arange(worlds.n))
+        except Exception as error:
+            k = self._find_failing(seen)
+            where = self._whenever() if k is None else self._when(k, worlds)
+            reason = f"{where}: observations of shape {seen.shape}: {describe_error(error)}"
+            raise AgentFailed(self.name, None if k is None else int(self._rows[k]), reason) from error
+
+    def _answer(self, seen: Observations, rows: Ints) -> tuple[NDArray[Any], State]:
+        """What the policy says in some rows of the batch, and its memory of them then."""
+        if self._initial_state is None:
+            return to_array(self._infer(seen[rows], None)[0]), None
+        action, state = self._infer(seen[rows], _take(self._state, rows))
+        return to_array(action), _checked_state(state, len(rows))
+
+    def _find_failing(self, seen: Observations) -> int | None:
+        """The row for which alone the policy fails too, found by halves; None where no half fails."""
+        rows = np.arange(len(seen))
+        while len(rows) > 1:
+            halves = (rows[: len(rows) // 2], rows[len(rows) // 2 :])
+            found = next((half for half in halves if self._fails(seen, half)), None)
+            if found is None:
+                return None
+            rows = found
+        return int(rows[0])
+
+    def _fails(self, seen: Observations, rows: Ints) -> bool:
+        try:
+            self._answer(seen, rows)
+        except Exception:
+            return True
+        return False
+
+    def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds) -> Floats:
+        """The actions [n] in [-1, 1]."""
+        n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
+        if action.shape != (n, 1) or action.dtype.kind not in "fiu":
+            first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0
+            raise self._refusal(first, worlds, f"{what}; one number per world is needed, shape ({n}, 1)")
+        values: Floats = action[:, 0].astype(np.float64)
+        if not np.isfinite(values).all():
+            k = int(np.argmin(np.isfinite(values)))
+            raise self._refusal(k, worlds, f"{what}, in which stands {values[k]}; must be in [-1, 1]")
+        inside = np.abs(values) <= LARGEST
+        if not (self._clip or inside.all()):
+            k = int(np.argmin(inside))
+            right = "must be in [-1, 1]; with clip=True the nearest is meant"
+            raise self._refusal(k, worlds, f"{what}, in which stands {values[k]:g}; {right}")
+        return values.clip(-1.0, 1.0)
+
+    def _refusal(self, k: int, worlds: Worlds, reason: str) -> AgentFailed:
+        return AgentFailed(self.name, int(self._rows[k]), f"{self._when(k, worlds)}: {reason}")
+
+    def _whenever(self) -> str:
+        """The step, of all running episodes, at which nobody knows whose it was."""
+        first, last = self._steps.min(initial=10**9) + 1, self._steps.max(initial=0) + 1
+        return f"step {first}" if first >= last else f"steps {first} to {last}"
+
+    def _when(self, k: int, worlds: Worlds) -> str:
+        return f"step {self._steps[k] + 1} ({worlds.time_s[k]:.2f} s)"
+
+
+def _take(state: State, rows: Ints) -> State:
+    return map_state(lambda array: array[rows], state)
+
+
+def _put(state: State, rows: Ints, part: State) -> State:
+    """The memory with that of ``rows`` from another; changes and gives the first."""
+
+    def put(array: Any, new: Any) -> Any:
+        array[rows] = new
+        return array
+
+    return map_state(put, state, part)
+
+
+def _checked_state(state: State, n: int) -> State:
+    def check(array: Any) -> Any:
+        shape = tuple(getattr(array, "shape", ()))
+        if not shape or shape[0] != n:
+            raise InvalidInput(f"state: {type(array).__name__} of shape {shape}; its first axis must be the {n} worlds")
+        return array
+
+    return map_state(check, state)
+
+
+# A trained policy as an agent: observe, infer, ask for that acceleration. Deterministic.
+
+
+class LearnedPolicy(Protocol):
+    """What an agent needs of a policy; ``ethbrake_marl.policies.bundle.Policy`` is one."""
+
+    @property
+    def observation(self) -> ObservationSpec:
+        """What to observe for it."""
+        ...
+
+    def __call__(self, observation: Observations, /) -> Observations:
+        """Map observation [n, F] to action [n, 1] in [-1, 1], each row on its own."""
+        ...
+
+
+class LearnedAgent:
+    """Drives one vehicle by a policy's deterministic action; holds no state between steps.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.LearnedAgent(eb.load_shipped("ppo"), name="mine").name
+    'mine'
+
+    """
+
+    knows = Source.MESSAGES
+    remembers = False
+
+    def __init__(self, policy: LearnedPolicy, name: str = "learned") -> None:
+        self.policy = policy
+        self.name = name
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: NDArray[np.int64]) -> None:
+        """Nothing to prepare: each action follows from the present state alone."""
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Wanted signed acceleration [n], m/s2; world k's does not depend on the other worlds of the batch."""
+        action = self.policy(observe(worlds, vehicle, self.policy.observation)).astype(np.float64)
+        if action.shape != (worlds.n, 1):
+            raise InvalidInput(
+                f"{self.name}: actions of shape {action.shape}; one per world is needed, ({worlds.n}, 1)"
+            )
+        return action_to_command(action[:, 0], worlds.vehicles, vehicle)
+
+    def take(self, rows: Ints) -> LearnedAgent:
+        """The same agent: it remembers nothing."""
+        return self

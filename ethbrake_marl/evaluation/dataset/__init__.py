@@ -1,1 +1,0 @@
-"""Datasets of episodes: recorded by the actions that replay them, written as Parquet or for Minari."""

@@ -1,0 +1,406 @@
+"""Whole episodes, exact at every moment: pieces of constant acceleration, impacts, and where a shield stepped in."""
+
+from __future__ import annotations
+
+import copy
+import io
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Agent, Driver, Team, team_of
+from ethbrake_marl.agents.rollout import Episodes, drive, episode_engine
+from ethbrake_marl.defaults import HARM_COUNTS
+from ethbrake_marl.envs.drawing.animation import animate_films
+from ethbrake_marl.envs.drawing.scene import Scene, Trace, kept_motions, scenes
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
+from ethbrake_marl.evaluation.rollout import controlled_vehicle
+from ethbrake_marl.harm import Ledger
+from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
+from ethbrake_marl.physics.episode import first_decision_s, segment_pieces
+from ethbrake_marl.physics.kernel import with_post_ahead
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.shield import HybridAgent
+from ethbrake_marl.shield.agents import shield_around
+
+if TYPE_CHECKING:
+    from ethbrake_marl.envs.drawing.frame import Frame
+
+
+_SAME = 1e-9  # m, m/s: a piece that goes on like the one before it is part of it
+_SHORT_S = 1e-4  # pieces of a cascade of tiny bounces may be shorter; they are not told apart
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeMotion:
+    """One world from the alert to the end of its episode, driven by one agent."""
+
+    world: Worlds  # n = 1, at the alert
+    pieces: Floats  # [k, 1 + N + 2 N] time (s), place of Vehicle 1 (m), gaps, speeds, accelerations where each begins
+    end_s: float
+    impacts: ImpactRows  # in order of time; world is 0
+    stepped_in_s: Floats  # beginnings of the decisions in which a shield replaced what was proposed
+    ledger: Ledger  # n = 1
+    final: Worlds  # n = 1, as the episode left it
+    at_rest: bool  # the line came to rest; else the horizon cut the episode off
+
+    @property
+    def harm(self) -> tuple[float, float]:
+        """Harm of the line, by first impacts and in total (m2/s2)."""
+        first, total = (float(self.ledger.world_harm(count)[0]) for count in HARM_COUNTS)
+        return first, total
+
+
+def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[EpisodeMotion]:
+    """Let an agent drive the scenario's learners through every world, as ``evaluate`` does, and keep every motion.
+
+    Args:
+        worlds: at the alert.
+        agent: drives each learner, or, as a team, its vehicles; it is left as it is.
+        scenario: of the worlds; its scripts drive the other vehicles.
+
+    Raises ``PhysicsError`` naming the worlds that could not be advanced.
+
+    """
+    team = team_of(agent, scenario.learners)
+    follower = _Follower(worlds, team)
+    episodes = drive(worlds, team, scenario, watched_by=[follower])
+    return [follower.motion(k, episodes) for k in range(worlds.n)]
+
+
+class _Follower:
+    """Watches a batch of episodes."""
+
+    def __init__(self, worlds: Worlds, team: Team) -> None:
+        self._worlds, self._drivers = worlds, list(team.drivers.values())
+        self._first_s = first_decision_s(worlds, list(team.drivers))
+        self._way_m = np.zeros(worlds.n)
+        self._pieces: list[list[Floats]] = [[] for _ in range(worlds.n)]
+        self._impacts: list[list[ImpactRows]] = [[] for _ in range(worlds.n)]
+        self._stepped_in: list[list[float]] = [[] for _ in range(worlds.n)]
+        self._count = np.zeros(worlds.n)
+
+    def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
+        """Keep the pieces and impacts of one step."""
+        moving = until_s > before.time_s
+        moving |= before.time_s == self._worlds.time_s  # an impact at the very alert
+        some = np.flatnonzero(moving)
+        rows = advance(before.take(some), command_mps2[some], until_s=until_s[some], record=True)[1].rows
+        assert rows is not None  # they were asked for
+        columns = [np.zeros_like(rows.world), *(getattr(rows, f.name) for f in fields(ImpactRows)[1:])]
+        starts = np.searchsorted(rows.world, np.arange(some.size + 1)).tolist()  # they come world by world
+        for k, first, end in zip(some.tolist(), starts[:-1], starts[1:], strict=True):
+            self._impacts[k].append(ImpactRows(*(column[first:end] for column in columns)))
+        some = np.flatnonzero(until_s > before.time_s)
+        for k, pieces in zip(
+            some.tolist(), segment_pieces(before.take(some), command_mps2[some], until_s[some]), strict=True
+        ):
+            way = _way(pieces, float(until_s[k]))
+            pieces[:, 1] += self._way_m[k]
+            self._pieces[k].append(pieces)
+            self._way_m[k] += way
+        count = _steps_taken_over(self._drivers, before.n)
+        for k in np.flatnonzero(count > self._count).tolist():
+            self._stepped_in[k].append(float(before.time_s[k]))
+        self._count = count
+
+    def motion(self, k: int, episodes: Episodes) -> EpisodeMotion:
+        """What was seen of world ``k``."""
+        parts, N = self._impacts[k], self._worlds.N
+        impacts = ImpactRows(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ImpactRows)))
+        pieces = np.concatenate(self._pieces[k]) if self._pieces[k] else _standing(self._worlds, k)
+        ledger = Ledger(*(getattr(episodes.ledger, f.name)[[k]] for f in fields(Ledger)))
+        final = episodes.final.take([k])
+        taken_over = list(self._stepped_in[k])
+        if any(isinstance(d, HybridAgent) and not d.chosen_policy[k] for d in self._drivers):
+            taken_over.append(float(self._first_s[k]))
+        return EpisodeMotion(
+            self._worlds.take([k]), join_pieces(pieces, N), float(final.time_s[0]), impacts,
+            np.array(sorted(taken_over)), ledger, final, bool(episodes.at_rest[k]),
+        )  # fmt: skip
+
+
+def join_pieces(pieces: Floats, vehicles: int) -> Floats:
+    """The pieces without those that go on like the one before; of many within ``_SHORT_S`` the last one stays."""
+    last_of_many = np.append(np.diff(np.floor(pieces[:, 0] / _SHORT_S)) > 0.0, True)
+    last_of_many[0] = True
+    kept: list[Floats] = []
+    for row in pieces[last_of_many]:
+        if not kept or not (np.abs(state_at(kept[-1], row[0], vehicles) - row[1:]) <= _SAME).all():
+            kept.append(row)
+    return np.array(kept)
+
+
+def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
+    """Place of Vehicle 1, gaps, speeds and accelerations [3 N] at a time of a piece [1 + 3 N]."""
+    t, N = time_s - piece[0], vehicles
+    speeds, accelerations = piece[1 + N : 1 + 2 * N], piece[1 + 2 * N :]
+    way = (speeds + 0.5 * accelerations * t) * t
+    gaps = piece[2 : 1 + N] + way[:-1] - way[1:]
+    return np.concatenate([[piece[1] + way[0]], gaps, speeds + accelerations * t, accelerations])
+
+
+def _way(pieces: Floats, until_s: float) -> float:
+    """How far Vehicle 1 has come at the end of these pieces."""
+    last = pieces[-1]
+    vehicles = (len(last) - 1) // 3
+    return float(state_at(last, until_s, vehicles)[0])
+
+
+def _standing(worlds: Worlds, k: int) -> Floats:
+    """The one piece of an episode that ends where it begins."""
+    N = worlds.N
+    return np.concatenate([worlds.time_s[[k]], [0.0], worlds.gaps_m[k], worlds.speeds_mps[k], np.zeros(N)])[np.newaxis]
+
+
+def _steps_taken_over(drivers: list[Agent], n: int) -> Floats:
+    """A count, [n], that rises with every decision in which a step shield applied something else than a proposal."""
+    count = np.zeros(n)
+    for driver in drivers:
+        if (shield := shield_around(driver)) is not None:
+            count += shield.interventions
+    return count
+
+
+# One episode at fine time resolution: what a figure or a viewer draws.
+#
+# Between decisions the motion follows from the state and the command alone, so the episode is first run as in an
+# evaluation, and then sampled inside its steps: every sample is advanced straight from the beginning of its step.
+
+SAMPLE_S = 0.02
+
+Segment = tuple[Worlds, Floats, Floats]  # world (n = 1) at its start, constant command [1, N], time of its end [1]
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeRecord:
+    """One world from the alert to its end, at k times; row 0 is the alert.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> world = scenario.sample(1, seed=7).worlds
+    >>> record = eb.record_episode(world, eb.make_agent("full_brake"), scenario=scenario)
+    >>> record.positions_m.shape, record.impacts.time_s.round(2), record.at_rest
+    ((196, 3), array([2.17, 3.3 ]), True)
+
+    """
+
+    agent: str  # its name
+    scenario: Scenario  # of the world
+    vehicle: int  # index (0 = front) of the vehicle that the agent drove
+    initial: Worlds  # n = 1, at the alert
+    time_s: Floats  # [k] since Vehicle 1 began to brake, ascending
+    gaps_m: Floats  # [k, P]
+    speeds_mps: Floats  # [k, N]
+    positions_m: Floats  # [k, N] front bumpers along the road; a vehicle's length is not counted
+    command_mps2: Floats  # [k, N] signed acceleration asked for from then on; 0 before the latency has elapsed
+    impacts: ImpactRows  # in order of time; world is 0
+    ledger: Ledger  # n = 1
+    at_rest: bool  # the line came to rest; else the horizon cut the episode off
+
+    def __repr__(self) -> str:
+        first, total = (float(self.ledger.world_harm(harm_count)[0]) for harm_count in HARM_COUNTS)
+        return (
+            f"EpisodeRecord({self.agent!r:.60} on {self.scenario.name!r}, {len(self.time_s)} samples to"
+            f" {self.time_s[-1]:g} s, {count_of(len(self.impacts.time_s), 'impact')}, harm {first:.2f} first-impact,"
+            f" {total:.2f} total)"
+        )
+
+
+def record_episode(
+    world: Worlds, agent: Agent, *, scenario: Scenario, vehicle: int | str | None = None, sample_s: float = SAMPLE_S
+) -> EpisodeRecord:
+    """Record one world from the alert on, exactly as ``evaluate`` runs it.
+
+    Args:
+        world: at the alert, n = 1.
+        agent: drives one vehicle; it is left as it is.
+        scenario: of the world; its scripts drive the other vehicles.
+        vehicle: the one that is driven, by name (``vehicle_2``) or index (0 = front); None: the scenario's only
+            learner.
+        sample_s: samples lie at most so far apart (s), and at every decision.
+
+    Raises ``InvalidInput`` for more than one world or ``sample_s`` not above 0.
+
+    """
+    if world.n != 1:
+        raise InvalidInput(
+            f"record_episode: {count_of(world.n, 'world')} given; exactly 1 is needed, for instance worlds.take([0])"
+        )
+    if not (sample_s > 0.0 and math.isfinite(sample_s)):
+        raise InvalidInput(f"record_episode: sample_s = {sample_s}; must be finite and above 0")
+    driven = controlled_vehicle(scenario, vehicle)
+    engine = episode_engine(world, copy.deepcopy(agent), scenario, driven)
+    segments: list[Segment] = list(engine.segments(world, engine.worlds.command_mps2))
+    at_rest = False
+    while not engine.ended.all():
+        before = engine.worlds
+        step = engine.step({})
+        segments += engine.segments(before, engine.wanted_mps2.copy())
+        at_rest = bool(step.terminated[0])
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
+    samples = list(_samples(segments, sample_s))
+    time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))
+    return EpisodeRecord(
+        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, _impacts(segments), engine.ledger,
+        at_rest,
+    )  # fmt: skip
+
+
+def _samples(segments: list[Segment], sample_s: float) -> Iterator[tuple[Floats, ...]]:
+    """Rows of (time, gaps, speeds, positions, command from then on), segment by segment, the last with its end.
+
+    Worlds know gaps and speeds only. An obstacle ahead of Vehicle 1, the world's own or one that is out of reach, makes
+    its position one more gap.
+    """
+    front = 0.0  # position of Vehicle 1 at the start of the segment
+    for number, (before, command, until_s) in enumerate(segments):
+        start, end = float(before.time_s[0]), float(until_s[0])
+        count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
+        times = np.linspace(start, end, count + 1)
+        post = with_post_ahead(before, np.array([end - start]))
+        copies = post.take(np.zeros(count + 1, np.int64))
+        moved, _ = advance(copies, command, until_s=times)
+        position, gaps, speeds = front + (post.obstacle_gap_m - moved.obstacle_gap_m), moved.gaps_m, moved.speeds_mps
+        in_force = np.where(before.vehicles.latency_s <= times[:, np.newaxis], command, 0.0)
+        rows = slice(None) if number == len(segments) - 1 else slice(count)
+        columns = (times, gaps, speeds, _positions(position, gaps), in_force)
+        yield tuple(column[rows] for column in columns)
+        front = float(position[-1])
+
+
+def _positions(front: Floats, gaps: Floats) -> Floats:
+    """Positions [k, N] from those of Vehicle 1 [k] and the gaps [k, P]."""
+    return np.concatenate([front[:, np.newaxis], front[:, np.newaxis] - np.cumsum(gaps, axis=1)], axis=1)
+
+
+def _impacts(segments: list[Segment]) -> ImpactRows:
+    """Every impact of the episode."""
+    parts = [advance(before, command, until_s=end, record=True)[1].rows for before, command, end in segments]
+    rows = [part for part in parts if part is not None]
+    return ImpactRows(*(np.concatenate([getattr(part, f.name) for part in rows]) for f in fields(ImpactRows)))
+
+
+# An episode as a film, in real time: the environment's own pictures as a GIF or MP4, or a moving drawing as SVG.
+
+Films = Mapping[str, Sequence[Scene]]  # of one world, by title
+
+FILM_FPS = 25
+MOST_FILMS = 12  # one below the other
+MOST_PICTURES = 2_500  # of all films together: 1.8 GB in memory
+_COLOURS = 64
+
+
+def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float = FILM_FPS) -> list[Scene]:
+    """What one world shows from the alert to the end of its episode, ``fps`` moments per second, then its end.
+
+    Args:
+        world: at the alert, n = 1.
+        agent: drives the learner, or, as a team, its vehicles; it is left as it is.
+        scenario: of the world; its scripts drive the other vehicles.
+        fps: moments per second of the world.
+
+    Raises ``InvalidInput`` for more than one world, ``PhysicsError`` for one that could not be advanced.
+
+    """
+    if world.n != 1:
+        raise InvalidInput(f"film_scenes: {count_of(world.n, 'world')} given; exactly 1 is needed: worlds.take([0])")
+    engine = episode_engine(world, team_of(agent, scenario.learners), scenario)
+    trace = Trace(engine, whole=True, alert=world)
+    while not engine.ended.all():
+        engine.step({})
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
+    end = float(engine.worlds.time_s[0])
+    times = np.append(np.arange(int(np.ceil(end * fps - 1e-9))) / fps, end)
+    shown: list[Scene] = []
+    for motion in kept_motions(engine, trace):
+        start, until = float(motion.start.time_s[0]), float(motion.until_s[0])
+        mine = times[(times >= start if motion.fresh[0] else times > start) & (times <= until)]
+        shown += scenes(engine, motion, 0, mine) if len(mine) else []
+    return shown
+
+
+def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
+    """Films of one world, titled and one below the other, in real time: an endless GIF or SVG, or an MP4.
+
+    A film that ends before the others shows its end. Raises ``InvalidInput`` without films, for more than
+    ``MOST_FILMS`` or ``MOST_PICTURES``, for an ``ending`` that is
+    none of ``.gif``, ``.mp4`` and ``.svg``, for an ``fps`` whose frames do not last whole hundredths of a second, as a
+    GIF needs, and for an MP4 where the library that writes it is missing.
+    """
+    check_ending(ending)
+    if not films or not all(films.values()):
+        raise InvalidInput("film_bytes: no films given")
+    if not fps > 0 or 100 % fps:
+        raise InvalidInput(f"film_bytes: fps = {fps}: must divide 100, for instance 10, 20, 25 or 50")
+    check_number_of_films(len(films))
+    pictures = len(films) * max(map(len, films.values()))
+    if pictures > MOST_PICTURES:
+        raise InvalidInput(
+            f"film of {len(films)} agents for {pictures // len(films) / fps:g} s: needs {pictures:,} pictures,"
+            f" and at most {MOST_PICTURES:,} are kept; give fewer agents, or a scenario with a shorter horizon_s"
+        )
+    return _WRITERS[ending](films, fps)
+
+
+def check_number_of_films(films: int) -> None:
+    """Refuse more than ``MOST_FILMS`` with ``InvalidInput``."""
+    if films > MOST_FILMS:
+        raise InvalidInput(f"film: {films} agents, one below the other; at most {MOST_FILMS} are shown")
+
+
+def check_ending(ending: str) -> None:
+    """Refuse, before any work, a film that cannot be written; raises as ``film_bytes``."""
+    if ending not in _WRITERS:
+        raise InvalidInput(f"a film that ends in {ending!r}: films are written as {', '.join(_WRITERS)}")
+    if ending == ".mp4":
+        need("imageio_ffmpeg")
+
+
+def _stacked(films: Films) -> Iterator[Frame]:
+    """The frames of all films, one below the other."""
+    from ethbrake_marl.envs.drawing.frame import draw_frame
+
+    for k in range(max(map(len, films.values()))):
+        each = (shown[min(k, len(shown) - 1)]._replace(title=title) for title, shown in films.items())
+        yield np.concatenate([draw_frame(scene) for scene in each])
+
+
+def _write_gif(films: Films, fps: int) -> bytes:
+    from PIL import Image
+
+    pictures = [
+        Image.fromarray(frame).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE) for frame in _stacked(films)
+    ]
+    buffer = io.BytesIO()
+    pictures[0].save(buffer, "GIF", save_all=True, append_images=pictures[1:], duration=1000 // fps, loop=0)
+    return buffer.getvalue()
+
+
+def _write_mp4(films: Films, fps: int) -> bytes:
+    from imageio_ffmpeg import write_frames
+
+    frames = list(_stacked(films))
+    height, width, _ = frames[0].shape
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "film.mp4"
+        writer = write_frames(str(path), (width, height), fps=fps, quality=8)
+        writer.send(None)
+        for frame in frames:
+            writer.send(frame)
+        writer.close()
+        return path.read_bytes()
+
+
+def _write_svg(films: Films, fps: int) -> bytes:
+    return animate_films(films, fps=fps).encode()
+
+
+_WRITERS = {".gif": _write_gif, ".mp4": _write_mp4, ".svg": _write_svg}

@@ -1,0 +1,665 @@
+"""A question to a list of any length, and the answer of one shard of it: a plain function that any process can run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial, reduce
+from itertools import pairwise
+from operator import add
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Driver, Knowledge, knowledge_of, knowledge_text, team_of
+from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number, naming_extras
+from ethbrake_marl.evaluation.harm_metrics import COLUMN, METRICS
+from ethbrake_marl.evaluation.inputs import (
+    make_lineup,
+    policies_by_name,
+    policy_sha256,
+    result_versions,
+    scenario_sha256,
+    worlds_sha256,
+)
+from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome, is_papers_list, parameters_of
+from ethbrake_marl.evaluation.regret import Distance, Regrets, assess
+from ethbrake_marl.evaluation.results import (
+    Columns,
+    initial_columns,
+    objective_columns,
+    outcome_columns,
+    results_to_json,
+)
+from ethbrake_marl.evaluation.rollout import evaluate_block
+from ethbrake_marl.evaluation.statistics import (
+    VALUE_BITS,
+    Estimate,
+    Moments,
+    decrease_of,
+    difference,
+    estimates_to_json,
+    exact_products,
+    exact_rate,
+    mean_of,
+    moments,
+)
+from ethbrake_marl.evaluation.summary import BASELINE, FAR_M, Rescored, SummaryRow
+from ethbrake_marl.files.store import new_file
+from ethbrake_marl.harm import scored
+from ethbrake_marl.limits.limits import Unproven, known_limits
+from ethbrake_marl.physics import Floats
+from ethbrake_marl.scenario import Sample, Scenario, Task
+from ethbrake_marl.scenario.quantities import DECLARED, quantity, quantity_rules
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
+
+# The statistics of some worlds of a list: counts and exact sums, which merge in any order to the same bits.
+
+HASHES = 1 << 256  # sums of hashes are kept modulo this
+_MOST = 1 << 64
+_ALWAYS = ("first_impact_harm", "total_harm")  # numbers that every agent has in every world
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class AgentTally:
+    """What one agent did in some worlds. What it does not have in all worlds of a list is told of none."""
+
+    counts: Mapping[str, int] = field(default_factory=dict)  # worlds in which something was so
+    moments: Mapping[str, Moments] = field(default_factory=dict)  # of a number that each world has
+    products: Mapping[str, int] = field(default_factory=dict)  # of a number with the baseline's of the same name
+
+    def __add__(self, other: AgentTally) -> AgentTally:
+        return AgentTally(
+            {name: self.counts.get(name, 0) + other.counts.get(name, 0) for name in {**self.counts, **other.counts}},
+            {
+                name: self.moments.get(name, Moments()) + other.moments.get(name, Moments())
+                for name in {**self.moments, **other.moments}
+            },
+            {
+                name: self.products.get(name, 0) + other.products.get(name, 0)
+                for name in {**self.products, **other.products}
+            },
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data; whole numbers of any size are hexadecimal texts."""
+        return {
+            "counts": dict(self.counts),
+            "moments": {name: [m.count, hex(m.total), hex(m.squares)] for name, m in self.moments.items()},
+            "products": {name: hex(value) for name, value in self.products.items()},
+        }
+
+    @classmethod
+    def from_json(cls, told: Mapping[str, Any]) -> AgentTally:
+        """What ``to_json`` gave; raises ``KeyError``, ``TypeError`` or ``ValueError`` for anything else."""
+        return cls(
+            {name: _whole(value) for name, value in told["counts"].items()},
+            {name: _moments(*parts) for name, parts in told["moments"].items()},
+            {name: int(value, 16) for name, value in told["products"].items()},
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """The statistics of some worlds, added in any order.
+
+    ``worlds_hash`` is the sum, modulo 2^256, of the SHA-256 of the leaves: 1,000 neighbouring worlds of the list each.
+    """
+
+    worlds: int = 0  # that count, driven by all agents
+    hidden: int = 0  # in which the channel hides something from a driven vehicle
+    worlds_hash: int = 0
+    ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)  # least and largest of every quantity
+    left_out: tuple[LeftOut, ...] = ()
+    agents: Mapping[str, AgentTally] = field(default_factory=dict)
+
+    def __add__(self, other: Tally) -> Tally:
+        return Tally(
+            self.worlds + other.worlds,
+            self.hidden + other.hidden,
+            (self.worlds_hash + other.worlds_hash) % HASHES,
+            {name: _joined(self.ranges, other.ranges, name) for name in {**self.ranges, **other.ranges}},
+            tuple(sorted((*self.left_out, *other.left_out))),
+            {
+                name: self.agents.get(name, AgentTally()) + other.agents.get(name, AgentTally())
+                for name in {**self.agents, **other.agents}
+            },
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data, as in the file of a finished shard."""
+        return {
+            "worlds": self.worlds,
+            "hidden": self.hidden,
+            "worlds_hash": hex(self.worlds_hash),
+            "ranges": {name: [list(each) for each in entries] for name, entries in self.ranges.items()},
+            "left_out": [list(left) for left in self.left_out],
+            "agents": {name: agent.to_json() for name, agent in self.agents.items()},
+        }
+
+    @classmethod
+    def from_json(cls, told: Any) -> Tally:
+        """What ``to_json`` gave; raises ``InvalidInput`` for anything else."""
+        try:
+            tally = cls(
+                _whole(told["worlds"]),
+                _whole(told["hidden"]),
+                int(told["worlds_hash"], 16) % HASHES,
+                {name: tuple((float(a), float(b)) for a, b in entries) for name, entries in told["ranges"].items()},
+                tuple(_left_out(*left) for left in told["left_out"]),
+                {name: AgentTally.from_json(agent) for name, agent in told["agents"].items()},
+            )
+            for agent in tally.agents.values() if tally.worlds else ():
+                if any(agent.moments[name].count != tally.worlds for name in _ALWAYS):
+                    raise ValueError("an agent that did not drive every world")
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise InvalidInput(f"is no tally of a shard: {error!r}") from None
+        return tally
+
+
+def _whole(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < _MOST:
+        raise ValueError(f"{value!r} is no whole number from 0 on")
+    return value
+
+
+def _moments(count: Any, total: str, squares: str) -> Moments:
+    """Moments that some values can have, none of them beyond 2^1000."""
+    found = Moments(_whole(count), int(total, 16), int(squares, 16))
+    n = found.count
+    if abs(found.total) > n << (VALUE_BITS + 1000) or n * found.squares < found.total**2 or (n == 0 < found.squares):
+        raise ValueError("moments that no values have")
+    return found
+
+
+def _left_out(world: Any, seed: Any, agent: Any, reason: Any) -> LeftOut:
+    if not (isinstance(agent, str) and isinstance(reason, str)):
+        raise ValueError(f"{agent!r}, {reason!r}: must be texts")
+    return LeftOut(_whole(world), _whole(seed), agent, reason)
+
+
+def _joined(
+    one: Mapping[str, tuple[Range, ...]], other: Mapping[str, tuple[Range, ...]], name: str
+) -> tuple[Range, ...]:
+    """The ranges that hold both."""
+    first, second = one.get(name), other.get(name)
+    if first is None or second is None:
+        return second if first is None else first  # type: ignore[return-value]  # one of them is there
+    return tuple((min(a[0], b[0]), max(a[1], b[1])) for a, b in zip(first, second, strict=True))
+
+
+# The numbers of an evaluation that are counted and summed: one tally for each agent.
+
+HARM_NAMES: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
+REGRET_NAMES: dict[HarmCount, str] = {"first": "regret_first", "total": "regret_total"}
+
+
+def objective_column(objective: str, harm_count: HarmCount, vehicle: int) -> str:
+    """The name of an objective under one count, of a vehicle (from 0)."""
+    return f"objective {objective} {harm_count} {vehicle + 1}"
+
+
+def agent_tallies(evaluation: Evaluation, objectives: Sequence[str], *, limits: bool) -> dict[str, AgentTally]:
+    """The tally of every agent; ``limits``: with what needs the best known harm of each world."""
+    regrets = assess(evaluation) if limits else None
+    reference = evaluation.outcomes.get(BASELINE)
+    paired = {} if reference is None else _paired(reference, regrets)
+    found = {}
+    for agent, outcome in evaluation.outcomes.items():
+        counts, columns, against = _counts(outcome), dict(_columns(outcome, objectives)), _paired(outcome, regrets)
+        if regrets is not None:
+            counts |= _limit_counts(outcome, regrets)
+            columns |= _limit_columns(regrets)
+        found[agent] = AgentTally(
+            counts,
+            {name: moments(column) for name, column in (columns | against).items()},
+            {name: exact_products(against[name], baseline) for name, baseline in paired.items()},
+        )
+    return found
+
+
+def _paired(outcome: Outcome, regrets: Regrets | None) -> dict[str, Floats]:
+    """What is compared with the baseline, world by world."""
+    found = {name: outcome.world_harm(harm_count) for harm_count, name in HARM_NAMES.items()}
+    if regrets is not None:
+        found |= {name: regrets.regret(outcome, harm_count) for harm_count, name in REGRET_NAMES.items()}
+    return found
+
+
+def _counts(outcome: Outcome) -> dict[str, int]:
+    found = {"collisions": int(outcome.collided.sum()), "horizon_ends": int((~outcome.at_rest).sum())}
+    if outcome.shoved_m is not None:
+        found["shoved_far"] = int((outcome.shoved_m > FAR_M).sum())
+    if outcome.chosen_policy is not None:
+        found |= {"policy": int(outcome.chosen_policy.sum()), "hybrid": len(outcome.chosen_policy)}
+    return found
+
+
+def _columns(outcome: Outcome, objectives: Sequence[str]) -> Iterator[tuple[str, Floats]]:
+    """Name and values [n] of every number that each world has, but those that are compared."""
+    for harm_count, name in HARM_NAMES.items():
+        yield from ((f"{name}_{i + 1}", column) for i, column in enumerate(outcome.vehicle_harm(harm_count).T))
+        for objective in objectives:
+            for values in scored(outcome.ledger, harm_count, [objective]).values():
+                yield from ((objective_column(objective, harm_count, i), column) for i, column in enumerate(values.T))
+    for name in ("predicted_harm", "shoved_m", "sampled_harm"):
+        if getattr(outcome, name) is not None:
+            yield name, getattr(outcome, name)
+    yield from ((f"{COLUMN}{name}", column) for name, column in outcome.metrics.items())
+
+
+def _limit_counts(outcome: Outcome, regrets: Regrets) -> dict[str, int]:
+    proof, known = regrets.limits.proof, regrets.limits.known
+    found = {
+        "known": int(known.sum()),
+        "below_best_known": int(regrets.below(outcome).sum()),
+    }
+    if proof.avoidable is not None:
+        found["unavoidable"] = int((~proof.avoidable).sum())
+        found["avoidable_collisions"] = int((outcome.collided & proof.avoidable).sum())
+    if proof.impact is not None:
+        found["impact_proven"] = int(proof.impact.sum())
+    return found
+
+
+def _limit_columns(regrets: Regrets) -> dict[str, Floats]:
+    first, total, proven = regrets.first_impact_harm, regrets.total_harm, regrets.limits.proof.harm
+    found = {"best_known_first": first, "best_known_total": total}
+    if proven is not None:
+        found |= {"proven_harm": proven, "gap_first": first - proven, "gap_total": total - proven}
+    return {name: np.asarray(column) for name, column in found.items()}
+
+
+# One row per world and agent of a shard, as a Parquet file: world by world, whatever the shards and blocks are.
+
+_TEXTS = {"agent", "scenario", "ended", "knows"}
+_WHOLE = {"world", "collided", "impacts", "chosen_policy", "hidden"}
+
+
+def row_columns(evaluation: Evaluation, objectives: Sequence[str]) -> Columns:
+    """The columns of ``--per-world`` but those of the best known harm, and with every quantity; world by world."""
+    n, agents = evaluation.worlds.n, evaluation.outcomes
+    initial, hidden = initial_columns(evaluation, every=True), evaluation.hidden.astype(int).tolist()
+    found: Columns = {}
+    for agent, outcome in agents.items():
+        columns: Columns = {"agent": [agent] * n, **initial, **outcome_columns(outcome)}
+        columns |= objective_columns(outcome, objectives)
+        columns |= {"knows": [knowledge_text(outcome.knows)] * n, "hidden": hidden}
+        found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
+    order = np.arange(n * len(agents)).reshape(len(agents), n).T.ravel().tolist()
+    return {name: [values[k] for k in order] for name, values in found.items()}
+
+
+@contextmanager
+def rows_file(path: Path, objectives: Sequence[str]) -> Iterator[Callable[[Evaluation], None]]:
+    """Give what adds the rows of evaluations to the file, which appears at ``path`` when the block ends well.
+
+    Worlds that were left out have no row. Raises ``MissingExtra`` without pyarrow.
+    """
+    with naming_extras():
+        import pyarrow
+        from pyarrow.parquet import ParquetWriter
+
+    def type_of(name: str) -> Any:
+        if name in _TEXTS or (name.startswith("vehicle_") and name.endswith("_type")):
+            return pyarrow.string()
+        return pyarrow.int64() if name in _WHOLE else pyarrow.float64()
+
+    writer = None
+    with new_file(path) as partial:
+
+        def add(evaluation: Evaluation) -> None:
+            nonlocal writer
+            columns = row_columns(evaluation, objectives)
+            table = pyarrow.table({name: pyarrow.array(values, type_of(name)) for name, values in columns.items()})
+            if writer is None:
+                writer = ParquetWriter(partial, table.schema, compression="zstd")
+            writer.write_table(table)
+
+        try:
+            yield add
+        finally:
+            if writer is not None:
+                writer.close()
+
+
+LEAF = 1_000  # worlds that are hashed together; shards and blocks begin at a multiple of it
+BLOCK = 4 * LEAF  # worlds advanced together: bounds memory, changes no result
+MOST_EPISODES = 10**12
+_TRIED = 100  # worlds at each end of a list that say whether best known harms may be had for all of it
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What is asked of the worlds 0 to ``episodes - 1`` of a list; it travels to other processes.
+
+    Args:
+        scenario: of the worlds, with the learners that are driven.
+        agents: by name, as they are written.
+        episodes: worlds of the list.
+        seed: of the list.
+        harm_count: harm that agents minimise.
+        uncertainty: what agents behind ``+robust`` do not know, as on the command line.
+        objectives: under which results are told, too.
+
+    """
+
+    scenario: Scenario
+    agents: tuple[str, ...]
+    episodes: int
+    seed: int
+    harm_count: HarmCount = "first"
+    uncertainty: str | None = None
+    objectives: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_whole_number("episodes", self.episodes, 1, MOST_EPISODES)
+        check_whole_number("seed", self.seed, 0)
+
+    @property
+    def task(self) -> Task:
+        """Who is driven."""
+        return Task(self.scenario, self.scenario.learners, self.harm_count)
+
+    def lineup(self) -> Mapping[str, Driver]:
+        """The agents, made anew; raises what ``make_lineup`` raises."""
+        intervals = None if self.uncertainty is None else parse_uncertainty(self.uncertainty)
+        return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=intervals)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A question with everything that its answer depends on, looked up once and told to every process."""
+
+    question: Question
+    identity: Mapping[str, Any]  # plain data
+    knows: Mapping[str, Knowledge]  # by agent
+    policies: Mapping[str, Mapping[str, str]]  # by agent: vehicle's name -> SHA-256 of its policy
+    limits: bool  # the best known harm of its worlds is looked up
+    because: str | None  # why nothing is proven for its worlds; None where something is
+
+    @property
+    def sha256(self) -> str:
+        """Of the identity: answers belong together where it is the same."""
+        return hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()
+
+
+def ask(question: Question) -> Asked:
+    """Look up what a question is about: hashes of scenario, policies and user files, versions, and what is proven.
+
+    Raises what ``Question.lineup`` raises.
+    """
+    lineup, scenario = question.lineup(), question.scenario
+    teams = {name: team_of(agent, scenario.learners) for name, agent in lineup.items()}
+    knows = {name: knowledge_of(team) for name, team in teams.items()}
+    policies = {
+        name: policies_by_name(
+            {vehicle: sha for vehicle, agent in team.drivers.items() if (sha := policy_sha256(agent)) is not None},
+            scenario,
+        )
+        for name, team in teams.items()
+    }
+    ends = sorted({0, max(question.episodes - _TRIED, 0)})
+    found = [
+        known_limits(scenario.sample(min(_TRIED, question.episodes), question.seed, first=k).worlds, question.task)
+        for k in ends
+    ]
+    because = next((each.because for each in found if isinstance(each, Unproven)), None)
+    identity = {
+        "format": 1,
+        "scenario": scenario.name,
+        "scenario_sha256": scenario_sha256(scenario),
+        "seed": question.seed,
+        "episodes": question.episodes,
+        "agents": list(lineup),
+        "policy_sha256": policies,
+        "knows": {name: knowledge_text(each) for name, each in knows.items()},
+        "harm_count": question.harm_count,
+        "uncertainty": question.uncertainty,
+        "objectives": list(question.objectives),
+        "metrics": sorted(METRICS),
+        "versions": result_versions(),
+    }
+    limits = all(not isinstance(each, Unproven) and bool(each.known.all()) for each in found)
+    return Asked(question, identity, knows, policies, limits, because)
+
+
+def shard_bounds(episodes: int, shards: int) -> list[tuple[int, int]]:
+    """First world and end of every shard: as equal as whole leaves allow, and no more shards than there are leaves."""
+    check_whole_number("shards", shards, 1)
+    leaves = -(-episodes // LEAF)
+    shards = min(shards, leaves)
+    ends = [min(leaves * k // shards * LEAF, episodes) for k in range(shards + 1)]
+    return list(pairwise(ends))
+
+
+_LINEUPS: dict[str, Mapping[str, Driver]] = {}  # of this process; an evaluation drives copies
+
+
+def answer_shard(asked: Asked, first: int, end: int, rows: Path | None = None, block: int = BLOCK) -> Tally:
+    """The statistics of worlds ``first`` to ``end - 1``; depends on nothing else, and ``block`` changes no bit.
+
+    Args:
+        asked: the question.
+        first: a multiple of ``LEAF``.
+        end: another one, or the end of the list.
+        rows: also write one row per world and agent to this Parquet file.
+        block: worlds advanced together, a multiple of ``LEAF``.
+
+    Raises ``InvalidInput`` for a policy that is not the one that was asked about, and what driving raises.
+
+    """
+    if first % LEAF or block % LEAF or not (end % LEAF == 0 or end == asked.question.episodes) or not first < end:
+        raise InvalidInput(f"shard from {first} to {end} in blocks of {block}: must be whole leaves of {LEAF:,} worlds")
+    lineup = _lineup_of(asked)
+    starts = range(first, end, block)
+    work = partial(_answer_block, asked, lineup)
+    if rows is None:
+        return reduce(add, (work(k, min(k + block, end), None) for k in starts), Tally())
+    with rows_file(rows, asked.question.objectives) as write:
+        return reduce(add, (work(k, min(k + block, end), write) for k in starts), Tally())
+
+
+def _lineup_of(asked: Asked) -> Mapping[str, Driver]:
+    """The agents in this process, once."""
+    if asked.sha256 not in _LINEUPS:
+        here = ask(asked.question)
+        if here.sha256 != asked.sha256:
+            changed = sorted(key for key in asked.identity if here.identity.get(key) != asked.identity[key])
+            raise InvalidInput(f"shards: {', '.join(changed)} changed since the evaluation began; begin it again")
+        _LINEUPS[asked.sha256] = asked.question.lineup()
+    return _LINEUPS[asked.sha256]
+
+
+def _answer_block(
+    asked: Asked, lineup: Mapping[str, Driver], first: int, end: int, write: Callable[[Evaluation], None] | None
+) -> Tally:
+    """The statistics of worlds that are advanced together."""
+    question = asked.question
+    sample = question.scenario.sample(end - first, question.seed, first=first)
+    evaluation, left_out = evaluate_block(sample, lineup, scenario=question.scenario, seed=question.seed)
+    if evaluation is None:
+        return Tally(left_out=left_out)
+    if write is not None:
+        write(evaluation)
+    worlds = evaluation.worlds
+    ranges = {
+        name: tuple((float(c.min()), float(c.max())) for c in quantity(worlds, name).T)
+        for name in quantity_rules(worlds)
+    }
+    hidden = int(evaluation.hidden.sum())
+    agents = agent_tallies(evaluation, question.objectives, limits=asked.limits)
+    kept = Sample(worlds, evaluation.index, 0)
+    return Tally(worlds.n, hidden, _worlds_hash(kept), ranges, left_out, agents)
+
+
+def _worlds_hash(kept: Sample) -> int:
+    """The sum of the hashes of the leaves; ``Tally`` keeps it modulo 2^256."""
+    leaf = kept.index // LEAF
+    total = 0
+    for number in np.unique(leaf):
+        rows = np.flatnonzero(leaf == number)
+        total += int(worlds_sha256(kept.worlds.take(rows), kept.index[rows]), 16)
+    return total
+
+
+# The table and the results file of a list that was evaluated in shards, from its merged tally alone.
+
+INTERVALS = {"rates": "Clopper-Pearson", "means": "Student's t, of exact sums"}
+
+
+class _Agent:
+    """What one agent did in all worlds of a list; what only some worlds have is not told."""
+
+    def __init__(self, tally: AgentTally, baseline: AgentTally | None, worlds: int) -> None:
+        self._tally, self._baseline, self._worlds = tally, baseline, worlds
+
+    def count(self, name: str) -> int:
+        """Worlds in which something was so."""
+        return self._tally.counts.get(name, 0)
+
+    def share(self, name: str) -> Estimate:
+        """Their share, with the exact interval."""
+        return exact_rate(self.count(name), self._worlds)
+
+    def share_if_counted(self, name: str) -> Estimate | None:
+        """Their share; None where nobody counted, not even to 0."""
+        return self.share(name) if name in self._tally.counts else None
+
+    def _whole(self, tally: AgentTally | None, name: str) -> Moments | None:
+        found = None if tally is None else tally.moments.get(name)
+        return found if found is not None and found.count == self._worlds else None
+
+    def mean(self, name: str) -> Estimate | None:
+        """The mean of a number; None unless every world has it."""
+        found = self._whole(self._tally, name)
+        return None if found is None else mean_of(found)
+
+    def needed(self, name: str) -> Estimate:
+        """The mean of a number that every world has."""
+        return mean_of(self._tally.moments[name])
+
+    def against(self, name: str) -> Estimate | None:
+        """The difference to the baseline, paired by world."""
+        one, other = self._whole(self._tally, name), self._whole(self._baseline, name)
+        if one is None or other is None:
+            return None
+        return mean_of(difference(one, other, self._tally.products[name]))
+
+    def decrease(self, name: str) -> Estimate | None:
+        """1 - mean / the baseline's mean, paired by world."""
+        one, other = self._whole(self._tally, name), self._whole(self._baseline, name)
+        return None if one is None or other is None else decrease_of(one, other, self._tally.products[name])
+
+    def distance(self) -> Distance:
+        """What was avoidable, and how far it stayed from the best known; all None unless that is known everywhere."""
+        if self.count("known") != self._worlds:
+            return Distance()
+        return Distance(
+            unavoidable_rate=self.share_if_counted("unavoidable"),
+            impact_proven_rate=None if self.mean("proven_harm") is None else self.share("impact_proven"),
+            avoidable_collision_rate=self.share_if_counted("avoidable_collisions"),
+            best_known_first=self.mean("best_known_first"),
+            best_known_total=self.mean("best_known_total"),
+            proven_harm=self.mean("proven_harm"),
+            gap_first=self.mean("gap_first"),
+            gap_total=self.mean("gap_total"),
+            regret_first=self.mean(REGRET_NAMES["first"]),
+            regret_total=self.mean(REGRET_NAMES["total"]),
+            realised_first=self.decrease(REGRET_NAMES["first"]),
+            realised_total=self.decrease(REGRET_NAMES["total"]),
+            known_best_share=1.0,
+            below_best_known=self.count("below_best_known"),
+        )
+
+
+def _agents(tally: Tally) -> dict[str, _Agent]:
+    baseline = tally.agents.get(BASELINE)
+    return {name: _Agent(each, baseline, tally.worlds) for name, each in tally.agents.items()}
+
+
+def summarise_shards(asked: Asked, tally: Tally) -> list[SummaryRow]:
+    """One row per agent, as ``summarise``; rates with exact intervals. Raises ``PhysicsError`` if no world is left."""
+    if not tally.worlds:
+        raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})
+    question = asked.question
+    told = {name: _told_range(name, entries) for name, entries in tally.ranges.items()}
+    conditions = parameters_of(question.task, question.seed, tally.worlds, asked.because, told)
+    agents = _agents(tally)
+    return [_row(asked, tally, name, agents[name], conditions) for name in asked.identity["agents"]]
+
+
+def _row(asked: Asked, tally: Tally, name: str, found: _Agent, conditions: dict[str, Any]) -> SummaryRow:
+    question, shoved, hybrid = asked.question, found.mean("shoved_m"), found.count("hybrid") == tally.worlds
+    columns = [column for column in tally.agents[name].moments if column.startswith(COLUMN)]
+    return SummaryRow(
+        agent=name,
+        episodes=tally.worlds,
+        collisions=found.count("collisions"),
+        horizon_ends=found.count("horizon_ends"),
+        collision_rate=found.share("collisions"),
+        first_impact_harm=found.needed(HARM_NAMES["first"]),
+        total_harm=found.needed(HARM_NAMES["total"]),
+        first_difference=found.against(HARM_NAMES["first"]),
+        total_difference=found.against(HARM_NAMES["total"]),
+        first_decrease=found.decrease(HARM_NAMES["first"]),
+        total_decrease=found.decrease(HARM_NAMES["total"]),
+        predicted_harm=found.mean("predicted_harm"),
+        policy_share=found.count("policy") / tally.worlds if hybrid else None,
+        parameters=conditions,
+        distance=found.distance(),
+        shoved_m=shoved,
+        shoved_far=None if shoved is None else found.share("shoved_far"),
+        sampled_harm=found.mean("sampled_harm"),
+        left_out=tally.left_out,
+        beside_paper=is_papers_list(question.scenario, question.seed, question.task.vehicles),
+        knows=asked.knows[name],
+        hidden_share=tally.hidden / tally.worlds,
+        worlds_sha256=f"{tally.worlds_hash:064x}",
+        scenario_sha256=asked.identity["scenario_sha256"],
+        policy_sha256=asked.policies[name],
+        versions=asked.identity["versions"],
+        metrics={column.removeprefix(COLUMN): found.needed(column) for column in columns},
+    )
+
+
+def rescore_shards(asked: Asked, tally: Tally) -> list[Rescored]:
+    """Every agent under every objective of the question and both counts, as ``rescore``."""
+    agents, vehicles = _agents(tally), range(asked.question.scenario.vehicles)
+    return [
+        Rescored(
+            name, each, harm_count, tuple(agents[name].needed(objective_column(each, harm_count, i)) for i in vehicles)
+        )
+        for name in asked.identity["agents"]
+        for harm_count in HARM_COUNTS
+        for each in asked.question.objectives
+    ]
+
+
+def shards_to_json(asked: Asked, tally: Tally, rows: Sequence[SummaryRow]) -> list[dict[str, Any]]:
+    """What a results file holds: one object per agent, each vehicle's harm and the kind of the intervals among it."""
+    question, agents = asked.question, _agents(tally)
+    settings = {"harm_count": question.harm_count, "uncertainty": question.uncertainty}
+    found = results_to_json(rows, told=rescore_shards(asked, tally), settings=settings)
+    names = [f"{name}_{i + 1}" for name in HARM_NAMES.values() for i in range(question.scenario.vehicles)]
+    return [
+        {
+            **row,
+            "kind": "evaluate-shards",
+            "intervals": INTERVALS,
+            "vehicle_harm": estimates_to_json({name: agents[row["agent"]].mean(name) for name in names}),
+        }
+        for row in found
+    ]
+
+
+def _told_range(name: str, entries: Sequence[tuple[float, float]]) -> Any:
+    """As ``conditions.quantities`` tells it."""
+    told = [low if low == high else [low, high] for low, high in entries]
+    return told[0] if DECLARED[name].per == "world" else told

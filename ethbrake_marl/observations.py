@@ -1,0 +1,682 @@
+"""Observations: named features with fixed analytic scalings, the same for every vehicle.
+
+An observation is the vehicle's own features followed by those of its nearest neighbours, front ones first. Each
+feature is ``clip(value / scale, low, high)``. What this vehicle does not know, or a neighbour that is absent, reads 0
+with its ``known`` flag 0. There are no running statistics: an observation means the same in every run. Over a channel
+(``v2x``), ``latency_left`` and what follows from it count the own part of a latency only: nobody knows beforehand when
+news that has not arrived will.
+
+Where an obstacle stands ahead of Vehicle 1 (``observation_for``), the vehicle's place in the line and what it knows of
+the obstacle follow. Vehicle 1 sees it; any other vehicle knows of it as soon as it has Vehicle 1's news.
+
+Where an observation lists the group ``contact``, it is followed by what three forecasts say (``observations.contact``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.advance import (
+    RESTITUTION,
+    TIME,
+    Packed,
+    command_at,
+    gap_at,
+    has_messages,
+    has_news,
+    pack,
+    params_at,
+    speed_at,
+    state_width,
+    unpack,
+    vehicles_in,
+)
+from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.forecast import CONTACT_CLOSING, CONTACT_ROWS, CONTACT_TIME, forecast_contacts
+from ethbrake_marl.physics.kernel import (
+    COMMAND,
+    DONE,
+    FAR_AWAY_M,
+    FIRST_HARM,
+    GAP,
+    HIT,
+    LIMIT,
+    MASS,
+    ONSET,
+    SPEED,
+    TABLE_ROWS,
+    TOTAL_HARM,
+    place_obstacle,
+    stopping_distance,
+)
+from ethbrake_marl.physics.messages import estimate_rows
+from ethbrake_marl.physics.worlds import known_at_once, read_only
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario.features import (
+    CONTACT_COMMANDS,
+    CONTACT_FAR_FEATURES,
+    CONTACT_FEATURES,
+    CONTACT_SIDES,
+    MOST_NEIGHBOURS,
+    NEIGHBOUR_FEATURES,
+    OBSTACLE_FEATURES,
+    OWN_FEATURES,
+    ROLE_FEATURES,
+    Feature,
+    RegisteredFeature,
+    checked_values,
+    feature_named,
+    listed_features,
+    register_feature,
+    registered_in,
+    side_of,
+)
+
+# The features that an observation holds, in order.
+
+
+@dataclass(frozen=True, slots=True)
+class ObservationSpec:
+    """How many neighbours an observation holds on each side, and whether place, obstacle and contacts follow.
+
+    With ``chosen`` it holds these features alone, in this order; ``choose_observation`` makes such a one.
+
+    >>> import ethbrake_marl as eb
+    >>> spec = eb.ObservationSpec(front=2, rear=0)
+    >>> spec.size, spec.features[7].name
+    (27, 'front_1.known')
+    >>> eb.choose_observation(["own", "front_1.gap"]).size
+    8
+
+    """
+
+    front: int = 1  # neighbours ahead, 0 to 64
+    rear: int = 1  # neighbours behind
+    role: bool = False  # ROLE_FEATURES
+    obstacle: bool = False  # OBSTACLE_FEATURES
+    chosen: tuple[str, ...] = ()  # full names; the other fields say how far these look
+    contact: bool = False  # CONTACT_FEATURES; those of contact_far must be chosen
+    time_step_s: float | None = None  # between two decisions; contact features need it, others do not look at it
+
+    def __post_init__(self) -> None:
+        """Refuse what is not a number of neighbours, and features that the rest does not fit."""
+        for side, count in (("front", self.front), ("rear", self.rear)):
+            whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+            if not whole or not 0 <= count <= MOST_NEIGHBOURS:
+                raise InvalidInput(f"observation: {side} = {count!r}; must be a whole number in 0..{MOST_NEIGHBOURS}")
+        for name, shown in (("role", self.role), ("obstacle", self.obstacle), ("contact", self.contact)):
+            if not isinstance(shown, bool):
+                raise InvalidInput(f"observation: {name} = {shown!r}; must be True or False")
+        if self.time_step_s is not None and not 0.0 < self.time_step_s < math.inf:
+            raise InvalidInput(f"observation: time_step_s = {self.time_step_s!r}; must be a positive number of seconds")
+        if self.chosen and _reach(self.chosen) != (self.front, self.rear, self.role, self.obstacle, self.contact):
+            raise InvalidInput("observation: chosen: the other fields do not fit; use eb.choose_observation([...])")
+
+    @property
+    def sides(self) -> tuple[tuple[str, int], ...]:
+        """Neighbours as (prefix, offset in the line), front ones first, nearest first."""
+        fronts = tuple((f"front_{k}", -k) for k in range(1, self.front + 1))
+        return fronts + tuple((f"rear_{k}", k) for k in range(1, self.rear + 1))
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """Every number of an observation in order; names are unique (``own.speed``, ``front_1.gap``)."""
+        return tuple(feature_named(name) for name in self.chosen) or self.whole
+
+    @property
+    def whole(self) -> tuple[Feature, ...]:
+        """The same with all built-in features of every group that it looks at."""
+        groups = [("own", OWN_FEATURES), *((prefix, NEIGHBOUR_FEATURES) for prefix, _ in self.sides)]
+        groups += [("role", ROLE_FEATURES)] if self.role else []
+        groups += [("obstacle", OBSTACLE_FEATURES)] if self.obstacle else []
+        groups += [("contact", CONTACT_FEATURES)] if self.contact else []
+        groups += [("contact_far", CONTACT_FAR_FEATURES)] if self.far else []
+        return tuple(
+            Feature(f"{prefix}.{f.name}", f.unit, f.scale, f.low, f.high, f.meaning)
+            for prefix, group in groups
+            for f in group
+        )
+
+    @property
+    def far(self) -> bool:
+        """Whether any of CONTACT_FAR_FEATURES is chosen."""
+        return any(name.startswith("contact_far.") for name in self.chosen)
+
+    @property
+    def size(self) -> int:
+        """Length F of an observation."""
+        further = self.role * len(ROLE_FEATURES) + self.obstacle * len(OBSTACLE_FEATURES)
+        further += self.contact * len(CONTACT_FEATURES)
+        return len(self.chosen) or len(OWN_FEATURES) + (self.front + self.rear) * len(NEIGHBOUR_FEATURES) + further
+
+    def at_steps_of(self, time_step_s: float) -> ObservationSpec:
+        """The same for decisions every ``time_step_s`` (s), where it needs to know and does not say so itself."""
+        return replace(self, time_step_s=time_step_s) if self.contact and self.time_step_s is None else self
+
+
+Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # or a list of groups and features, or the fields
+
+
+def choose_observation(listed: Observation, time_step_s: float | None = None) -> ObservationSpec:
+    """The observation of a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
+
+    A mapping names the fields of an ``ObservationSpec``, which is what JSON makes of one. ``time_step_s`` (s) is the
+    time between two decisions; an environment knows its own, so only who observes without one gives it, for contact
+    features. Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no such list.
+    """
+    spec = _spec_of(listed)
+    return spec if time_step_s is None else spec.at_steps_of(time_step_s)
+
+
+def _spec_of(listed: Observation) -> ObservationSpec:
+    if isinstance(listed, ObservationSpec):
+        return listed
+    if isinstance(listed, Mapping):
+        return _spec_of_fields(listed)
+    names = listed_features(listed)
+    front, rear, role, obstacle, contact = _reach(names)
+    usual = ObservationSpec(front, rear, role, obstacle, contact=contact)
+    if tuple(feature.name for feature in usual.features) == names:
+        return usual
+    return replace(usual, chosen=names)
+
+
+def _spec_of_fields(given: Mapping[str, Any]) -> ObservationSpec:
+    known = [field.name for field in fields(ObservationSpec)]
+    for name in given:
+        if name not in known:
+            raise unknown_name("observation", name, known)
+    chosen = given.get("chosen", ())
+    if not isinstance(chosen, list | tuple):
+        raise InvalidInput(f"observation: chosen = {chosen!r}; must be a list of features")
+    return ObservationSpec(**{**given, "chosen": listed_features(chosen) if chosen else ()})
+
+
+def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
+    """How far features look: neighbours in front and behind, the own place, the obstacle, contacts."""
+    sides = [side for name in names if (side := side_of(name)) is not None]
+    front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
+    groups = {name.partition(".")[0] for name in names}
+    return front, rear, "role" in groups, "obstacle" in groups, bool(groups & {"contact", "contact_far"})
+
+
+def observation_for(scenario: Scenario) -> ObservationSpec:
+    """What vehicles observe in this scenario unless somebody says otherwise: what it declares.
+
+    Where it declares nothing: one neighbour on each side; where Vehicle 1 has an obstacle ahead, also the own place in
+    the line and the obstacle.
+    """
+    if scenario.observation is not None:
+        return choose_observation(scenario.observation, scenario.time_step_s)
+    return ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)
+
+
+# The contact features: what three forecasts of the vehicle's own command say of its next impacts.
+#
+# The vehicle looks at the part of the line around it whose news it has, as its other features tell it. It goes on, once
+# its own latency has elapsed, with full braking, coasting or full driving. Every other vehicle of that part goes on
+# with
+# the command that is observed of it; one of which none is in force brakes fully as soon as its latency has elapsed.
+
+FORECAST_S = 10.0  # how far the forecasts look; also the time to an impact that never comes
+_OF_PAIR, _HARMS = 4, 2  # numbers of each pair; of the line
+_OF_COMMAND = len(CONTACT_SIDES) * _OF_PAIR + _HARMS
+_NEAR = len(CONTACT_COMMANDS) * _OF_COMMAND  # columns of contact; behind them are those of contact_far
+_FAR = len(CONTACT_SIDES) + _HARMS  # numbers of contact_far for each command
+
+
+class Contacts(NamedTuple):
+    """Which contact features are wanted, and how they are scaled."""
+
+    time_step_s: float  # between two decisions
+    commands: Ints  # those to forecast, as places in CONTACT_COMMANDS
+    features: Floats  # [3, 30], with far [3, 42]: 1 / scale, low, high of every contact feature
+
+
+def contacts_of(names: set[str], time_step_s: float | None, *, far: bool = False) -> Contacts:
+    """What to forecast for these contact features (names in their groups); ``far``: contact_far too.
+
+    Raises ``InvalidInput`` without a time step.
+    """
+    if time_step_s is None:
+        raise InvalidInput(
+            "observation: contact features need the time between two decisions; give it as time_step_s, for instance"
+            " eb.choose_observation([...], time_step_s=scenario.time_step_s)"
+        )
+    wanted = [c for c, command in enumerate(CONTACT_COMMANDS) if any(n.startswith(f"{command}_") for n in names)]
+    features = CONTACT_FEATURES + CONTACT_FAR_FEATURES if far else CONTACT_FEATURES
+    scaling = [[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]]
+    return Contacts(time_step_s, np.array(wanted, np.int64), np.array(scaling))
+
+
+def observe_contacts(state: Floats, params: Floats, vehicles: Ints, contacts: Contacts) -> NDArray[np.float32]:
+    """All contact features of several vehicles in worlds given as rows of ``physics.rows``, scaled, [n, vehicles, C].
+
+    C is 30, and 42 with those of contact_far.
+
+    Those of commands that are not wanted are 0. Raises ``PhysicsError`` naming the worlds in which a forecast failed.
+    """
+    found = np.zeros((len(state), len(vehicles), contacts.features.shape[1]), np.float32)
+    failed = np.zeros(len(state), np.bool_)
+    _observe_contacts(state, params, vehicles, *contacts, found, failed)
+    if failed.any():
+        reason = f"a forecast of contacts could not look {FORECAST_S:g} s ahead"
+        raise PhysicsError({k: reason for k in np.flatnonzero(failed).tolist()})
+    return found
+
+
+@compiled
+def _observe_contacts(
+    state: Floats, params: Floats, observers: Ints, time_step: float, commands: Ints, features: Floats,
+    out: NDArray[np.float32], failed: Bools,
+) -> None:  # fmt: skip
+    """Fill ``out``, and ``failed`` [n] where a check of the kernel failed."""
+    N = vehicles_in(state)
+    at = 1 if state.shape[1] > state_width(N) else 0  # vehicle i stands in column at + i, behind an obstacle
+    line, table = np.zeros((TABLE_ROWS, N + at)), np.zeros((TABLE_ROWS, N + at))
+    found, value = np.zeros((CONTACT_ROWS, N + at)), np.zeros(_OF_COMMAND + _FAR)
+    braking, driving = params_at(0, N), params_at(1, N)
+    for k in range(out.shape[0]):
+        for o in range(observers.shape[0]):
+            i = observers[o]
+            first, last = _place_known(line, state, params, k, i, at)
+            for c in commands:
+                for j in range(N + at):
+                    for row in (SPEED, COMMAND, MASS, LIMIT, ONSET, GAP, HIT):
+                        table[row, j] = line[row, j]
+                table[COMMAND, at + i] = 0.0
+                if c == 0:
+                    table[COMMAND, at + i] = -params[k, braking + i]
+                elif c == 2:
+                    table[COMMAND, at + i] = params[k, driving + i]
+                if forecast_contacts(table, params[k, RESTITUTION], FORECAST_S, found) != DONE:
+                    failed[k] = True
+                    break
+                _tell(table, found, at + i, first, last, time_step, value)
+                for f in range(_OF_COMMAND + _FAR if out.shape[2] > _NEAR else _OF_COMMAND):
+                    column = c * _OF_COMMAND + f if f < _OF_COMMAND else _NEAR + c * _FAR + f - _OF_COMMAND
+                    scaled = value[f] * features[0, column]
+                    out[k, o, column] = min(max(scaled, features[1, column]), features[2, column])
+
+
+@compiled
+def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, at: int) -> tuple[int, int]:
+    """Write world k, as vehicle i knows it, into a table; its first and last columns that are known.
+
+    Whoever is not known stands far away. Where an obstacle is known, it is the first column.
+    """
+    N = vehicles_in(state)
+    speed, command, gap = speed_at(N), command_at(N), gap_at(N)
+    braking, latency, mass, limit, news = (
+        params_at(0, N), params_at(2, N), params_at(3, N), params_at(4, N), params_at(6, N),
+    )  # fmt: skip
+    by_link, time = has_news(params, N), state[k, TIME]
+    own_part = params_at(5, N) if by_link else latency
+    first, last = i, i
+    while first > 0 and time >= params[k, news + i * N + first - 1 if by_link else latency + i]:
+        first -= 1
+    while last < N - 1 and time >= params[k, news + i * N + last + 1 if by_link else latency + i]:
+        last += 1
+    for j in range(N):
+        known = first <= j <= last
+        in_force = state[k, command + j]
+        table[SPEED, at + j] = state[k, speed + j] if known else 0.0
+        table[MASS, at + j] = params[k, mass + j]
+        table[LIMIT, at + j] = params[k, limit + j]
+        table[ONSET, at + j] = 0.0
+        table[COMMAND, at + j] = in_force if known else 0.0
+        if j == i or in_force == 0.0:
+            table[ONSET, at + j] = max(params[k, own_part + j] - time, 0.0)
+            table[COMMAND, at + j] = -params[k, braking + j] if known else 0.0
+        if j < N - 1:
+            table[GAP, at + j] = state[k, gap + j] if first <= j < last else FAR_AWAY_M
+            table[HIT, at + j] = state[k, gap + N - 1 + j]
+    if at == 1:
+        obstacle = state_width(N)
+        seen = first == 0 and state[k, obstacle] < math.inf
+        place_obstacle(table, state[k, obstacle] if seen else FAR_AWAY_M, state[k, obstacle + 1])
+        return (0 if seen else 1 + first), 1 + last
+    return first, last
+
+
+@compiled
+def _tell(table: Floats, found: Floats, own: int, first: int, last: int, time_step: float, value: Floats) -> None:
+    """The numbers of one forecast before scaling; 0 for a pair whose other vehicle is not known, or not there.
+
+    An impact at the very end of a decision step belongs to that step, as in the engine.
+    """
+    for side in range(2):
+        p, at = own - 1 + side, side * _OF_PAIR
+        if not first <= p < last:
+            for f in range(_OF_PAIR):
+                value[at + f] = 0.0
+            continue
+        time = found[CONTACT_TIME, p]
+        met = time < math.inf
+        steps = (time if met else FORECAST_S) / time_step
+        whole = max(math.ceil(steps) - 1.0, 0.0)
+        value[at] = time if met else FORECAST_S
+        value[at + 1] = found[CONTACT_CLOSING, p]
+        value[at + 2] = steps - whole if met else 0.0
+        value[at + 3] = whole
+    first_harm, total_harm = 0.0, 0.0
+    for p in range(first, last):
+        first_harm += table[FIRST_HARM, p]
+        total_harm += table[TOTAL_HARM, p]
+    value[2 * _OF_PAIR] = first_harm
+    value[2 * _OF_PAIR + 1] = total_harm
+    value[_OF_COMMAND], value[_OF_COMMAND + 1] = value[0], value[_OF_PAIR]
+    value[_OF_COMMAND + 2], value[_OF_COMMAND + 3] = math.sqrt(first_harm), math.sqrt(total_harm)
+
+
+# From worlds to observations: compiled loops over the built-in features, then the functions of registered ones.
+
+Observations = NDArray[np.float32]
+
+_OWN, _NEIGHBOUR = len(OWN_FEATURES), len(NEIGHBOUR_FEATURES)
+_ROLE, _OBSTACLE = len(ROLE_FEATURES), len(OBSTACLE_FEATURES)
+
+
+def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
+    """Observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in its own memory."""
+    if not 0 <= vehicle < worlds.N:
+        raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{worlds.N - 1}")
+    packed = pack(worlds)
+    return observe_packed(packed.state, packed.params, np.array([vehicle]), plan_of(spec))[:, 0].copy()
+
+
+class Scaling(NamedTuple):
+    """The groups of a specification as the kernel wants them."""
+
+    offsets: Ints  # of the neighbours in the line
+    role: bool
+    obstacle: bool
+    features: Floats  # [3, F] 1 / scale, low, high
+
+
+class Extra(NamedTuple):
+    """A registered feature in an observation."""
+
+    column: int
+    entry: RegisteredFeature
+    offset: int  # of the neighbour in the line; 0: its own
+    known: int  # column of the neighbour's ``known`` in the whole groups
+
+
+class Plan(NamedTuple):
+    """How an observation is made: by kernels, which fill whole groups, and by functions of registered features."""
+
+    scaling: Scaling
+    contacts: Contacts | None  # their group is the last one; None: it holds none
+    picked: Ints | None  # [F] columns of the whole groups; None: all of them
+    extras: tuple[Extra, ...]
+
+
+def plan_of(spec: ObservationSpec) -> Plan:
+    """Offsets of the neighbours and scaling of every feature, in order; what is picked, and what is added.
+
+    Made once for each specification, not to be changed.
+    """
+    return _plan(spec, tuple(registered_in(spec.chosen).items()) if spec.chosen else ())
+
+
+@cache
+def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature], ...]) -> Plan:
+    whole, entries = spec.whole, dict(registered)
+    usual = whole[: len(whole) - spec.contact * len(CONTACT_FEATURES) - spec.far * len(CONTACT_FAR_FEATURES)]
+    scaling = Scaling(
+        np.array([offset for _, offset in spec.sides], np.int64),
+        spec.role,
+        spec.obstacle,
+        np.array([[1.0 / f.scale for f in usual], [f.low for f in usual], [f.high for f in usual]]),
+    )
+    contacts = _contacts(spec) if spec.contact else None
+    if not spec.chosen:
+        return Plan(scaling, contacts, None, ())
+    place, offsets = {feature.name: c for c, feature in enumerate(whole)}, dict(spec.sides)
+    extras = []
+    for column, name in enumerate(spec.chosen):
+        if name not in place:
+            side, _, own = name.rpartition(".")
+            extras.append(Extra(column, entries[own], offsets.get(side, 0), place.get(f"{side}.known", 0)))
+    picked = np.array([place.get(name, 0) for name in spec.chosen], np.int64)
+    return Plan(scaling, contacts, picked, tuple(extras))
+
+
+def _contacts(spec: ObservationSpec) -> Contacts:
+    inside = (name.partition(".") for name in spec.chosen or (feature.name for feature in spec.whole))
+    names = {own for group, _, own in inside if group in ("contact", "contact_far")}
+    return contacts_of(names, spec.time_step_s, far=spec.far)
+
+
+def observe_packed(
+    state: Floats, params: Floats, vehicles: Ints, plan: Plan, steps: Floats | None = None
+) -> Observations:
+    """Observations of several vehicles in worlds given as rows of ``physics.rows``, [n, len(vehicles), F].
+
+    ``steps`` [n] is how many steps each world has made, for error texts. Over a channel of periodic messages a vehicle
+    sees the worlds as it takes them to be (``physics.estimates``).
+    """
+    if not has_messages(state, params):
+        return _observe_present(state, params, vehicles, plan, steps)
+    estimate, seen = np.empty(state.shape), []
+    for vehicle in vehicles.tolist():
+        estimate_rows(state, params, vehicle, estimate)
+        seen.append(_observe_present(estimate, params, np.array([vehicle]), plan, steps))
+    return np.concatenate(seen, axis=1)
+
+
+def _observe_present(state: Floats, params: Floats, vehicles: Ints, plan: Plan, steps: Floats | None) -> Observations:
+    """The same where everything known is known as it is."""
+    whole = np.empty((len(state), len(vehicles), plan.scaling.features.shape[1]), np.float32)
+    _observe_rows(state, params, vehicles, *plan.scaling, whole)
+    if plan.contacts is not None:
+        whole = np.concatenate([whole, observe_contacts(state, params, vehicles, plan.contacts)], axis=2)
+    if plan.picked is None:
+        return whole
+    observation: Observations = whole.take(plan.picked, axis=2)
+    if plan.extras:
+        _add_extras(observation, whole, read_only(unpack(Packed(state, params))), vehicles, plan.extras, steps)
+    return observation
+
+
+def _add_extras(
+    out: Observations, whole: Observations, worlds: Worlds, vehicles: Ints, extras: Sequence[Extra],
+    steps: Floats | None,
+) -> None:  # fmt: skip
+    """Fill the columns of registered features; one of a neighbour tells where the kernel says that it is known."""
+    for extra in extras:
+        for o, vehicle in enumerate(vehicles.tolist()):
+            neighbour = vehicle + extra.offset if extra.offset else None
+            counts = np.ones(worlds.n, np.bool_) if neighbour is None else whole[:, o, extra.known] == 1.0
+            if counts.any():
+                values = checked_values(extra.entry, worlds, vehicle, neighbour, counts, steps)
+            else:  # nobody is there, or nobody is heard
+                values = extra.entry.scaled(np.full(worlds.n, extra.entry.unknown))
+            out[:, o, extra.column] = values
+
+
+@compiled
+def _observe_rows(  # noqa: C901
+    state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, features: Floats,
+    out: Observations,
+) -> None:  # fmt: skip
+    """Fill ``out`` with the clipped features of each observer, in the order of the lists of features above.
+
+    One long loop on purpose: handing these arrays on to functions made it four times as slow.
+    """
+    N = vehicles_in(state)
+    speed, command, gap_column = speed_at(N), command_at(N), gap_at(N)
+    hit = gap_column + N - 1
+    braking, driving, latency, mass = params_at(0, N), params_at(1, N), params_at(2, N), params_at(3, N)
+    news, obstacle = params_at(6, N), state_width(N)
+    by_link, some_obstacle = has_news(params, N), state.shape[1] > obstacle
+    own_part = params_at(5, N) if by_link else latency  # of vehicle j's latency: own_part + j
+    value = np.zeros(out.shape[2])
+    for k in range(out.shape[0]):
+        time = state[k, TIME]
+        for o in range(observers.shape[0]):
+            i = observers[o]
+            own_speed, own_latency = state[k, speed + i], max(params[k, own_part + i] - time, 0.0)
+            own_stop = stopping_distance(own_speed, own_latency, params[k, braking + i])
+            value[0] = own_speed
+            value[1] = state[k, command + i]
+            value[2] = params[k, braking + i]
+            value[3] = params[k, driving + i]
+            value[4] = params[k, mass + i]
+            value[5] = own_latency
+            value[6] = params[k, RESTITUTION]
+            c = _OWN
+            for offset in offsets:
+                j = i + offset
+                if not (0 <= j < N and time >= params[k, news + i * N + j if by_link else latency + i]):
+                    for absent in range(c, c + _NEIGHBOUR):
+                        value[absent] = 0.0
+                    c += _NEIGHBOUR
+                    continue
+                gap = 0.0
+                for p in range(min(i, j), max(i, j)):
+                    gap += state[k, gap_column + p]
+                in_front = j < i
+                other_speed = state[k, speed + j]
+                other_latency = max(params[k, own_part + j] - time, 0.0)
+                other_stop = stopping_distance(other_speed, other_latency, params[k, braking + j])
+                room = gap + other_stop if in_front else other_stop - gap
+                value[c] = 1.0
+                value[c + 1] = gap
+                value[c + 2] = own_speed - other_speed if in_front else other_speed - own_speed
+                value[c + 3] = state[k, command + j]
+                value[c + 4] = params[k, braking + j]
+                value[c + 5] = params[k, mass + j]
+                value[c + 6] = other_latency
+                value[c + 7] = state[k, hit + (i - 1 if in_front else i)]
+                value[c + 8] = gap + other_stop - own_stop if in_front else gap + own_stop - other_stop
+                value[c + 9] = _fitting_deceleration(own_speed, own_latency, room)
+                c += _NEIGHBOUR
+            if role:
+                value[c] = i
+                value[c + 1] = N - 1 - i
+                c += _ROLE
+            if with_obstacle:
+                told = i == 0 or time >= params[k, news + i * N if by_link else latency + i]
+                for absent in range(c, c + _OBSTACLE):
+                    value[absent] = 0.0
+                if told and some_obstacle and state[k, obstacle] < math.inf:
+                    gap = state[k, obstacle]
+                    for p in range(i):
+                        gap += state[k, gap_column + p]
+                    value[c] = 1.0
+                    value[c + 1] = gap
+                    value[c + 2] = state[k, obstacle + 1]
+                    value[c + 3] = gap - own_stop
+                    value[c + 4] = _fitting_deceleration(own_speed, own_latency, gap)
+            for c in range(out.shape[2]):
+                out[k, o, c] = min(max(value[c] * features[0, c], features[1, c]), features[2, c])
+
+
+@compiled
+def _fitting_deceleration(speed: float, latency_left: float, room: float) -> float:
+    """Constant deceleration that uses up exactly ``room`` after the own latency: ``v^2 / (2 (room - v tau))``.
+
+    Room below 1 mm counts as 1 mm. Without room it therefore reads as the upper clipping bound (20 m/s2) from 0.2 m/s
+    on, and lower for a slower vehicle; at rest it is 0.
+    """
+    speed = max(speed, 0.0)
+    left = max(room - speed * latency_left, 1e-3)
+    return speed * speed / (2.0 * left)
+
+
+__all__ = [
+    "CONTACT_FEATURES",
+    "NEIGHBOUR_FEATURES",
+    "OBSTACLE_FEATURES",
+    "OWN_FEATURES",
+    "ROLE_FEATURES",
+    "Feature",
+    "Observation",
+    "ObservationSpec",
+    "Observations",
+    "choose_observation",
+    "observation_for",
+    "observe",
+    "observe_packed",
+    "plan_of",
+    "register_feature",
+]
+
+
+# The full state of a line as one vector, for centralised critics: all vehicles, all pairs, the time.
+#
+# It reuses the features of ``observations`` and hides nothing: no latency keeps a value from a critic. Rows of learners
+# may end with it, or with the learner's place among the learners (``appended``).
+
+Appended = Literal["number", "state"]  # what a row holds behind the vehicle's own observation
+
+_OWN_ONLY = ObservationSpec(front=0, rear=0)
+_PAIR_MEANING = {"gap": "free distance between the two", "hit": "1 if the pair has had an impact"}
+_OBSTACLE_FEATURES = tuple(
+    replace(f, name=f"obstacle.{f.name}", meaning=meaning)
+    for f in OBSTACLE_FEATURES
+    for name, meaning in (("gap", "distance from Vehicle 1 to the obstacle"), ("hit", f.meaning))
+    if f.name == name
+)
+_PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in NEIGHBOUR_FEATURES if f.name in _PAIR_MEANING)
+
+
+def state_features(scenario: Scenario) -> tuple[Feature, ...]:
+    """Every number of the state in order: each vehicle's own features, each pair's gap and hit flag, the time.
+
+    Where there is an obstacle ahead of Vehicle 1, its gap and hit flag follow.
+    """
+    vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in OWN_FEATURES]
+    pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
+    time = Feature("time", "s", scenario.horizon_s, 0.0, 1.0, "time since Vehicle 1 began to brake; scale: the horizon")
+    obstacle = _OBSTACLE_FEATURES if scenario.has_obstacle else ()
+    return (*vehicles, *pairs, time, *obstacle)
+
+
+def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
+    """State of every world, [n, S] float32 in its own memory; S = 7 N + 2 P + 1, and 2 more with an obstacle ahead."""
+    latency = worlds.vehicles.latency_s  # whole, with what a channel has drawn
+    whole_latency = replace(worlds.vehicles, own_latency_s=latency, known_from_s=known_at_once(latency))
+    vehicles = [observe(replace(worlds, vehicles=whole_latency), i, _OWN_ONLY) for i in range(worlds.N)]
+    pair_values = {"gap": worlds.gaps_m, "hit": worlds.pair_hit.astype(np.float64)}
+    columns = [pair_values[f.name][:, p] for p in range(worlds.N - 1) for f in _PAIR_FEATURES]
+    columns.append(worlds.time_s)
+    if scenario.has_obstacle:
+        columns += [worlds.obstacle_gap_m, worlds.obstacle_hit.astype(np.float64)]
+    features = state_features(scenario)[-len(columns) :]
+    rest = [np.clip(c / f.scale, f.low, f.high) for c, f in zip(columns, features, strict=True)]
+    return np.concatenate([*vehicles, np.stack(rest, axis=1)], axis=1, dtype=np.float32)
+
+
+def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: Scenario) -> tuple[Feature, ...]:
+    """Every number of a learner's row in order; raises ``InvalidInput`` for another word than ``Appended`` has."""
+    if appended not in (None, *get_args(Appended)):
+        raise InvalidInput(f"appended = {appended!r}: must be {' or '.join(get_args(Appended))}, or None")
+    if appended is None:
+        return own
+    if appended == "state":
+        return (*own, *state_features(scenario))
+    last = len(scenario.learners) - 1
+    return (*own, Feature("learner", "1", 1.0, 0.0, float(max(last, 1)), "the learner's place among the learners"))
+
+
+def appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
+    """What stands behind the own observation of one learner, from worlds and vehicle: [n, features]."""
+
+    def number(worlds: Worlds, vehicle: int) -> Observations:
+        if vehicle not in scenario.learners:
+            raise InvalidInput(f"appended = 'number': vehicle_{vehicle + 1} is no learner of {scenario.name!r}")
+        return np.full((worlds.n, 1), scenario.learners.index(vehicle), np.float32)
+
+    return number if appended == "number" else lambda worlds, _: full_state(worlds, scenario)

@@ -1,1 +1,0 @@
-"""Independent jobs: in processes of this machine or on a Ray cluster, tried again where one is lost."""

@@ -1,1 +1,0 @@
-"""Sweeps: many independent trainings from one file, and one table of what they reached."""
