@@ -46,9 +46,6 @@ def estimates_to_json(estimates: Mapping[str, Estimate | None]) -> dict[str, Any
     return found
 
 
-Cell = Estimate | float | int | str | None
-
-
 class Shown(NamedTuple):
     """A cell in words."""
 
@@ -59,6 +56,9 @@ class Shown(NamedTuple):
     def in_words(self) -> str:
         """In one line: ``24.19 [23.85, 24.53]``."""
         return f"{self.value} [{self.interval}]" if self.interval else self.value
+
+
+Cell = Estimate | Shown | float | int | str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +86,8 @@ class Column:
 
     def show(self, cell: Cell) -> Shown:
         """A cell of this column in words."""
-        if cell is None:
-            return Shown(DASH)
+        if cell is None or isinstance(cell, Shown):
+            return cell or Shown(DASH)
         if isinstance(cell, str | int):
             return Shown(str(cell))
         if not isinstance(cell, Estimate):
@@ -134,6 +134,11 @@ class Sheet:
         """Of its columns."""
         return [column.heading for column in self._columns()]
 
+    @property
+    def names(self) -> list[str]:
+        """Of its columns, in CSV and JSON."""
+        return [column.name for column in self._columns()]
+
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
         """Its rows in words, each of as many cells as there are columns; sections are their names."""
         columns = self._columns()
@@ -153,7 +158,9 @@ class Sheet:
     def filled(self) -> list[int]:
         """Numbers of the columns in which some row has a value; all of them without rows."""
         rows = [row for row in self.rows if not isinstance(row, str)]
-        return [k for k in range(len(self.columns)) if not rows or any(row[k] not in (None, DASH) for row in rows)]
+        return [
+            k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
+        ]
 
     def rich(self, width: int = WIDE) -> RenderableType:
         """For a terminal of this width, the note below; all lines of a cell but its first are dim."""
