@@ -36,7 +36,7 @@ def state(**given):
     at = np.zeros(LINE.WIDTH)
     at[LINE.OBSTACLE] = math.inf
     for name, value in given.items():
-        at[getattr(lower_bound, name)] = value
+        at[getattr(LINE, name)] = value
     return at
 
 
