@@ -24,8 +24,7 @@ from ethbrake_marl.evaluation.statistics import (
     moments,
 )
 from ethbrake_marl.files.sheet import Column
-from ethbrake_marl.limits.best_harm import shipped_tables, world_identity
-from ethbrake_marl.limits.best_harm_table import BestHarmTable
+from ethbrake_marl.limits.best_harm import BestHarmTable, shipped_tables, world_identity
 from ethbrake_marl.limits.limits import Limits, Unproven, prove, unproven_because
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, leaving_out_failed, make_worlds
 from ethbrake_marl.physics.worlds import read_only
