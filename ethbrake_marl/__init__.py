@@ -100,7 +100,7 @@ if TYPE_CHECKING:
 
     # Registration of your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent
-    from ethbrake_marl.evaluation.harm_metrics import register_harm_metric as register_harm_metric
+    from ethbrake_marl.evaluation.measures import register_measure as register_measure
     from ethbrake_marl.files.plugins import load_plugin as load_plugin
     from ethbrake_marl.learning.recipe import register_algorithm as register_algorithm
     from ethbrake_marl.harm import register_objective as register_objective

@@ -23,8 +23,8 @@ from ethbrake_marl.errors import (
     naming_agent,
     unknown_name,
 )
-from ethbrake_marl.evaluation.harm_metrics import ImpactWatch
 from ethbrake_marl.evaluation.inputs import policy_sha256
+from ethbrake_marl.evaluation.measures import ImpactWatch
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate, leaving_out_failed
