@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -327,7 +328,7 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
     return finish(figure, caption, panels[0])
 
 
-def _band(axes: Axes, gap: Floats, harm: Floats, groups: list[Bools], style: dict[str, object], agent: str) -> None:
+def _band(axes: Axes, gap: Floats, harm: Floats, groups: list[Bools], style: dict[str, Any], agent: str) -> None:
     """One agent's mean harm per group, with its intervals where the group has at least two worlds."""
     estimates = [mean(harm[group]) for group in groups]
     at = [float(gap[group].mean()) for group in groups]
