@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from xml.sax.saxutils import escape
 
-from ethbrake_marl.envs.drawing.scene import BODY_M, Scene, Struck, pair_words, speed_words, vehicle_colour
+from ethbrake_marl.envs.drawing.scene import BODY_M, Scene, Struck, pair_words, speed_words, star, vehicle_colour
 from ethbrake_marl.errors import plain_text
 
 WIDTH = 800
@@ -137,13 +137,10 @@ class _Strip:
         """At the front of Vehicle ``i + 1``, a star for each of its impacts with what is ahead, while it is shown."""
         for start, until, struck in self._events():
             if struck.pair + 1 == i:
-                star = " ".join(
-                    f"{r * math.cos(k * math.pi / 8):.1f},{_LANE + r * math.sin(k * math.pi / 8):.1f}"
-                    for k, r in enumerate([17, 8] * 8)
-                )
+                points = " ".join(f"{x:.1f},{y:.1f}" for x, y in star(0.0, _LANE, 17, 8))
                 lit = [start <= k < until for k in range(len(self._film))]
                 yield (
-                    f'<polygon points="{star}" fill="var(--flash)" stroke="#c1121f" opacity="0">'
+                    f'<polygon points="{points}" fill="var(--flash)" stroke="#c1121f" opacity="0">'
                     f"{self._switched(lit)}</polygon>"
                 )
 
