@@ -30,7 +30,7 @@ from ethbrake_marl.envs.common import (
     report,
     restart,
 )
-from ethbrake_marl.envs.drawing.scene import BATCH_MODES, CLASS_METADATA, Viewer, render_metadata
+from ethbrake_marl.envs.drawing.viewer import BATCH_MODES, CLASS_METADATA, Viewer, render_metadata
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observation, Observations
 from ethbrake_marl.physics import Bools, Floats

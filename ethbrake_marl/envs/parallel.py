@@ -26,7 +26,7 @@ from ethbrake_marl.envs.common import (
     report,
     restart,
 )
-from ethbrake_marl.envs.drawing.scene import CLASS_METADATA, Viewer, render_metadata
+from ethbrake_marl.envs.drawing.viewer import CLASS_METADATA, Viewer, render_metadata
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.observations import Observation, Observations, full_state, state_features
 from ethbrake_marl.physics import Ints

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import os
 from functools import cache
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -272,7 +271,9 @@ class Window:
     def __init__(self) -> None:
         need("pygame")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # importing a library says nothing
-        self._pygame: Any = import_module("pygame")
+        import pygame
+
+        self._pygame: Any = pygame
         self._screen: Any = None
         self._clock: Any = None
         self.closed_by_user = False  # until an episode begins
