@@ -188,7 +188,7 @@ class Entry:
         return getattr(import_module(f"ethbrake_marl.{module}"), function)
 
 
-_SCRIPTS, _POLICIES = "agents.scripts", "learning.team_file:make_policy_agent"
+_SCRIPTS, _POLICIES = "agents.scripts", "learning.training:make_policy_agent"
 _FROM_FILE = "agents.registry:make_from_file"
 _ENTRIES: dict[str, Entry] = {
     "coast": Entry("coast", "nothing at all", (Source.SENSORS,), f"{_SCRIPTS}:make_state_free"),

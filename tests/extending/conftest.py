@@ -21,7 +21,7 @@ TABLES = (
     (v2x, "CHANNELS"),
     (harm, "KINDS"),
     (agents, "_ENTRIES"),
-    (algorithms, "_ENTRIES"),
+    (algorithms, "_ALGORITHMS"),
     (terms, "TERMS"),
     (harm_metrics, "METRICS"),
     (plugins, "_RUN"),
