@@ -44,6 +44,8 @@ def flow_text(value: Any, longest: int | None = None) -> str:
 
 
 def _flow(value: Any) -> str:
+    if isinstance(value, BaseModel):
+        value = value.model_dump(exclude_none=True)
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_flow(key)}: {_flow(entry)}" for key, entry in value.items()) + "}"
     if isinstance(value, list | tuple):
@@ -302,13 +304,12 @@ class FileModel(BaseModel):
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    """Raise the error for ``value`` at ``at`` (inside the field being checked): ``right`` says what would do.
+UNSHOWN = object()  # a value that the message does not show
 
-    A value of "" is not shown.
-    """
-    plain = value.model_dump(exclude_none=True) if isinstance(value, BaseModel) else value
-    shown = plain if plain == "" else flow_text(plain, 60)
+
+def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
+    """Raise the error for ``value`` at ``at`` (inside the field being checked): ``right`` says what would do."""
+    shown = "" if value is UNSHOWN else flow_text(value, 60)
     raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})
 
 

@@ -46,10 +46,6 @@ Rate = Annotated[float, Field(gt=0.0, le=1.0)]
 Layers = Annotated[tuple[Width, ...], Field(strict=False, min_length=1, max_length=8)]
 
 
-def _none(value: Any) -> bool:
-    return value is None
-
-
 class LearningRate(FileModel):
     """A learning rate that falls from ``start`` to ``end`` over the training."""
 
@@ -101,7 +97,9 @@ class ActorShape(_Shape):
 
     policy: Layers
     activation: Activation = "relu"
-    initial_action: Annotated[float | None, Field(ge=-1.0, le=1.0, exclude_if=_none)] = None  # at first; None: 0
+    initial_action: Annotated[float | None, Field(ge=-1.0, le=1.0, exclude_if=lambda value: value is None)] = (
+        None  # at first; None: 0
+    )
 
 
 class OffsetRange(FileModel):
@@ -151,7 +149,9 @@ class TrainingRecipe(FileModel):
     learning_rate: LearningRate  # from its start to its end
     gamma: Fraction  # discount of one time step
     reward: RewardParams  # what is learned for
-    observation: Annotated[ListedFeatures | None, Field(exclude_if=_none)] = None  # of learners; None: the scenario's
+    observation: Annotated[ListedFeatures | None, Field(exclude_if=lambda value: value is None)] = (
+        None  # of learners; None: the scenario's
+    )
     horizon_is_end: bool = False  # nothing is expected beyond the horizon
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of worlds, networks and exploration
     evaluation: EvaluationPlan  # the fixed list, and how often
@@ -357,10 +357,6 @@ class SacRecipe(TrainingRecipe):
 MOMENTS_LIMIT = 2**22  # decisions held in memory between two updates
 
 
-def _zero(value: float) -> bool:
-    return value == 0.0
-
-
 Steps = Annotated[int, Field(ge=1, le=1000)]
 
 
@@ -382,11 +378,13 @@ class CounterfactualRecipe(TrainingRecipe):
     n_epochs: Annotated[int, Field(ge=1, le=1000)]
     batch_size: Annotated[int, Field(ge=2)]
     averaging: Fraction
-    focus: Annotated[float, Field(ge=0.0, le=0.99, exclude_if=_zero)] = (
+    focus: Annotated[float, Field(ge=0.0, le=0.99, exclude_if=lambda focus: focus == 0.0)] = (
         0.0  # share of what is tried that a scout chooses
     )
     network: ActorShape
-    modes: Annotated[ModesPlan | None, Field(exclude_if=_none)] = None  # several networks and a gate
+    modes: Annotated[ModesPlan | None, Field(exclude_if=lambda value: value is None)] = (
+        None  # several networks and a gate
+    )
 
     @model_validator(mode="after")
     def _counts_to_the_end(self) -> CounterfactualRecipe:

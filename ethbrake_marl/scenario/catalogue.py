@@ -307,8 +307,6 @@ def register_preset(name: str, settings: Mapping[str, Any]) -> None:
     try:
         channel = V2X.model_validate(dict(settings)).channel
     except ValidationError as error:
-        raise explain(
-            error, Document(f"preset {name!r}", dict(settings), {}), ScenarioWording(V2X.model_fields)
-        ) from None
+        raise explain(error, Document(f"preset {name!r}", dict(settings), {}), ScenarioWording(V2X)) from None
     if CHANNELS.setdefault(name, channel) != channel:
         raise AlreadyExists(f"preset {name!r} is registered already; give another name")

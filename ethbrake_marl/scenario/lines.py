@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import (
-    BaseModel,
-    ConfigDict,
+    AfterValidator,
     Discriminator,
     Field,
     GetJsonSchemaHandler,
@@ -22,10 +21,10 @@ from pydantic import (
     field_validator,
 )
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, PydanticCustomError
+from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.yaml import YamlPath, flow_text, parse_numeral, suggestion
+from ethbrake_marl.files.yaml import UNSHOWN, FileModel, YamlPath, parse_numeral, refuse, suggestion
 from ethbrake_marl.harm import ObjectiveName
 from ethbrake_marl.physics.worlds import Floats, Ints
 from ethbrake_marl.scenario.features import ListedFeatures
@@ -156,10 +155,8 @@ TypeQuantity = Annotated[
 AnyTypeQuantity = float | Uniform | LogUniform | Normal | Choice | WithLoad
 
 
-class VehicleType(BaseModel):
+class VehicleType(FileModel):
     """One type: how likely it is, and every quantity that it declares; the rest is as beside ``vehicle_types``."""
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
     weight: Weight = Field(default=1.0, description="how likely it is, relative to the other types")
     load: Quantity = Field(
@@ -179,10 +176,10 @@ class VehicleType(BaseModel):
     @classmethod
     def _in_range(cls, value: Any, info: ValidationInfo) -> Any:
         if value is None:
-            _refuse((), value, "must be a number or a distribution; a key that is not used is left out")
+            refuse((), value, "must be a number or a distribution; a key that is not used is left out")
         rule = DECLARED[str(info.field_name)]
         if not rule.allows(*support(value)):
-            _refuse((), _plain(value), f"must be {rule.interval}")
+            refuse((), value, f"must be {rule.interval}")
         return value
 
     @field_validator("load")
@@ -190,11 +187,17 @@ class VehicleType(BaseModel):
     def _share(cls, value: Any) -> Any:
         low, high = support(value)
         if not (low >= 0.0 and high <= 1.0):
-            _refuse((), _plain(value), "must be in [0, 1]: 0 empty, 1 full")
+            refuse((), value, "must be in [0, 1]: 0 empty, 1 full")
         return value
 
 
-VehicleTypes = Annotated[dict[TypeName, VehicleType], Field(min_length=1)]
+def _check_type_names(kinds: dict[str, VehicleType]) -> dict[str, VehicleType]:
+    if ANY in kinds:
+        refuse((ANY,), UNSHOWN, f"{ANY} stands for every type; give another name")
+    return kinds
+
+
+VehicleTypes = Annotated[dict[TypeName, VehicleType], Field(min_length=1), AfterValidator(_check_type_names)]
 TypesHere = str | dict[str, Weight]  # of one vehicle: a type, ``any``, or a weight for each type that may stand there
 
 
@@ -209,28 +212,22 @@ Types = Annotated[
 ]
 
 
-def check_type_names(kinds: Mapping[str, VehicleType]) -> None:
-    """Refuse a type whose name would mean every type."""
-    if ANY in kinds:
-        _refuse((ANY,), "", f"{ANY} stands for every type; give another name")
-
-
 def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: int) -> None:
     """Every entry names types that are declared, and a list has one entry per vehicle."""
     if kinds is None:
-        _refuse((), _plain(types), "needs vehicle_types, which says what the types are")
+        refuse((), types, "needs vehicle_types, which says what the types are")
     listed = isinstance(types, tuple)
     if listed and len(types) != vehicles:
-        _refuse((), "", f"has {len(types)} entries; {vehicles} vehicles need {vehicles}, or one for all")
+        refuse((), UNSHOWN, f"has {len(types)} entries; {vehicles} vehicles need {vehicles}, or one for all")
     for index, entry in enumerate(types if listed else (types,)):
         at: YamlPath = (index,) if listed else ()
         names = [entry] if isinstance(entry, str) else list(entry)
         if not names:
-            _refuse(at, entry, "must name a type")
+            refuse(at, entry, "must name a type")
         for name in names:
             if name not in kinds and not (name == ANY and isinstance(entry, str)):
                 hint = suggestion(name, kinds) or f"known: {', '.join(kinds)}"
-                _refuse(at, entry, f"unknown type {name}; {hint}")
+                refuse(at, entry, f"unknown type {name}; {hint}")
 
 
 class TypesOfLine:
@@ -279,15 +276,6 @@ def typed_quantity(kinds: Sequence[VehicleType], kind: int, key: str) -> AnyType
     return found
 
 
-def _refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    shown = value if value == "" else flow_text(value, 60)
-    raise PydanticCustomError("scenario", "{right}", {"right": right, "value": shown, "at": at})
-
-
-def _plain(value: Any) -> Any:
-    return value.model_dump(exclude_none=True) if isinstance(value, BaseModel) else value
-
-
 AnyQuantity = float | Uniform | LogUniform | Normal | Choice
 
 OF_EVERY_VEHICLE = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s")  # needed: no default
@@ -299,19 +287,7 @@ def _one_or_each(value: object) -> str:
     return "#each" if isinstance(value, list | tuple) else "#one"
 
 
-def _none(value: Any) -> bool:
-    return value is None
-
-
-class _LeftOut:
-    """Stands for a key that is not given, where a check must say whether it may be."""
-
-
-LEFT_OUT = _LeftOut()
-
-
-def _left_out() -> Any:
-    return LEFT_OUT
+LEFT_OUT: Any = object()  # a key that is not given, where a check must say whether it may be
 
 
 PerVehicle = Annotated[
@@ -328,19 +304,15 @@ class _MemberSchema:
         return {"anyOf": [{"type": "string"}, {"type": "object"}]}
 
 
-class Member(BaseModel):
+class Member(FileModel):
     """One scenario of a mixture: what it says, and how likely it is, relative to the others."""
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
     scenario: Annotated[dict[str, Any], _MemberSchema] = Field(description="a name, a path, or what its file says")
     weight: Weight = Field(default=1.0, description="how likely it is, relative to the other scenarios")
 
 
-class ScenarioFields(BaseModel):
+class ScenarioFields(FileModel):
     """What is declared of a line of vehicles, and what follows from the declaration alone. See ``Scenario``."""
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
     name: str = Field(pattern=NAME_PATTERN, description="name; equal to the file's name without .yaml")
     title: str = Field(default="", description="one line for lists and figures")
@@ -348,15 +320,19 @@ class ScenarioFields(BaseModel):
     source: str = Field(default="", description="where the values come from")
     vehicles: int = Field(default=3, ge=2, le=64, description="number of vehicles N, vehicle_1 in front")
     vehicle_types: VehicleTypes | None = Field(
-        default=None, exclude_if=_none, description="what a car, a truck, ... is: type -> weight and quantities"
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="what a car, a truck, ... is: type -> weight and quantities",
     )
     types: Types | None = Field(
         default=None,
-        exclude_if=_none,
+        exclude_if=lambda value: value is None,
         description="which types may stand where: a type, any, or a weight for each; one entry for all or one for each",
     )
     mixture: Annotated[tuple[Member, ...], Field(strict=False)] | None = Field(
-        default=None, exclude_if=_none, description="scenarios that each world is drawn from one of, by weight"
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="scenarios that each world is drawn from one of, by weight",
     )
     time_step_s: float = Field(default=0.1, ge=1e-4, allow_inf_nan=False, description="time between two decisions")
     horizon_s: float = Field(
@@ -368,16 +344,16 @@ class ScenarioFields(BaseModel):
     line_speed_mps: Quantity | None = Field(default=None, description=DECLARED["line_speed_mps"].meaning)
     speed_deviations_mps: PerVehicle = Field(default=0.0, description=DECLARED["speed_deviations_mps"].meaning)
     braking_capacity_mps2: PerVehicle | None = Field(
-        default_factory=_left_out, validate_default=True, description=DECLARED["braking_capacity_mps2"].meaning
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=DECLARED["braking_capacity_mps2"].meaning
     )
     driving_capacity_mps2: PerVehicle | None = Field(
-        default_factory=_left_out, validate_default=True, description=DECLARED["driving_capacity_mps2"].meaning
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=DECLARED["driving_capacity_mps2"].meaning
     )
     mass_t: PerVehicle | None = Field(
-        default_factory=_left_out, validate_default=True, description=DECLARED["mass_t"].meaning
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=DECLARED["mass_t"].meaning
     )
     latency_s: PerVehicle | None = Field(
-        default_factory=_left_out, validate_default=True, description=DECLARED["latency_s"].meaning
+        default_factory=lambda: LEFT_OUT, validate_default=True, description=DECLARED["latency_s"].meaning
     )
     speed_limit_mps: PerVehicle = Field(default=40.0, description=DECLARED["speed_limit_mps"].meaning)
     restitution: Quantity = Field(default=0.1, description=DECLARED["restitution"].meaning)
@@ -395,7 +371,9 @@ class ScenarioFields(BaseModel):
         default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
     )
     observation: ListedFeatures | None = Field(
-        default=None, exclude_if=_none, description="what vehicles observe: groups and single features, in this order"
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="what vehicles observe: groups and single features, in this order",
     )
     v2x: V2X = Field(
         default_factory=V2X, description="what each vehicle knows when: a preset, and what differs from it"

@@ -13,10 +13,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import Discriminator, Field, Tag, model_validator
 
-from ethbrake_marl.files.yaml import UNITS, flow_text
+from ethbrake_marl.files.yaml import UNITS, FileModel, refuse
 from ethbrake_marl.physics.compiled import exp_each, log, normal_probability, normal_quantile_each
 from ethbrake_marl.physics.worlds import Floats, Ints, Worlds, concatenate
 
@@ -159,8 +158,8 @@ Pair = Annotated[tuple[Number, Number], Field(strict=False)]
 Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
 
 
-class _Distribution(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+class _Distribution(FileModel):
+    """A way to draw a quantity."""
 
 
 class Uniform(_Distribution):
@@ -300,7 +299,7 @@ class WithLoad(_Distribution):
 def _require(holds: bool, key: str, value: Any, right: str) -> None:
     """Refuse the value of ``key`` unless ``holds``; ``right`` says what would do."""
     if not holds:
-        raise PydanticCustomError("distribution", "{right}", {"right": right, "value": flow_text(value), "at": (key,)})
+        refuse((key,), value, right)
 
 
 def _kind(value: object) -> str | None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ValidationError, field_validator, model_validator
@@ -15,8 +15,19 @@ from pydantic_core.core_schema import ValidationInfo
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.html import html_table
-from ethbrake_marl.files.yaml import Document, FileSchema, Wording, YamlPath, explain, flow_text, publish, suggestion
-from ethbrake_marl.harm import Declared, check_harm_count, objectives_of
+from ethbrake_marl.files.yaml import (
+    UNSHOWN,
+    Document,
+    FileSchema,
+    Wording,
+    YamlPath,
+    explain,
+    flow_text,
+    publish,
+    refuse,
+    suggestion,
+)
+from ethbrake_marl.harm import check_harm_count, objectives_of
 from ethbrake_marl.physics.messages import MOST_SAMPLES
 from ethbrake_marl.scenario.features import listed_features
 from ethbrake_marl.scenario.lines import (
@@ -27,8 +38,6 @@ from ethbrake_marl.scenario.lines import (
     TYPE_KEYS,
     Member,
     ScenarioFields,
-    VehicleType,
-    check_type_names,
     check_types,
     complete_roles,
     constant_deceleration,
@@ -42,8 +51,6 @@ from ethbrake_marl.scenario.quantities import (
     DISTRIBUTIONS,
     OPTIONAL,
     QUANTITIES,
-    Choice,
-    NormalShape,
     QuantityRule,
     Sample,
     join_samples,
@@ -58,17 +65,10 @@ from ethbrake_marl.scenario.sampling import (
     quantity_bounds,
     uniform_numbers,
 )
-from ethbrake_marl.scenario.v2x import V2X
 
 # Checks of a scenario that concern a whole field or several fields at once.
 #
 # Each raises pydantic's error for the first defect, with the path inside the field or file and the value.
-
-
-def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    """Raise the error for ``value`` at ``at`` (inside the field being checked): ``right`` says what would do."""
-    plain = value.model_dump(exclude_none=True) if isinstance(value, BaseModel) else value
-    raise PydanticCustomError("scenario", "{right}", {"right": right, "value": flow_text(plain, 60), "at": at})
 
 
 def check_entries(rule: QuantityRule, value: Any, vehicles: int | None) -> None:
@@ -77,44 +77,12 @@ def check_entries(rule: QuantityRule, value: Any, vehicles: int | None) -> None:
     if listed and vehicles is not None and len(value) != rule.count(vehicles):
         per = "one per pair" if rule.per == "pair" else "one per vehicle"
         right = f"has {len(value)} entries; {vehicles} vehicles need {rule.count(vehicles)} ({per}), or one for all"
-        raise PydanticCustomError("scenario", "{right}", {"right": right, "value": "", "at": ()})
+        refuse((), UNSHOWN, right)
     for index, entry in enumerate(value if listed else (value,)):
         low, high = support(entry)
         if not rule.allows(low, high):
             overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
             refuse((index,) if listed else (), entry, f"must be {rule.interval}{overlap}")
-
-
-def check_roles(roles: Mapping[str, str], vehicles: int) -> None:
-    """Every key is a vehicle of this scenario and every value is ``learner`` or the syntax of a script."""
-    names = [f"vehicle_{i + 1}" for i in range(vehicles)]
-    for name, role in roles.items():
-        if name not in names:
-            close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
-            refuse((name,), role, f"unknown vehicle; {hint}")
-        try:
-            is_state_free(role)
-        except InvalidInput as error:
-            refuse((name,), role, str(error))
-        if role.startswith(f"{LEARNER}:"):
-            refuse((name,), role, f"{LEARNER} takes no argument")
-
-
-def check_objective(declared: Declared, vehicles: int) -> None:
-    """The objective is a known one, and there is one for all vehicles or one for each."""
-    try:
-        objectives_of(declared, vehicles)
-    except InvalidInput as error:
-        refuse((), declared, str(error).removeprefix("objective: "))
-
-
-def check_observation(listed: object) -> None:
-    """An observation is a list of groups and features that are known, none of them twice."""
-    try:
-        listed_features(listed)
-    except InvalidInput as error:
-        refuse((), listed, str(error).removeprefix("observation: "))
 
 
 def check_given(key: str, value: Any, data: Mapping[str, Any]) -> Any:
@@ -131,7 +99,7 @@ def check_given(key: str, value: Any, data: Mapping[str, Any]) -> Any:
             raise PydanticCustomError("missing", "missing", {"at": ()})
         if without is not None:
             right = f"type {without} does not declare it: give it there, or here for every type that does not"
-            raise PydanticCustomError("scenario", "{right}", {"right": right, "value": "", "at": ()})
+            refuse((), UNSHOWN, right)
         return None
     if value is None:
         refuse((), value, "must be a number or a distribution; a key that is not used is left out")
@@ -140,21 +108,22 @@ def check_given(key: str, value: Any, data: Mapping[str, Any]) -> Any:
     return value
 
 
-def check_alternatives(scenario: ScenarioFields) -> None:
+def _check_alternatives(scenario: ScenarioFields) -> None:
     """Gaps and speeds are declared in one of two ways, an obstacle in one at most; deviations need a line speed."""
     if "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None:
         right = "needs line_speed_mps, the speed that it is added to"
-        refuse(("speed_deviations_mps",), _declared(scenario.speed_deviations_mps), right)
+        refuse(("speed_deviations_mps",), scenario.speed_deviations_mps, right)
     for usual, other in ALTERNATIVES.items():
         given = [key for key in (usual, other) if getattr(scenario, key) is not None]
         if not given and usual not in OPTIONAL:
             raise PydanticCustomError("missing", "missing", {"at": (usual,)})
         if len(given) == 2:
-            refuse((other,), _declared(getattr(scenario, other)), f"give either {usual} or {other}, not both")
+            refuse((other,), getattr(scenario, other), f"give either {usual} or {other}, not both")
 
 
 def check_whole(scenario: ScenarioFields) -> None:
-    """Fields that limit each other: time step, horizon, latency, speeds, gaps, constant scripts, rejection."""
+    """Fields that limit each other: quantities declared twice, time step, horizon, latency, speeds, gaps, scripts."""
+    _check_alternatives(scenario)
     if not scenario.time_step_s <= scenario.horizon_s:
         refuse(("time_step_s",), scenario.time_step_s, f"must not be above horizon_s ({scenario.horizon_s:g} s)")
     for i, latencies in enumerate(scenario.possible_quantities("latency_s")):
@@ -200,7 +169,7 @@ def _check_speeds(scenario: ScenarioFields) -> None:
         lowest = min(limits[i].values(), key=lambda quantity: support(quantity)[0])
         if low >= 0.0 and high <= support(lowest)[0]:
             continue
-        limit = f"speed_limit_mps of vehicle_{i + 1}, {flow_text(_declared(lowest))} m/s"
+        limit = f"speed_limit_mps of vehicle_{i + 1}, {flow_text(lowest)} m/s"
         if scenario.line_speed_mps is None:
             speed = scenario.quantities("speeds_mps")[i]
             refuse(_path(scenario, "speeds_mps", i), speed, f"must not be above {limit}")
@@ -251,10 +220,6 @@ def _path(scenario: ScenarioFields, field: str, index: int, kind: int = 0) -> Ya
     if line is not None and field in TYPE_KEYS and getattr(line.kinds[kind], field) is not None:
         return ("vehicle_types", line.names[kind], field)
     return (field, index) if isinstance(getattr(scenario, field), tuple) else (field,)
-
-
-def _declared(quantity: Any) -> Any:
-    return quantity.model_dump(exclude_none=True) if isinstance(quantity, BaseModel) else quantity
 
 
 # Mixtures of scenarios: each world is drawn from one member, by weight, and is then that member's own world.
@@ -391,32 +356,10 @@ def draw_mixture(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0,
 _DISTRIBUTION = (
     "{uniform: [low, high]}, {loguniform: [low, high]}, {normal: {mean, sd, low, high}} or {choice: [a, b, ...]}"
 )
-_INSIDE = {
-    "uniform": ("uniform",),
-    "loguniform": ("loguniform",),
-    "normal": tuple(NormalShape.model_fields),
-    "choice": tuple(Choice.model_fields),
-}
 
 
-@dataclass(frozen=True, slots=True)
 class ScenarioWording(Wording):
-    """The ``Wording`` of a scenario; ``keys`` are its top-level keys."""
-
-    keys: Iterable[str]
-
-    def known(self, path: YamlPath) -> list[str]:
-        """The keys that may stand where ``path`` ends: at the top, in a distribution, in its parameters, in v2x."""
-        if len(path) == 1:
-            return list(self.keys)
-        if path[0] == "vehicle_types" and len(path) == 3:
-            return list(VehicleType.model_fields)
-        if path[0] == "mixture":
-            return list(Member.model_fields)
-        outer = str(path[-2])
-        if outer == "v2x":
-            return list(V2X.model_fields)
-        return list(_INSIDE[outer]) if outer == "normal" else sorted({*DISTRIBUTIONS, "weights"})
+    """The ``Wording`` of a scenario, or of a part of one."""
 
     def instead(self, key: str) -> str:
         """What the model has in place of friction: what each vehicle's brakes can on that road."""
@@ -509,12 +452,6 @@ class Scenario(ScenarioFields):
             refuse((), value, "must not be empty; a key that is not used is left out")
         return value
 
-    @field_validator("vehicle_types")
-    @classmethod
-    def _kinds(cls, value: Any) -> Any:
-        check_type_names(value)
-        return value
-
     @field_validator("types")
     @classmethod
     def _types(cls, value: Any, info: ValidationInfo) -> Any:
@@ -535,27 +472,43 @@ class Scenario(ScenarioFields):
         vehicles = info.data.get("vehicles")
         if vehicles is None:
             return value
-        check_roles(value, vehicles)
+        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+        for name, role in value.items():
+            if name not in names:
+                close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
+                hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
+                refuse((name,), role, f"unknown vehicle; {hint}")
+            try:
+                is_state_free(role)
+            except InvalidInput as error:
+                refuse((name,), role, str(error))
+            if role.startswith(f"{LEARNER}:"):
+                refuse((name,), role, f"{LEARNER} takes no argument")
         return complete_roles(value, vehicles)
 
     @field_validator("objective", mode="before")
     @classmethod
     def _objective(cls, value: Any, info: ValidationInfo) -> Any:
         if "vehicles" in info.data:
-            check_objective(value, info.data["vehicles"])
+            try:
+                objectives_of(value, info.data["vehicles"])
+            except InvalidInput as error:
+                refuse((), value, str(error).removeprefix("objective: "))
         return value
 
     @field_validator("observation", mode="before")
     @classmethod
     def _observation(cls, value: Any) -> Any:
-        check_observation(value)
+        try:
+            listed_features(value)
+        except InvalidInput as error:
+            refuse((), value, str(error).removeprefix("observation: "))
         return value
 
     @model_validator(mode="after")
     def _whole(self) -> Scenario:
         if self.mixture is not None:  # its members have been checked
             return self
-        check_alternatives(self)
         check_whole(self)
         return self
 
@@ -662,7 +615,7 @@ def _build(scenario: Scenario, document: Document) -> None:
     try:
         BaseModel.__init__(scenario, **document.content)
     except ValidationError as error:
-        raise explain(error, document, ScenarioWording(Scenario.model_fields)) from None
+        raise explain(error, document, ScenarioWording(Scenario)) from None
     scenario._members = members
 
 
