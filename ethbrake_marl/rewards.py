@@ -22,6 +22,7 @@ import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import not_
 from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
@@ -202,9 +203,7 @@ class RewardParams(FileModel):
     target_gap_m: NonNegative = 3.0
     distance_slope_per_m: Positive = 1.0
     # weights of terms that somebody registered; in a file or a mapping they may stand beside the others
-    terms: dict[str, NonNegative] = Field(
-        default_factory=dict, validate_default=True, exclude_if=lambda terms: not terms
-    )
+    terms: dict[str, NonNegative] = Field(default_factory=dict, validate_default=True, exclude_if=not_)
 
     @model_validator(mode="before")
     @classmethod

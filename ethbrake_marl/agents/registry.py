@@ -23,7 +23,7 @@ from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, des
 from ethbrake_marl.files.plugins import load_function, note_file
 from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.lines import parse_agent_spec
+from ethbrake_marl.scenario.fields import parse_agent_spec
 
 # The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
 #

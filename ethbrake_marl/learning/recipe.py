@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from operator import not_
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
@@ -33,8 +34,8 @@ from ethbrake_marl.files.yaml import (
 from ethbrake_marl.policies.actor import Activation, NetworkSpec, Width
 from ethbrake_marl.rewards import RewardParams, registered_terms, setting_names
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.catalogue import check_file_name, shipped_folder
 from ethbrake_marl.scenario.features import ListedFeatures, listed_features
+from ethbrake_marl.scenario.schema import check_file_name, shipped_folder
 
 WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
 
@@ -97,7 +98,7 @@ class ActorShape(_Shape):
 
     policy: Layers
     activation: Activation = "relu"
-    initial_action: Annotated[float | None, Field(ge=-1.0, le=1.0, exclude_if=lambda value: value is None)] = (
+    initial_action: Annotated[float | None, Field(ge=-1.0, le=1.0, exclude_if=lambda v: v is None)] = (
         None  # at first; None: 0
     )
 
@@ -149,9 +150,7 @@ class TrainingRecipe(FileModel):
     learning_rate: LearningRate  # from its start to its end
     gamma: Fraction  # discount of one time step
     reward: RewardParams  # what is learned for
-    observation: Annotated[ListedFeatures | None, Field(exclude_if=lambda value: value is None)] = (
-        None  # of learners; None: the scenario's
-    )
+    observation: Annotated[ListedFeatures | None, Field(exclude_if=not_)] = None  # of learners; None: the scenario's
     horizon_is_end: bool = False  # nothing is expected beyond the horizon
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of worlds, networks and exploration
     evaluation: EvaluationPlan  # the fixed list, and how often
@@ -378,13 +377,11 @@ class CounterfactualRecipe(TrainingRecipe):
     n_epochs: Annotated[int, Field(ge=1, le=1000)]
     batch_size: Annotated[int, Field(ge=2)]
     averaging: Fraction
-    focus: Annotated[float, Field(ge=0.0, le=0.99, exclude_if=lambda focus: focus == 0.0)] = (
+    focus: Annotated[float, Field(ge=0.0, le=0.99, exclude_if=not_)] = (
         0.0  # share of what is tried that a scout chooses
     )
     network: ActorShape
-    modes: Annotated[ModesPlan | None, Field(exclude_if=lambda value: value is None)] = (
-        None  # several networks and a gate
-    )
+    modes: Annotated[ModesPlan | None, Field(exclude_if=not_)] = None  # several networks and a gate
 
     @model_validator(mode="after")
     def _counts_to_the_end(self) -> CounterfactualRecipe:

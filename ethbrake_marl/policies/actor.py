@@ -13,6 +13,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
+from operator import not_
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -61,7 +62,7 @@ class NetworkSpec(FileModel):
     activation: Activation
     output: Output
     networks: Annotated[int, Field(ge=1, le=16, exclude_if=lambda networks: networks == 1)] = 1
-    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=lambda several: not several)] = ()
+    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()
 
     @model_validator(mode="after")
     def _a_gate_between_several(self) -> NetworkSpec:
@@ -168,9 +169,7 @@ class ObservationSchema(_Strict):
     rear: Neighbours
     features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]
     scaling_sha256: Sha256
-    registered: Annotated[
-        tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=lambda several: not several)
-    ] = ()
+    registered: Annotated[tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=not_)] = ()
 
     @property
     def spec(self) -> ObservationSpec:

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from operator import not_
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -133,7 +134,7 @@ class V2X(FileModel):
     processing_s: Seconds | None = None
     actuation_s: Seconds | None = None
     sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = None
-    persistence: Persistence | None = Field(default=None, exclude_if=lambda value: value is None)
+    persistence: Persistence | None = Field(default=None, exclude_if=not_)
 
     @model_validator(mode="before")
     @classmethod

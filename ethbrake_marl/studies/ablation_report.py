@@ -33,8 +33,7 @@ from ethbrake_marl.pages.vector import drawing
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.policies.bundle import Policy, load_policy
 from ethbrake_marl.scenario import Sample, Scenario
-from ethbrake_marl.scenario.lines import LEARNER
-from ethbrake_marl.scenario.quantities import DECLARED
+from ethbrake_marl.scenario.fields import DECLARED, LEARNER
 from ethbrake_marl.studies.ablation import (
     TOLERANCE,
     Harms,
