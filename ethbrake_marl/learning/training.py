@@ -129,26 +129,12 @@ class RunDirectory:
         write_file(file, json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
 
 
-class RunRecord:
-    """Keeps ``run.json``: ``running`` from the moment it is made, something else from ``end`` on."""
-
-    def __init__(self, run: RunDirectory) -> None:
-        self._run = run
-        self._started = read_object(run.status).get("started_utc") or _now()
-        write_status(run, "running", {"started_utc": self._started})
-
-    def end(self, status: RunStatus, reason: str | None, left: Mapping[str, Any]) -> None:
-        """Say how the run ended, why if it failed, and what it leaves."""
-        policy = self._run.policy.name if self._run.policy.is_dir() else None
-        left_over = () if status == "finished" else self._run.checkpoints.glob("step_*")
-        checkpoints = sorted(path.name for path in left_over)
-        more = {"ended_utc": _now(), "reason": reason, **left, "policy": policy, "checkpoints": checkpoints}
-        write_status(self._run, status, {"started_utc": self._started, **more})
-
-
 def write_status(run: RunDirectory, status: RunStatus, more: Mapping[str, Any]) -> None:
-    """Replace ``run.json``."""
-    run.write_json(run.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **more})
+    """Replace ``run.json``: when it was started stays, and when it ended is now."""
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    before = read_object(run.status) if run.status.exists() else {}
+    times = {"started_utc": before.get("started_utc") or now} | ({} if status == "running" else {"ended_utc": now})
+    run.write_json(run.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **times, **more})
 
 
 def read_object(file: Path) -> dict[str, Any]:
@@ -178,10 +164,6 @@ def progress_column(table: Sequence[Mapping[str, str]], name: str) -> dict[int, 
     return {int(row["steps"]): float(row[name]) for row in table if row.get(name)}
 
 
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
-
-
 def create_run(
     path: Path, config: Mapping[str, Any], *, team: Mapping[str, Any] | None = None, force: bool = False
 ) -> RunDirectory:
@@ -204,7 +186,7 @@ def create_run(
         new.write_json(new.config, config)
         if team is not None:
             new.write_json(new.team, team)
-        write_status(new, "running", {"started_utc": _now()})
+        write_status(new, "running", {})
     return run
 
 
