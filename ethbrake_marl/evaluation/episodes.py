@@ -6,7 +6,7 @@ import copy
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -16,10 +16,8 @@ import numpy as np
 from ethbrake_marl.agents.protocol import Agent, Driver, Team, team_of
 from ethbrake_marl.agents.rollout import Episodes, drive, episode_engine
 from ethbrake_marl.defaults import HARM_COUNTS
-from ethbrake_marl.envs.drawing.animation import animate_films
-from ethbrake_marl.envs.drawing.scene import Scene, Trace, kept_motions, scenes
+from ethbrake_marl.envs.drawing.scene import Scene, Trace, animate_films, kept_motions, scenes
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
-from ethbrake_marl.evaluation.measures import Tape
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
@@ -70,74 +68,59 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
     team = team_of(agent, scenario.learners)
     follower = _Follower(worlds, team)
     episodes = drive(worlds, team, scenario, watched_by=[follower])
-    return follower.motions(episodes)
+    return [follower.motion(k, episodes) for k in range(worlds.n)]
 
 
-class _Follower(Tape):
-    """Keeps the steps, and in which decisions a shield stepped in."""
+class _Follower:
+    """Watches a batch of episodes."""
 
     def __init__(self, worlds: Worlds, team: Team) -> None:
-        super().__init__(worlds)
-        self._drivers = list(team.drivers.values())
+        self._worlds, self._drivers = worlds, list(team.drivers.values())
         self._first_s = first_decision_s(worlds, list(team.drivers))
+        self._way_m = np.zeros(worlds.n)
+        self._pieces: list[list[Floats]] = [[] for _ in range(worlds.n)]
+        self._impacts: list[list[ImpactRows]] = [[] for _ in range(worlds.n)]
         self._stepped_in: list[list[float]] = [[] for _ in range(worlds.n)]
         self._count = np.zeros(worlds.n)
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Keep one step."""
-        super().see(before, command_mps2, until_s)
-        count = np.zeros(before.n)  # rises with every decision in which a step shield applied something else
-        for driver in self._drivers:
-            if (shield := shield_around(driver)) is not None:
-                count += shield.interventions
+        """Keep the pieces and impacts of one step."""
+        moving = until_s > before.time_s
+        moving |= before.time_s == self._worlds.time_s  # an impact at the very alert
+        some = np.flatnonzero(moving)
+        rows = advance(before.take(some), command_mps2[some], until_s=until_s[some], record=True)[1].rows
+        assert rows is not None  # they were asked for
+        columns = [np.zeros_like(rows.world), *(getattr(rows, f.name) for f in fields(ImpactRows)[1:])]
+        starts = np.searchsorted(rows.world, np.arange(some.size + 1)).tolist()  # they come world by world
+        for k, first, end in zip(some.tolist(), starts[:-1], starts[1:], strict=True):
+            self._impacts[k].append(ImpactRows(*(column[first:end] for column in columns)))
+        some = np.flatnonzero(until_s > before.time_s)
+        for k, pieces in zip(
+            some.tolist(), segment_pieces(before.take(some), command_mps2[some], until_s[some]), strict=True
+        ):
+            way = _way(pieces, float(until_s[k]))
+            pieces[:, 1] += self._way_m[k]
+            self._pieces[k].append(pieces)
+            self._way_m[k] += way
+        count = _steps_taken_over(self._drivers, before.n)
         for k in np.flatnonzero(count > self._count).tolist():
             self._stepped_in[k].append(float(before.time_s[k]))
         self._count = count
 
-    def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
-        """What was seen, world by world."""
-        n, N = self.worlds.n, self.worlds.N
-        impacts, pieces = self.impacts(), self._pieces()
-        ends = np.searchsorted(impacts.world, np.arange(n + 1))
-        found = []
-        for k in range(n):
-            mine = slice(*ends[k : k + 2])
-            rows = ImpactRows(*(getattr(impacts, f.name)[mine] for f in fields(ImpactRows)))
-            ledger = Ledger(*(getattr(episodes.ledger, f.name)[[k]] for f in fields(Ledger)))
-            final, taken_over = episodes.final.take([k]), list(self._stepped_in[k])
-            if any(isinstance(d, HybridAgent) and not d.chosen_policy[k] for d in self._drivers):
-                taken_over.append(float(self._first_s[k]))
-            found.append(
-                EpisodeMotion(
-                    self.worlds.take([k]),
-                    join_pieces(pieces[k], N),
-                    float(final.time_s[0]),
-                    replace(rows, world=np.zeros_like(rows.world)),
-                    np.array(sorted(taken_over)),
-                    ledger,
-                    final,
-                    bool(episodes.at_rest[k]),
-                )
-            )
-        return found
-
-    def _pieces(self) -> list[Floats]:
-        """The pieces of each world's motion, one after the other; one piece where it ends at once."""
-        parts: list[list[Floats]] = [[] for _ in range(self.worlds.n)]
-        way_m = np.zeros(self.worlds.n)
-        for before, command, until_s in self.steps:
-            some = np.flatnonzero(until_s > before.time_s)
-            seen = segment_pieces(before.take(some), command[some], until_s[some])
-            for k, pieces in zip(some.tolist(), seen, strict=True):
-                way = float(state_at(pieces[-1], float(until_s[k]), self.worlds.N)[0])
-                pieces[:, 1] += way_m[k]
-                parts[k].append(pieces)
-                way_m[k] += way
-        w = self.worlds
-        standing = np.concatenate(
-            [w.time_s[:, np.newaxis], np.zeros((w.n, 1)), w.gaps_m, w.speeds_mps, 0.0 * w.speeds_mps], axis=1
-        )
-        return [np.concatenate(each) if each else standing[[k]] for k, each in enumerate(parts)]
+    def motion(self, k: int, episodes: Episodes) -> EpisodeMotion:
+        """What was seen of world ``k``."""
+        parts, N = self._impacts[k], self._worlds.N
+        impacts = ImpactRows(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ImpactRows)))
+        pieces = np.concatenate(self._pieces[k]) if self._pieces[k] else _standing(self._worlds, k)
+        ledger = Ledger(*(getattr(episodes.ledger, f.name)[[k]] for f in fields(Ledger)))
+        final = episodes.final.take([k])
+        taken_over = list(self._stepped_in[k])
+        if any(isinstance(d, HybridAgent) and not d.chosen_policy[k] for d in self._drivers):
+            taken_over.append(float(self._first_s[k]))
+        return EpisodeMotion(
+            self._worlds.take([k]), join_pieces(pieces, N), float(final.time_s[0]), impacts,
+            np.array(sorted(taken_over)), ledger, final, bool(episodes.at_rest[k]),
+        )  # fmt: skip
 
 
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
@@ -160,12 +143,36 @@ def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
     return np.concatenate([[piece[1] + way[0]], gaps, speeds + accelerations * t, accelerations])
 
 
+def _way(pieces: Floats, until_s: float) -> float:
+    """How far Vehicle 1 has come at the end of these pieces."""
+    last = pieces[-1]
+    vehicles = (len(last) - 1) // 3
+    return float(state_at(last, until_s, vehicles)[0])
+
+
+def _standing(worlds: Worlds, k: int) -> Floats:
+    """The one piece of an episode that ends where it begins."""
+    N = worlds.N
+    return np.concatenate([worlds.time_s[[k]], [0.0], worlds.gaps_m[k], worlds.speeds_mps[k], np.zeros(N)])[np.newaxis]
+
+
+def _steps_taken_over(drivers: list[Agent], n: int) -> Floats:
+    """A count, [n], that rises with every decision in which a step shield applied something else than a proposal."""
+    count = np.zeros(n)
+    for driver in drivers:
+        if (shield := shield_around(driver)) is not None:
+            count += shield.interventions
+    return count
+
+
 # One episode at fine time resolution: what a figure or a viewer draws.
 #
 # Between decisions the motion follows from the state and the command alone, so the episode is first run as in an
 # evaluation, and then sampled inside its steps: every sample is advanced straight from the beginning of its step.
 
 SAMPLE_S = 0.02
+
+Segment = tuple[Worlds, Floats, Floats]  # world (n = 1) at its start, constant command [1, N], time of its end [1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,17 +233,25 @@ def record_episode(
     if not (sample_s > 0.0 and math.isfinite(sample_s)):
         raise InvalidInput(f"record_episode: sample_s = {sample_s}; must be finite and above 0")
     driven = controlled_vehicle(scenario, vehicle)
-    tape = Tape(world)
-    episodes = drive(world, copy.deepcopy(agent), scenario, driven, watched_by=[tape])
-    samples = list(_samples(tape.steps, sample_s))
+    engine = episode_engine(world, copy.deepcopy(agent), scenario, driven)
+    segments: list[Segment] = list(engine.segments(world, engine.worlds.command_mps2))
+    at_rest = False
+    while not engine.ended.all():
+        before = engine.worlds
+        step = engine.step({})
+        segments += engine.segments(before, engine.wanted_mps2.copy())
+        at_rest = bool(step.terminated[0])
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
+    samples = list(_samples(segments, sample_s))
     time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))
     return EpisodeRecord(
-        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, tape.impacts(), episodes.ledger,
-        bool(episodes.at_rest[0]),
+        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, _impacts(segments), engine.ledger,
+        at_rest,
     )  # fmt: skip
 
 
-def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
+def _samples(segments: list[Segment], sample_s: float) -> Iterator[tuple[Floats, ...]]:
     """Rows of (time, gaps, speeds, positions, command from then on), segment by segment, the last with its end.
 
     Worlds know gaps and speeds only. An obstacle ahead of Vehicle 1, the world's own or one that is out of reach, makes
@@ -253,14 +268,21 @@ def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float)
         position, gaps, speeds = front + (post.obstacle_gap_m - moved.obstacle_gap_m), moved.gaps_m, moved.speeds_mps
         in_force = np.where(before.vehicles.latency_s <= times[:, np.newaxis], command, 0.0)
         rows = slice(None) if number == len(segments) - 1 else slice(count)
-        columns = (times, gaps, speeds, line_positions(position, gaps), in_force)
+        columns = (times, gaps, speeds, _positions(position, gaps), in_force)
         yield tuple(column[rows] for column in columns)
         front = float(position[-1])
 
 
-def line_positions(front: Floats, gaps: Floats) -> Floats:
+def _positions(front: Floats, gaps: Floats) -> Floats:
     """Positions [k, N] from those of Vehicle 1 [k] and the gaps [k, P]."""
     return np.concatenate([front[:, np.newaxis], front[:, np.newaxis] - np.cumsum(gaps, axis=1)], axis=1)
+
+
+def _impacts(segments: list[Segment]) -> ImpactRows:
+    """Every impact of the episode."""
+    parts = [advance(before, command, until_s=end, record=True)[1].rows for before, command, end in segments]
+    rows = [part for part in parts if part is not None]
+    return ImpactRows(*(np.concatenate([getattr(part, f.name) for part in rows]) for f in fields(ImpactRows)))
 
 
 # An episode as a film, in real time: the environment's own pictures as a GIF or MP4, or a moving drawing as SVG.

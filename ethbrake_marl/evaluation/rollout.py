@@ -24,7 +24,7 @@ from ethbrake_marl.errors import (
     unknown_name,
 )
 from ethbrake_marl.evaluation.inputs import policy_sha256
-from ethbrake_marl.evaluation.measures import REGISTERED, Tape
+from ethbrake_marl.evaluation.measures import ImpactWatch
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate, leaving_out_failed
@@ -46,8 +46,7 @@ from ethbrake_marl.physics.kernel import (
 from ethbrake_marl.physics.sampled import sample_numbers, sample_worlds
 from ethbrake_marl.physics.worlds import sum_rows
 from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.scenario.lines import constant_command
-from ethbrake_marl.scenario.quantities import kind_columns
+from ethbrake_marl.scenario.fields import constant_command, kind_columns
 from ethbrake_marl.shield.agents import drives_alone
 
 # The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
@@ -392,7 +391,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     task = Task(scenario, tuple(team.drivers))
     shoved = ShovedFront.of(worlds, task) if aftermath else None
     sampled = SampledHarm.of(worlds, task) if aftermath else None
-    impacts = Tape(worlds, steps=False) if aftermath and REGISTERED else None
+    impacts = ImpactWatch.of(worlds) if aftermath else None
     episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled, impacts) if w is not None])
     alone = drives_alone(team)
     predicted, chosen = (_read_column(alone, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
@@ -406,7 +405,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
         None if shoved is None else shoved.metres,
         None if sampled is None else sampled.finish(),
         {vehicle: sha for vehicle, agent in team.drivers.items() if (sha := policy_sha256(agent)) is not None},
-        {} if impacts is None else impacts.measured(),
+        {} if impacts is None else impacts.finish(),
     )
 
 

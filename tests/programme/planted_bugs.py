@@ -45,10 +45,10 @@ EXACT, SEEDS, TABLE, REGRET, ROLLOUT = (
 SHARDS = "ethbrake_marl/studies/shards.py"
 COURSE, LOOP, EVENTS, KEPT, INDEPENDENT, RECIPE = (
     "ethbrake_marl/learning/progress.py",
-    "ethbrake_marl/learning/loop.py",
+    "ethbrake_marl/learning/train.py",
     "ethbrake_marl/learning/progress.py",
     "ethbrake_marl/learning/training.py",
-    "ethbrake_marl/learning/algorithms/networks.py",
+    "ethbrake_marl/learning/algorithms.py",
     "ethbrake_marl/learning/recipe.py",
 )
 
@@ -264,7 +264,7 @@ BUGS: dict[str, Bug] = {
         COURSE, "max(TIMES_LEAST * least[harm],", "max(4.0 * least[harm],", OF_LEARNING
     ),
     "a lost training is not stopped": Bug(
-        LOOP, "self.course.lost if self._stop_when_lost else None", "None", OF_LEARNING
+        LOOP, "self.course.lost if self._wishes.stop_when_lost else None", "None", OF_LEARNING
     ),
     "the learning rate falls at once": Bug(
         RECIPE, "done = min(max(1.0 - remaining, 0.0), 1.0)", "done = 1.0", OF_LEARNING
