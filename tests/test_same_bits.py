@@ -34,7 +34,7 @@ REMAINS = {
     ("envs/drawing/scene.py", "math.sin"): PRINTED,
     ("envs/drawing/scene.py", "**"): SQUARES,
     ("evaluation/statistics.py", "**"): SQUARES,
-    ("evaluation/seed_statistics.py", "scipy.stats"): "resampling and sorting: sums and products alone",
+    ("evaluation/statistics.py", "scipy.stats"): "resampling and sorting: sums and products alone",
     ("evaluation/shards.py", "**"): SQUARES,
     (
         "evaluation/statistics.py",

@@ -15,8 +15,15 @@ from ethbrake_marl.errors import count_of
 if TYPE_CHECKING or LATE:
     from ethbrake_marl.cli.report import check_page
     from ethbrake_marl.evaluation import check_target
-    from ethbrake_marl.evaluation.episodes import check_ending, film_bytes, film_scenes
-    from ethbrake_marl.evaluation.passport import Given, Replay, parse_passport, replay
+    from ethbrake_marl.evaluation.episodes import (
+        Given,
+        Replay,
+        check_ending,
+        film_bytes,
+        film_scenes,
+        parse_passport,
+        replay,
+    )
     from ethbrake_marl.evaluation.results import write_output
     from ethbrake_marl.learning.recipe import read_settings
     from ethbrake_marl.shield.uncertainty import parse_uncertainty

@@ -7,7 +7,6 @@ from ethbrake_marl.evaluation.episodes import EpisodeRecord, record_episode
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome, parameter_line, parameters
 from ethbrake_marl.evaluation.results import check_target, write_per_world_csv
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.evaluation.summary import (
     Rescored,
     SummaryRow,
@@ -20,6 +19,7 @@ from ethbrake_marl.evaluation.summary import (
     rich_table,
     summarise,
 )
+from ethbrake_marl.files.sheet import Estimate
 
 __all__ = [
     "EpisodeRecord",

@@ -15,16 +15,8 @@ from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error
 from ethbrake_marl.evaluation.inputs import result_identity
 from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
-from ethbrake_marl.evaluation.statistics import (
-    Estimate,
-    Moments,
-    decrease_of,
-    difference,
-    exact_products,
-    mean_of,
-    moments,
-)
-from ethbrake_marl.files.sheet import Cell, Column, Sheet
+from ethbrake_marl.evaluation.statistics import Moments, decrease_of, difference, exact_products, mean_of, moments
+from ethbrake_marl.files.sheet import Cell, Column, Estimate, Sheet
 from ethbrake_marl.limits.best_harm import BestHarmTable, shipped_tables, world_identity
 from ethbrake_marl.limits.limits import Limits, Unproven, prove, unproven_because
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, leaving_out_failed, make_worlds

@@ -24,8 +24,9 @@ from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, cou
 from ethbrake_marl.evaluation.inputs import Kind
 from ethbrake_marl.evaluation.measures import COLUMN, Regrets, assess
 from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
-from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, paired_difference, unpaired_difference
+from ethbrake_marl.evaluation.statistics import paired_difference, unpaired_difference
 from ethbrake_marl.evaluation.summary import Rescored, SummaryRow
+from ethbrake_marl.files.sheet import Estimate, estimates_to_json
 from ethbrake_marl.files.store import check_writable, parse_strict_json, read_plain, write_file
 from ethbrake_marl.harm import Declared, scored
 from ethbrake_marl.physics import Floats

@@ -37,15 +37,9 @@ from ethbrake_marl.evaluation.results import (
     vehicle_columns,
 )
 from ethbrake_marl.evaluation.rollout import evaluate_block
-from ethbrake_marl.evaluation.statistics import (
-    VALUE_BITS,
-    Moments,
-    estimates_to_json,
-    exact_rate,
-    mean_of,
-)
+from ethbrake_marl.evaluation.statistics import VALUE_BITS, Moments, exact_rate, mean_of
 from ethbrake_marl.evaluation.summary import Rescored, SummaryRow, summarise_tallies
-from ethbrake_marl.files.sheet import parquet_file
+from ethbrake_marl.files.sheet import estimates_to_json, parquet_file
 from ethbrake_marl.limits.limits import Unproven, known_limits
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Sample, Scenario, Task

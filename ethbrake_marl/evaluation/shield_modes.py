@@ -15,7 +15,8 @@ from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.evaluation.inputs import policies_by_name, policy_sha256, result_identity
 from ethbrake_marl.evaluation.rollout import OnWorlds
-from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, paired_difference
+from ethbrake_marl.evaluation.statistics import mean, paired_difference
+from ethbrake_marl.files.sheet import Estimate, estimates_to_json
 from ethbrake_marl.physics import Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Sample, Task
 from ethbrake_marl.shield import HybridAgent, ShieldedTeam, StepShieldAgent

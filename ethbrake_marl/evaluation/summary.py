@@ -39,8 +39,8 @@ from ethbrake_marl.evaluation.outcome import (
     parameter_line,
     parameters,
 )
-from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, rate
-from ethbrake_marl.files.sheet import DASH, Column, Row, Sheet, Shown
+from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl.files.sheet import DASH, Column, Estimate, Row, Sheet, Shown, estimates_to_json
 from ethbrake_marl.harm import Declared, objectives_of, scored, standard_objectives
 from ethbrake_marl.limits.limits import Limits
 

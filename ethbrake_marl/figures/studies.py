@@ -17,8 +17,8 @@ from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.envs.drawing.scene import vehicle_colour
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.episodes import EpisodeRecord
-from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.style import COLOURS, GREY, ends_of, finish, name_axes, new_figure, new_panels, series_style
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.physics import Floats
 
 LINEAR = 0.1  # m2/s2; axes are linear up to there and logarithmic beyond: harm falls to a hundredth

@@ -18,8 +18,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from ethbrake_marl.envs.drawing.scene import COLOURS as COLOURS  # one palette for figures and frames
 from ethbrake_marl.errors import plain_text
 from ethbrake_marl.evaluation.results import write_output
-from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures import picture_ending
+from ethbrake_marl.files.sheet import Estimate
 
 # Markers and dashes repeat the distinction of the colours.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")

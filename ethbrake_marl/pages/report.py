@@ -13,7 +13,7 @@ from markupsafe import Markup
 from ethbrake_marl.agents.protocol import Driver, team_of
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.episodes import follow_episodes
+from ethbrake_marl.evaluation.episodes import follow_episodes, issue_passport
 from ethbrake_marl.evaluation.inputs import policy_sha256
 from ethbrake_marl.evaluation.measures import BASELINE, Regrets, assess
 from ethbrake_marl.evaluation.outcome import (
@@ -22,10 +22,9 @@ from ethbrake_marl.evaluation.outcome import (
     parameter_line,
     parameters,
 )
-from ethbrake_marl.evaluation.passport import issue_passport
 from ethbrake_marl.evaluation.results import write_output
 from ethbrake_marl.evaluation.shield_modes import ModeRow, are_teams, compare_behind_shields
-from ethbrake_marl.evaluation.statistics import Estimate, mean, rate
+from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import (
     SummaryRow,
     identity_lines,
@@ -39,7 +38,7 @@ from ethbrake_marl.evaluation.summary import (
 )
 from ethbrake_marl.figures.evaluation import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.figures.style import Figure
-from ethbrake_marl.files.sheet import Sheet
+from ethbrake_marl.files.sheet import Estimate, Sheet
 from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.pages.frame import Block, Cell, Part, Row, Section, facts, page, paragraph, table
 from ethbrake_marl.pages.player import Played, player

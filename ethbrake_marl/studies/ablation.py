@@ -22,7 +22,7 @@ from ethbrake_marl.errors import CorruptBundle, InvalidInput, OnProgress, Progre
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, load_runnable, policies_by_name, result_identity
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.seed_statistics import (
+from ethbrake_marl.evaluation.statistics import (
     interquartile_mean,
     mean_over_seeds,
     paired_over_seeds,

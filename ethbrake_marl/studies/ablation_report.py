@@ -19,10 +19,10 @@ from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, policy_sha256, result_identity
 from ethbrake_marl.evaluation.results import write_output
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.seed_statistics import mean_over_seeds, rate_over_seeds, share_over_seeds
-from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json
+from ethbrake_marl.evaluation.statistics import mean_over_seeds, rate_over_seeds, share_over_seeds
 from ethbrake_marl.figures.studies import change_figure, harm_curve, who_pays
 from ethbrake_marl.figures.style import Figure, write_picture
+from ethbrake_marl.files.sheet import Estimate, estimates_to_json
 from ethbrake_marl.learning.recipe import WORDS
 from ethbrake_marl.learning.training import RunDirectory, is_team, load_team
 from ethbrake_marl.limits.best_harm import best_harm

@@ -34,7 +34,8 @@ from ethbrake_marl.evaluation.inputs import (
 from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.evaluation.results import write_output
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.statistics import Estimate, mean, rate, relative_decrease
+from ethbrake_marl.evaluation.statistics import mean, rate, relative_decrease
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.files.store import parse_strict_json, read_plain
 from ethbrake_marl.files.yaml import first_mistake
 from ethbrake_marl.limits.best_harm import load_table, world_identity

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ethbrake_marl.errors import InvalidInput, one_line
-from ethbrake_marl.evaluation.statistics import Estimate
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.pages.frame import Block, Cell, Section, facts, page, paragraph, table
 from ethbrake_marl.studies.benchmark import Entry, ListResult, NotDriven, Suite, load_suite, read_entry
 

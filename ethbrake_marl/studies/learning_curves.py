@@ -14,7 +14,7 @@ from typing import Any
 from ethbrake_marl.errors import InvalidInput, OnProgress, count_of
 from ethbrake_marl.evaluation.inputs import result_identity, worlds_sha256
 from ethbrake_marl.evaluation.results import write_output
-from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
+from ethbrake_marl.evaluation.statistics import interquartile_mean
 from ethbrake_marl.figures.studies import SeedCurve, at_common_steps, seed_curves
 from ethbrake_marl.figures.style import Figure, write_picture
 from ethbrake_marl.learning.progress import HARM_METRIC

@@ -18,8 +18,9 @@ from scipy.stats import ttest_ind
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.results import compare_results, read_result
-from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, unpaired_difference
+from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
 from ethbrake_marl.files import plugins
+from ethbrake_marl.files.sheet import Estimate
 
 
 @pytest.fixture(scope="module")

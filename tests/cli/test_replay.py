@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.evaluation.episodes import follow_episodes
-from ethbrake_marl.evaluation.passport import Passport, issue_passport
+from ethbrake_marl.evaluation.episodes import Passport, follow_episodes, issue_passport
 from ethbrake_marl.scenario import load_scenario, new_scenario_text
 from tests.pages.hostile import HOSTILE, UNSEEN
 

@@ -8,8 +8,7 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.episodes import follow_episodes
-from ethbrake_marl.evaluation.passport import MOST_CHARACTERS, Passport, issue_passport, parse_passport
+from ethbrake_marl.evaluation.episodes import MOST_CHARACTERS, Passport, follow_episodes, issue_passport, parse_passport
 from ethbrake_marl.scenario import Scenario
 from tests.pages.hostile import HOSTILE
 

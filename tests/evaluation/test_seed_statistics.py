@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import seed_statistics
-from ethbrake_marl.evaluation.seed_statistics import (
+from ethbrake_marl.evaluation import statistics
+from ethbrake_marl.evaluation.statistics import (
     interquartile_mean,
     mean_over_seeds,
     paired_over_seeds,
+    rate,
     rate_over_seeds,
     share_over_seeds,
 )
-from ethbrake_marl.evaluation.statistics import rate
 
 
 @pytest.mark.parametrize(
@@ -113,9 +113,9 @@ def test_intervals__two_worlds_have_one_and_a_single_world_has_none() -> None:
 
 @pytest.mark.parametrize("resamples", [1, 2, 3])
 def test_resamples__are_as_many_as_asked_for(resamples: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(seed_statistics, "_AT_ONCE", 4)  # two at a time
+    monkeypatch.setattr(statistics, "_AT_ONCE", 4)  # two at a time
     sides = (np.arange(4.0).reshape(2, 2),)
-    assert seed_statistics._resample_means(sides, resamples, 0).shape == (resamples, 1)
+    assert statistics._resample_means(sides, resamples, 0).shape == (resamples, 1)
 
 
 def test_mean_over_seeds__is_the_mean_with_the_spread_between_seeds() -> None:

@@ -5,15 +5,8 @@ import pytest
 from scipy.stats import binom, bootstrap
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.statistics import (
-    Estimate,
-    estimates_to_json,
-    exact_rate,
-    mean,
-    paired_difference,
-    rate,
-    relative_decrease,
-)
+from ethbrake_marl.evaluation.statistics import exact_rate, mean, paired_difference, rate, relative_decrease
+from ethbrake_marl.files.sheet import Estimate, estimates_to_json
 
 T_4, T_1 = 2.7764451, 12.7062047  # 97.5 % quantiles of Student's t with 4 and 1 degrees of freedom
 Z_SQUARED = 3.8414588  # of the normal quantile at 97.5 %

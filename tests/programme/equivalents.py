@@ -15,6 +15,6 @@ EQUIVALENT: dict[str, str] = {
     "figures/evaluation.py: 1 -> 2 in `1` (5)": "how a line is dashed, which is judged by eye",
     "studies/ablation.py: `Json = dict[str, Any]` removed (1)": ONLY_TYPES,
     "figures/evaluation.py: True -> False in `True` (2)": "two panels for two counts, always",
-    "evaluation/seed_statistics.py: 0 -> 1 in `0` (5)": "all sides have as many worlds, which was checked just before",
+    "evaluation/statistics.py: 0 -> 1 in `0` (23)": "all sides have as many worlds, which was checked just before",
     "rewards.py: `Value = TypeVar('Value', float, Floats)` removed (1)": ONLY_TYPES,
 }

@@ -112,8 +112,8 @@ def shields() -> dict[str, str]:
 
 
 def tallies() -> dict[str, str]:
-    from ethbrake_marl.evaluation.seed_statistics import paired_over_seeds
     from ethbrake_marl.evaluation.shards import Question, answer_shard, ask
+    from ethbrake_marl.evaluation.statistics import paired_over_seeds
     from ethbrake_marl.harm import injury_probability
     from ethbrake_marl.scenario import load_scenario
 

@@ -37,7 +37,7 @@ COMPARISON, OPTIMUM, PLAN = (
 )
 EXACT, SEEDS, TABLE, REGRET, ROLLOUT = (
     "ethbrake_marl/evaluation/statistics.py",
-    "ethbrake_marl/evaluation/seed_statistics.py",
+    "ethbrake_marl/evaluation/statistics.py",
     "ethbrake_marl/evaluation/summary.py",
     "ethbrake_marl/evaluation/measures.py",
     "ethbrake_marl/evaluation/rollout.py",

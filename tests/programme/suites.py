@@ -191,8 +191,7 @@ EVALUATION = Suite(
         "evaluation/*.py", "figures/studies.py", "figures/evaluation.py", "figures/evaluation.py",
     ),
     quick={
-        "evaluation/statistics.py": ("tests/evaluation/test_statistics.py",),
-        "evaluation/seed_statistics.py": ("tests/evaluation/test_seed_statistics.py",),
+        "evaluation/statistics.py": ("tests/evaluation/test_statistics.py", "tests/evaluation/test_seed_statistics.py"),
         "figures/studies.py": ("tests/figures/test_learning_curves.py",),
         "evaluation/rollout.py": ("tests/evaluation/test_rollout.py", "tests/agents/test_team.py"),
         "evaluation/outcome.py": ("tests/evaluation/test_rollout.py", "tests/evaluation/test_left_out.py"),

@@ -17,8 +17,9 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import OnProgress, Progress
 from ethbrake_marl.evaluation import Evaluation, evaluate
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, make_agents
-from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, unpaired_difference
+from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
 from ethbrake_marl.figures.style import Figure
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario

@@ -16,8 +16,9 @@ from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation import Evaluation, evaluate
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.outcome import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST, PaperRow
-from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, rate, relative_decrease
+from ethbrake_marl.evaluation.statistics import mean, paired_difference, rate, relative_decrease
 from ethbrake_marl.figures.studies import Line, bars_figure, changes_figure, lines_figure
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies.shipped import load_shipped

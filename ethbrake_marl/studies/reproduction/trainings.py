@@ -16,9 +16,9 @@ import numpy as np
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.errors import OnProgress
-from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
-from ethbrake_marl.evaluation.statistics import Estimate, mean
+from ethbrake_marl.evaluation.statistics import interquartile_mean, mean
 from ethbrake_marl.figures.studies import SeedCurve, at_common_steps, seed_curves
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.training import RETURN, RunDirectory, is_finished, progress_column, progress_rows
 from ethbrake_marl.physics import Floats

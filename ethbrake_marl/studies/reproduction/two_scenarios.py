@@ -10,9 +10,9 @@ import numpy as np
 from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation import EpisodeRecord, record_episode
 from ethbrake_marl.evaluation.inputs import make_agents
-from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.evaluation import trajectories
 from ethbrake_marl.figures.studies import profiles_figure, road_figure
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.pages.player import Played, player_content
 from ethbrake_marl.pages.report import drive_played
 from ethbrake_marl.physics import Floats

@@ -14,7 +14,7 @@ import pytest
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.passport import Given, parse_passport, replay
+from ethbrake_marl.evaluation.episodes import Given, parse_passport, replay
 from ethbrake_marl.learning import train as learning_train
 from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.studies import trainings

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.passport import Given, parse_passport, replay
+from ethbrake_marl.evaluation.episodes import Given, parse_passport, replay
 from ethbrake_marl.files.yaml import parse_overrides
 from ethbrake_marl.studies.reproduction.folder import EPISODES, choose_items, kept_player, reproduce
 from ethbrake_marl.studies.reproduction.item import Settings

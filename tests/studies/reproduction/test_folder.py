@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from pydantic import ValidationError
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.studies import Line, lines_figure
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.studies.reproduction.folder import (
     checked_result,
     docs_page,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from ethbrake_marl.evaluation.statistics import Estimate, rate
+from ethbrake_marl.evaluation.statistics import rate
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.studies.reproduction.item import (
     PERCENT,
     Bound,
