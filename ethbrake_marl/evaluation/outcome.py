@@ -16,7 +16,7 @@ from ethbrake_marl.agents.protocol import Knowledge, Source
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import IncompleteTable, InvalidInput, PhysicsError, count_of
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.files.html import html_table
+from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
@@ -208,7 +208,7 @@ class Evaluation:
             means = [mean(getattr(outcome, name)).in_words() for name in harms.values()]
             rows.append((agent, collided.in_words(digits=1, scale=100.0, unit=" %"), *means))
         note = "Means per world in m²/s², with their 95 % intervals. eb.summarise tells more."
-        return html_table(("Agent", "Collisions", *harms), rows, caption=repr(self), note=note)
+        return Sheet(repr(self), ("Agent", "Collisions", *harms), rows, note).html()
 
     def complete(self) -> Evaluation:
         """The evaluation itself, for who needs every world; raises ``PhysicsError`` if some were left out."""

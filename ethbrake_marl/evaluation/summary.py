@@ -38,7 +38,7 @@ from ethbrake_marl.evaluation.statistics import (
     rate,
     relative_decrease,
 )
-from ethbrake_marl.files.html import html_table
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.harm import Declared, objectives_of, scored, standard_objectives
 
 ALL = "standard"
@@ -82,21 +82,18 @@ def rescore(evaluation: Evaluation, declared: Sequence[Declared] | None = None) 
     ]
 
 
-def rescored_table(rows: Sequence[Rescored], harm_count: HarmCount) -> Table:
-    """The means under one count for a terminal: one line per agent and objective, one column per vehicle."""
+def rescored_table(rows: Sequence[Rescored], harm_count: HarmCount) -> Sheet:
+    """The means under one count: one line per agent and objective, one column per vehicle."""
     shown = [row for row in rows if row.harm_count == harm_count]
-    harm = "first-impact" if harm_count == "first" else "total"
-    table = Table(
-        box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, title=f"Objectives, {harm} harm", title_justify="left"
-    )
-    table.add_column("Agent", overflow="fold")
-    table.add_column("Objective")
-    for i in range(len(shown[0].each) if shown else 0):
-        table.add_column(f"Vehicle {i + 1}", justify="right", no_wrap=True)
-    for k, row in enumerate(shown):
-        agent = "" if k and shown[k - 1].agent == row.agent else row.agent
-        table.add_row(Text(agent), Text(row.objective), *(f"{estimate.value:.2f}" for estimate in row.each))
-    return table
+    vehicles = range(len(shown[0].each) if shown else 0)
+    columns: list[Column | str] = [
+        "Agent",
+        "Objective",
+        *(Column(f"Vehicle {i + 1}", interval="hidden") for i in vehicles),
+    ]
+    names = ["" if k and shown[k - 1].agent == row.agent else row.agent for k, row in enumerate(shown)]
+    lines = [(name, row.objective, *row.each) for name, row in zip(names, shown, strict=True)]
+    return Sheet(f"Objectives, {'first-impact' if harm_count == 'first' else 'total'} harm", columns, lines)
 
 
 BASELINE = "full_brake"
@@ -222,7 +219,7 @@ class SummaryTable(list[SummaryRow]):
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
         note += f" WARNING: {self[0].distance.warning}." if self and self[0].distance.warning else ""
         worlds = f"{self[0].parameters['scenario']}, {count_of(self[0].episodes, 'world')}" if self else "no agent"
-        return html_table(_HEAD, rows, caption=worlds, note=note)
+        return Sheet(worlds, _HEAD, rows, note).html()
 
 
 NO_VALUE = "–"
@@ -486,15 +483,11 @@ def rich_table(rows: Sequence[SummaryRow]) -> RenderableType:
     return Group(_TerminalTable(rows), Text(), Text(_conditions(rows), style="dim"))
 
 
-def metrics_table(rows: Sequence[SummaryRow]) -> Table:
-    """The registered harm metrics for a terminal: one line per agent, the mean per world with its interval."""
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, title="Harm metrics", title_justify="left")
-    table.add_column("Agent", overflow="fold")
-    for heading in metric_headings(rows[0].metrics).values() if rows else ():
-        table.add_column(Text(heading), justify="right", overflow="fold")
-    for row in rows:
-        table.add_row(Text(row.agent), *(Text(estimate.in_words()) for estimate in row.metrics.values()))
-    return table
+def metrics_table(rows: Sequence[SummaryRow]) -> Sheet:
+    """The registered harm metrics: one line per agent, the mean per world with its interval."""
+    headings = metric_headings(rows[0].metrics).values() if rows else ()
+    lines = [(row.agent, *row.metrics.values()) for row in rows]
+    return Sheet("Harm metrics", ["Agent", *map(Column, headings)], lines)
 
 
 @dataclass(frozen=True, slots=True)
