@@ -71,9 +71,7 @@ def ablate_command(
             LADDER,
             STANDARD,
             check_finished,
-            check_settings,
             cost_of,
-            keep_settings,
         )
 
         chosen = dict(QUICK if quick else FULL)
@@ -84,11 +82,10 @@ def ablate_command(
             raise InvalidInput(f"jobs {jobs}: must be from 1 to 64")
         plan = _plan(names, recipes, scheme, settings, list_seed, output, shield, chosen)
         if not cost:
-            check_settings(plan)
+            plan.job_folder().check()
         check_finished(plan.trainings())
         say(str(cost_of(plan)))
         if not cost:
-            keep_settings(plan)
             _run(plan, jobs, as_json)
 
 
@@ -155,7 +152,8 @@ def _plan(
     numbers: dict[str, int],
 ) -> Plan:
     from ethbrake_marl.learning.recipe import check_scheme, load_recipe, scheme_of
-    from ethbrake_marl.studies.ablation import Plan, check_folder, check_plan, common_worlds, read_levels, with_scheme
+    from ethbrake_marl.studies.ablation import Plan, check_plan, common_worlds, read_levels, with_scheme
+    from ethbrake_marl.studies.jobs import JobFolder
 
     chosen = None if scheme is None else check_scheme(scheme)
     loaded = [load_recipe(each.strip()) for each in recipes.split(",")]
@@ -170,7 +168,7 @@ def _plan(
         **numbers,
     )
     check_plan(plan)
-    check_folder(output)
+    JobFolder(output, "an ablation").check()
     common_worlds(plan.levels, 5, list_seed)
     for training in plan.trainings():
         scheme_of(training.recipe, training.level.scenario)
@@ -178,14 +176,14 @@ def _plan(
 
 
 def _run(plan: Plan, jobs: int, as_json: bool) -> None:
-    from ethbrake_marl.studies.ablation import measure, train_all
+    from ethbrake_marl.studies.ablation import run_ablation
     from ethbrake_marl.studies.ablation_report import FIGURES, PAGE, TEXT, write_ablation
 
     with progress_bars() as bars:
-        if not train_all(list(plan.trainings()), jobs, bars.show_progress):
-            say(f"interrupted; {KEPT}")
-            raise typer.Exit(INTERRUPTED)
-        measured = measure(plan, jobs, bars.show_progress)
+        measured = run_ablation(plan, jobs, bars.show_progress)
+    if measured is None:
+        say(f"interrupted; {KEPT}")
+        raise typer.Exit(INTERRUPTED)
     found = write_ablation(plan, measured, str(this_machine()))
     if as_json:
         write_json(found)

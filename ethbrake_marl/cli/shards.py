@@ -27,7 +27,7 @@ from ethbrake_marl.files.store import write_file
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from ethbrake_marl.studies.jobs import Workers
-from ethbrake_marl.studies.shards import MOST_JOBS, ShardFolder, evaluate_shards
+from ethbrake_marl.studies.shards import MOST_JOBS, evaluate_shards
 
 RESULTS = "results.json"
 _INTERVALS = (
@@ -107,12 +107,11 @@ def evaluate_in_shards(
     question = Question(scenario, tuple(lineup), episodes, seed, harm_count, uncertainty, tuple(objectives))
     check_agents(lineup, scenario.sample(1, seed).worlds, scenario)
     asked = ask(question)
-    folder = None if output is None else ShardFolder(output, asked, rows)
-    kept = "nothing was written" if folder is None else "finished shards are kept: the same command goes on"
+    kept = "nothing was written" if output is None else "finished shards are kept: the same command goes on"
     with interruptible(kept), progress_bars() as bars, ExitStack() as stack:
         workers = None if ray is None else stack.enter_context(closing(_on_ray(ray, jobs)))
         tally = evaluate_shards(
-            asked, shards=shards, jobs=jobs, workers=workers, folder=folder, tell=bars.show_progress
+            asked, shards=shards, jobs=jobs, workers=workers, folder=output, with_rows=rows, tell=bars.show_progress
         )
     _tell(asked, tally, output, as_json=as_json)
 
@@ -138,7 +137,7 @@ def _tell(asked: Asked, tally: Tally, output: Path | None, *, as_json: bool) -> 
 
 def _on_ray(address: str, jobs: int) -> Workers:
     """A Ray, with all its cores where ``jobs`` is 1, which says nothing."""
-    from ethbrake_marl.studies.cluster import LOCAL, RayWorkers
+    from ethbrake_marl.studies.jobs import LOCAL, RayWorkers
 
     most = None if jobs == 1 else jobs
     return RayWorkers(address, len(os.sched_getaffinity(0)) if address == LOCAL and most is None else most)

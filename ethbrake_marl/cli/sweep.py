@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ethbrake_marl.cli.options import JsonOption, schema_option
-from ethbrake_marl.cli.terminal import INTERRUPTED, Bars, interruptible, progress_bars, say, show, write_json
+from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, show, write_json
 from ethbrake_marl.errors import InvalidInput, need
 
 if TYPE_CHECKING:
     from ethbrake_marl.studies.jobs import Workers
-    from ethbrake_marl.studies.sweep import SweepResult, SweepState
-    from ethbrake_marl.studies.sweep_file import SweepPlan
+    from ethbrake_marl.studies.sweep import SweepPlan, SweepResult
 
 FAILED = 1  # exit status where some jobs failed
 KEPT = "the same command goes on with what is in the folder"
@@ -24,7 +23,7 @@ _MOST = 4096
 
 
 def _schema() -> dict[str, Any]:
-    from ethbrake_marl.studies.sweep_file import sweep_json_schema
+    from ethbrake_marl.studies.sweep import sweep_json_schema
 
     return sweep_json_schema()
 
@@ -55,8 +54,8 @@ def sweep_command(
     """
     with interruptible(KEPT):
         # torch takes seconds to load, and no other command needs it
-        from ethbrake_marl.studies.ablation import check_folder
-        from ethbrake_marl.studies.sweep_file import plan_sweep, read_sweep
+        from ethbrake_marl.studies.jobs import JobFolder
+        from ethbrake_marl.studies.sweep import plan_sweep, read_sweep, run_sweep
 
         number = len(os.sched_getaffinity(0)) if jobs is None else jobs
         if ray is not None:
@@ -66,12 +65,12 @@ def sweep_command(
         if form == "parquet":
             need("pyarrow")
         plan = plan_sweep(read_sweep(file))
-        check_folder(output)
+        JobFolder(output, "a sweep").check()
         if dry_run:
             _show_plan(plan, output, number, as_json)
             return
-        with closing(workers_for(ray, jobs, number)) as workers:
-            result = _run(plan, output, workers, retries, form)
+        with closing(workers_for(ray, jobs, number)) as workers, progress_bars() as bars:
+            result = run_sweep(plan, output, workers, retries=retries, form=form, tell=bars.show_progress)
     _show_result(result, output, as_json)
 
 
@@ -81,60 +80,38 @@ def workers_for(ray: str | None, jobs: int | None, number: int) -> Workers:
         from ethbrake_marl.studies.jobs import LocalWorkers
 
         return LocalWorkers(number)
-    from ethbrake_marl.studies.cluster import LOCAL, RayWorkers
+    from ethbrake_marl.studies.jobs import LOCAL, RayWorkers
 
     return RayWorkers(ray, number if ray == LOCAL else jobs)
 
 
-def _run(plan: SweepPlan, output: Path, workers: Workers, retries: int, form: Literal["csv", "parquet"]) -> SweepResult:
-    from ethbrake_marl.studies.sweep import run_sweep
-
-    with progress_bars() as bars:
-
-        def tell(state: SweepState) -> None:
-            _show_state(bars, state)
-
-        return run_sweep(plan, output, workers, retries=retries, form=form, tell=tell)
-
-
-def _show_state(bars: Bars, state: SweepState) -> None:
-    left = "" if state.left_s is None or state.done == state.total else f", about {_coarse(state.left_s)} left"
-    bars.show("sweep", state.done, state.total, note=state.note, label=f"sweep{left}")
-
-
-def _coarse(seconds: float) -> str:
-    """A time in so few words that it seldom changes."""
-    if seconds < 100.0:
-        return f"{max(round(seconds / 20.0) * 20, 10)} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.0f} h"
-
-
 def _show_plan(plan: SweepPlan, output: Path, number: int, as_json: bool) -> None:
-    from ethbrake_marl.studies.sweep import cost_of, state_of
+    from ethbrake_marl.studies.sweep import cost_of
 
-    cost = cost_of(plan, output, number)
-    left = {row.identity for row in cost.rows}
-    states = ((row, state_of(output, row) if row.identity in left else "finished") for row in plan.rows)
+    cost = cost_of(plan, output)
     if as_json:
-        jobs = [{"hash": row.identity, "job": row.name, "set": row.settings, "state": state} for row, state in states]
+        jobs = [
+            {"hash": row.identity, "job": row.name, "set": row.settings, "state": cost.states[row.name]}
+            for row in plan.rows
+        ]
         write_json({"jobs": jobs, "decisions_left": cost.decisions, "core_s_left": cost.work_s})
         return
-    for row, state in states:
-        show("  ".join([f"{state:8}", row.name, *row.asked.settings]))
-    say(str(cost))
+    for row in plan.rows:
+        show("  ".join([f"{cost.states[row.name]:8}", row.name, *row.asked.settings]))
+    say(cost.in_words(number))
 
 
 def _show_result(result: SweepResult, output: Path, as_json: bool) -> None:
     from ethbrake_marl.studies.sweep import FAILURES
 
-    counts = {"jobs": result.jobs, "finished": result.finished, "failed": len(result.failures)}
+    counts = {"jobs": result.jobs, "finished": result.finished, "failed": result.failed}
     if as_json:
         write_json({**counts, "interrupted": result.interrupted, "table": str(result.table)})
     told = f"{result.finished:,} of {result.jobs:,} jobs finished; table: {result.table}"
-    if result.failures:
-        told += f"; {len(result.failures):,} failed: {output / FAILURES}"
+    if result.failed:
+        told += f"; {result.failed:,} failed: {output / FAILURES}"
     say(f"interrupted; {told}; {KEPT}" if result.interrupted else told)
     if result.interrupted:
         raise typer.Exit(INTERRUPTED)
-    if result.failures:
+    if result.failed:
         raise typer.Exit(FAILED)

@@ -10,18 +10,17 @@ import typer
 
 from ethbrake_marl.cli.options import ForceOption, JsonOption, schema_option
 from ethbrake_marl.cli.sweep import FAILED, KEPT, workers_for
-from ethbrake_marl.cli.terminal import INTERRUPTED, Bars, interruptible, progress_bars, say, show, write_json
+from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, say, show, write_json
 from ethbrake_marl.errors import InvalidInput, count_of, need
 
 if TYPE_CHECKING:
-    from ethbrake_marl.studies.tuning import TuningResult, TuningState
-    from ethbrake_marl.studies.tuning_file import TuningPlan
+    from ethbrake_marl.studies.tuning import TuningPlan, TuningResult
 
 _MOST, _MOST_TRIALS = 4096, 100_000
 
 
 def _schema() -> dict[str, Any]:
-    from ethbrake_marl.studies.tuning_file import tuning_json_schema
+    from ethbrake_marl.studies.tuning import tuning_json_schema
 
     return tuning_json_schema()
 
@@ -61,16 +60,13 @@ def tune_command(
     need("optuna")
     with interruptible(KEPT):
         # torch takes seconds to load
-        from ethbrake_marl.studies.ablation import check_folder
-        from ethbrake_marl.studies.tuning import check_tuning, run_tuning
-        from ethbrake_marl.studies.tuning_file import plan_tuning, read_tuning
+        from ethbrake_marl.studies.tuning import plan_tuning, read_tuning, run_tuning, tuning_folder
 
         _check_options(trials, jobs, retries, storage)
         if ray is not None:
             need("ray")
         plan = plan_tuning(read_tuning(file))
-        check_folder(output)
-        check_tuning(plan, output)
+        tuning_folder(plan, output).check()
         if export is not None:
             force = force or _is_an_export(plan, export)
             _check_export(plan, export, force)
@@ -78,11 +74,9 @@ def tune_command(
             _show_plan(plan, trials, jobs, as_json)
             return
         with closing(workers_for(ray, jobs, jobs)) as workers, progress_bars() as bars:
-
-            def tell(state: TuningState) -> None:
-                _show_state(bars, state)
-
-            result = run_tuning(plan, output, workers, trials, storage=storage, retries=retries, tell=tell)
+            result = run_tuning(
+                plan, output, workers, trials, storage=storage, retries=retries, tell=bars.show_progress
+            )
     _show_result(plan, result, export, force, as_json)
 
 
@@ -117,16 +111,10 @@ def _is_an_export(plan: TuningPlan, export: Path) -> bool:
         return file.read(len(head)) == head
 
 
-def _show_state(bars: Bars, state: TuningState) -> None:
-    least = "" if state.least is None else f", least harm {state.least:.3f}"
-    bars.show("tuning", state.done, state.total, note=state.note, label=f"tuning{least}")
-
-
 def _show_plan(plan: TuningPlan, trials: int, jobs: int, as_json: bool) -> None:
     from ethbrake_marl.studies.trainings import told_seconds
-    from ethbrake_marl.studies.tuning import seconds_per_trial
 
-    per_trial = seconds_per_trial(plan)
+    per_trial = plan.seconds_per_trial()
     own = plan.own_values()
     space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
     if as_json:

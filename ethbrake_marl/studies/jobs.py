@@ -98,7 +98,7 @@ def answer(call: bytes, plugins: Sequence[Plugin]) -> Answer:
 
     An error of this package would come again; any other one may be of the machine.
     """
-    started, where = time.monotonic(), f"{os.uname().nodename}, process {os.getpid()}"
+    started = time.monotonic()
     value, told, lasting = None, None, False
     try:
         load_the_same(plugins)
@@ -110,7 +110,11 @@ def answer(call: bytes, plugins: Sequence[Plugin]) -> Answer:
             pickle.loads(pickle.dumps(error))
         except Exception:
             told = RuntimeError(describe_error(error))
-    return Answer(value, told, value is None and not lasting, time.monotonic() - started, where)
+    return Answer(value, told, value is None and not lasting, time.monotonic() - started, _process_name())
+
+
+def _process_name(number: int | None = None) -> str:
+    return f"{os.uname().nodename}, process {number or os.getpid()}"
 
 
 RETRIES = 2  # further attempts at a job whose worker was lost
@@ -139,8 +143,8 @@ def run_jobs(
     running: dict[int, tuple[Job, int]] = {}
     try:
         with stop_on_signal() as asked:
-            for attempt in _attempts(jobs, workers, running, retries, asked):
-                on_attempt(attempt)
+            for ended in _attempts(jobs, workers, running, retries, asked):
+                on_attempt(ended)
     except BaseException as error:
         workers.interrupt()
         while running:
@@ -156,10 +160,11 @@ def run_jobs(
 
 def _run_here(jobs: Iterable[Job], on_attempt: Callable[[Attempt], None]) -> bool:
     for job in jobs:
+        started = time.monotonic()
         value = job.function(*job.given)
         if value is None:
             return False
-        on_attempt(Attempt(job, 1, Answer(value), True))
+        on_attempt(Attempt(job, 1, Answer(value, wall_s=time.monotonic() - started, where=_process_name()), True))
     return True
 
 
@@ -455,8 +460,8 @@ class LocalWorkers:
         worker.pipe.close()
         ended = worker.process.exitcode or 0
         how = f"was killed by signal {-ended}" if ended < 0 else f"ended with status {ended}"
-        where = f"{os.uname().nodename}, process {worker.process.pid}"
-        return Answer(None, WorkerLost(f"the worker {how} in the middle of the job"), True, 0.0, where)
+        told = WorkerLost(f"the worker {how} in the middle of the job")
+        return Answer(None, told, True, 0.0, _process_name(worker.process.pid))
 
 
 @contextmanager

@@ -68,7 +68,11 @@ def evaluate_shards(
 
         say(note)
         left = [
-            Job(name := f"{first:013d}-{end:013d}", _answer, (asked, first, end, _rows_file(folder, with_rows, name), block))
+            Job(
+                name := f"{first:013d}-{end:013d}",
+                _answer,
+                (asked, first, end, _rows_file(folder, with_rows, name), block),
+            )
             for first, end in _missing(shard_bounds(asked.question.episodes, shards), done)
         ]
         if not run(left, workers or (jobs if len(left) > 1 else 1), each(take)):
