@@ -106,8 +106,8 @@ if TYPE_CHECKING:
     from ethbrake_marl.harm import register_objective as register_objective
     from ethbrake_marl.scenario.features import register_feature as register_feature
     from ethbrake_marl.rewards import register_term as register_term
-    from ethbrake_marl.scenario.catalogue import register_scenarios as register_scenarios
-    from ethbrake_marl.scenario.catalogue import register_preset as register_preset
+    from ethbrake_marl.scenario.schema import register_scenarios as register_scenarios
+    from ethbrake_marl.scenario.schema import register_preset as register_preset
 
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError

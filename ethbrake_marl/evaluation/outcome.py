@@ -22,7 +22,7 @@ from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.messages import is_periodic
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
-from ethbrake_marl.scenario.quantities import DECLARED, Texts, quantity, quantity_rules
+from ethbrake_marl.scenario.fields import DECLARED, Texts, quantity, quantity_rules
 from ethbrake_marl.scenario.v2x import hidden_from
 
 _SHOWN_AGENTS = 5  # by name, in ``repr``

@@ -30,7 +30,7 @@ from ethbrake_marl.evaluation.summary import Rescored, SummaryRow
 from ethbrake_marl.files.store import check_writable, parse_strict_json, read_plain, write_file
 from ethbrake_marl.harm import Declared, scored
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.scenario.quantities import quantity, quantity_rules
+from ethbrake_marl.scenario.fields import quantity, quantity_rules
 
 # One row per agent and world: its columns, and its file, written whole and never over another by accident.
 

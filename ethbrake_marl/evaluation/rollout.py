@@ -51,8 +51,7 @@ from ethbrake_marl.physics.kernel import (
 from ethbrake_marl.physics.sampled import sample_numbers, sample_worlds
 from ethbrake_marl.physics.worlds import sum_rows
 from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.scenario.lines import constant_command
-from ethbrake_marl.scenario.quantities import kind_columns
+from ethbrake_marl.scenario.fields import constant_command, kind_columns
 from ethbrake_marl.shield.agents import drives_alone
 
 # The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.

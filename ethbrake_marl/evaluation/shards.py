@@ -55,7 +55,7 @@ from ethbrake_marl.harm import scored
 from ethbrake_marl.limits.limits import Unproven, known_limits
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.scenario.quantities import DECLARED, quantity, quantity_rules
+from ethbrake_marl.scenario.fields import DECLARED, quantity, quantity_rules
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 # The statistics of some worlds of a list: counts and exact sums, which merge in any order to the same bits.

@@ -20,8 +20,7 @@ from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe
-from ethbrake_marl.learning.team_file import load_team
-from ethbrake_marl.learning.training import resolve
+from ethbrake_marl.learning.training import load_team, resolve
 from ethbrake_marl.limits.best_harm import best_harm, chunks_left, realised_harm, search_list, world_identity
 from ethbrake_marl.limits.best_harm_table import BestHarmTable
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds

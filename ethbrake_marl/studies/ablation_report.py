@@ -32,8 +32,7 @@ from ethbrake_marl.figures.style import Figure, write_picture
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text, estimates_to_json
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import WORDS
-from ethbrake_marl.learning.team_file import is_team, load_team
-from ethbrake_marl.learning.training import RunDirectory, read_object
+from ethbrake_marl.learning.training import RunDirectory, is_team, load_team, read_object
 from ethbrake_marl.limits.best_harm import best_harm
 from ethbrake_marl.pages.frame import Section, facts, page, table
 from ethbrake_marl.pages.player import Played, player
@@ -42,8 +41,7 @@ from ethbrake_marl.pages.vector import drawing
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies.bundle import Policy, load_policy
 from ethbrake_marl.scenario import Sample, Scenario
-from ethbrake_marl.scenario.lines import LEARNER
-from ethbrake_marl.scenario.quantities import DECLARED
+from ethbrake_marl.scenario.fields import DECLARED, LEARNER
 from ethbrake_marl.shield.agents import Shielded
 from ethbrake_marl.studies.ablation import Harms, Level, Measured, Plan, Training, harms_of
 from ethbrake_marl.studies.jobs import Job, each, run_jobs

@@ -20,16 +20,15 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput, OnProgress, Progre
 from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.files.store import remove_folder
-from ethbrake_marl.learning.loop import StopAt
 from ethbrake_marl.learning.progress import OBJECTIVE, chosen_by
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, read_settings
-from ethbrake_marl.learning.team_file import load_team
-from ethbrake_marl.learning.train import resume, train
+from ethbrake_marl.learning.train import StopAt, resume, train
 from ethbrake_marl.learning.training import (
     RunDirectory,
     Training,
     check_same,
     is_finished,
+    load_team,
     progress_rows,
     read_object,
     wait_for_others,

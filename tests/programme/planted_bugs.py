@@ -45,10 +45,10 @@ EXACT, SEEDS, TABLE, REGRET, ROLLOUT = (
 SHARDS = "ethbrake_marl/studies/shards.py"
 COURSE, LOOP, EVENTS, KEPT, INDEPENDENT, RECIPE = (
     "ethbrake_marl/learning/progress.py",
-    "ethbrake_marl/learning/loop.py",
+    "ethbrake_marl/learning/train.py",
     "ethbrake_marl/learning/progress.py",
     "ethbrake_marl/learning/training.py",
-    "ethbrake_marl/learning/algorithms/networks.py",
+    "ethbrake_marl/learning/algorithms.py",
     "ethbrake_marl/learning/recipe.py",
 )
 

@@ -247,8 +247,7 @@ LEARNING = Suite(
             "tests/learning/test_train.py",
             "tests/learning/test_resume.py",
         ),
-        "learning/algorithms/networks.py": ("tests/learning/test_teams.py",),
-        "learning/team_file.py": ("tests/learning/test_teams.py",),
+        "learning/algorithms.py": ("tests/learning/test_teams.py",),
         "learning/train.py": (
             "tests/learning/test_sb3_policy.py",
             "tests/learning/test_train.py",
