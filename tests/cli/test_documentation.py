@@ -7,11 +7,11 @@ import re
 from pathlib import Path
 
 import pytest
+from ethbrake_marl.cli.recipe import recipe_app
 from typer.main import get_command
 
 from ethbrake_marl.agents.registry import agent_names
 from ethbrake_marl.cli.app import app
-from ethbrake_marl.cli.recipe import recipe_app
 from ethbrake_marl.cli.scenario import scenario_app
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
