@@ -296,8 +296,8 @@ def make_agent(
 
     Args:
         spec: ``name[:argument][@policy]`` and what is put around it, for instance ``constant:3.5``, ``planner:20ms``,
-            ``ppo@shipped+refined+step``; ``ethbrake agent list`` has all. ``my_file.py:make_agent`` runs that file, which
-            can do whatever you can: its function gets what a factory of ``register_agent`` gets, or nothing.
+            ``ppo@shipped+refined+step``; ``ethbrake agent list`` has all. ``my_file.py:make_agent`` runs that file,
+            which can do whatever you can: its function gets what a factory of ``register_agent`` gets, or nothing.
         scenario: needed by teams, by what is put around an agent, and to find the shipped policy of this scenario.
         harm_count: which harm an optimising agent minimises, ``first`` or ``total``.
         horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.

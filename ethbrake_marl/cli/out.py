@@ -1,4 +1,4 @@
-"""What a command says: results on stdout; lines, progress and warnings on stderr; the files that it was asked for."""
+"""The output of commands: results on stdout; lines, progress and warnings on stderr; the files that are asked for."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,8 +15,6 @@ from ethbrake_marl.defaults import LIST_SEED, DatasetFormat, HarmCount
 from ethbrake_marl.errors import count_of
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from ethbrake_marl.evaluation.passport import Replay
     from ethbrake_marl.physics import LeftOutRows
     from ethbrake_marl.scenario import Scenario
@@ -273,7 +271,7 @@ def _check_picture(out: Out, output: Path) -> None:
     out.check(output)
 
 
-def _write_picture(out: Out, output: Path, figure: Figure, left_out: LeftOutRows = (), whole: int = 0) -> None:
+def _write_picture(out: Out, output: Path, figure: Any, left_out: LeftOutRows = (), whole: int = 0) -> None:
     """Write a picture; ``left_out`` of ``whole`` worlds count in none of its figures."""
     from ethbrake_marl.figures.style import write_picture
 

@@ -99,7 +99,7 @@ def test_film__as_svg_moves_every_vehicle_as_its_scenes_say() -> None:
 def test_film__of_the_readme_is_that_of_its_command(tmp_path: Path) -> None:
     made = tmp_path / "made.svg"
     text = " ".join(README.read_text("utf-8").split())
-    command = re.search(r"`ethbrake (record .*?) --output docs/figures/emergency.svg`", text)
+    command = re.search(r"`ethbrake (watch record .*?) --output docs/figures/emergency.svg`", text)
     assert command is not None
     assert run_command([*command[1].split(), "--output", str(made)]) == 0
     kept = (README.parent / "docs" / "figures" / "emergency.svg").read_text("utf-8")

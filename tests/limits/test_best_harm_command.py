@@ -76,7 +76,7 @@ def test_best_harm_command__lets_the_whole_ladder_drive(tmp_path: Path, capsys: 
         (["--budget", "0"], "budget = 0"),
         (["--vehicles", "vehicle_9"], "vehicle_9"),
         (["--output", "nowhere/t.npz"], "no folder"),
-        (["--output", "t.txt"], "ends in .npz"),
+        (["--output", "t.txt"], "a table must end in .npz"),
         (["--start", "missing.npz"], "no such table"),
         (["--start", str(TABLES / "paper-delay-low.npz")], "scenario paper-delay-low, list_seed 7"),
         (["--start", str(TABLES / "paper-random.npz"), "--seed", "8"], "holds none of these 4 worlds"),
