@@ -196,8 +196,8 @@ def create_run(
         if not run.status.is_file():
             raise AlreadyExists(f"{path}: is there already, and is no run; give another name")
         raise AlreadyExists(
-            f"{path}: is there already; give another name (--name), go on with it (ethbrake resume), or replace it with"
-            " force (--force; make run ARGS=--force)"
+            f"{path}: is there already; give another name (--name), go on with it (ethbrake train resume), or replace"
+            " it with force (--force; make run ARGS=--force)"
         )
     with new_folder(path, replace=replace) as partial:
         new = RunDirectory(partial)

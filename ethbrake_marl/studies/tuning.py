@@ -805,7 +805,7 @@ def best_recipe(plan: TuningPlan, values: Values, file: Path, source: str) -> st
     Raises ``InvalidInput`` for a file whose name cannot be a recipe's.
     """
     check_file_name("recipe", file.stem)
-    described = f"Settings of {plan.file.recipe} that `ethbrake tune` found."
+    described = f"Settings of {plan.file.recipe} that `ethbrake study tune` found."
     recipe = plan.training(values).recipe.replace(
         name=file.stem, title=plan.file.title, description=described, source=source
     )

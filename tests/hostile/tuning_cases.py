@@ -96,6 +96,6 @@ def _case(category: str, content: bytes | str, *, certain: bool = True) -> Case:
         write(folder / "mine.yaml", content)
         write(folder / "taken", "precious")
 
-    command = ("tune", "mine.yaml", "--output", "taken")
+    command = ("study", "tune", "mine.yaml", "--output", "taken")
     read = (lambda: plan_tuning(read_tuning("mine.yaml"))) if certain else None
     return Case("tuning", category, command, build, certain=certain, reader=read, content=content)

@@ -29,7 +29,7 @@ from tests.studies.sweep.disturbing import PROGRAM, holders, journal
 
 WORK = {
     "counting": ([sys.executable, "-m", "tests.studies.sweep.counting"], []),
-    "training": ([*PROGRAM, "sweep"], ["--retries", "5", "--output"]),
+    "training": ([*PROGRAM, "study", "sweep"], ["--retries", "5", "--output"]),
 }
 NODES = 2  # with one core each
 LONGEST_S = 3600.0

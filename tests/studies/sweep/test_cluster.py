@@ -114,7 +114,7 @@ def test_ray__lost_jobs_are_tried_again_by_us_and_refused_ones_are_not(monkeypat
 
 def test_ray__is_an_extra(monkeypatch, write_sweep, small, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
-    command = ["sweep", str(write_sweep(**small)), "--output", str(tmp_path / "out"), "--ray", "local"]
+    command = ["study", "sweep", str(write_sweep(**small)), "--output", str(tmp_path / "out"), "--ray", "local"]
     assert run_command(command) == 2
     assert "needs the package ray" in (told := capsys.readouterr().err) and "ethbrake-marl[cluster]" in told
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""``ethbrake tune``: what it writes, that its best trial can be had again, and that no disturbance shows."""
+"""``ethbrake study tune``: what it writes, that its best trial can be had again, and that no disturbance shows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def read(file: Path) -> list[dict[str, str]]:
 
 
 def tune(file: Path, folder: Path, *options: str) -> int:
-    return run_command(["tune", str(file), "--output", str(folder), "--trials", str(TRIALS), *options])
+    return run_command(["study", "tune", str(file), "--output", str(folder), "--trials", str(TRIALS), *options])
 
 
 def test_table__has_every_trial_the_first_with_the_recipes_own_values(finished_tuning):
@@ -93,7 +93,18 @@ def test_trials__that_ended_are_kept_and_more_go_on_as_if_they_had_been_asked_fo
 def test_disturbed_tuning__has_the_same_table(finished_tuning, write_tuning, tmp_path):
     file, folder = write_tuning(), tmp_path / "out"
     export = tmp_path / "best.yaml"
-    command = [*PROGRAM, "tune", str(file), "--output", str(folder), "--trials", str(TRIALS), "--export", str(export)]
+    command = [
+        *PROGRAM,
+        "study",
+        "tune",
+        str(file),
+        "--output",
+        str(folder),
+        "--trials",
+        str(TRIALS),
+        "--export",
+        str(export),
+    ]
     for trial, end in ((1, signal.SIGKILL), (3, signal.SIGINT)):
         driver = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         try:

@@ -124,7 +124,7 @@ def test_bad_files__without_their_mistake_are_planned(tmp_path):
 @pytest.mark.parametrize("changes", [{"recipe": "pppo"}, searching(gama=RATE), {"prune": 1}])
 def test_bad_files__begin_no_trial_and_make_nothing(write_tuning, tmp_path, changes):
     file = write_tuning(**changes)
-    assert run_command(["tune", str(file), "--output", str(tmp_path / "new")]) == 2
+    assert run_command(["study", "tune", str(file), "--output", str(tmp_path / "new")]) == 2
     assert [*tmp_path.iterdir()] == [file]
 
 
