@@ -29,7 +29,7 @@ from ethbrake_marl.errors import InvalidInput, count_of
 
 if TYPE_CHECKING:
     from ethbrake_marl.evaluation.inputs import NamedWorld, NamedWorlds
-    from ethbrake_marl.limits.best_harm_table import BestHarmTable
+    from ethbrake_marl.limits.best_harm import BestHarmTable
     from ethbrake_marl.scenario import Sample, Scenario, Task
     from ethbrake_marl.studies.falsification import Falsified, Measure
 
@@ -85,8 +85,7 @@ def best_harm_command(
     from ethbrake_marl.evaluation.inputs import load_runnable, make_agents
     from ethbrake_marl.evaluation.regret import shipped_bounds, shipped_lines
     from ethbrake_marl.learning.recipe import read_settings
-    from ethbrake_marl.limits.best_harm import fold_agent, search_list
-    from ethbrake_marl.limits.best_harm_table import load_table, save_table
+    from ethbrake_marl.limits.best_harm import fold_agent, load_table, save_table, search_list
     from ethbrake_marl.scenario import Task
 
     if shipped:

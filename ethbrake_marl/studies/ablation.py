@@ -21,10 +21,16 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe
 from ethbrake_marl.learning.training import load_team, resolve
-from ethbrake_marl.limits.best_harm import best_harm, chunks_left, realised_harm, search_list, world_identity
-from ethbrake_marl.limits.best_harm_table import BestHarmTable
+from ethbrake_marl.limits.best_harm import (
+    BestHarmTable,
+    best_harm,
+    chunks_left,
+    realised_harm,
+    search_list,
+    world_identity,
+)
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.episode import first_decision_s
+from ethbrake_marl.physics.kernel import first_decision_s
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.shield.agents import Shielded, drive_chunks, stack
 from ethbrake_marl.studies.jobs import JobFolder
