@@ -139,10 +139,15 @@ def test_a_damaged_line__is_told_and_its_worlds_are_driven_again(asked, tally, d
     told = []
     assert evaluate_shards(asked, shards=4, folder=tmp_path, tell=told.append) == tally
     assert driven == [(0, 1_000)] and "1 finished shard damaged" in told[0].note
-    first, *others = whole.splitlines(keepends=True)
-    journal.write_text("".join([first.replace("0000000000000-", "0000000000001-"), *others, first]))
+
+
+def test_lines_of_another_journal__are_refused_where_worlds_would_count_twice(asked, tmp_path: Path) -> None:
+    journals = [tmp_path / name / "journal.jsonl" for name in ("one", "other")]
+    for shards, journal in enumerate(journals, 1):
+        evaluate_shards(asked, shards=shards, folder=journal.parent)
+    journals[0].write_text(journals[0].read_text() + journals[1].read_text())
     with pytest.raises(InvalidInput, match="two of its shards overlap"):
-        evaluate_shards(asked, shards=4, folder=tmp_path)
+        evaluate_shards(asked, shards=1, folder=tmp_path / "one")
 
 
 def test_rows__are_the_same_for_any_shards_and_those_of_killed_shards_go(asked, tally, tmp_path: Path) -> None:
