@@ -18,10 +18,18 @@ from ethbrake_marl import __version__
 from ethbrake_marl.cli.out import Out
 from ethbrake_marl.defaults import UNCERTAINTY_EXAMPLE
 from ethbrake_marl.envs.registration import register_environments
-from ethbrake_marl.errors import AlreadyExists, need
+from ethbrake_marl.errors import AlreadyExists, check_whole_number, need
 from ethbrake_marl.files.plugins import load_plugin
 
 Run = TypeVar("Run", bound=Callable[..., None])
+
+MOST_JOBS = 64
+
+
+def _check_jobs(jobs: int) -> int:
+    check_whole_number("jobs", jobs, 1, MOST_JOBS)
+    return jobs
+
 
 OPTIONS: dict[str, Any] = {  # of parameters that bring no option of their own, by their name
     "scenario": typer.Option(metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file."),
@@ -39,7 +47,9 @@ OPTIONS: dict[str, Any] = {  # of parameters that bring no option of their own, 
     "uncertainty": typer.Option(
         metavar="QUANTITY=WIDTH,...", help=f"What the robust shield does not know, such as {UNCERTAINTY_EXAMPLE}."
     ),
-    "jobs": typer.Option(min=1, max=64, help="So many at once, a process each; changes no result."),
+    "jobs": typer.Option(
+        help=f"So many at once, up to {MOST_JOBS}, a process each; changes no result.", callback=_check_jobs
+    ),
     "ray": typer.Option(metavar="local|ADDRESS", help="Do the work on Ray, not in processes of our own."),
     "force": typer.Option("--force", help="Replace what is already there."),
     "as_json": typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout."),

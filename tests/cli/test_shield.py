@@ -107,7 +107,7 @@ def test_shield__a_shielded_team_and_a_vehicle_that_is_no_learner_are_refused(et
 
 
 @pytest.mark.parametrize("spec", ["ppo@shipped+episode", "full_brake+step", "ppo@shipped+refined+step"])
-@pytest.mark.parametrize("command", ["shield", "picture shield", "picture robustness"])
+@pytest.mark.parametrize("command", ["shield", "watch picture shield", "watch picture robustness"])
 def test_shield__what_has_a_shield_already_is_refused(ethbrake, tmp_path, command, spec):
     option = "--agent" if command.endswith("robustness") else "--agents"
     output = () if command == "shield" else ("--output", tmp_path / "shield.png")

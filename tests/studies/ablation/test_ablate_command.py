@@ -168,7 +168,7 @@ def test_ablate__bad_input_is_refused(tmp_path, tiny, capsys):
     assert "seeds 0: must be at least 1" in refused(capsys, *start, "--seeds", "0")
     assert "at most the 10 worlds" in refused(capsys, *start, "--episodes", "10", "--search-episodes", "11")
     assert "scheme" in refused(capsys, *start, "--scheme", "shard")
-    assert "jobs 0" in refused(capsys, *start, "--jobs", "0")
+    assert "jobs = 0: must be a whole number in 1..64" in refused(capsys, *start, "--jobs", "0")
     only = "cooperation-0-sensors,paper-distance"
     assert "is a file; give a folder" in refused(capsys, "--output", tiny, "--recipes", tiny)
     assert "is a file; give a folder" in refused(capsys, "--output", tiny / "new", "--recipes", tiny)

@@ -190,9 +190,9 @@ def test_storage__can_be_shared_by_folders(write_tuning, tmp_path):
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (["--trials", "0"], "trials 0: must be from 1"),
-        (["--jobs", "0"], "jobs 0: must be from 1"),
-        (["--retries", "-1"], "retries -1"),
+        (["--trials", "0"], "trials = 0: must be a whole number in 1..100000"),
+        (["--jobs", "0"], "jobs = 0: must be a whole number in 1..4096"),
+        (["--retries", "-1"], "retries = -1: must be"),
         (["--storage", "study.db"], "must be an address such as sqlite:///study.db"),
         (["--storage", "none://me:secret@here/x"], "storage none://...: cannot be used"),
         (["--export", "best.txt"], "must end in .yaml"),
