@@ -477,8 +477,7 @@ def drive_command(
     The score of a list is the realised share of what is possible, 0 for full braking and 1 for the best known. A list
     that the agent cannot drive has none, and then there is no overall score.
     """
-    from ethbrake_marl.studies.benchmark import load_suite, make_entry, write_entry
-    from ethbrake_marl.studies.leaderboard import list_table
+    from ethbrake_marl.studies.benchmark import entry_sheet, load_suite, make_entry, write_entry
 
     out.check(output, ".json", what="an entry")
     chosen = load_suite(suite)
@@ -494,7 +493,7 @@ def drive_command(
             f"{agent}: no overall score, as it drives {entry.lists_driven} of {len(chosen.lists)} lists of suite"
             f" {suite}; {mean} of what is possible there"
         )
-    out.result(entry.model_dump(mode="json"), list_table(entry, chosen), told)
+    out.result(entry.model_dump(mode="json"), entry_sheet(entry, chosen), told)
 
 
 @command(benchmark_group, "table", "benchmark table mine.json theirs.json --output table.html", json=True, force=True)
@@ -509,19 +508,10 @@ def table_command(
 
     Refused by name: entries of another suite, and changed ones.
     """
-    from ethbrake_marl.studies.leaderboard import (
-        RANK,
-        SCORE,
-        leaderboard_markdown,
-        leaderboard_page,
-        leaderboard_table,
-        read_leaderboard,
-    )
+    from ethbrake_marl.studies.benchmark import read_leaderboard
 
     out.check(output, *PAGES, ".md", what="the table")
     found = read_leaderboard(entries)
     if output is not None:
-        is_page = output.suffix.lower() != ".md"
-        out.write(output, leaderboard_page(found) if is_page else leaderboard_markdown(found), what="table")
-    suite = f"Suite {found.suite.name}, SHA-256 {found.suite.sha256}"
-    out.result(found.to_json(), leaderboard_table(found), SCORE, RANK, suite)
+        out.write(output, found.markdown() if output.suffix.lower() == ".md" else found.page(), what="table")
+    out.result(found.to_json(), found.sheet(), *found.notes)
