@@ -529,11 +529,15 @@ class Leaderboard:
         # templates take time to load, and most commands write no page
         from ethbrake_marl.pages.frame import Block, Cell, Section, facts, page, paragraph, table
 
+        def cell(column: Column, figure: Estimate | float | None) -> Cell:
+            value, interval = column.show(figure)
+            return Cell(value, f"[{interval}]" if interval else "")
+
         percent, harm = Column("", digits=1, scale=100.0), Column("")
         suite, names = self.suite, [each.name for each in self.suite.lists]
         rows = [
-            [entry.agent, rank, Cell(*percent.show(entry.mean_of_driven)), self._driven(entry)]
-            + [Cell(*percent.show(each.realised_share if isinstance(each, ListResult) else None))
+            [entry.agent, rank, cell(percent, entry.mean_of_driven), self._driven(entry)]
+            + [cell(percent, each.realised_share if isinstance(each, ListResult) else None)
                for each in map(entry.lists.__getitem__, names)]
             for rank, entry in self._ranks()
         ]  # fmt: skip
@@ -553,7 +557,7 @@ class Leaderboard:
                 cells = (
                     [Cell(_NOT_DRIVEN, result.not_driven, words=True)]
                     if isinstance(result, NotDriven)
-                    else [Cell(*column.show(figure)) for column, figure in zip(columns, _figures(result), strict=True)]
+                    else [cell(column, figure) for column, figure in zip(columns, _figures(result), strict=True)]
                 )
                 lines.append([entry.agent, *cells, *[DASH] * (len(columns) - len(cells))])
         head = (
