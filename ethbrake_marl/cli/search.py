@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario import Sample, Scenario, Task
     from ethbrake_marl.studies.falsification import Falsified, Measure
 
-WORSE = 1  # exit status when a kept world is worse than it was
 ROUNDING = 1e-6  # m2/s2
 
 search_group = new_group(
@@ -332,7 +331,7 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     worse = sum(bool(row["worse"]) for row in rows)
     out.note(f"{file}: {agent or kept.agent} is worse in {worse} of {count_of(len(rows), 'world')}")
     if worse:
-        raise typer.Exit(WORSE)
+        raise typer.Exit(1)
 
 
 def _table(worlds: list[NamedWorld], measure: Measure) -> list[Table]:

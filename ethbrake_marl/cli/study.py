@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.studies.tuning import TuningResult, TuningState
     from ethbrake_marl.studies.tuning_file import TuningPlan
 
-FAILED = 1  # exit status where some jobs failed
 KEPT = "the same command goes on with what is in the folder"
 PAPER_EPISODES = 10_000
 _MOST_JOBS, _MOST_TRIALS, _MOST_RETRIES = 4096, 100_000, 100
@@ -134,7 +133,7 @@ def _tell_sweep(out: Out, result: SweepResult, output: Path) -> None:
         out.interrupted(f"interrupted; {told}; {KEPT}")
     out.note(told)
     if result.failures:
-        raise typer.Exit(FAILED)
+        raise typer.Exit(1)
 
 
 def _tuning_schema() -> dict[str, Any]:
@@ -257,7 +256,7 @@ def _tell_tuning(out: Out, plan: TuningPlan, result: TuningResult, export: Path 
         out.interrupted(f"interrupted; {told}; {KEPT}")
     out.note(told)
     if best is None:
-        raise typer.Exit(FAILED)
+        raise typer.Exit(1)
 
 
 @command(study_group, "ablate", "study ablate --quick --output runs/ablation-quick", kept=KEPT, json=True)
