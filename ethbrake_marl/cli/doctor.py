@@ -162,7 +162,7 @@ def _kernel_cache() -> tuple[bool, str]:
 
 def _scenarios() -> tuple[bool, str]:
     from ethbrake_marl.scenario import list_scenarios, scenario_folder
-    from ethbrake_marl.scenario.catalogue import SHIPPED
+    from ethbrake_marl.scenario.schema import SHIPPED
 
     found = [entry for entry in list_scenarios() if entry.origin == SHIPPED]
     return len(found) > 0, f"{len(found)} in {scenario_folder()}"

@@ -132,7 +132,7 @@ def evaluate_command(
     from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, check_agents, choose_worlds
     from ethbrake_marl.evaluation.shards import Question
     from ethbrake_marl.evaluation.summary import check_group, summarise_by
-    from ethbrake_marl.scenario.quantities import kind_columns
+    from ethbrake_marl.scenario.fields import kind_columns
 
     whole = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
     _check_shards(shards, jobs, ray, output, rows, whole)

@@ -30,7 +30,7 @@ scenario_group = new_group(
 def scenario_list(out: Out) -> None:
     """List the scenarios that have a name: that and the title, and the folder of those that a plug-in registers."""
     from ethbrake_marl.scenario import list_scenarios
-    from ethbrake_marl.scenario.catalogue import SHIPPED
+    from ethbrake_marl.scenario.schema import SHIPPED
 
     entries = list_scenarios()
     width = max(len(entry.name) for entry in entries)
@@ -56,8 +56,7 @@ def scenario_validate(out: Out, path: NameArgument) -> None:
     from ethbrake_marl.agents.registry import make_single_agent
     from ethbrake_marl.agents.rollout import drive
     from ethbrake_marl.evaluation.inputs import load_runnable
-    from ethbrake_marl.scenario.lines import LEARNER, is_state_free
-    from ethbrake_marl.scenario.quantities import count_kinds
+    from ethbrake_marl.scenario.fields import LEARNER, count_kinds, is_state_free
 
     scenario = load_runnable(path)
     sample = scenario.sample(CHECKED_DRAWS, LIST_SEED)

@@ -29,7 +29,7 @@ from ethbrake_marl.errors import InvalidInput, count_of
 
 if TYPE_CHECKING:
     from ethbrake_marl.evaluation.inputs import NamedWorld, NamedWorlds
-    from ethbrake_marl.limits.best_harm_table import BestHarmTable
+    from ethbrake_marl.limits.best_harm import BestHarmTable
     from ethbrake_marl.scenario import Sample, Scenario, Task
     from ethbrake_marl.studies.falsification import Falsified, Measure
 
@@ -82,10 +82,9 @@ def best_harm_command(
     command goes on where it was interrupted.
     """
     from ethbrake_marl.evaluation.inputs import load_runnable, make_agents
-    from ethbrake_marl.evaluation.regret import shipped_bounds, shipped_lines
+    from ethbrake_marl.evaluation.measures import shipped_bounds, shipped_lines
     from ethbrake_marl.learning.recipe import read_settings
-    from ethbrake_marl.limits.best_harm import fold_agent, search_list
-    from ethbrake_marl.limits.best_harm_table import load_table, save_table
+    from ethbrake_marl.limits.best_harm import fold_agent, load_table, save_table, search_list
     from ethbrake_marl.scenario import Task
 
     if shipped:
@@ -152,7 +151,7 @@ def _figures(
     import numpy as np
 
     from ethbrake_marl.evaluation.inputs import result_identity
-    from ethbrake_marl.evaluation.regret import proven_of_table
+    from ethbrake_marl.evaluation.measures import proven_of_table
     from ethbrake_marl.limits.best_harm import LEFT_OUT
 
     told: dict[str, object] = {key: value for key, value in table.header.items() if key != "after"}

@@ -16,14 +16,12 @@ import numpy as np
 from ethbrake_marl.agents.protocol import Agent, Driver, Team, team_of
 from ethbrake_marl.agents.rollout import Episodes, drive, episode_engine
 from ethbrake_marl.defaults import HARM_COUNTS
-from ethbrake_marl.envs.drawing.animation import animate_films
-from ethbrake_marl.envs.drawing.scene import Scene, Trace, kept_motions, scenes
+from ethbrake_marl.envs.drawing.scene import Scene, Trace, animate_films, kept_motions, scenes
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
-from ethbrake_marl.physics.episode import first_decision_s, segment_pieces
-from ethbrake_marl.physics.kernel import with_post_ahead
+from ethbrake_marl.physics.kernel import first_decision_s, segment_pieces, with_post_ahead
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import HybridAgent
 from ethbrake_marl.shield.agents import shield_around
