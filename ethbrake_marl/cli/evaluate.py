@@ -31,6 +31,7 @@ from ethbrake_marl.defaults import EPISODES, LIST_SEED, HarmCount
 from ethbrake_marl.errors import InvalidInput, count_of
 
 if TYPE_CHECKING or LATE:
+    from ethbrake_marl.agents.protocol import Driver
     from ethbrake_marl.cli.report import check_page, write_evaluation_report
     from ethbrake_marl.cli.results import counted_without, picture_target, results_beside, tell_left_out, tell_results
     from ethbrake_marl.cli.shards import check_shards, evaluate_in_shards

@@ -14,6 +14,7 @@ from ethbrake_marl.defaults import LIST_SEED, HarmCount
 from ethbrake_marl.errors import count_of
 
 if TYPE_CHECKING or LATE:
+    from ethbrake_marl.agents.protocol import Agent
     from ethbrake_marl.cli.results import counted_without, picture_target, tell_left_out
     from ethbrake_marl.evaluation.curves import CELLS, criticality_map, deceleration_curve
     from ethbrake_marl.evaluation.inputs import (

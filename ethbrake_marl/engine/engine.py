@@ -446,8 +446,8 @@ class Engine(Running):
     def _apart(self) -> Engine:
         """An engine that goes on from here without changing this one (scripts that remember are shared)."""
         new = copy.copy(self)
-        new.__dict__.update({name: getattr(self, name).copy() for name in RUNNING})
-        new.roster = copy.deepcopy(self.roster)
+        new.__dict__.update({name: getattr(new, name).copy() for name in RUNNING})
+        new.roster = copy.deepcopy(new.roster)
         return new
 
     def _renew(self, rows: Ints) -> None:
@@ -468,17 +468,18 @@ class Engine(Running):
         columns = self._columns(actions)
         if not (self.guard or self._memories or self._terms.are_foreign or self._on_own_grid):  # nobody can refuse it
             return self._advance(columns)
-        new = self._apart()
+        before = copy.copy(self)  # of one moment, whatever another thread does meanwhile
+        new = before._apart()
         if self.guard is not None:
-            if self.guarded is None:
+            if before.guarded is None:
                 raise UncertifiedStep("shield: this episode began before the shield was put around it; reset first")
             proposed = columns if isinstance(actions, Mapping) else self._in_range(columns)  # those of one are checked
-            ruling = self.guard.decide(self, self.guarded, proposed)
+            ruling = self.guard.decide(before, before.guarded, proposed)
             columns = np.ascontiguousarray(ruling.applied)
         step = new._advance(columns)
         if self.guard is not None:
             new.ruling, new.guarded = ruling, self.guard.check(ruling, new)
-        new._memories = {w: w.stepped(memory, self, new) for w, memory in self._memories.items()}
+        new._memories = {w: w.stepped(memory, before, new) for w, memory in self._memories.items()}
         self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
         return step
 

@@ -55,6 +55,8 @@ class ShieldedDriver:
         **options: Any,
     ) -> None:
         self.options = ShieldOptions(**options)
+        if self.options.mode == "episode":
+            raise InvalidInput("shield: mode = 'episode': HybridAgent is that of mode episode")
         if not isinstance(policy, Team):
             check_agent(policy, str(self.options.mode))
         check_scenario(scenario, str(self.options.mode))
