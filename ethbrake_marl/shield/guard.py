@@ -46,10 +46,10 @@ from ethbrake_marl.engine.stream import Script, ask_script, begin_script
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, check_one_learner, count_of, unknown_name
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.profiles import state_columns
+from ethbrake_marl.search import state_columns
 from ethbrake_marl.shield.believed import BelievedShield
 from ethbrake_marl.shield.certify import REASONS, Decision, Proposer, difference, proposed_actions, seen_columns
-from ethbrake_marl.shield.interior import CORNERS, INTERIOR, checked_robust, expects
+from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust, expects
 from ethbrake_marl.shield.step_shield import CAPS, Cap, StepShield, by_vehicle
 from ethbrake_marl.shield.uncertainty import (
     Uncertainty,

@@ -54,12 +54,12 @@ KERNEL, MEMBERS, CERTIFY, ALERT, GUARD, ROLLOUTS, ATTACHED, COMPARISON, TEAM = (
 )  # fmt: skip
 ENGINE = "ethbrake_marl/engine/engine.py"
 FORMS, INSIDE, WAIT, MOTION, TOUCH, ROUGH = (
-    "ethbrake_marl/shield/enclosure_motion.py",
-    "ethbrake_marl/shield/interior.py",
-    "ethbrake_marl/shield/interior.py",
-    "ethbrake_marl/shield/enclosure_motion.py",
-    "ethbrake_marl/shield/enclosure_motion.py",
-    "ethbrake_marl/shield/enclosure_motion.py",
+    "ethbrake_marl/shield/enclosure.py",
+    "ethbrake_marl/shield/enclosure.py",
+    "ethbrake_marl/shield/enclosure.py",
+    "ethbrake_marl/shield/enclosure.py",
+    "ethbrake_marl/shield/enclosure.py",
+    "ethbrake_marl/shield/enclosure.py",
 )
 
 BUGS: dict[str, tuple[Patch, ...]] = {

@@ -37,10 +37,10 @@ EVENTS, IMPACT, SEGMENT, ADVANCE = (
 )
 HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/kernel.py"
 FLIGHTS, LOWER_BOUND = (
-    "ethbrake_marl/limits/meetings.py",
+    "ethbrake_marl/limits/lower_bound.py",
     "ethbrake_marl/limits/lower_bound.py",
 )
-PROFILES = "ethbrake_marl/search/profiles.py"
+PROFILES = "ethbrake_marl/search.py"
 
 
 BUGS: dict[str, tuple[Patch, ...]] = {
