@@ -21,16 +21,15 @@ from numpy.typing import NDArray
 from ethbrake_marl.agents.protocol import knowledge_text
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, count_of, naming_extras, need, unknown_name
-from ethbrake_marl.evaluation.harm_metrics import COLUMN
 from ethbrake_marl.evaluation.inputs import Kind
+from ethbrake_marl.evaluation.measures import COLUMN, Regrets, assess
 from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
-from ethbrake_marl.evaluation.regret import Regrets, assess
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, paired_difference, unpaired_difference
 from ethbrake_marl.evaluation.summary import Rescored, SummaryRow
 from ethbrake_marl.files.store import check_writable, parse_strict_json, read_plain, write_file
 from ethbrake_marl.harm import Declared, scored
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.scenario.quantities import quantity, quantity_rules
+from ethbrake_marl.scenario.fields import quantity, quantity_rules
 
 # One row per agent and world: its columns, and its file, written whole and never over another by accident.
 
@@ -169,15 +168,17 @@ def objective_columns(outcome: Outcome, objectives: Sequence[Declared]) -> Colum
     }
 
 
+def vehicle_columns(outcome: Outcome) -> Columns:
+    """What each vehicle bears under both counts (m2/s2): ``total_harm_2``."""
+    harms = {"first_impact_harm": outcome.vehicle_harm("first"), "total_harm": outcome.vehicle_harm("total")}
+    return {f"{name}_{i + 1}": harm[:, i].tolist() for name, harm in harms.items() for i in range(harm.shape[1])}
+
+
 def outcome_columns(outcome: Outcome) -> Columns:
     """What happened in each world; a column that the agent says nothing about is empty."""
     n = len(outcome.collided)
     columns: Columns = {"collided": outcome.collided.astype(int).tolist(), "impacts": outcome.impacts.tolist()}
-    for name, harm in (
-        ("first_impact_harm", outcome.vehicle_harm("first")),
-        ("total_harm", outcome.vehicle_harm("total")),
-    ):
-        columns |= {f"{name}_{i + 1}": harm[:, i].tolist() for i in range(harm.shape[1])}
+    columns |= vehicle_columns(outcome)
     columns |= {"first_impact_harm": outcome.first_impact_harm.tolist(), "total_harm": outcome.total_harm.tolist()}
     for name, column in (("sampled_harm", outcome.sampled_harm), ("vehicle_1_shoved_m", outcome.shoved_m)):
         columns[name] = [None] * n if column is None else column.tolist()
@@ -192,7 +193,7 @@ def outcome_columns(outcome: Outcome) -> Columns:
     predicted, chosen = outcome.predicted_harm, outcome.chosen_policy
     columns["predicted_harm"] = [None] * n if predicted is None else predicted.tolist()
     columns["chosen_policy"] = [None] * n if chosen is None else chosen.astype(int).tolist()
-    columns |= {f"{COLUMN}{name}": column.tolist() for name, column in outcome.metrics.items()}
+    columns |= {COLUMN + name: (column + 0).tolist() for name, column in outcome.metrics.items()}  # truths as 0 and 1
     return columns
 
 

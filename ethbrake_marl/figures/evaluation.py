@@ -19,8 +19,8 @@ from ethbrake_marl.envs.drawing.scene import vehicle_colour
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.curves import NO_REGION, CriticalityMap, DecelerationCurve
 from ethbrake_marl.evaluation.episodes import EpisodeRecord
+from ethbrake_marl.evaluation.measures import assess
 from ethbrake_marl.evaluation.outcome import Evaluation, parameter_line, parameters, quantities, quantity_line
-from ethbrake_marl.evaluation.regret import assess
 from ethbrake_marl.evaluation.shield_modes import NONE, STEP, STEP_ALERT, STEP_CAP, ModeRow, are_teams
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.evaluation.summary import SummaryRow
@@ -69,8 +69,7 @@ def harm_by_agent(rows: Sequence[SummaryRow]) -> Figure:
                 f"{estimate.value:.2f}", (ends[1], k), xytext=(5, 0), textcoords="offset points", va="center",
                 fontsize=9,
             )  # fmt: skip
-        distance = rows[0].distance
-        best = distance.best_known_first if count == "first" else distance.best_known_total
+        best = rows[0]["best_known_first_impact_harm" if count == "first" else "best_known_total_harm"]
         if best is not None:
             axes.axvline(best.value, color=COLOURS[3], linewidth=1.6, linestyle="--", label="best known")
         name_axes(axes, x=_TITLES[count])

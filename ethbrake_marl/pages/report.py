@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,36 +15,31 @@ from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.episodes import follow_episodes
 from ethbrake_marl.evaluation.inputs import policy_sha256
+from ethbrake_marl.evaluation.measures import BASELINE, Regrets, assess
 from ethbrake_marl.evaluation.outcome import (
-    PAPER_NOTE,
-    PAPER_PARAMETERS,
     Evaluation,
     Outcome,
     parameter_line,
     parameters,
 )
 from ethbrake_marl.evaluation.passport import issue_passport
-from ethbrake_marl.evaluation.regret import Regrets, assess
 from ethbrake_marl.evaluation.results import write_output
 from ethbrake_marl.evaluation.shield_modes import ModeRow, are_teams, compare_behind_shields
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate
 from ethbrake_marl.evaluation.summary import (
-    BASELINE,
-    Line,
     SummaryRow,
-    filled_columns,
     identity_lines,
     knowledge_lines,
     left_out_lines,
     limit_lines,
-    our_lines,
-    paper_blocks,
-    table_columns,
+    paper_lines,
+    summary_sheet,
     table_meanings,
     warning_lines,
 )
 from ethbrake_marl.figures.evaluation import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.figures.style import Figure
+from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.pages.frame import Block, Cell, Part, Row, Section, facts, page, paragraph, table
 from ethbrake_marl.pages.player import Played, player
@@ -288,8 +283,7 @@ def _cell(estimate: Estimate, scale: float = 1.0, digits: int = 2, unit: str = "
     return Cell(f"{value}{unit}".replace("-", "−"), ", ".join(ends).replace("-", "−"))
 
 
-_HEADLINE = (0, 1, 2, 6, 7, 9, 10)  # of the table's columns; those of registered harm metrics follow
-_OTHERS = (3, 4, 5, 8)
+_OTHERS = ("sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_rate", "predicted_harm")
 
 
 @dataclass(frozen=True, slots=True)
@@ -401,27 +395,24 @@ def _results(report: Report) -> Section:
                 "Mean per world of the squared closing speed of impacts: each pair's first one, and every one.",
             )
         )
-    columns = table_columns(rows)
-    blocks = paper_blocks(rows)
-    shown = filled_columns(_all_lines(rows), (*_HEADLINE, *range(len(table_columns(())), len(columns))))
-    lines: list[Row] = [_row(line, shown) for line in our_lines(rows)]
-    for name, paper in blocks:
-        lines += [Block(f"The paper's {name}, as printed"), *(_row(line, shown) for line in paper)]
-    body.append(table(["Agent", *(columns[k] for k in shown)], lines, caption="Means with 95 % intervals"))
+    sheet = summary_sheet(rows)
+    names = [name for name in sheet.names if name not in ("Knows", *_OTHERS)]
+    body.append(_table(sheet, names, "Means with 95 % intervals"))
     if rows:
         body.append(paragraph(f"{parameter_line(rows[0].parameters)}. Harm in m²/s².", "quiet"))
     body += [paragraph(text, "quiet") for text in _empty_lines(report)]
     body += [paragraph(text, "note") for text in (*left_out_lines(rows), *warning_lines(rows))]
     body += [paragraph(f"The limit: {text}", "quiet") for text in limit_lines(rows)]
     body += [paragraph(f"Who knows what: {text}", "note") for text in knowledge_lines(rows)]
-    body += [paragraph(f"The paper's {name}: {PAPER_PARAMETERS[name]}.", "quiet") for name, _ in blocks]
-    body += [paragraph(PAPER_NOTE, "note")] if blocks else []
+    *paper, note = paper_lines(rows) or [""]
+    body += [paragraph(f"The paper's {line}", "quiet") for line in paper]
+    body += [paragraph(note, "note")] if note else []
     return Section("Results", body)
 
 
 def _empty_lines(report: Report) -> list[str]:
     """Which columns of the tables hold nothing, and why where that is known, as a sentence; none where all do."""
-    names = _empty(report.rows, _all_lines(report.rows))
+    names = _empty(report.rows)
     if not names:
         return []
     limits = report.evaluation.limits if report.evaluation is not None else None
@@ -429,20 +420,27 @@ def _empty_lines(report: Report) -> list[str]:
     return [f"Columns without a value in any row are left out: {'; '.join(names)}.{because}"]
 
 
-def _all_lines(rows: Sequence[SummaryRow]) -> list[Line]:
-    """Our lines and the paper's."""
-    return [*our_lines(rows), *(line for _, paper in paper_blocks(rows) for line in paper)]
+def _empty(rows: Sequence[SummaryRow]) -> list[str]:
+    """Columns of the table of these rows in which no line has a value."""
+    sheet = summary_sheet(rows)
+    filled = sheet.filled()
+    return [name for k, name in enumerate(sheet.headings) if k not in filled]
 
 
-def _empty(rows: Sequence[SummaryRow], lines: Sequence[Line]) -> list[str]:
-    """Columns of the table of these rows in which none of the lines has a value."""
-    columns = table_columns(rows)
-    filled = filled_columns(lines, range(len(columns)))
-    return [name for k, name in enumerate(columns) if k not in filled]
-
-
-def _row(line: Line, columns: Sequence[int]) -> Row:
-    return [line.agent, *(Cell(line.cells[k].value, line.cells[k].interval) for k in columns)]
+def _table(sheet: Sheet, names: Sequence[str], caption: str) -> Part:
+    """Columns of a table by name, below those of the agent; what is empty is left out."""
+    filled = set(sheet.filled())
+    kept = [k for k, name in enumerate(sheet.names) if k == 0 or (name in names and k in filled)]
+    some = sheet.only(kept)
+    words = [name == "Knows" for name in some.names[1:]]
+    lines: list[Row] = []
+    for row in some.shown():
+        if isinstance(row, str):
+            lines.append(Block(f"The paper's {row.removeprefix('paper, ')}, as printed"))
+        else:
+            cells = (Cell(value, below, text) for (value, below), text in zip(row[1:], words, strict=True))
+            lines.append([row[0].value, *cells])
+    return table(some.headings, lines, caption=caption)
 
 
 def _episodes(report: Report) -> list[Section]:
@@ -484,12 +482,10 @@ def _unrepeated(played: Sequence[Played], evaluation: Evaluation) -> list[str]:
 
 
 def _other_test(test: ReportTest) -> Section:
-    columns = table_columns(test.rows)
-    filled = filled_columns(our_lines(test.rows), range(len(columns)))
-    lines = [_row(line, filled) for line in our_lines(test.rows)]
-    head = ["Agent", *(columns[k] for k in filled)]
-    body: list[str | Part] = [test.description, table(head, lines, caption=test.title)]
-    if empty := _empty(test.rows, our_lines(test.rows)):
+    sheet = summary_sheet(test.rows)
+    names = [name for name in sheet.names if name != "Knows"]
+    body: list[str | Part] = [test.description, _table(sheet, names, test.title)]
+    if empty := _empty(test.rows):
         body.append(paragraph(f"Columns without a value in any row are left out: {'; '.join(empty)}.", "quiet"))
     if test.rows:
         told = [f"{parameter_line(test.rows[0].parameters)}.", *limit_lines(test.rows), *identity_lines(test.rows)]
@@ -499,16 +495,15 @@ def _other_test(test: ReportTest) -> Section:
 
 
 def _measures(report: Report) -> Section:
-    filled = filled_columns(our_lines(report.rows), _OTHERS)
-    lines = [[line.agent, Cell(line.knows, words=True), *_row(line, filled)[1:]] for line in our_lines(report.rows)]
-    head = ["Agent", "Knows", *(table_columns(())[k] for k in filled)]
-    return Section("Other measures", [table(head, lines, caption="In the same worlds")])
+    sheet = summary_sheet(report.rows)
+    ours = replace(sheet, rows=sheet.rows[: len(report.rows)])
+    return Section("Other measures", [_table(ours, ("Knows", *_OTHERS), "In the same worlds")])
 
 
 def _reading(report: Report) -> Section:
-    empty = set(_empty(report.rows, _all_lines(report.rows)))
-    empty = empty.intersection(*(_empty(test.rows, our_lines(test.rows)) for test in report.tests))
-    columns = table_columns(report.rows)
+    empty = set(_empty(report.rows))
+    empty = empty.intersection(*(_empty(test.rows) for test in report.tests))
+    columns = summary_sheet(report.rows).headings[2:]
     told = {}
     for name, meaning in table_meanings(report.rows).items():
         about = {column for column in columns if column.startswith(name)}

@@ -196,7 +196,7 @@ EVALUATION = Suite(
         "figures/studies.py": ("tests/figures/test_learning_curves.py",),
         "evaluation/rollout.py": ("tests/evaluation/test_rollout.py", "tests/agents/test_team.py"),
         "evaluation/outcome.py": ("tests/evaluation/test_rollout.py", "tests/evaluation/test_left_out.py"),
-        "evaluation/regret.py": ("tests/evaluation/test_regret.py",),
+        "evaluation/measures.py": ("tests/evaluation/shards/test_shards.py", "tests/evaluation/test_regret.py",),
         'evaluation/episodes.py': (
             'tests/evaluation/test_record.py',
             'tests/evaluation/test_film.py',
@@ -259,8 +259,7 @@ LEARNING = Suite(
             "tests/learning/test_train.py",
             "tests/learning/test_resume.py",
         ),
-        "learning/algorithms/networks.py": ("tests/learning/test_teams.py",),
-        "learning/team_file.py": ("tests/learning/test_teams.py",),
+        "learning/algorithms.py": ("tests/learning/test_teams.py",),
         "learning/train.py": (
             "tests/learning/test_sb3_policy.py",
             "tests/learning/test_train.py",

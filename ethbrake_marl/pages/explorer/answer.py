@@ -24,8 +24,8 @@ from ethbrake_marl.pages.player import played_episode, played_world
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.kernel import decision_at, first_decision_s, number_of_decisions
 from ethbrake_marl.scenario import Scenario, Task
-from ethbrake_marl.scenario.initial_states import initial_state_worlds
-from ethbrake_marl.scenario.quantities import OPTIONAL, QUANTITIES, SYMBOLS, QuantityRule
+from ethbrake_marl.scenario.fields import OPTIONAL, QUANTITIES, SYMBOLS, QuantityRule
+from ethbrake_marl.scenario.sampling import initial_state_worlds
 from ethbrake_marl.search import (
     Profiles,
     constant_profiles,

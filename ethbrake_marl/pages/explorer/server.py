@@ -45,8 +45,8 @@ from ethbrake_marl.pages.player import live_player
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.policies.bundle import Policy
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.initial_states import table_columns
-from ethbrake_marl.scenario.quantities import OTHERWISE
+from ethbrake_marl.scenario.fields import OTHERWISE
+from ethbrake_marl.scenario.sampling import table_columns
 from ethbrake_marl.shield import HybridAgent, StepShieldAgent
 
 if TYPE_CHECKING:
