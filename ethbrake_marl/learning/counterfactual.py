@@ -53,8 +53,7 @@ from ethbrake_marl.physics.advance import command_at, speed_at
 from ethbrake_marl.policies.actor import Float32s, tensor_table
 from ethbrake_marl.policies.bundle import Policy
 from ethbrake_marl.policies.shipped import PolicyKind, load_named_policy
-from ethbrake_marl.search.profiles import profile_problem
-from ethbrake_marl.search.refine import best_templates
+from ethbrake_marl.search import best_templates, profile_problem
 
 _KINDS: dict[str, PolicyKind] = {name: name for name in get_args(PolicyKind)}
 

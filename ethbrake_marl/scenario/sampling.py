@@ -17,8 +17,7 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.files.store import read_plain
 from ethbrake_marl.files.yaml import parse_numeral, suggestion
 from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.episode import first_decision_s
-from ethbrake_marl.physics.kernel import stopping_distances
+from ethbrake_marl.physics.kernel import first_decision_s, stopping_distances
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, make_worlds
 from ethbrake_marl.scenario.fields import (
     ALTERNATIVES,

@@ -40,13 +40,13 @@ from ethbrake_marl.engine.stream import ask_script, begin_script
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of, renumbered
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.advance import TIME, Packed
-from ethbrake_marl.physics.episode import decision_s, first_decision_s
+from ethbrake_marl.physics.kernel import decision_s, first_decision_s
 from ethbrake_marl.physics.worlds import vehicles_at_once
 from ethbrake_marl.scenario import Scenario, Task
-from ethbrake_marl.search.profiles import state_columns
+from ethbrake_marl.search import state_columns
 from ethbrake_marl.shield.believed import BelievedShieldAgent
 from ethbrake_marl.shield.certify import Proposer, difference, proposed_actions, seen_columns
-from ethbrake_marl.shield.interior import CORNERS, checked_robust, expects
+from ethbrake_marl.shield.enclosure import CORNERS, checked_robust, expects
 from ethbrake_marl.shield.step_shield import Cap, Certified, StepShield, by_vehicle
 from ethbrake_marl.shield.uncertainty import Uncertainty, check_scenario, checked_uncertainty, mode_uncertainty
 

@@ -36,7 +36,7 @@ from ethbrake_marl.physics.advance import params_at
 from ethbrake_marl.shield.agents import Bound, HybridAgent
 from ethbrake_marl.shield.believed import BelievedShield
 from ethbrake_marl.shield.certify import REASONS, Decision, Proposer, difference, proposed_actions, seen_columns
-from ethbrake_marl.shield.interior import CORNERS, INTERIOR, checked_robust, expects
+from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust, expects
 from ethbrake_marl.shield.step_shield import (
     CAPS,
     Cap,
