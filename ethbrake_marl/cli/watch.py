@@ -392,7 +392,7 @@ def picture_robustness(
 
     Prints the figures, too.
     """
-    from ethbrake_marl.agents.protocol import Team
+    from ethbrake_marl.agents.protocol import Agent
     from ethbrake_marl.evaluation.inputs import make_proposers, result_identity
     from ethbrake_marl.figures.evaluation import robustness_figure, robustness_table
     from ethbrake_marl.shield.review import robustness
@@ -403,7 +403,7 @@ def picture_robustness(
     task = asked_task(scenario, vehicle, settings, harm_count, alone=True)
     sample = task.scenario.sample(episodes, LIST_SEED)
     (policy,) = make_proposers([agent], task.scenario, harm_count=harm_count).values()
-    assert not isinstance(policy, Team)  # one vehicle learns
+    assert isinstance(policy, Agent)  # one vehicle learns
     points = robustness(
         sample.worlds, policy, task, intervals, robust=robust,
         on_progress=lambda what, done: out.progress(what, done, episodes),
