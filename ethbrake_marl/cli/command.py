@@ -181,7 +181,7 @@ class CommandWithParts(TyperCommand):
 
 def part_names() -> list[tuple[str, str]]:
     """Kinds of parts, each with its names; what is registered is among them."""
-    from ethbrake_marl.evaluation.harm_metrics import METRICS
+    from ethbrake_marl.evaluation.measures import REGISTERED
     from ethbrake_marl.harm import KINDS
     from ethbrake_marl.learning.recipe import algorithm_names
     from ethbrake_marl.rewards import TERMS
@@ -195,7 +195,7 @@ def part_names() -> list[tuple[str, str]]:
         ("V2X presets", ", ".join(CHANNELS)),
         ("Objectives", ", ".join(kind.form for kind in KINDS.values())),
         ("Algorithms", ", ".join(algorithm_names())),
-        *([("Harm metrics", ", ".join(METRICS))] if METRICS else []),
+        *([("Measures", ", ".join(REGISTERED))] if REGISTERED else []),
     ]
 
 

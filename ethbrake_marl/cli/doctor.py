@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
     from ethbrake_marl.studies.speed import Speed
 
-DISTRIBUTION = "ethbrake-marl"
 EXTRAS = ("train", "marl", "export", "data", "render", "explore", "cluster", "tune")
 _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=counterfactuals=16", "--set=evaluation.worlds=10")
 _LINEUP = "ladder,ppo@shipped,ppo@shipped+refined+episode,full_brake+step,full_brake+robust"
@@ -132,7 +131,7 @@ def _requirements() -> list[tuple[str, Requirement]]:
 
     project = _CHECKOUT / "pyproject.toml"
     if not project.is_file():
-        lines = [Requirement(line) for line in requires(DISTRIBUTION) or []]
+        lines = [Requirement(line) for line in requires("ethbrake-marl") or []]
         plain = [("", r) for r in lines if r.marker is None or r.marker.evaluate({"extra": ""})]
         extra = [(e, r) for e in EXTRAS for r in lines if r.marker is not None and r.marker.evaluate({"extra": e})]
         return plain + [(e, r) for e, r in extra if ("", r) not in plain]

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario import Sample, Scenario, Task
     from ethbrake_marl.studies.jobs import Workers
 
-RESULTS = "results.json"  # in the folder of an evaluation in parts
-SHIELD_EPISODES = 2_000
 PROPOSERS = "ppo@shipped,full_brake,constant:3"
 _INTERVALS = (
     "Intervals: rates exact (Clopper-Pearson), means by Student's t; all from exact sums, the same bits in any"
@@ -37,6 +35,24 @@ _INTERVALS = (
 )
 _HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", "harm": "Harm"}
 _POLICIES = {"same": "the same", "other": "another", "none": ""}
+
+
+def asked_task(
+    scenario: str,
+    vehicle: str | None,
+    settings: Sequence[str] | None,
+    harm_count: HarmCount = "first",
+    *,
+    alone: bool = False,
+) -> Task:
+    """The scenario that is named, with its settings and with who is driven; ``alone``: that is one vehicle."""
+    from ethbrake_marl.evaluation.inputs import load_driven, load_evaluated
+    from ethbrake_marl.learning.recipe import read_settings
+    from ethbrake_marl.scenario import Task
+
+    load = load_driven if alone else load_evaluated
+    chosen = load(scenario, vehicle, read_settings(settings).scenario)
+    return Task(chosen, chosen.learners, harm_count)
 
 
 def make_drivers(
@@ -113,16 +129,15 @@ def evaluate_command(
     PATH is a run or a policy bundle, or shipped.
     """
     from ethbrake_marl.evaluation import declared_objectives, evaluate, summarise
-    from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, check_agents, choose_worlds, load_evaluated
+    from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, check_agents, choose_worlds
     from ethbrake_marl.evaluation.shards import Question
     from ethbrake_marl.evaluation.summary import check_group, summarise_by
-    from ethbrake_marl.learning.recipe import read_settings
     from ethbrake_marl.scenario.fields import kind_columns
 
     whole = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
     _check_shards(shards, jobs, ray, output, rows, whole)
     _check_outputs(out, per_world, report)
-    chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
+    chosen = asked_task(scenario, vehicle, settings).scenario
     objectives = declared_objectives(objective or (), chosen.vehicles)
     if shards is not None:
         lineup = make_drivers(agents, chosen, harm_count, uncertainty)
@@ -221,8 +236,8 @@ def _evaluate_in_shards(
     summary = summarise_shards(asked, tally)
     results = shards_to_json(asked, tally, summary)
     if output is not None:
-        write_file(output / RESULTS, _json_file(results))
-        out.note(f"finished shards: {output}; the results: {output / RESULTS}")
+        write_file(output / "results.json", _json_file(results))
+        out.note(f"finished shards: {output}; the results: {output / 'results.json'}")
     out.result(results, *_tables(summary), _INTERVALS)
     _tell_horizon(summary, tally.worlds, question.scenario)
     if question.objectives and not out.as_json:
@@ -302,7 +317,7 @@ def show_run(out: Out, rows: Sequence[SummaryRow], beside: Mapping[str, Sequence
 
     shown = _tables(rows)
     for test, found in beside.items():
-        shown += [f"\n{TESTS[test]}\n", rich_table(found)]
+        shown += [Text(f"\n{TESTS[test]}\n"), rich_table(found)]
     out.result(results, *shown)
 
 
@@ -394,7 +409,7 @@ def shield_command(
     out: Out,
     agents: str = PROPOSERS,
     scenario: str = "paper-random",
-    episodes: int = SHIELD_EPISODES,
+    episodes: int = 2_000,
     harm_count: HarmCount = "first",
     vehicle: str | None = None,
     settings: list[str] | None = None,
@@ -406,18 +421,15 @@ def shield_command(
     replaced is simulated again without it: needed (harm would have been higher), harmless (the same), costly (lower).
     """
     from ethbrake_marl.evaluation import horizon_note
-    from ethbrake_marl.evaluation.inputs import load_evaluated
     from ethbrake_marl.evaluation.shield_modes import NONE, modes_tables, modes_to_json
-    from ethbrake_marl.learning.recipe import read_settings
-    from ethbrake_marl.scenario import Task
 
-    chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
-    sample, task = chosen.sample(episodes, LIST_SEED), Task(chosen, chosen.learners, harm_count)
+    task = asked_task(scenario, vehicle, settings, harm_count)
+    sample = task.scenario.sample(episodes, LIST_SEED)
     rows = measure_modes(out, agents, sample, task)
     out.result(modes_to_json(rows, sample, task), *modes_tables(rows))
     tell_left_out(rows[0].left_out, episodes)
     moving = {f"{row.agent} ({row.mode})": row.horizon_ends for row in rows if row.mode != NONE}
-    if note := horizon_note(moving, episodes - len(rows[0].left_out), chosen.horizon_s):
+    if note := horizon_note(moving, episodes - len(rows[0].left_out), task.scenario.horizon_s):
         say(note)
 
 

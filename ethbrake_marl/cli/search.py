@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario import Sample, Scenario, Task
     from ethbrake_marl.studies.falsification import Falsified, Measure
 
-WORSE = 1  # exit status when a kept world is worse than it was
 ROUNDING = 1e-6  # m2/s2
 
 search_group = new_group(
@@ -83,7 +82,7 @@ def best_harm_command(
     command goes on where it was interrupted.
     """
     from ethbrake_marl.evaluation.inputs import load_runnable, make_agents
-    from ethbrake_marl.evaluation.regret import shipped_bounds, shipped_lines
+    from ethbrake_marl.evaluation.measures import shipped_bounds, shipped_lines
     from ethbrake_marl.learning.recipe import read_settings
     from ethbrake_marl.limits.best_harm import fold_agent, load_table, save_table, search_list
     from ethbrake_marl.scenario import Task
@@ -152,7 +151,7 @@ def _figures(
     import numpy as np
 
     from ethbrake_marl.evaluation.inputs import result_identity
-    from ethbrake_marl.evaluation.regret import proven_of_table
+    from ethbrake_marl.evaluation.measures import proven_of_table
     from ethbrake_marl.limits.best_harm import LEFT_OUT
 
     told: dict[str, object] = {key: value for key, value in table.header.items() if key != "after"}
@@ -331,7 +330,7 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     worse = sum(bool(row["worse"]) for row in rows)
     out.note(f"{file}: {agent or kept.agent} is worse in {worse} of {count_of(len(rows), 'world')}")
     if worse:
-        raise typer.Exit(WORSE)
+        raise typer.Exit(1)
 
 
 def _table(worlds: list[NamedWorld], measure: Measure) -> list[Table]:

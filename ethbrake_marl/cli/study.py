@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.studies.sweep import SweepPlan, SweepResult
     from ethbrake_marl.studies.tuning import TuningPlan, TuningResult
 
-FAILED = 1  # exit status where some jobs failed
 KEPT = "the same command goes on with what is in the folder"
 PAPER_EPISODES = 10_000
 _MOST_JOBS, _MOST_TRIALS, _MOST_RETRIES = 4096, 100_000, 100
@@ -118,7 +118,7 @@ def _tell_sweep(out: Out, result: SweepResult, output: Path) -> None:
         out.interrupted(f"interrupted; {told}; {KEPT}")
     out.note(told)
     if result.failed:
-        raise typer.Exit(FAILED)
+        raise typer.Exit(1)
 
 
 def _tuning_schema() -> dict[str, Any]:
@@ -232,7 +232,7 @@ def _tell_tuning(out: Out, plan: TuningPlan, result: TuningResult, export: Path 
         out.interrupted(f"interrupted; {told}; {KEPT}")
     out.note(told)
     if best is None:
-        raise typer.Exit(FAILED)
+        raise typer.Exit(1)
 
 
 @command(study_group, "ablate", "study ablate --quick --output runs/ablation-quick", kept=KEPT, json=True)
@@ -414,14 +414,13 @@ def reproduce_command(
     """
     from ethbrake_marl.studies.reproduction.folder import (
         PAGE,
-        ReproductionFolder,
         check_docs,
         choose_items,
         reproduce,
         tell_cost,
         write_docs,
     )
-    from ethbrake_marl.studies.reproduction.item import FULL, QUICK, Settings
+    from ethbrake_marl.studies.reproduction.item import Settings
     from ethbrake_marl.studies.speed import this_machine
 
     chosen = choose_items(names or ())
@@ -439,17 +438,17 @@ def reproduce_command(
         need("torch")
     if docs is not None:
         check_docs(docs)
-    settings = Settings(FULL if full else QUICK, output, episodes, out.show_progress, str(this_machine()))
+    settings = Settings("full" if full else "quick", output, episodes, out.show_progress, str(this_machine()))
     out.note(tell_cost(chosen, settings))
     if cost:
         return
     results, finished = reproduce(chosen, settings, force=out.force)
     if docs is not None:
-        write_docs(docs, ReproductionFolder(output), results)
+        write_docs(docs, output, results)
     table = plain_table("Item", "Verdict", "Because", show_edge=False)
     for result in results:
-        table.add_row(Text(result["name"]), Text(result["verdict"]["outcome"]), Text(result["verdict"]["because"]))
-    out.result(results, table)
+        table.add_row(Text(result.name), Text(result.verdict.outcome), Text(result.verdict.because))
+    out.result([asdict(result) for result in results], table)
     out.note(f"page: {output / PAGE}")
     if not finished:
         out.interrupted(f"interrupted: items are made of the trainings that were finished; {KEPT}")

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ethbrake_marl.cli.command import command, new_group
-from ethbrake_marl.cli.evaluate import PROPOSERS, SHIELD_EPISODES, make_drivers, measure_modes, tell_left_out
+from ethbrake_marl.cli.evaluate import (
+    PROPOSERS,
+    asked_task,
+    make_drivers,
+    measure_modes,
+    tell_left_out,
+)
 from ethbrake_marl.cli.out import PAGES, Out
 from ethbrake_marl.defaults import LIST_SEED, DatasetFormat, HarmCount
 from ethbrake_marl.errors import count_of
@@ -18,8 +24,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.evaluation.passport import Replay
     from ethbrake_marl.physics import LeftOutRows
     from ethbrake_marl.scenario import Scenario
-
-DIFFERS = 1  # exit status of an episode that is not the passport's
 
 watch_group = new_group(
     "watch",
@@ -42,12 +46,11 @@ def record_command(
 ) -> None:
     """Agents in one world of the list, in real time: the road to scale, commands, impacts, harm."""
     from ethbrake_marl.evaluation.episodes import check_ending, check_number_of_films, film_bytes, film_scenes
-    from ethbrake_marl.evaluation.inputs import load_evaluated
 
     check_ending(output.suffix.lower())
     out.check(output)
     check_number_of_films(len(agents.split(",")))
-    chosen = load_evaluated(scenario, vehicle)
+    chosen = asked_task(scenario, vehicle, None).scenario
     lineup = make_drivers(agents, chosen, uncertainty=uncertainty)
     worlds = chosen.sample(1, seed, first=world).worlds
     films = {
@@ -114,7 +117,7 @@ def replay_command(
     if output is not None:
         out.note(f"written: {output}")
     if not found.same:
-        raise typer.Exit(DIFFERS)
+        raise typer.Exit(1)
 
 
 def _picture_of(found: Replay, lines: list[str], ending: str) -> bytes:
@@ -150,12 +153,10 @@ def explore_command(
 
     It listens on this machine alone, and its address holds a token that is new each time. Ctrl-C ends it.
     """
-    from ethbrake_marl.evaluation.inputs import load_driven
-    from ethbrake_marl.learning.recipe import read_settings
     from ethbrake_marl.pages.explorer.answer import Explored
     from ethbrake_marl.pages.explorer.server import Setting, serve_explorer
 
-    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
+    chosen = asked_task(scenario, vehicle, settings, alone=True).scenario
     explored = Explored(chosen, make_drivers(agents, chosen, harm_count), harm_count)
 
     def ready(address: str) -> None:
@@ -190,10 +191,9 @@ def dataset_command(
     replay to the same bits. The reward counts the harm of --harm-count, too.
     """
     from ethbrake_marl.evaluation.dataset import check_dataset, write_dataset
-    from ethbrake_marl.evaluation.inputs import check_agents, load_evaluated
-    from ethbrake_marl.learning.recipe import read_settings
+    from ethbrake_marl.evaluation.inputs import check_agents
 
-    chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
+    chosen = asked_task(scenario, vehicle, settings, harm_count).scenario
     kind = check_dataset(output, chosen, format, force=out.force)
     lineup = make_drivers(agents, chosen, harm_count, uncertainty)
     check_agents(lineup, chosen.sample(1, seed).worlds, chosen)
@@ -251,11 +251,10 @@ def picture_criticality(
     Everything else must be a fixed number in the scenario.
     """
     from ethbrake_marl.evaluation.curves import criticality_map
-    from ethbrake_marl.evaluation.inputs import load_driven, make_agents
-    from ethbrake_marl.learning.recipe import read_settings
+    from ethbrake_marl.evaluation.inputs import make_agents
 
     _check_picture(out, output)
-    chosen = load_driven(scenario, None, read_settings(settings).scenario)
+    chosen = asked_task(scenario, None, settings, alone=True).scenario
     lineup = make_agents([agent], chosen, harm_count=harm_count)
     found = criticality_map(chosen, lineup, cells=cells, gap_range_m=gaps, on_progress=out.progress)
     from ethbrake_marl.figures.evaluation import criticality_figure  # matplotlib takes a second to load
@@ -301,15 +300,12 @@ def picture_deceleration(
 ) -> None:
     """Harm of one world against the constant deceleration of one vehicle: predicted, realised, and the best known."""
     from ethbrake_marl.evaluation.curves import deceleration_curve
-    from ethbrake_marl.evaluation.inputs import load_driven
     from ethbrake_marl.figures.evaluation import deceleration_figure
-    from ethbrake_marl.learning.recipe import read_settings
-    from ethbrake_marl.scenario import Task
 
     _check_picture(out, output)
-    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
-    curve = deceleration_curve(chosen.sample(1, seed, first=world).worlds, Task(chosen, chosen.learners))
-    title = f"{chosen.name}, world {world} of the list of seed {seed}"
+    task = asked_task(scenario, vehicle, settings, alone=True)
+    curve = deceleration_curve(task.scenario.sample(1, seed, first=world).worlds, task)
+    title = f"{task.scenario.name}, world {world} of the list of seed {seed}"
     _write_picture(out, output, deceleration_figure(curve, title=title))
 
 
@@ -330,23 +326,21 @@ def picture_shield(
 
     The agents propose, and --harm-count is the harm that is guaranteed.
     """
-    from ethbrake_marl.evaluation.inputs import load_evaluated, make_proposers
+    from ethbrake_marl.evaluation.inputs import make_proposers
     from ethbrake_marl.figures.evaluation import operating_figure
-    from ethbrake_marl.learning.recipe import read_settings
-    from ethbrake_marl.scenario import Task
     from ethbrake_marl.shield.review import ALLOWANCES, operating_curves
 
     _check_picture(out, output)
-    chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
-    worlds = chosen.sample(episodes, LIST_SEED).worlds
-    lineup = make_proposers(agents.split(","), chosen, harm_count=harm_count)
+    task = asked_task(scenario, vehicle, settings, harm_count)
+    worlds = task.scenario.sample(episodes, LIST_SEED).worlds
+    lineup = make_proposers(agents.split(","), task.scenario, harm_count=harm_count)
     curves = operating_curves(
-        worlds, lineup, Task(chosen, chosen.learners, harm_count), ALLOWANCES,
+        worlds, lineup, task, ALLOWANCES,
         on_progress=lambda name: out.progress(name, episodes, episodes),
     )  # fmt: skip
     left_out = next(iter(curves.values()))[0].left_out
     rest = f"; step shield, {harm_count} harm. Beside the points: what certificates may reach above the bound (m²/s²)."
-    figure = operating_figure(list(curves.items()), caption=_caption(chosen, episodes, rest, left_out))
+    figure = operating_figure(list(curves.items()), caption=_caption(task.scenario, episodes, rest, left_out))
     _write_picture(out, output, figure, left_out, episodes)
 
 
@@ -356,23 +350,19 @@ def picture_shield_modes(
     output: PictureOption,
     agents: str = PROPOSERS,
     scenario: str = "paper-random",
-    episodes: int = SHIELD_EPISODES,
+    episodes: int = 2_000,
     harm_count: HarmCount = "first",
     vehicle: str | None = None,
     settings: list[str] | None = None,
 ) -> None:
     """Harm without a shield and in step mode beside episode mode, as ``ethbrake shield`` measures it."""
-    from ethbrake_marl.evaluation.inputs import load_evaluated
     from ethbrake_marl.figures.evaluation import shield_modes_figure
-    from ethbrake_marl.learning.recipe import read_settings
-    from ethbrake_marl.scenario import Task
 
     _check_picture(out, output)
-    chosen = load_evaluated(scenario, vehicle, read_settings(settings).scenario)
-    task = Task(chosen, chosen.learners, harm_count)
-    rows = measure_modes(out, agents, chosen.sample(episodes, LIST_SEED), task)
+    task = asked_task(scenario, vehicle, settings, harm_count)
+    rows = measure_modes(out, agents, task.scenario.sample(episodes, LIST_SEED), task)
     rest = f", {harm_count} harm; mean and 95 % interval of the difference, paired by world."
-    figure = shield_modes_figure(rows, caption=_caption(chosen, episodes, rest, rows[0].left_out))
+    figure = shield_modes_figure(rows, caption=_caption(task.scenario, episodes, rest, rows[0].left_out))
     _write_picture(out, output, figure, rows[0].left_out, episodes)
 
 
@@ -402,29 +392,27 @@ def picture_robustness(
 
     Prints the figures, too.
     """
-    from ethbrake_marl.agents.protocol import Team
-    from ethbrake_marl.evaluation.inputs import load_driven, make_proposers, result_identity
+    from ethbrake_marl.agents.protocol import Agent
+    from ethbrake_marl.evaluation.inputs import make_proposers, result_identity
     from ethbrake_marl.figures.evaluation import robustness_figure, robustness_table
-    from ethbrake_marl.learning.recipe import read_settings
-    from ethbrake_marl.scenario import Task
     from ethbrake_marl.shield.review import robustness
     from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
     _check_picture(out, output)
     intervals = parse_uncertainty(uncertainty)
-    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
-    sample = chosen.sample(episodes, LIST_SEED)
-    (policy,) = make_proposers([agent], chosen, harm_count=harm_count).values()
-    assert not isinstance(policy, Team)  # one vehicle learns
+    task = asked_task(scenario, vehicle, settings, harm_count, alone=True)
+    sample = task.scenario.sample(episodes, LIST_SEED)
+    (policy,) = make_proposers([agent], task.scenario, harm_count=harm_count).values()
+    assert isinstance(policy, Agent)  # one vehicle learns
     points = robustness(
-        sample.worlds, policy, Task(chosen, chosen.learners, harm_count), intervals, robust=robust,
+        sample.worlds, policy, task, intervals, robust=robust,
         on_progress=lambda what, done: out.progress(what, done, episodes),
     )  # fmt: skip
     left_out = points[0].left_out
     rest = f"; {agent} proposes; {harm_count} harm. Intervals of width 1: {intervals}." + (
         f" Robust mode certifies their {robust}." if robust != "corners" else ""
     )
-    caption = _caption(chosen, episodes, rest, left_out)
-    about = result_identity("robustness", chosen, sample, [world for world, _ in left_out])
+    caption = _caption(task.scenario, episodes, rest, left_out)
+    about = result_identity("robustness", task.scenario, sample, [world for world, _ in left_out])
     _write_picture(out, output, robustness_figure(points, caption=caption), left_out, episodes)
     out.result([about | point._asdict() for point in points], robustness_table(points))

@@ -50,7 +50,7 @@ class Outcome:
     shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself, see ``travel``
     sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands, see ``sampled_harm``
     policies: Mapping[int, str] = field(default_factory=dict)  # vehicle (0 = front) -> SHA-256 of its policy's manifest
-    metrics: Mapping[str, Floats] = field(default_factory=dict)  # registered harm metrics by column, [n]
+    metrics: Mapping[str, Floats] = field(default_factory=dict)  # registered measures by column, [n]
 
     def __repr__(self) -> str:
         return f"Outcome({count_of(len(self.collided), 'world')}, {int(self.collided.sum()):,} collided, {self._means})"

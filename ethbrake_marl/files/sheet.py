@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from ethbrake_marl.errors import plain_text
+from ethbrake_marl.errors import naming_extras, plain_text
+from ethbrake_marl.files.store import new_file
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
@@ -46,9 +49,6 @@ def estimates_to_json(estimates: Mapping[str, Estimate | None]) -> dict[str, Any
     return found
 
 
-Cell = Estimate | float | int | str | None
-
-
 class Shown(NamedTuple):
     """A cell in words."""
 
@@ -59,6 +59,9 @@ class Shown(NamedTuple):
     def in_words(self) -> str:
         """In one line: ``24.19 [23.85, 24.53]``."""
         return f"{self.value} [{self.interval}]" if self.interval else self.value
+
+
+Cell = Estimate | Shown | float | int | str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +89,8 @@ class Column:
 
     def show(self, cell: Cell) -> Shown:
         """A cell of this column in words."""
-        if cell is None:
-            return Shown(DASH)
+        if cell is None or isinstance(cell, Shown):
+            return cell or Shown(DASH)
         if isinstance(cell, str | int):
             return Shown(str(cell))
         if not isinstance(cell, Estimate):
@@ -134,6 +137,11 @@ class Sheet:
         """Of its columns."""
         return [column.heading for column in self._columns()]
 
+    @property
+    def names(self) -> list[str]:
+        """Of its columns, in CSV and JSON."""
+        return [column.name for column in self._columns()]
+
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
         """Its rows in words, each of as many cells as there are columns; sections are their names."""
         columns = self._columns()
@@ -153,7 +161,9 @@ class Sheet:
     def filled(self) -> list[int]:
         """Numbers of the columns in which some row has a value; all of them without rows."""
         rows = [row for row in self.rows if not isinstance(row, str)]
-        return [k for k in range(len(self.columns)) if not rows or any(row[k] not in (None, DASH) for row in rows)]
+        return [
+            k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
+        ]
 
     def rich(self, width: int = WIDE) -> RenderableType:
         """For a terminal of this width, the note below; all lines of a cell but its first are dim."""
@@ -257,6 +267,38 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = 
     writer.writeheader()
     writer.writerows(flat)
     return text.getvalue()
+
+
+@contextmanager
+def parquet_file(
+    path: Path, *, told: Callable[[], Mapping[str, str]] | None = None, **options: Any
+) -> Iterator[Callable[..., None]]:
+    """Give what adds columns of arrays by name to a Parquet file, which appears when the block ends well.
+
+    ``together`` keeps what is added at once in one row group. ``told`` is asked for metadata at the end; ``options``
+    are those of ``pyarrow.parquet.ParquetWriter``. Raises ``MissingExtra`` without pyarrow.
+    """
+    with naming_extras():
+        import pyarrow
+        from pyarrow.parquet import ParquetWriter
+
+    writer = None
+    with new_file(path) as partial:
+
+        def add(columns: Mapping[str, Any], *, together: bool = False) -> None:
+            nonlocal writer
+            table = pyarrow.table(dict(columns))
+            if writer is None:
+                writer = ParquetWriter(partial, table.schema, **options)
+            writer.write_table(table, row_group_size=max(table.num_rows, 1) if together else None)
+
+        try:
+            yield add
+        finally:
+            if writer is not None:
+                if told is not None:
+                    writer.add_key_value_metadata(told())
+                writer.close()
 
 
 def _html(value: str) -> str:

@@ -122,7 +122,7 @@ class _Between(FileModel):
 
 
 class Numbers(FileModel):
-    """``state.json``: what ``capture_model``, ``BetweenUpdates.state`` and the session keep of a training."""
+    """``state.json``: what ``capture_model`` and the session keep of a training."""
 
     training: Sha256  # which one, see ``Training.identity``
     counters: _Counters
@@ -168,7 +168,7 @@ class TrainingState:
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
-    """Write ``folder``, completely or not at all, with every byte on the disk before it has its name."""
+    """Write ``folder``, completely or not at all, with every byte on the disk before it has its name; old ones go."""
     with new_folder(folder) as partial:
         write_file(partial / _NUMBERS, json.dumps(state.numbers, allow_nan=False).encode())
         write_file(partial / _ARRAYS, safetensors.numpy.save(_contiguous(state.arrays)))
@@ -191,6 +191,8 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
             },
         }
         write_file(partial / LISTING, json.dumps(listing, indent=2).encode() + b"\n")
+    for old in checkpoint_folders(folder.parent)[KEPT:]:
+        remove_folder(old)
 
 
 def read_checkpoint(folder: Path) -> TrainingState:
@@ -257,12 +259,6 @@ def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:
             reasons.append(str(error))
             remove_folder(path)
     return None, reasons
-
-
-def prune(folder: Path, keep: int = KEPT) -> None:
-    """Delete all but the newest ``keep`` checkpoints."""
-    for path in checkpoint_folders(folder)[keep:]:
-        remove_folder(path)
 
 
 def _check_files(folder: Path) -> tuple[Listing, dict[str, bytes]]:
@@ -379,8 +375,11 @@ REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "t
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "_total_timesteps")
 
 
-def capture_model(model: Model, algorithm: Algorithm) -> tuple[Arrays, dict[str, Any]]:
-    """Weights, optimisers, environment, random generators and counters between two updates, replay memory aside."""
+def capture_model(model: Model, algorithm: Algorithm) -> tuple[Arrays, dict[str, Any], Arrays]:
+    """Weights, optimisers, environment, random generators, counters and log between two updates, and replay memory.
+
+    Of the replay memory (nothing without one, as in PPO) the filled part, as views.
+    """
     arrays: Arrays = {f"policy.{name}": _copy(tensor) for name, tensor in model.policy.state_dict().items()}
     arrays |= {name: _copy(tensor) for name, tensor in algorithm.learned_beside(model).items()}
     rates: dict[str, float] = {}
@@ -401,13 +400,21 @@ def capture_model(model: Model, algorithm: Algorithm) -> tuple[Arrays, dict[str,
         "episodes.steps": np.array([episode["l"] for episode in episodes], np.int64),
     }
     counters = {name: getattr(model, name) for name in _COUNTERS}
-    return arrays, {"counters": counters, "learning_rates": rates, "random": random_plain, "log": _pending_log(model)}
+    log = model.logger
+    pending = {}
+    for name, value in log.name_to_value.items():
+        number = value.item() if isinstance(value, np.generic | torch.Tensor) else value
+        pending[name] = [number, log.name_to_count[name], list(log.name_to_excluded[name] or ())]
+    memory: Any = getattr(model, "replay_buffer", None)
+    place = {} if memory is None else {"pos": memory.pos, "full": memory.full}
+    replay = {} if memory is None else {name: getattr(memory, name)[: memory.size()] for name in REPLAY}
+    numbers = {"counters": counters, "learning_rates": rates, "random": random_plain, "log": pending, "replay": place}
+    return arrays, numbers, replay
 
 
-def restore_model(
-    model: Model, algorithm: Algorithm, arrays: Mapping[str, NDArray[Any]], plain: Mapping[str, Any]
-) -> None:
-    """Bring a freshly built model of the same recipe to the state of ``capture_model``."""
+def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> None:
+    """Bring a freshly built model of the same recipe, whose logger is set, to the state of ``capture_model``."""
+    arrays, plain = state.arrays, state.numbers
     model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in _group(arrays, "policy.").items()})
     for name, tensor in algorithm.learned_beside(model).items():
         tensor.data.copy_(torch.from_numpy(arrays[name]))
@@ -419,36 +426,19 @@ def restore_model(
         setattr(model, name, plain["counters"][name])
     model._last_obs = arrays["last.observations"].copy()
     model._last_episode_starts = arrays["last.episode_starts"].copy()
-    model.ep_info_buffer, model.ep_success_buffer = _deques(model)
+    model.ep_info_buffer, model.ep_success_buffer = (deque[Any](maxlen=model._stats_window_size) for _ in range(2))
     for gained, steps in zip(arrays["episodes.return"].tolist(), arrays["episodes.steps"].tolist(), strict=True):
         model.ep_info_buffer.append({"r": gained, "l": steps, "t": 0.0})
     restore_random(model.action_space, arrays, plain["random"])
-
-
-def restore_log(model: Model, plain: Mapping[str, Any]) -> None:
-    """Give the model's logger what was recorded and not yet written."""
     for name, (value, count, excluded) in plain["log"].items():
         model.logger.name_to_value[name] = value
         model.logger.name_to_count[name] = count
         model.logger.name_to_excluded[name] = tuple(excluded)
-
-
-def replay_arrays(model: Model) -> tuple[Arrays, dict[str, Any]]:
-    """The filled part of the replay memory, as views, and where it goes on; nothing without one (PPO)."""
     memory: Any = getattr(model, "replay_buffer", None)
-    if memory is None:
-        return {}, {}
-    return {name: getattr(memory, name)[: memory.size()] for name in REPLAY}, {"pos": memory.pos, "full": memory.full}
-
-
-def restore_replay(model: Model, arrays: Mapping[str, NDArray[Any]], plain: Mapping[str, Any]) -> None:
-    """Fill the replay memory of a fresh model."""
-    memory: Any = getattr(model, "replay_buffer", None)
-    if memory is None:
-        return
-    for name in REPLAY:
-        getattr(memory, name)[: len(arrays[name])] = arrays[name]
-    memory.pos, memory.full = plain["pos"], plain["full"]
+    if memory is not None:
+        for name in REPLAY:
+            getattr(memory, name)[: len(state.replay[name])] = state.replay[name]
+        memory.pos, memory.full = plain["replay"]["pos"], plain["replay"]["full"]
 
 
 def _restore_optimizer(optimizer: torch.optim.Optimizer, arrays: Arrays, rate: float) -> None:
@@ -460,20 +450,6 @@ def _restore_optimizer(optimizer: torch.optim.Optimizer, arrays: Arrays, rate: f
     for group in content["param_groups"]:
         group["lr"] = rate
     optimizer.load_state_dict({"state": state, "param_groups": content["param_groups"]})
-
-
-def _pending_log(model: Model) -> dict[str, Any]:
-    log = model.logger
-    pending = {}
-    for name, value in log.name_to_value.items():
-        number = value.item() if isinstance(value, np.generic | torch.Tensor) else value
-        pending[name] = [number, log.name_to_count[name], list(log.name_to_excluded[name] or ())]
-    return pending
-
-
-def _deques(model: Model) -> tuple[Any, Any]:
-    size = model._stats_window_size
-    return deque(maxlen=size), deque(maxlen=size)
 
 
 def _group(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:

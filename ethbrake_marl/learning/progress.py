@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, filter_excluded_keys
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
@@ -236,19 +235,6 @@ def check_step(model: Model, rewards: Any, observations: Any) -> None:
             raise TrainingDiverged(
                 f"training: {name}[row {row}] = {entries[~good][0]} at step {model.num_timesteps}: must be finite;"
                 " the environment or its reward is at fault"
-            )
-
-
-def check_rollout(model: OnPolicyAlgorithm) -> None:
-    """Refuse a rollout that holds a reward or observation that is not finite; names which."""
-    for name in ("observations", "rewards"):
-        entries = getattr(model.rollout_buffer, name)
-        good = np.isfinite(entries)
-        if not good.all():
-            step, row = np.argwhere(~good)[0][:2]
-            raise TrainingDiverged(
-                f"training: {name}[step {step}, row {row}] = {entries[~good][0]} in the rollout that ends at step"
-                f" {model.num_timesteps}: must be finite; the environment or its reward is at fault"
             )
 
 
