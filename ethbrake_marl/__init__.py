@@ -59,7 +59,8 @@ if TYPE_CHECKING:
     from ethbrake_marl.policies.bundle import load_policy as load_policy
     from ethbrake_marl.policies.shipped import load_shipped as load_shipped
 
-    # Shields, one for each interface
+    # Shields: for any interface, and one for each
+    from ethbrake_marl.shield.wrappers import shield as shield
     from ethbrake_marl.shield import HybridShield as HybridShield
     from ethbrake_marl.shield import ShieldedEnv as ShieldedEnv
     from ethbrake_marl.shield import ShieldedVectorEnv as ShieldedVectorEnv
@@ -100,7 +101,7 @@ if TYPE_CHECKING:
 
     # Registration of your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent
-    from ethbrake_marl.evaluation.harm_metrics import register_harm_metric as register_harm_metric
+    from ethbrake_marl.evaluation.measures import register_measure as register_measure
     from ethbrake_marl.files.plugins import load_plugin as load_plugin
     from ethbrake_marl.learning.recipe import register_algorithm as register_algorithm
     from ethbrake_marl.harm import register_objective as register_objective
@@ -145,6 +146,7 @@ def _import_public(name: str) -> Any:
     register_environments()
     with naming_extras():
         value = getattr(import_module(_HOMES[name]), name)
+    value = sys.modules.get(f"{__name__}.{name}", value)  # a folder of that name, as ``shield``, is called like it
     globals()[name] = value
     return value
 

@@ -17,7 +17,7 @@ from pydantic_core.core_schema import ValidationInfo
 
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
-from ethbrake_marl.files.html import html_table
+from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.yaml import (
     UNSHOWN,
     Document,
@@ -529,7 +529,7 @@ class Scenario(ScenarioFields):
         if self.mixture is not None:
             told["mixture"] = ", ".join(f"{e.weight:g} x {e.scenario['name']}" for e in self.mixture)
         rows = [(key, value if isinstance(value, str) else flow_text(value)) for key, value in told.items()]
-        return html_table(("Key", "Value"), rows, caption=f"Scenario {self.name}: {self.title or 'no title'}")
+        return Sheet(f"Scenario {self.name}: {self.title or 'no title'}", ("Key", "Value"), rows).html()
 
     def bounds(self, field: str) -> tuple[tuple[float, float], ...]:
         """Smallest and largest value of each entry of ``gaps_m``, ``speeds_mps``, ..., however it is declared."""

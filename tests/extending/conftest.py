@@ -10,7 +10,7 @@ import pytest
 from ethbrake_marl import harm
 from ethbrake_marl import rewards as terms
 from ethbrake_marl.agents import registry as agents
-from ethbrake_marl.evaluation import harm_metrics
+from ethbrake_marl.evaluation import measures
 from ethbrake_marl.files import plugins
 from ethbrake_marl.learning import recipe as algorithms
 from ethbrake_marl.scenario import features, schema, v2x
@@ -23,7 +23,7 @@ TABLES = (
     (agents, "_ENTRIES"),
     (algorithms, "_ALGORITHMS"),
     (terms, "TERMS"),
-    (harm_metrics, "METRICS"),
+    (measures, "REGISTERED"),
     (plugins, "_RUN"),
     (plugins, "_LOADED"),
 )
