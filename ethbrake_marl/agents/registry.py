@@ -335,7 +335,7 @@ def make_agent(
 def make_single_agent(spec: str, **settings: Any) -> Agent:
     """``make_agent`` for who drives one vehicle; raises ``InvalidInput`` for a team too."""
     agent = make_agent(spec, **settings)
-    if isinstance(agent, Team):
+    if not isinstance(agent, Agent):
         raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
     return agent
 

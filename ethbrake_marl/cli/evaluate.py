@@ -31,7 +31,7 @@ from ethbrake_marl.defaults import EPISODES, LIST_SEED, HarmCount
 from ethbrake_marl.errors import InvalidInput, count_of
 
 if TYPE_CHECKING or LATE:
-    from ethbrake_marl.agents.protocol import Agent, Team
+    from ethbrake_marl.agents.protocol import Driver
     from ethbrake_marl.cli.report import check_page, write_evaluation_report
     from ethbrake_marl.cli.results import counted_without, picture_target, results_beside, tell_left_out, tell_results
     from ethbrake_marl.cli.shards import check_shards, evaluate_in_shards
@@ -141,7 +141,7 @@ def evaluate_command(
 def _drive(
     sample: Sample,
     seed: int | None,
-    lineup: Mapping[str, Agent | Team],
+    lineup: Mapping[str, Driver],
     scenario: Scenario,
     report: Path | None,
     *,

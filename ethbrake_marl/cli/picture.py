@@ -14,7 +14,7 @@ from ethbrake_marl.defaults import LIST_SEED, HarmCount
 from ethbrake_marl.errors import count_of
 
 if TYPE_CHECKING or LATE:
-    from ethbrake_marl.agents.protocol import Team
+    from ethbrake_marl.agents.protocol import Agent
     from ethbrake_marl.cli.results import counted_without, picture_target, tell_left_out
     from ethbrake_marl.evaluation.curves import CELLS, criticality_map, deceleration_curve
     from ethbrake_marl.evaluation.inputs import (
@@ -177,7 +177,7 @@ def picture_robustness(
     chosen = load_driven(scenario, vehicle, read_settings(settings).scenario)
     sample = chosen.sample(episodes, LIST_SEED)
     (policy,) = make_proposers([agent], chosen, harm_count=harm_count).values()
-    assert not isinstance(policy, Team)  # one vehicle learns
+    assert isinstance(policy, Agent)  # one vehicle learns
     with interruptible("nothing was written"), progress_bars() as bars:
         points = robustness(
             sample.worlds, policy, Task(chosen, chosen.learners, harm_count), intervals, robust=robust,

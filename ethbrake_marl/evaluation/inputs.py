@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ethbrake_marl.agents.policy import LearnedAgent, PolicyAgent
 from ethbrake_marl.agents.protocol import Agent, AgentAround, Driver, Team, team_of
 from ethbrake_marl.agents.registry import make_agent, make_single_agent, parse_spec
-from ethbrake_marl.agents.rollout import script_agents, set_others
+from ethbrake_marl.agents.rollout import episode_engine, script_agents, set_others
 from ethbrake_marl.defaults import EPISODES, LIST_SEED, MOST_NAMED_WORLDS, HarmCount
 from ethbrake_marl.engine.stream import ask_script, begin_script
 from ethbrake_marl.errors import InvalidInput, check_one_learner, naming_agent
@@ -327,6 +327,10 @@ def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenari
     for name, agent in agents.items():
         team = team_of(agent, scenario.learners)
         scripts = script_agents(scenario, except_for=team.drivers)
+        if team.shield is not None:
+            with naming_agent(name, [script.name for script in scripts.values()]):
+                episode_engine(worlds.take([0]), team, scenario).step({})
+            continue
         for vehicle, driver in team.drivers.items():
             set_others(driver, vehicle, scripts)
             with naming_agent(name, [script.name for script in scripts.values()]):
@@ -365,7 +369,7 @@ def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCou
     for spec, agent in make_lineup(specs, scenario, harm_count=harm_count).items():
         if isinstance(agent, Team):
             raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
-        alone[spec] = agent
+        alone[spec] = agent  # type: ignore[assignment]  # or one behind a shield
     return alone
 
 

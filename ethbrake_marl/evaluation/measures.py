@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -23,7 +24,7 @@ from ethbrake_marl.evaluation.statistics import (
     mean_of,
     moments,
 )
-from ethbrake_marl.files.sheet import Column
+from ethbrake_marl.files.sheet import Cell, Column, Sheet
 from ethbrake_marl.limits.best_harm import BestHarmTable, shipped_tables, world_identity
 from ethbrake_marl.limits.limits import Limits, Unproven, prove, unproven_because
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, leaving_out_failed, make_worlds
@@ -570,10 +571,8 @@ def proven_of(worlds: Worlds, task: Task, first: Floats, total: Floats) -> Prove
     if isinstance(proof, Unproven):
         return None
     contact, impact = proof.contact, proof.impact
-    harm, impact_rate = float(proof.harm.mean()), float(impact.mean())
-    if contact is None:
-        return Proven(harm, None, impact_rate, None)
-    return Proven(harm, float(contact.mean()), impact_rate, between(contact, impact, first, total))
+    told = (None, None) if contact is None else (float(contact.mean()), between(contact, impact, first, total))
+    return Proven(float(proof.harm.mean()), told[0], float(impact.mean()), told[1])
 
 
 def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> Proven | None:
@@ -652,35 +651,25 @@ def bounds_of(table: BestHarmTable) -> ShippedBounds:
 
 def shipped_lines(found: Sequence[ShippedBounds]) -> list[str]:
     """The table of all of them, in markdown; harms are means over the worlds, m2/s2."""
-    head = (
-        "list", "worlds", "proven", "best known, first", "gap", "best known, total", "gap", "contact proven",
-        "impact proven", "between", "best known there, first", "next to none there",
+    harm, share = partial(Column, digits=3, sign="-"), partial(Column, digits=1, scale=100.0, unit=" %", sign="-")
+    columns = (
+        "list", Column("worlds"), harm("proven"), harm("best known, first"), share("gap"), harm("best known, total"),
+        share("gap"), share("contact proven"), share("impact proven"), share("between"),
+        harm("best known there, first"), share("next to none there"),
     )  # fmt: skip
-    return ["| " + " | ".join(head) + " |", "|" + "---|" * len(head), *(_shipped_line(one) for one in found)]
-
-
-def _shipped_line(one: ShippedBounds) -> str:
-    cells = [f"{one.scenario} (seed {one.list_seed})", f"{one.worlds:,}"]
-    proven, inside = one.proven, None if one.proven is None else one.proven.between
-    cells += [_number(None if proven is None else proven.proven_harm)]
-    for best in (one.best_known_first, one.best_known_total):
-        cells += [_number(best), _percent(one.gap(best))]
-    cells += [_percent(rate) for rate in _rates(proven)]
-    cells += [_number(None if inside is None else inside.mean_first)]
-    cells += [_percent(None if inside is None else inside.harmless_rate)]
-    return "| " + " | ".join(cells) + (f" | {one.nothing_proven_because}" if one.nothing_proven_because else "") + " |"
-
-
-def _rates(proven: Proven | None) -> tuple[float | None, ...]:
-    if proven is None:
-        return (None, None, None)
-    inside = proven.between
-    return proven.contact_proven_rate, proven.impact_proven_rate, None if inside is None else inside.rate
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"
-
-
-def _percent(value: float | None) -> str:
-    return "–" if value is None else f"{100 * value:.1f} %"
+    rows = []
+    for one in found:
+        proven, inside = one.proven, None if one.proven is None else one.proven.between
+        why = f": {one.nothing_proven_because}" if one.nothing_proven_because else ""
+        row: list[Cell] = [f"{one.scenario} (seed {one.list_seed}){why}", f"{one.worlds:,}"]
+        row += [getattr(proven, "proven_harm", None)]
+        for best in (one.best_known_first, one.best_known_total):
+            row += [best, one.gap(best)]
+        row += [getattr(proven, "contact_proven_rate", None), getattr(proven, "impact_proven_rate", None)]
+        row += [
+            getattr(inside, "rate", None),
+            getattr(inside, "mean_first", None),
+            getattr(inside, "harmless_rate", None),
+        ]
+        rows.append(row)
+    return Sheet("", columns, rows).markdown().splitlines()

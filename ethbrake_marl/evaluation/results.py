@@ -107,16 +107,20 @@ def write_per_world_csv(
     write_output(path, text.getvalue().encode(), force=force)
 
 
-def per_world_columns(evaluation: Evaluation, objectives: Sequence[Declared] = ()) -> Columns:
-    """The columns of ``write_per_world_csv``, agent by agent, then world by world; None where there is no value."""
+def per_world_columns(evaluation: Evaluation, objectives: Sequence[Declared] = (), *, limits: bool = True) -> Columns:
+    """The columns of ``write_per_world_csv``, agent by agent, then world by world; None where there is no value.
+
+    Without ``limits`` those of the best known harm are left out, every quantity is told, and no world that was left
+    out: the rows of a shard, which have the same columns as those of any other.
+    """
     found: Columns = {}
-    initial, regrets = initial_columns(evaluation), assess(evaluation)
+    initial, regrets = initial_columns(evaluation, every=not limits), assess(evaluation) if limits else None
     hidden: Columns = {"hidden": evaluation.hidden.astype(int).tolist()}
     for agent, outcome in evaluation.outcomes.items():
         columns = {"agent": [agent] * evaluation.worlds.n, **initial, **outcome_columns(outcome)}
-        columns |= regret_columns(outcome, regrets) | objective_columns(outcome, objectives)
+        columns |= (regret_columns(outcome, regrets) if limits else {}) | objective_columns(outcome, objectives)
         columns |= {"knows": [knowledge_text(outcome.knows)] * evaluation.worlds.n, **hidden}
-        for left in evaluation.left_out:
+        for left in evaluation.left_out if limits else ():
             told = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
             columns = {name: [*values, told.get(name)] for name, values in columns.items()}
         found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
@@ -206,13 +210,18 @@ _HARMS = ("agent", "world", "first_impact_harm", "total_harm")
 _TEXTS = {"agent", "scenario", "unavoidable_reason", "best_known_source", "ended", "knows"}
 
 
+def is_text(column: str) -> bool:
+    """Whether a column with every world holds texts."""
+    return column in _TEXTS or (column.startswith("vehicle_") and column.endswith("_type"))
+
+
 def typed_columns(evaluation: Evaluation, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
     """The columns of ``per_world_columns`` as arrays: NaN for no number, the empty text for no text."""
     return {name: _typed(name, values) for name, values in per_world_columns(evaluation, objectives).items()}
 
 
 def _typed(name: str, values: list[Any]) -> NDArray[Any]:
-    if name in _TEXTS or (name.startswith("vehicle_") and name.endswith("_type")):
+    if is_text(name):
         return np.array([value or "" for value in values])
     return np.array([np.nan if value is None else value for value in values])
 

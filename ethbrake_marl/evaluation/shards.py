@@ -30,9 +30,9 @@ from ethbrake_marl.evaluation.measures import COUNTED, KNOWN, REGISTERED, AgentT
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome, is_papers_list, parameters_of
 from ethbrake_marl.evaluation.results import (
     Columns,
-    initial_columns,
+    is_text,
     objective_columns,
-    outcome_columns,
+    per_world_columns,
     results_to_json,
     vehicle_columns,
 )
@@ -45,7 +45,7 @@ from ethbrake_marl.evaluation.statistics import (
     mean_of,
 )
 from ethbrake_marl.evaluation.summary import Rescored, SummaryRow, summarise_tallies
-from ethbrake_marl.files.store import new_file
+from ethbrake_marl.files.sheet import parquet_file
 from ethbrake_marl.limits.limits import Unproven, known_limits
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Sample, Scenario, Task
@@ -170,21 +170,14 @@ def _further(objectives: Sequence[str]) -> Callable[[Outcome], Mapping[str, Floa
 
 # One row per world and agent of a shard, as a Parquet file: world by world, whatever the shards and blocks are.
 
-_TEXTS = {"agent", "scenario", "ended", "knows"}
 _WHOLE = {"world", "collided", "impacts", "chosen_policy", "hidden"}
 
 
 def row_columns(evaluation: Evaluation, objectives: Sequence[str]) -> Columns:
-    """The columns of ``--per-world`` but those of the best known harm, and with every quantity; world by world."""
-    n, agents = evaluation.worlds.n, evaluation.outcomes
-    initial, hidden = initial_columns(evaluation, every=True), evaluation.hidden.astype(int).tolist()
-    found: Columns = {}
-    for agent, outcome in agents.items():
-        columns: Columns = {"agent": [agent] * n, **initial, **outcome_columns(outcome)}
-        columns |= objective_columns(outcome, objectives)
-        columns |= {"knows": [knowledge_text(outcome.knows)] * n, "hidden": hidden}
-        found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
-    order = np.arange(n * len(agents)).reshape(len(agents), n).T.ravel().tolist()
+    """The columns of a shard's rows, world by world."""
+    found = per_world_columns(evaluation, objectives, limits=False)
+    n, agents = evaluation.worlds.n, len(evaluation.outcomes)
+    order = np.arange(n * agents).reshape(agents, n).T.ravel().tolist()
     return {name: [values[k] for k in order] for name, values in found.items()}
 
 
@@ -196,29 +189,18 @@ def rows_file(path: Path, objectives: Sequence[str]) -> Iterator[Callable[[Evalu
     """
     with naming_extras():
         import pyarrow
-        from pyarrow.parquet import ParquetWriter
 
-    def type_of(name: str) -> Any:
-        if name in _TEXTS or (name.startswith("vehicle_") and name.endswith("_type")):
-            return pyarrow.string()
-        return pyarrow.int64() if name in _WHOLE else pyarrow.float64()
+    def array(name: str, values: Sequence[Any]) -> Any:
+        whole = pyarrow.int64() if name in _WHOLE else pyarrow.float64()
+        return pyarrow.array(values, pyarrow.string() if is_text(name) else whole)
 
-    writer = None
-    with new_file(path) as partial:
+    with parquet_file(path, compression="zstd") as write:
 
         def add(evaluation: Evaluation) -> None:
-            nonlocal writer
             columns = row_columns(evaluation, objectives)
-            table = pyarrow.table({name: pyarrow.array(values, type_of(name)) for name, values in columns.items()})
-            if writer is None:
-                writer = ParquetWriter(partial, table.schema, compression="zstd")
-            writer.write_table(table)
+            write({name: array(name, values) for name, values in columns.items()})
 
-        try:
-            yield add
-        finally:
-            if writer is not None:
-                writer.close()
+        yield add
 
 
 LEAF = 1_000  # worlds that are hashed together; shards and blocks begin at a multiple of it

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from ethbrake_marl.errors import plain_text
+from ethbrake_marl.errors import naming_extras, plain_text
+from ethbrake_marl.files.store import new_file
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
@@ -264,6 +267,38 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = 
     writer.writeheader()
     writer.writerows(flat)
     return text.getvalue()
+
+
+@contextmanager
+def parquet_file(
+    path: Path, *, told: Callable[[], Mapping[str, str]] | None = None, **options: Any
+) -> Iterator[Callable[..., None]]:
+    """Give what adds columns of arrays by name to a Parquet file, which appears when the block ends well.
+
+    ``together`` keeps what is added at once in one row group. ``told`` is asked for metadata at the end; ``options``
+    are those of ``pyarrow.parquet.ParquetWriter``. Raises ``MissingExtra`` without pyarrow.
+    """
+    with naming_extras():
+        import pyarrow
+        from pyarrow.parquet import ParquetWriter
+
+    writer = None
+    with new_file(path) as partial:
+
+        def add(columns: Mapping[str, Any], *, together: bool = False) -> None:
+            nonlocal writer
+            table = pyarrow.table(dict(columns))
+            if writer is None:
+                writer = ParquetWriter(partial, table.schema, **options)
+            writer.write_table(table, row_group_size=max(table.num_rows, 1) if together else None)
+
+        try:
+            yield add
+        finally:
+            if writer is not None:
+                if told is not None:
+                    writer.add_key_value_metadata(told())
+                writer.close()
 
 
 def _html(value: str) -> str:

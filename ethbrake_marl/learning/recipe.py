@@ -652,7 +652,6 @@ def _described(key: str, value: dict[str, Any]) -> dict[str, Any]:
 # Schemes of training several learners together, and the network that therefore drives each vehicle.
 
 SCHEMES: tuple[Scheme, ...] = get_args(Scheme)
-POLICY = "policy"  # folder of a run in which the policies stand
 
 
 def scheme_of(recipe: TrainingRecipe, scenario: Scenario) -> Scheme:
@@ -693,7 +692,7 @@ def drivers(scheme: Scheme, scenario: Scenario) -> dict[str, str]:
 
 def driver(scheme: Scheme, vehicle: str) -> str:
     """Where in the run's folder the bundle stands that drives a learner."""
-    return f"{POLICY}/{vehicle}" if scheme == "independent" else POLICY
+    return f"policy/{vehicle}" if scheme == "independent" else "policy"
 
 
 def who_drives_what(given: Mapping[str, str]) -> str:

@@ -21,7 +21,7 @@ from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, Told, listener
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.files.store import remove_folder, remove_unfinished
+from ethbrake_marl.files.store import hold_lock, remove_folder, remove_unfinished
 from ethbrake_marl.harm import objective_harm
 from ethbrake_marl.learning.algorithms import tensors_of
 from ethbrake_marl.learning.checkpoint import (
@@ -60,7 +60,6 @@ from ethbrake_marl.learning.training import (
     check_run_plugins,
     create_run,
     has_finished,
-    only_process,
     open_run,
     resolve,
     stop_on_signal,
@@ -301,7 +300,7 @@ def _run(begin: Callable[[], tuple[RunDirectory, bool | None]], training: Traini
     with own_random_state(), stop_on_signal() as stop, _environment(training) as environment:
         model = make_model(algorithm, training, environment)
         run, other_versions = begin()
-        with only_process(run):
+        with hold_lock(run.lock, "another process is training here"):
             state, damaged = (None, []) if other_versions is None else _newest(run, training.identity, other_versions)
             session = Session(run, training, algorithm, model, wishes, stop)
             if state is not None:

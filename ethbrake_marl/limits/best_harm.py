@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.agents.planner import MOST_CANDIDATES, PROFILE_BUDGET, BestHarm
-from ethbrake_marl.agents.protocol import Agent, fixed_commands
+from ethbrake_marl.agents.protocol import Agent, Driver, fixed_commands
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import record_commands, script_agents
 from ethbrake_marl.defaults import HARM_COUNTS, SEARCH_BUDGET, HarmCount
@@ -688,7 +688,7 @@ def _driven_in(agent: Agent, every: Worlds, task: Task, last_step: Ints, rows: I
     return driven_profiles(agent, every.take(rows), task, last_step[rows])
 
 
-def driven_profiles(agent: Agent, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
+def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
     """What ``agent`` commands the vehicle in every step of its episodes, as profiles; equal neighbours are joined."""
     commands = record_commands(agent, worlds, task.scenario, task.vehicle, int(last_step.max()))
     return _phases_of(commands, last_step)

@@ -32,7 +32,7 @@ from ethbrake_marl.files.yaml import (
     schema_lines,
     suggestion,
 )
-from ethbrake_marl.harm import Declared, check_harm_count, objectives_of
+from ethbrake_marl.harm import check_harm_count, objectives_of
 from ethbrake_marl.physics.messages import MOST_SAMPLES
 from ethbrake_marl.scenario.features import listed_features
 from ethbrake_marl.scenario.fields import (

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.inputs import policy_sha256
 from ethbrake_marl.policies.shipped import onnx_model
-from ethbrake_marl.shield.agents import StepShieldAgent
+from ethbrake_marl.shield.agents import ShieldedDriver
 
 SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(12, 7).worlds
@@ -98,7 +98,7 @@ def test_policy_of_another_library__is_known_by_its_weights():
     module = torch.nn.Linear(27, 1)
     agent = eb.policy_agent(module)
     before = policy_sha256(agent)
-    assert before == policy_sha256(StepShieldAgent(agent, SCENARIO)) == policy_sha256(eb.policy_agent(module))
+    assert before == policy_sha256(ShieldedDriver(agent, SCENARIO)) == policy_sha256(eb.policy_agent(module))
     with torch.no_grad():
         module.bias += 0.1
     assert policy_sha256(agent) not in (before, None)

@@ -16,7 +16,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield import HybridAgent, StepShieldAgent
+from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 
 SCENARIO = load_scenario("paper-random")
 
@@ -72,13 +72,13 @@ def test_make_agent__says_where_a_scenario_is_needed(spec):
 @pytest.mark.parametrize(
     ("spec", "kind"),
     [
-        ("full_brake+step", StepShieldAgent),
-        ("constant:-5+step", StepShieldAgent),
+        ("full_brake+step", ShieldedDriver),
+        ("constant:-5+step", ShieldedDriver),
         ("planner:8+episode", HybridAgent),
         ("best_harm:20+refined", Refined),
         ("e_v2x_bm+refined+episode", HybridAgent),
-        ("gentlest_front+robust", StepShieldAgent),
-        ("ppo@shipped+refined+step", StepShieldAgent),
+        ("gentlest_front+robust", ShieldedDriver),
+        ("ppo@shipped+refined+step", ShieldedDriver),
     ],
 )
 def test_shields__go_around_any_agent_and_hold(spec, kind):

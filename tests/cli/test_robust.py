@@ -8,7 +8,7 @@ import pytest
 
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield import StepShieldAgent, parse_uncertainty
+from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -26,7 +26,7 @@ def test_lineup__robust_agents_certify_against_the_uncertainty():
     intervals = parse_uncertainty("gaps_m=0.5")
     lineup = make_lineup(["ppo@shipped+robust"], load_scenario("paper-random"), uncertainty=intervals)
     agent = lineup["ppo@shipped+robust"]
-    assert isinstance(agent, StepShieldAgent) and agent.name == "ppo@shipped+robust"
+    assert isinstance(agent, ShieldedDriver) and agent.name == "ppo@shipped+robust"
 
 
 @pytest.mark.parametrize(

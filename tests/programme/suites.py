@@ -197,10 +197,7 @@ EVALUATION = Suite(
         "evaluation/rollout.py": ("tests/evaluation/test_rollout.py", "tests/agents/test_team.py"),
         "evaluation/outcome.py": ("tests/evaluation/test_rollout.py", "tests/evaluation/test_left_out.py"),
         "evaluation/measures.py": ("tests/evaluation/shards/test_shards.py", "tests/evaluation/test_regret.py",),
-        'evaluation/episodes.py': (
-            'tests/evaluation/test_record.py',
-            'tests/evaluation/test_film.py',
-        ),
+        'evaluation/episodes.py': ('tests/evaluation/test_record.py', 'tests/evaluation/test_film.py',),
         "evaluation/summary.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
         'evaluation/curves.py': (
             'tests/figures/test_criticality.py',

@@ -27,7 +27,7 @@ from ethbrake_marl.policies.bundle import Policy, load_policy
 from ethbrake_marl.policies.shipped import load_shipped
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import HybridAgent
-from ethbrake_marl.shield.agents import Bound
+from ethbrake_marl.shield.guard import Bound
 from ethbrake_marl.studies.reproduction.item import (
     FULL_BRAKE,
     NAMES,
