@@ -41,20 +41,12 @@ from ethbrake_marl.physics.advance import (
     vehicles_in,
 )
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.forecast import CONTACT_CLOSING, CONTACT_ROWS, CONTACT_TIME, forecast_contacts
 from ethbrake_marl.physics.kernel import (
-    COMMAND,
-    DONE,
+    CONTACT,
     FAR_AWAY_M,
-    FIRST_HARM,
-    GAP,
-    HIT,
-    LIMIT,
-    MASS,
-    ONSET,
-    SPEED,
-    TABLE_ROWS,
-    TOTAL_HARM,
+    FLAG,
+    ROW,
+    forecast_contacts,
     place_obstacle,
     stopping_distance,
 )
@@ -282,8 +274,8 @@ def _observe_contacts(
     """Fill ``out``, and ``failed`` [n] where a check of the kernel failed."""
     N = vehicles_in(state)
     at = 1 if state.shape[1] > state_width(N) else 0  # vehicle i stands in column at + i, behind an obstacle
-    line, table = np.zeros((TABLE_ROWS, N + at)), np.zeros((TABLE_ROWS, N + at))
-    found, value = np.zeros((CONTACT_ROWS, N + at)), np.zeros(_OF_COMMAND + _FAR)
+    line, table = np.zeros((ROW.OF_SEGMENT, N + at)), np.zeros((ROW.OF_SEGMENT, N + at))
+    found, value = np.zeros((CONTACT.WIDTH, N + at)), np.zeros(_OF_COMMAND + _FAR)
     braking, driving = params_at(0, N), params_at(1, N)
     for k in range(out.shape[0]):
         for o in range(observers.shape[0]):
@@ -291,14 +283,14 @@ def _observe_contacts(
             first, last = _place_known(line, state, params, k, i, at)
             for c in commands:
                 for j in range(N + at):
-                    for row in (SPEED, COMMAND, MASS, LIMIT, ONSET, GAP, HIT):
+                    for row in (ROW.SPEED, ROW.COMMAND, ROW.MASS, ROW.LIMIT, ROW.ONSET, ROW.GAP, ROW.HIT):
                         table[row, j] = line[row, j]
-                table[COMMAND, at + i] = 0.0
+                table[ROW.COMMAND, at + i] = 0.0
                 if c == 0:
-                    table[COMMAND, at + i] = -params[k, braking + i]
+                    table[ROW.COMMAND, at + i] = -params[k, braking + i]
                 elif c == 2:
-                    table[COMMAND, at + i] = params[k, driving + i]
-                if forecast_contacts(table, params[k, RESTITUTION], FORECAST_S, found) != DONE:
+                    table[ROW.COMMAND, at + i] = params[k, driving + i]
+                if forecast_contacts(table, params[k, RESTITUTION], FORECAST_S, found) != FLAG.DONE:
                     failed[k] = True
                     break
                 _tell(table, found, at + i, first, last, time_step, value)
@@ -329,17 +321,17 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
     for j in range(N):
         known = first <= j <= last
         in_force = state[k, command + j]
-        table[SPEED, at + j] = state[k, speed + j] if known else 0.0
-        table[MASS, at + j] = params[k, mass + j]
-        table[LIMIT, at + j] = params[k, limit + j]
-        table[ONSET, at + j] = 0.0
-        table[COMMAND, at + j] = in_force if known else 0.0
+        table[ROW.SPEED, at + j] = state[k, speed + j] if known else 0.0
+        table[ROW.MASS, at + j] = params[k, mass + j]
+        table[ROW.LIMIT, at + j] = params[k, limit + j]
+        table[ROW.ONSET, at + j] = 0.0
+        table[ROW.COMMAND, at + j] = in_force if known else 0.0
         if j == i or in_force == 0.0:
-            table[ONSET, at + j] = max(params[k, own_part + j] - time, 0.0)
-            table[COMMAND, at + j] = -params[k, braking + j] if known else 0.0
+            table[ROW.ONSET, at + j] = max(params[k, own_part + j] - time, 0.0)
+            table[ROW.COMMAND, at + j] = -params[k, braking + j] if known else 0.0
         if j < N - 1:
-            table[GAP, at + j] = state[k, gap + j] if first <= j < last else FAR_AWAY_M
-            table[HIT, at + j] = state[k, gap + N - 1 + j]
+            table[ROW.GAP, at + j] = state[k, gap + j] if first <= j < last else FAR_AWAY_M
+            table[ROW.HIT, at + j] = state[k, gap + N - 1 + j]
     if at == 1:
         obstacle = state_width(N)
         seen = first == 0 and state[k, obstacle] < math.inf
@@ -360,18 +352,18 @@ def _tell(table: Floats, found: Floats, own: int, first: int, last: int, time_st
             for f in range(_OF_PAIR):
                 value[at + f] = 0.0
             continue
-        time = found[CONTACT_TIME, p]
+        time = found[CONTACT.TIME, p]
         met = time < math.inf
         steps = (time if met else FORECAST_S) / time_step
         whole = max(math.ceil(steps) - 1.0, 0.0)
         value[at] = time if met else FORECAST_S
-        value[at + 1] = found[CONTACT_CLOSING, p]
+        value[at + 1] = found[CONTACT.CLOSING, p]
         value[at + 2] = steps - whole if met else 0.0
         value[at + 3] = whole
     first_harm, total_harm = 0.0, 0.0
     for p in range(first, last):
-        first_harm += table[FIRST_HARM, p]
-        total_harm += table[TOTAL_HARM, p]
+        first_harm += table[ROW.FIRST_HARM, p]
+        total_harm += table[ROW.TOTAL_HARM, p]
     value[2 * _OF_PAIR] = first_harm
     value[2 * _OF_PAIR + 1] = total_harm
     value[_OF_COMMAND], value[_OF_COMMAND + 1] = value[0], value[_OF_PAIR]

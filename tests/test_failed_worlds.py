@@ -16,7 +16,7 @@ from ethbrake_marl.errors import FailedWorld, PhysicsError
 from ethbrake_marl.physics import advance, concatenate, forecast, leaving_out_failed
 from ethbrake_marl.physics.advance import gap_at, speed_at
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.search.profiles import profile_problem
+from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield.certify import Backup, begin_running, certify
 from ethbrake_marl.shield.step_shield import StepShield
 from tests.failing_worlds import plant, planted_list, without

@@ -155,7 +155,7 @@ def digest_in(package: Path, name: str) -> str:
         ("physics/advance.py", "physics/kernel.py", True),  # what it calls
         ("shield/certify_kernel.py", "physics/kernel.py", True),  # through several files
         ("observations.py", "scenario/features.py", True),  # constants, from a file without kernels
-        ("physics/advance.py", "search/kernel.py", False),  # kernels that it does not call
+        ("physics/advance.py", "search.py", False),  # kernels that it does not call
         ("physics/kernel.py", "physics/advance.py", False),  # its callers
         ("physics/advance.py", "physics/worlds.py", False),  # types
         ("physics/compiled.py", "kernel_store.py", False),  # where kernels are kept
@@ -223,7 +223,7 @@ import os, time
 import numpy as np
 from pathlib import Path
 from numba.core import event
-from ethbrake_marl.physics.kernel import GAP, IMPACT_ROWS, MASS, SPEED, pool
+from ethbrake_marl.physics.kernel import ROW, pool
 
 class Count(event.Listener):
     names = []
@@ -236,10 +236,10 @@ Path(f"ready-{os.getpid()}").touch()
 while len(list(Path().glob("ready-*"))) < int(os.environ["AT_ONCE"]):
     time.sleep(0.001)
 event.register("numba:compile", Count())
-table = np.zeros((IMPACT_ROWS, 2))
-table[MASS] = 1.0
-table[SPEED] = 2.0, 4.0
-print(pool(table, SPEED, SPEED, 0, 1, GAP), *table[GAP], *sorted(set(Count.names)))
+table = np.zeros((ROW.OF_IMPACT, 2))
+table[ROW.MASS] = 1.0
+table[ROW.SPEED] = 2.0, 4.0
+print(pool(table, ROW.SPEED, ROW.SPEED, 0, 1, ROW.GAP), *table[ROW.GAP], *sorted(set(Count.names)))
 """
 SAME = "1 3.0 3.0\n"  # two of one mass, the one behind faster: one block, at the mean of both speeds
 COMPILED = "1 3.0 3.0 pool\n"

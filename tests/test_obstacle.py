@@ -19,13 +19,12 @@ from ethbrake_marl.evaluation.episodes import record_episode
 from ethbrake_marl.evaluation.results import write_per_world_csv
 from ethbrake_marl.figures.evaluation import trajectories
 from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.limits.avoidability import avoidability
 from ethbrake_marl.limits.best_harm import best_harm, realised_harm
-from ethbrake_marl.limits.lower_bound import lower_bound
+from ethbrake_marl.limits.lower_bound import avoidability, lower_bound
 from ethbrake_marl.physics import advance, concatenate
 from ethbrake_marl.policies.actor import observation_schema
 from ethbrake_marl.scenario import Scenario, Task, initial_state_worlds, load_scenario, worlds_from_table
-from ethbrake_marl.search.profiles import constant_profiles, follow_profiles, profile_problem
+from ethbrake_marl.search import constant_profiles, follow_profiles, profile_problem
 from ethbrake_marl.shield.agents import ShieldedDriver
 from tests.reference.avoidability_lp import avoidable_by_lp
 

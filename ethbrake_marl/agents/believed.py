@@ -20,18 +20,7 @@ from ethbrake_marl.agents.protocol import Agent, AgentAround, Knowledge, Predict
 from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.messages import (
-    OBSTACLE_PLACE,
-    TOLD_COMMAND,
-    TOLD_HIT,
-    TOLD_PLACE,
-    TOLD_S,
-    TOLD_SPEED,
-    is_periodic,
-    links_of,
-    move_on,
-    place_at,
-)
+from ethbrake_marl.physics.messages import CHANNEL, LINK, is_periodic, links_of, move_on, place_at
 from ethbrake_marl.physics.worlds import vehicles_at_once
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.scenario.sampling import make_sample
@@ -103,16 +92,20 @@ def _told_by_messages(worlds: Worlds, vehicle: int, told: Told, periodic: Bools)
     """The same where what is known is as old as the newest message, or the present of who is in sight."""
     links, own = links_of(worlds)[:, vehicle], worlds.messages[:, [place_at(worlds.N) + vehicle]]
     other = periodic[:, np.newaxis] & (np.arange(worlds.N) != vehicle)
-    stale = other & (links[..., TOLD_S] < worlds.time_s[:, np.newaxis])
-    for values, column in ((told.place_m, TOLD_PLACE), (told.speed_mps, TOLD_SPEED), (told.command_mps2, TOLD_COMMAND)):
-        since = own if column == TOLD_PLACE else 0.0
+    stale = other & (links[..., LINK.TOLD_S] < worlds.time_s[:, np.newaxis])
+    for values, column in (
+        (told.place_m, LINK.TOLD_PLACE),
+        (told.speed_mps, LINK.TOLD_SPEED),
+        (told.command_mps2, LINK.TOLD_COMMAND),
+    ):
+        since = own if column == LINK.TOLD_PLACE else 0.0
         values[stale] = (links[..., column] - since)[stale]
-    told.at_s[stale] = links[..., TOLD_S][stale]
+    told.at_s[stale] = links[..., LINK.TOLD_S][stale]
     if vehicle > 0:
-        standing = worlds.messages[:, OBSTACLE_PLACE] - own[:, 0]
+        standing = worlds.messages[:, CHANNEL.OBSTACLE_PLACE] - own[:, 0]
         told.obstacle_m[periodic] = standing[periodic]
-        told.obstacle_hit[periodic] = links[periodic, 0, TOLD_HIT] == 1.0
-    return told._replace(known=told.known & (~other | (links[..., TOLD_S] >= 0.0)))
+        told.obstacle_hit[periodic] = links[periodic, 0, LINK.TOLD_HIT] == 1.0
+    return told._replace(known=told.known & (~other | (links[..., LINK.TOLD_S] >= 0.0)))
 
 
 @dataclass(frozen=True, slots=True)

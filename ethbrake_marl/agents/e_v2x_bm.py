@@ -29,7 +29,7 @@ from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance
 from ethbrake_marl.physics.advance import failure
 from ethbrake_marl.physics.compiled import by_parts, compiled
-from ethbrake_marl.physics.kernel import DONE
+from ethbrake_marl.physics.kernel import FLAG
 
 # E-V2X-BM coupled: the best constant deceleration of one vehicle in the engine's own physics.
 #
@@ -130,7 +130,7 @@ def _minimise(
 
     parts = by_parts(search, rows.size, (os.cpu_count() or 1) if rows.size >= _MANY else 1)
     found, status = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
-    if (status != DONE).any():
+    if (status != FLAG.DONE).any():
         with renumbered(rows):
             raise failure(status, worlds.time_s[rows], np.full(rows.size, horizon_s))
     if rows.size >= _MANY:

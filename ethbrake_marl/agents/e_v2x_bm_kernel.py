@@ -27,32 +27,15 @@ from numpy.typing import ArrayLike
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled, compiled_apart, compiled_bare, compiled_bare_apart, compiled_within
-from ethbrake_marl.physics.episode import onset_s
 from ethbrake_marl.physics.kernel import (
-    ACCELERATION,
-    ACTIVE,
-    COMMAND,
-    CONTACT_SPEED,
-    COUNT,
-    DONE,
-    FIRST_HARM,
-    GAP,
-    HIT,
-    IMPACT,
-    JOINED,
-    LIMIT,
-    MASS,
+    FLAG,
+    LISTED,
     MOST_EVENTS,
-    ONSET,
-    PENETRATED,
-    ROW_WIDTH,
-    SPEED,
-    STUCK,
-    TABLE_ROWS,
-    TOTAL_HARM,
+    ROW,
     TOUCH_SPEED_MPS,
     accelerate,
     move_apart,
+    onset_s,
     place_obstacle,
     record_impacts,
     resolve_impacts,
@@ -615,7 +598,7 @@ _DIGIT = 1_000.0  # impacts of a pair that are told apart
 class Line(NamedTuple):
     """One world as candidates run in it, in tables of ``physics.segment``; an obstacle ahead stands in column 0."""
 
-    start: Floats  # [TABLE_ROWS, N or N + 1] with everybody's command but that of the controlled vehicle
+    start: Floats  # [ROW.OF_SEGMENT, N or N + 1] with everybody's command but that of the controlled vehicle
     shared: Floats  # the same where that vehicle's command takes effect
     table: Floats  # room
     clock: Floats  # [3] length of a simulation, restitution, time from the start to ``shared``
@@ -634,20 +617,22 @@ def make_line(
     """One world at its ``time``, ready for ``share_start``; an ``obstacle`` that is finitely far is in it."""
     at = 1 if obstacle < math.inf else 0
     vehicles = speed.shape[0]
-    table = np.zeros((TABLE_ROWS, vehicles + at))
+    table = np.zeros((ROW.OF_SEGMENT, vehicles + at))
     if at == 1:
         place_obstacle(table, obstacle, 1.0 if obstacle_hit else 0.0)
-        table[ONSET, 0] = onset_s(0.0, time)
+        table[ROW.ONSET, 0] = onset_s(0.0, time)
     for i in range(vehicles):
-        table[COMMAND, at + i], table[SPEED, at + i] = command[i], speed[i]
-        table[MASS, at + i], table[LIMIT, at + i] = mass[i], limit[i]
-        table[ONSET, at + i] = onset_s(latency[i], time)
+        table[ROW.COMMAND, at + i], table[ROW.SPEED, at + i] = command[i], speed[i]
+        table[ROW.MASS, at + i], table[ROW.LIMIT, at + i] = mass[i], limit[i]
+        table[ROW.ONSET, at + i] = onset_s(latency[i], time)
     for p in range(vehicles - 1):
-        table[GAP, at + p] = gap[p]
-        table[HIT, at + p] = 1.0 if hit[p] else 0.0
+        table[ROW.GAP, at + p] = gap[p]
+        table[ROW.HIT, at + p] = 1.0 if hit[p] else 0.0
     clock = np.array([horizon - time, restitution, 0.0])
-    rows = (TOTAL_HARM, FIRST_HARM) if total else (FIRST_HARM, TOTAL_HARM)
-    return Line(table, table.copy(), table.copy(), clock, at + vehicle, at, rows[0], rows[1], np.empty((0, ROW_WIDTH)))
+    rows = (ROW.TOTAL_HARM, ROW.FIRST_HARM) if total else (ROW.FIRST_HARM, ROW.TOTAL_HARM)
+    return Line(
+        table, table.copy(), table.copy(), clock, at + vehicle, at, rows[0], rows[1], np.empty((0, LISTED.WIDTH))
+    )
 
 
 @compiled_bare_apart
@@ -658,16 +643,16 @@ def share_start(line: Line) -> int:
     start_events(table)
     now = 0.0
     for _ in range(MOST_EVENTS):
-        if table[ACTIVE, line.controlled] == 1.0 or now >= clock[DURATION]:
+        if table[ROW.ACTIVE, line.controlled] == 1.0 or now >= clock[DURATION]:
             clock[SHARED_S] = now
-            return DONE
+            return FLAG.DONE
         if resolve_impacts(table, clock[RESTITUTION]):
             record_impacts(table, now, 0, line.no_rows, 0)
             continue
         sound, now = to_next_event(table, now, clock[DURATION])
         if not sound:
-            return PENETRATED
-    return STUCK
+            return FLAG.PENETRATED
+    return FLAG.STUCK
 
 
 @compiled_bare_apart
@@ -681,32 +666,32 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
             copy_sample(samples, s - 1, samples, s)
             continue
         status = _simulate_one(line, -samples.at[s], bound)
-        if status != DONE:
+        if status != FLAG.DONE:
             return status
         samples.harm[s] = _sum_row(line, line.harm)
         samples.other[s] = _sum_row(line, line.other)
         samples.course[s] = _course(line)
-    return DONE
+    return FLAG.DONE
 
 
 @compiled_within
 def _simulate_one(line: Line, command: float, bound: float) -> int:
     """Leave the harm of one candidate in the line's table."""
     table, duration = line.table, line.clock[DURATION]
-    table[COMMAND, line.controlled] = command
+    table[ROW.COMMAND, line.controlled] = command
     _copy_state(line.start, table)
     if move_apart(table, duration):
-        return DONE
+        return FLAG.DONE
     _copy_state(line.shared, table)
     now = line.clock[SHARED_S]
     for _ in range(MOST_EVENTS):
         status, now = to_next_impact(table, line.clock[RESTITUTION], now, duration)
-        if status != IMPACT:
+        if status != FLAG.IMPACT:
             return status
         record_impacts(table, now, 0, line.no_rows, 0)
         if _sum_row(line, line.harm) >= bound or will_stay_apart(table):
-            return DONE
-    return STUCK
+            return FLAG.DONE
+    return FLAG.STUCK
 
 
 @compiled_within
@@ -714,15 +699,15 @@ def _copy_state(of: Floats, table: Floats) -> None:
     """Put the table into the state of another one; both have the same vehicles."""
     vehicles = table.shape[1]
     for i in range(vehicles):
-        table[SPEED, i] = of[SPEED, i]
-        table[ACTIVE, i] = of[ACTIVE, i]
+        table[ROW.SPEED, i] = of[ROW.SPEED, i]
+        table[ROW.ACTIVE, i] = of[ROW.ACTIVE, i]
     for p in range(vehicles - 1):
-        table[GAP, p] = of[GAP, p]
-        table[CONTACT_SPEED, p] = of[CONTACT_SPEED, p]
-        table[HIT, p] = of[HIT, p]
-        table[FIRST_HARM, p] = of[FIRST_HARM, p]
-        table[TOTAL_HARM, p] = of[TOTAL_HARM, p]
-        table[COUNT, p] = of[COUNT, p]
+        table[ROW.GAP, p] = of[ROW.GAP, p]
+        table[ROW.CONTACT_SPEED, p] = of[ROW.CONTACT_SPEED, p]
+        table[ROW.HIT, p] = of[ROW.HIT, p]
+        table[ROW.FIRST_HARM, p] = of[ROW.FIRST_HARM, p]
+        table[ROW.TOTAL_HARM, p] = of[ROW.TOTAL_HARM, p]
+        table[ROW.COUNT, p] = of[ROW.COUNT, p]
 
 
 @compiled_within
@@ -749,25 +734,31 @@ def will_stay_apart(table: Floats) -> bool:
     """
     vehicles, hardest = table.shape[1], 0.0
     for i in range(vehicles):
-        if table[ACTIVE, i] == 0.0 or table[COMMAND, i] > 0.0 or table[SPEED, i] < 0.0:
+        if table[ROW.ACTIVE, i] == 0.0 or table[ROW.COMMAND, i] > 0.0 or table[ROW.SPEED, i] < 0.0:
             return False
-        hardest = max(hardest, -table[COMMAND, i])
+        hardest = max(hardest, -table[ROW.COMMAND, i])
     for p in range(vehicles - 1):  # what surely meets is soon told
-        closing = table[SPEED, p + 1] - table[SPEED, p]
-        if closing > 0.0 and closing * closing >= 2.0 * hardest * table[GAP, p]:
+        closing = table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
+        if closing > 0.0 and closing * closing >= 2.0 * hardest * table[ROW.GAP, p]:
             return False
     accelerate(table)
     for p in range(vehicles - 1):
-        front, rear = table[SPEED, p], table[SPEED, p + 1]
-        gap, closing, harder = table[GAP, p], rear - front, table[ACCELERATION, p] - table[ACCELERATION, p + 1]
-        if rear == 0.0 or table[JOINED, p] == 1.0 or (closing <= 0.0 and harder >= 0.0):
+        front, rear = table[ROW.SPEED, p], table[ROW.SPEED, p + 1]
+        gap, closing, harder = (
+            table[ROW.GAP, p],
+            rear - front,
+            table[ROW.ACCELERATION, p] - table[ROW.ACCELERATION, p + 1],
+        )
+        if rear == 0.0 or table[ROW.JOINED, p] == 1.0 or (closing <= 0.0 and harder >= 0.0):
             continue
         if not (gap > CLEAR_M or closing < -CLEAR_MPS):
             return False
         gap -= CLEAR_M
         if closing > 0.0 and harder > 0.0 and front > 0.0 and not closing * closing < 2.0 * harder * gap:
             return False
-        if not gap + _way_to_stop(front, table[ACCELERATION, p]) > _way_to_stop(rear, table[ACCELERATION, p + 1]):
+        if not gap + _way_to_stop(front, table[ROW.ACCELERATION, p]) > _way_to_stop(
+            rear, table[ROW.ACCELERATION, p + 1]
+        ):
             return False
     return True
 
@@ -783,9 +774,9 @@ def _course(line: Line) -> float:
     """A number that says how many impacts each pair, and the obstacle, had."""
     course, digit, table = 0.0, 1.0, line.table
     for p in range(line.vehicles, table.shape[1] - 1):
-        course += table[COUNT, p] * digit
+        course += table[ROW.COUNT, p] * digit
         digit *= _DIGIT
-    return course + table[COUNT, 0] * digit if line.vehicles == 1 else course
+    return course + table[ROW.COUNT, 0] * digit if line.vehicles == 1 else course
 
 
 @compiled_within
@@ -871,15 +862,15 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
     ``breakpoints`` [CANDIDATES] are looked at beside the grid.
     """
     status = share_start(line)
-    if status == DONE:
+    if status == FLAG.DONE:
         status = look_evenly(line, room, breakpoints, capacity)
-    if status == DONE:
+    if status == FLAG.DONE:
         status = look_inside(line, room)
-    if status == DONE:
+    if status == FLAG.DONE:
         status = locate_borders(line, room)
-    if status == DONE:
+    if status == FLAG.DONE:
         status = narrow_minima(line, room)
-    if status == DONE:
+    if status == FLAG.DONE:
         status = step_back(line, room.few, choose(room.two, _MOST, room.values), capacity, out)
     return status
 
@@ -894,7 +885,7 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
         new.at[k] = breakpoints[k]
     put_in_order(new, CANDIDATES)
     status = simulate(line, grid, _ZERO, _GRID_END, math.inf)
-    if status == DONE:
+    if status == FLAG.DONE:
         status = simulate(line, new, _ZERO, _CANDIDATES_END, math.inf)
     merge(grid, GRID, new, CANDIDATES, room.two)
     return status
@@ -959,13 +950,13 @@ def locate_borders(line: Line, room: Room) -> int:
         copy_sample(looked, places[b] + 1, few, 5)
         if bounds[places[b]] < math.inf:
             status = _cut(line, few)
-            if status != DONE:
+            if status != FLAG.DONE:
                 return status
         copy_sample(few, 0, new, 2 * b)
         copy_sample(few, 5, new, 2 * b + 1)
     put_in_order(new, 2 * BORDERS)
     merge(looked, _LOOKED, new, 2 * BORDERS, room.two)
-    return DONE
+    return FLAG.DONE
 
 
 @compiled_bare
@@ -976,7 +967,7 @@ def _cut(line: Line, few: Samples) -> int:
         for k in range(4):
             few.at[1 + k] = low + width * _FIFTHS[k]
         status = simulate(line, few, _ONE, _FIVE, math.inf)
-        if status != DONE:
+        if status != FLAG.DONE:
             return status
         border, least = 0, math.inf
         for k in range(5):
@@ -985,7 +976,7 @@ def _cut(line: Line, few: Samples) -> int:
                 border, least = k, lower
         copy_sample(few, border + 1, few, 5)  # first: it may be sample 1 that moves to 0
         copy_sample(few, border, few, 0)
-    return DONE
+    return FLAG.DONE
 
 
 @compiled_bare_apart
@@ -999,9 +990,9 @@ def narrow_minima(line: Line, room: Room) -> int:
         if room.values[middle] < math.inf:
             low, high = found.at[max(middle - 1, 0)], found.at[min(middle + 1, last)]
             status = _narrow(line, room.few, low, high, found, to)
-            if status != DONE:
+            if status != FLAG.DONE:
                 return status
-    return DONE
+    return FLAG.DONE
 
 
 @compiled_bare
@@ -1016,7 +1007,7 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
         few.at[0], few.at[1], few.at[2], few.at[3] = low + left, middle - left, middle + right, high - right
         first, end = 0 if left > 0.0 else 2, 4 if right > 0.0 else 2  # the middle itself is known
         status = simulate(line, few, first, end, found.harm[to])
-        if status != DONE:
+        if status != FLAG.DONE:
             return status
         pick, least = -1, found.harm[to]
         for k in range(first, end):
@@ -1030,7 +1021,7 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
             few.at[1] if pick == 0 else middle if pick == 1 else few.at[3] if pick == 2 else high,
         )
         copy_sample(few, pick, found, to)
-    return DONE
+    return FLAG.DONE
 
 
 @compiled_bare_apart

@@ -18,9 +18,9 @@ from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.episode import START, decision_at
-from ethbrake_marl.search.kernel import MOST_PHASES
-from ethbrake_marl.search.profiles import (
+from ethbrake_marl.physics.kernel import CLOCK, decision_at
+from ethbrake_marl.search import (
+    MOST_PHASES,
     TIME_STEP_S,
     ProfileProblem,
     Profiles,
@@ -243,7 +243,7 @@ class BestHarm:
         first, total = follow_profiles(problem, profiles)
         self.predicted_harm = place(self.predicted_harm, rows, first if self._harm_count == "first" else total)
         self.searched = place(self.searched, rows, (~known).astype(np.float64))
-        self._start_s = place(self._start_s, rows, problem.clock[:, START])
+        self._start_s = place(self._start_s, rows, problem.clock[:, CLOCK.START])
         self._profiles = _place(self._profiles, rows, profiles, self._start_s.size)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:

@@ -17,10 +17,9 @@ from ethbrake_marl.engine.stream import ask_script, begin_script
 from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
 from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.physics.episode import START, decision_at
+from ethbrake_marl.physics.kernel import CLOCK, decision_at
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.profiles import ProfileProblem, profile_problem
-from ethbrake_marl.search.refine import Refinement, refine_commands
+from ethbrake_marl.search import ProfileProblem, Refinement, profile_problem, refine_commands
 
 # The compiled refinement of a policy: a search around its own episode at the alert, which then drives.
 
@@ -79,7 +78,7 @@ class RefinedProfile(AgentAround):
         more = self._commands.shape[1] - own.shape[1]
         commands = np.pad(found.commands_mps2, ((0, 0), (0, more)), mode="edge")
         self._commands = place(self._commands, rows, commands)
-        self._start_s = place(self._start_s, rows, problem.clock[:, START])
+        self._start_s = place(self._start_s, rows, problem.clock[:, CLOCK.START])
         harm = found.first_impact_harm if self.harm_count == "first" else found.total_harm
         self.predicted_harm = place(self.predicted_harm, rows, harm)
 

@@ -16,7 +16,7 @@ from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.advance import unpack
-from ethbrake_marl.physics.episode import decision_at, first_decision_s
+from ethbrake_marl.physics.kernel import decision_at, first_decision_s
 from ethbrake_marl.scenario import Scenario
 
 

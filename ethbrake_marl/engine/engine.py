@@ -64,8 +64,7 @@ from ethbrake_marl.physics.advance import (
     with_news_columns,
     with_obstacle_columns,
 )
-from ethbrake_marl.physics.episode import decision_s, number_of_decisions
-from ethbrake_marl.physics.kernel import DONE
+from ethbrake_marl.physics.kernel import FLAG, decision_s, number_of_decisions
 from ethbrake_marl.physics.messages import hear_rows
 from ethbrake_marl.rewards import (
     Reward,
@@ -504,7 +503,7 @@ class Engine(Running):
         if way is not None:
             status = self._add_way(way, reward, outcome, status)
         step = Step(reward, outcome, self.reward, {})
-        if status != DONE:
+        if status != FLAG.DONE:
             times = self._state[:, 0]
             self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
         if self._terms.add_something:
@@ -656,7 +655,7 @@ class Engine(Running):
         ahead, _, outcome = self._look_ahead(until_s, until_s, none)
         failed = np.where(way.failed != 0, way.failed, outcome[FAILED].astype(np.int64))
         if failed.any():
-            raise failure(np.where(failed == 0, DONE, failed), self._state[:, TIME], until_s)
+            raise failure(np.where(failed == 0, FLAG.DONE, failed), self._state[:, TIME], until_s)
         self._state[rows], self._params[rows] = ahead.state[rows], ahead.params[rows]
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:

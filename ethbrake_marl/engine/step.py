@@ -24,23 +24,16 @@ from ethbrake_marl.physics.advance import (
     state_width,
 )
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.episode import command_in_force, onset_s, stands, step_end_s
 from ethbrake_marl.physics.kernel import (
-    COMMAND,
-    COUNT,
-    DONE,
     FAR_AWAY_M,
-    FIRST_HARM,
-    GAP,
-    HIT,
-    LIMIT,
-    MASS,
-    ONSET,
-    SPEED,
-    TABLE_ROWS,
-    TOTAL_HARM,
+    FLAG,
+    ROW,
     advance_table,
+    command_in_force,
+    onset_s,
     place_obstacle,
+    stands,
+    step_end_s,
 )
 from ethbrake_marl.rewards import RewardParams, shared_terms
 
@@ -155,9 +148,9 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         params_at(0, N), params_at(1, N), params_at(2, N), params_at(3, N), params_at(4, N),
     )  # fmt: skip
     P, obstacle = N - 1, state_width(N)
-    worst, worst_status = -1, DONE
+    worst, worst_status = -1, FLAG.DONE
     at = 1 if state.shape[1] > obstacle else 0  # vehicle i stands in column at + i, behind an obstacle
-    table = np.zeros((TABLE_ROWS, N + at))
+    table = np.zeros((ROW.OF_SEGMENT, N + at))
     for k in range(n):
         if clock[k, ENDED] == 1.0:
             for f in range(OUTCOME_ROWS):
@@ -175,19 +168,19 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         if at == 1:
             place_obstacle(table, min(state[k, obstacle], FAR_AWAY_M), state[k, obstacle + 1])
         for i in range(N):
-            table[SPEED, at + i] = state[k, speed + i]
-            table[COMMAND, at + i] = wanted[k, i]
-            table[MASS, at + i] = params[k, mass + i]
-            table[LIMIT, at + i] = params[k, limit + i]
-            table[ONSET, at + i] = onset_s(params[k, latency + i], time)
+            table[ROW.SPEED, at + i] = state[k, speed + i]
+            table[ROW.COMMAND, at + i] = wanted[k, i]
+            table[ROW.MASS, at + i] = params[k, mass + i]
+            table[ROW.LIMIT, at + i] = params[k, limit + i]
+            table[ROW.ONSET, at + i] = onset_s(params[k, latency + i], time)
             state[k, previous + i] = state[k, command + i]
             state[k, command + i] = command_in_force(wanted[k, i], params[k, latency + i], until)
         for p in range(P):
-            table[GAP, at + p] = state[k, gap + p]
-            table[HIT, at + p] = state[k, gap + P + p]
+            table[ROW.GAP, at + p] = state[k, gap + p]
+            table[ROW.HIT, at + p] = state[k, gap + P + p]
         status = advance_table(table, params[k, RESTITUTION], until - time, time, k, no_rows, 0)[1]
         outcome[FAILED, k] = 0.0
-        if status != DONE:
+        if status != FLAG.DONE:
             worst, worst_status = k, status
             for f in range(OUTCOME_ROWS):
                 outcome[f, k] = 0.0
@@ -201,26 +194,26 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         state[k, TIME] = until
         at_rest = True
         for i in range(N):
-            state[k, speed + i] = table[SPEED, at + i]
-            at_rest = at_rest and stands(table[SPEED, at + i], wanted[k, i])
+            state[k, speed + i] = table[ROW.SPEED, at + i]
+            at_rest = at_rest and stands(table[ROW.SPEED, at + i], wanted[k, i])
         impacts, first_harm, total_harm = 0.0, 0.0, 0.0
         if at == 1 and state[k, obstacle] < math.inf:
-            state[k, obstacle] = table[GAP, 0]
-            state[k, obstacle + 1] = table[HIT, 0]
-            state[k, obstacle + 2] += table[FIRST_HARM, 0]
-            state[k, obstacle + 3] += table[TOTAL_HARM, 0]
-            state[k, obstacle + 4] += table[COUNT, 0]
-            first_harm = table[FIRST_HARM, 0]
-            total_harm = table[TOTAL_HARM, 0]
+            state[k, obstacle] = table[ROW.GAP, 0]
+            state[k, obstacle + 1] = table[ROW.HIT, 0]
+            state[k, obstacle + 2] += table[ROW.FIRST_HARM, 0]
+            state[k, obstacle + 3] += table[ROW.TOTAL_HARM, 0]
+            state[k, obstacle + 4] += table[ROW.COUNT, 0]
+            first_harm = table[ROW.FIRST_HARM, 0]
+            total_harm = table[ROW.TOTAL_HARM, 0]
             impacts = state[k, obstacle + 4]
         for p in range(P):
-            state[k, gap + p] = table[GAP, at + p]
-            state[k, gap + P + p] = table[HIT, at + p]
-            state[k, harm + p] += table[FIRST_HARM, at + p]
-            state[k, harm + P + p] += table[TOTAL_HARM, at + p]
-            state[k, harm + 2 * P + p] += table[COUNT, at + p]
-            first_harm += table[FIRST_HARM, at + p]
-            total_harm += table[TOTAL_HARM, at + p]
+            state[k, gap + p] = table[ROW.GAP, at + p]
+            state[k, gap + P + p] = table[ROW.HIT, at + p]
+            state[k, harm + p] += table[ROW.FIRST_HARM, at + p]
+            state[k, harm + P + p] += table[ROW.TOTAL_HARM, at + p]
+            state[k, harm + 2 * P + p] += table[ROW.COUNT, at + p]
+            first_harm += table[ROW.FIRST_HARM, at + p]
+            total_harm += table[ROW.TOTAL_HARM, at + p]
             impacts += state[k, harm + 2 * P + p]
         outcome[STEP_FIRST_HARM, k] = first_harm
         outcome[STEP_TOTAL_HARM, k] = total_harm

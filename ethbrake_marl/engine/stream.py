@@ -21,8 +21,7 @@ from ethbrake_marl.errors import (
 )
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance, concatenate, leaving_out_failed
 from ethbrake_marl.physics.advance import Packed, failure, harm_at, has_obstacle, pack, state_width
-from ethbrake_marl.physics.episode import first_decision_s, number_of_decisions
-from ethbrake_marl.physics.kernel import DONE
+from ethbrake_marl.physics.kernel import FLAG, first_decision_s, number_of_decisions
 from ethbrake_marl.physics.worlds import read_only
 from ethbrake_marl.scenario import Scenario
 
@@ -93,7 +92,7 @@ class Roster:
 
     def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
         """Enter the worlds with a ``status``: a step from ``from_s`` to ``until_s`` [n] could not advance them."""
-        new = failure(np.where(status == 0, DONE, status), from_s, until_s).worlds
+        new = failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds
         self.failed |= new
         for row, reason in new.items() if self.warns else ():
             number = int(self.numbers[row])

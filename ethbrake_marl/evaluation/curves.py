@@ -15,9 +15,9 @@ from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
 from ethbrake_marl.evaluation.rollout import controlled_vehicle, evaluate
-from ethbrake_marl.limits.avoidability import avoidability
 from ethbrake_marl.limits.best_harm import scripted_commands
 from ethbrake_marl.limits.limits import Limits, Unproven, known_limits, undecided_because
+from ethbrake_marl.limits.lower_bound import avoidability
 from ethbrake_marl.physics import Bools, Floats, Worlds, advance, forecast, make_worlds
 from ethbrake_marl.scenario import Scenario, Task, worlds_from_table
 from ethbrake_marl.scenario.quantities import QUANTITIES

@@ -23,8 +23,7 @@ from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
-from ethbrake_marl.physics.episode import first_decision_s, segment_pieces
-from ethbrake_marl.physics.kernel import with_post_ahead
+from ethbrake_marl.physics.kernel import first_decision_s, segment_pieces, with_post_ahead
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import HybridAgent
 

@@ -17,8 +17,7 @@ from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.evaluation.inputs import result_identity
 from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate, relative_decrease
-from ethbrake_marl.limits.best_harm import shipped_tables, world_identity
-from ethbrake_marl.limits.best_harm_table import BestHarmTable
+from ethbrake_marl.limits.best_harm import BestHarmTable, shipped_tables, world_identity
 from ethbrake_marl.limits.limits import Limits, Unproven, prove, unproven_because
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, leaving_out_failed
 from ethbrake_marl.scenario import Task, load_scenario

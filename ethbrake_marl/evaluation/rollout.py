@@ -30,20 +30,15 @@ from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate, leaving_out_failed
 from ethbrake_marl.physics.advance import failure
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.episode import decision_s, first_decision_s, onset_s
 from ethbrake_marl.physics.kernel import (
-    COMMAND,
-    DONE,
-    GAP,
-    HIT,
-    LIMIT,
-    MASS,
-    ONSET,
-    ROW_WIDTH,
-    SPEED,
-    TABLE_ROWS,
+    FLAG,
+    LISTED,
+    ROW,
     advance_table,
+    decision_s,
+    first_decision_s,
     obstacle_ahead,
+    onset_s,
     place_obstacle,
     solo_motion,
     with_post_ahead,
@@ -89,12 +84,12 @@ class ShovedFront:
         """Add the way of one step, by a post ahead: the world's own obstacle, or one out of reach."""
         v = before.vehicles
         post_m = with_post_ahead(before, until_s - before.time_s).obstacle_gap_m
-        status = np.full(before.n, DONE)
+        status = np.full(before.n, FLAG.DONE)
         add_front_ways(
             post_m, before.obstacle_hit, before.gaps_m, before.speeds_mps, before.time_s, before.pair_hit, command_mps2,
             until_s, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, self._way_m, status,
         )  # fmt: skip
-        if (status != DONE).any():
+        if (status != FLAG.DONE).any():
             raise failure(status, before.time_s, until_s)
 
     @property
@@ -122,24 +117,24 @@ def add_front_ways(
     ``status`` [n] tells which could not be advanced.
     """
     vehicles = speeds.shape[1]
-    table = np.zeros((TABLE_ROWS, vehicles + 1))
-    no_rows = np.empty((0, ROW_WIDTH))
+    table = np.zeros((ROW.OF_SEGMENT, vehicles + 1))
+    no_rows = np.empty((0, LISTED.WIDTH))
     for k in range(speeds.shape[0]):
         if not until[k] > time[k]:
             continue
         place_obstacle(table, post[k], 1.0 if post_hit[k] else 0.0)
-        table[SPEED, 0] = 0.0
+        table[ROW.SPEED, 0] = 0.0
         for i in range(vehicles):
-            table[COMMAND, i + 1] = command[k, i]
-            table[SPEED, i + 1] = speeds[k, i]
-            table[MASS, i + 1] = mass[k, i]
-            table[LIMIT, i + 1] = limit[k, i]
-            table[ONSET, i + 1] = onset_s(latency[k, i], time[k])
+            table[ROW.COMMAND, i + 1] = command[k, i]
+            table[ROW.SPEED, i + 1] = speeds[k, i]
+            table[ROW.MASS, i + 1] = mass[k, i]
+            table[ROW.LIMIT, i + 1] = limit[k, i]
+            table[ROW.ONSET, i + 1] = onset_s(latency[k, i], time[k])
         for p in range(vehicles - 1):
-            table[GAP, p + 1] = gaps[k, p]
-            table[HIT, p + 1] = 1.0 if hit[k, p] else 0.0
+            table[ROW.GAP, p + 1] = gaps[k, p]
+            table[ROW.HIT, p + 1] = 1.0 if hit[k, p] else 0.0
         status[k] = advance_table(table, restitution[k], until[k] - time[k], time[k], k, no_rows, 0)[1]
-        way[k] += post[k] - table[GAP, 0]
+        way[k] += post[k] - table[ROW.GAP, 0]
 
 
 VEHICLE_2 = 1  # the map's samples begin with its latency

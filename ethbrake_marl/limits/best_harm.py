@@ -1,10 +1,9 @@
-"""The least harm known in each world: search over whole profiles of the controlled vehicles, in the engine's physics.
-
-What is found is realised harm: an upper bound of the true minimum, never below it. See docs/best-harm.md.
-"""
+"""Tables of best known harm: small files that are looked up by what a world is, never by its place in a list."""
 
 from __future__ import annotations
 
+import io
+import json
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -12,9 +11,11 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.agents.planner import MOST_CANDIDATES, PROFILE_BUDGET, BestHarm
@@ -23,28 +24,262 @@ from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import record_commands, script_agents
 from ethbrake_marl.defaults import HARM_COUNTS, SEARCH_BUDGET, HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError, check_one_learner
-from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.limits.avoidability import empty_plan
-from ethbrake_marl.limits.best_harm_table import BestHarmTable, BestKnown, join_tables, load_table, save_table
-from ethbrake_marl.limits.lower_bound import onset_states
-from ethbrake_marl.limits.meetings import FRONT_FIRST, REAR_FIRST, meet_front, meet_rear
+from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
+from ethbrake_marl.files.store import parse_strict_json, read_plain, write_file
+from ethbrake_marl.files.yaml import first_mistake, parse_numeral
+from ethbrake_marl.limits.lower_bound import FRONT_FIRST, REAR_FIRST, empty_plan, meet_front, meet_rear, onset_states
 from ethbrake_marl.physics import Bools, Floats, Ints, UInt64s, Worlds, advance, leaving_out_failed
 from ethbrake_marl.physics.compiled import compiled, compiled_apart
-from ethbrake_marl.physics.episode import LAST_STEP, START, TIME_STEP, follow_whole
+from ethbrake_marl.physics.kernel import CLOCK, follow_whole
 from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.search.kernel import MOST_PHASES, SearchWorld, allowed, copy_profile, copy_rows, largest
-from ethbrake_marl.search.profiles import (
+from ethbrake_marl.search import (
+    MOST_PHASES,
     ProfileProblem,
     Profiles,
     SearchResult,
+    SearchWorld,
+    allowed,
+    check_profiles,
     constant_profiles,
+    copy_profile,
+    copy_rows,
     even_grid,
     follow_profiles,
+    largest,
     make_search_world,
     pad_profiles,
     profile_problem,
     search_profiles,
 )
+
+TABLE_FORMAT = 1
+SIZE_LIMIT_BYTES = 64 << 20  # of a file
+UNPACKED_LIMIT_BYTES = 256 << 20  # of its arrays
+DECODED_LIMIT = 1 << 26  # numbers of the profiles of one count, every world with as many phases as the longest
+TOLERANCE = 1e-6  # an agent must be this much (m2/s2) below the table to replace its value
+_ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # of the header, in an error
+_COUNTS: tuple[HarmCount, ...] = ("first", "total")
+
+
+class BestKnown(NamedTuple):
+    """The least harm known under one count."""
+
+    harm: Floats  # [n] m2/s2
+    profiles: Profiles  # [n] that do it; all ends 0 where only the harm is known
+
+
+@dataclass(frozen=True, slots=True)
+class BestHarmTable:
+    """The least harm known in n worlds, for one or both counts, and how it was found (``header``)."""
+
+    identity: UInt64s  # [n]
+    best: Mapping[HarmCount, BestKnown]
+    header: Mapping[str, Any]
+
+    def rows(self, identity: UInt64s) -> NDArray[np.int64]:
+        """Row of each world, -1 where it is not in the table."""
+        order = np.argsort(self.identity, kind="stable")
+        place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
+        rows = order[place]
+        return np.where(self.identity[rows] == identity, rows, -1)
+
+    def check_holds_any(self, identity: UInt64s) -> None:
+        """Raise ``InvalidInput`` if none of these worlds is in the table: it is of another list."""
+        if not (self.rows(identity) >= 0).any():
+            made = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
+            raise InvalidInput(
+                f"table of best known harm ({made}): holds none of these {len(identity)} worlds; give the scenario,"
+                " seed and vehicles that it was made for"
+            )
+
+    def check_fits(self, problem: ProfileProblem) -> None:
+        """Raise ``InvalidInput`` if a profile kept for one of these worlds cannot be driven there."""
+        for harm_count in self.best:
+            try:
+                check_profiles(problem, self.profiles(problem.identity, harm_count, problem.last_step)[0])
+            except InvalidInput as error:
+                raise InvalidInput(f"table of best known harm, {harm_count}: {error}") from None
+
+    def harm(self, identity: UInt64s, harm_count: HarmCount) -> Floats:
+        """Best known harm of each world (m2/s2), NaN where it is not in the table."""
+        rows = self.rows(identity)
+        if harm_count not in self.best:
+            return np.full(rows.shape, np.nan)
+        return np.where(rows >= 0, self.best[harm_count].harm[rows], np.nan)
+
+    def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
+        """Kept profiles [n], and where there is one [n]; coasting elsewhere. ``last_step`` [n] ends each of them."""
+        rows = self.rows(identity)
+        if harm_count not in self.best:
+            controlled = next(iter(self.best.values())).profiles.commands_mps2.shape[2]
+            coasting = Profiles(last_step[:, np.newaxis].copy(), np.zeros((len(rows), 1, controlled)))
+            return coasting, np.zeros(len(rows), np.bool_)
+        kept = self.best[harm_count].profiles.take(rows)
+        known = (rows >= 0) & (kept.ends[:, -1] > 0)
+        ends = np.where(known[:, np.newaxis], kept.ends, last_step[:, np.newaxis])
+        return Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], kept.commands_mps2, 0.0)), known
+
+    def improved(
+        self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
+    ) -> tuple[BestHarmTable, Bools]:
+        """The table with every value replaced that ``harm`` [m] undercuts by more than ``TOLERANCE``; and where it did.
+
+        ``profiles`` [m] are what did it; without them only the harm is known there. Worlds that are not in the table
+        change nothing. Raises ``InvalidInput`` for a count that the table does not hold, or shapes that do not fit.
+        """
+        if harm_count not in self.best:
+            raise InvalidInput(f"table of {', '.join(self.best)}: holds no {harm_count!r} harm")
+        if harm.shape != identity.shape:
+            raise InvalidInput(f"improve: {harm.shape} harms for {identity.shape} worlds")
+        rows = self.rows(identity)
+        old = self.best[harm_count]
+        better = (rows >= 0) & (harm < old.harm[rows] - TOLERANCE)
+        at = rows[better]
+        new_harm = old.harm.copy()
+        new_harm[at] = harm[better]
+        if profiles is None:
+            profiles = Profiles(
+                np.zeros((len(harm), 1), np.int64), np.zeros((len(harm), 1, old.profiles.commands_mps2.shape[2]))
+            )
+        kept, new = pad_profiles([old.profiles, profiles], 1)
+        kept.ends[at] = new.ends[better]
+        kept.commands_mps2[at] = new.commands_mps2[better]
+        return replace(self, best={**self.best, harm_count: BestKnown(new_harm, kept)}), better
+
+
+def join_tables(parts: list[BestHarmTable]) -> BestHarmTable:
+    """One table of all the worlds; the header is the first one's."""
+    counts = [harm_count for harm_count in _COUNTS if all(harm_count in part.best for part in parts)]
+    best: dict[HarmCount, BestKnown] = {}
+    for harm_count in counts:
+        padded = pad_profiles([part.best[harm_count].profiles for part in parts], 1)
+        profiles = Profiles(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
+        best[harm_count] = BestKnown(np.concatenate([part.best[harm_count].harm for part in parts]), profiles)
+    return BestHarmTable(np.concatenate([part.identity for part in parts]), best, parts[0].header)
+
+
+def table_bytes(table: BestHarmTable) -> bytes:
+    """The table as a compressed .npz without pickles: only the phases in use, bytes of like weight together."""
+    arrays: dict[str, NDArray[Any]] = {
+        "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
+        "identity": table.identity.astype("<u8"),
+    }
+    for harm_count, best in table.best.items():
+        ends, commands = best.profiles
+        used = _used(ends)
+        inside = np.arange(ends.shape[1]) < used[:, np.newaxis]
+        arrays[f"{harm_count}_harm"] = best.harm.astype("<f8")
+        arrays[f"{harm_count}_phases"] = used.astype("<u2")
+        arrays[f"{harm_count}_ends"] = ends[inside].astype("<u2")
+        flat = np.ascontiguousarray(commands[inside], "<f8")
+        arrays[f"{harm_count}_commands"] = flat.view(np.uint8).reshape(*flat.shape, 8).transpose(2, 0, 1).copy()
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def save_table(path: Path, table: BestHarmTable) -> None:
+    """Write the table in one step."""
+    write_file(path, table_bytes(table))
+
+
+def load_table(path: Path) -> BestHarmTable:
+    """Read a table. Raises ``InvalidInput`` if there is no file and ``CorruptBundle`` if it is not a table.
+
+    Names, types, shapes and sizes are checked from the headers before anything is unpacked. What a table says of a
+    world is believed; that its profiles fit a problem is for ``check_fits`` to say.
+    """
+    if not os.path.exists(path):
+        raise InvalidInput(f"{path}: there is no such table of best known harm")
+    data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
+    try:
+        archive = ArrayArchive(data, UNPACKED_LIMIT_BYTES)
+        counts = [harm_count for harm_count in _COUNTS if f"{harm_count}_harm" in archive.headers]
+        arrays = archive.unpack([row for harm_count in counts or _COUNTS for row in _rows(harm_count)])
+        header = _header(arrays["header"].tobytes())
+        best = {harm_count: _read_best(arrays, harm_count) for harm_count in counts}
+    except ValueError as error:
+        raise CorruptBundle(f"{path}: is not a table of best known harm: {error}") from None
+    return BestHarmTable(arrays["identity"].astype(np.uint64), best, header)
+
+
+def _rows(harm_count: HarmCount) -> list[ArrayRow]:
+    """What a table holds of one count: n worlds, m phases in all, C controlled vehicles."""
+    return [
+        ArrayRow("header", "|u1", ("bytes",)),
+        ArrayRow("identity", "<u8", ("n",)),
+        ArrayRow(f"{harm_count}_harm", "<f8", ("n",)),
+        ArrayRow(f"{harm_count}_phases", "<u2", ("n",)),
+        ArrayRow(f"{harm_count}_ends", "<u2", (f"m of {harm_count}",)),
+        ArrayRow(f"{harm_count}_commands", "|u1", (8, f"m of {harm_count}", "C")),
+    ]
+
+
+class _Header(BaseModel):
+    """What other code relies on in a header; it may say more."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    format: Annotated[int, Field(ge=TABLE_FORMAT, le=TABLE_FORMAT)]  # neither true nor 1.0
+    scenario: str = ""
+    vehicles: list[str] = []
+    budget: int = 0
+    search_seed: int = 0
+    episodes: int = 0
+    list_seed: int = 0
+    after: dict[str, Any] = {}
+    lowered_by: dict[str, dict[str, int]] = {}
+
+
+def _header(data: bytes) -> dict[str, Any]:
+    content = parse_strict_json(data)
+    try:
+        _Header.model_validate(content)
+    except ValidationError as error:
+        raise ValueError(f"header: {first_mistake(error)}") from None
+    del content["format"]
+    return dict(content)
+
+
+def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> BestKnown:
+    """One count of a table whose arrays have the right shapes; raises ``ValueError`` for numbers that cannot be."""
+    harm = arrays[f"{harm_count}_harm"].astype(np.float64)
+    used = arrays[f"{harm_count}_phases"].astype(np.int64)
+    planes = arrays[f"{harm_count}_commands"]
+    flat = np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f8")[..., 0].astype(np.float64)
+    if not len(harm):
+        raise ValueError("it holds no world")
+    if not (np.isfinite(harm).all() and (harm >= 0.0).all()):
+        raise ValueError(f"{harm_count}_harm: a harm must be a finite number of at least 0 m2/s2")
+    if not np.isfinite(flat).all():
+        raise ValueError(f"{harm_count}_commands: a command must be a finite number")
+    if used.sum() != len(flat):
+        raise ValueError(f"{harm_count}_phases: {used.sum()} phases in all, but there are {len(flat)} commands")
+    width, controlled = max(int(used.max()), 1), flat.shape[1]
+    if not 1 <= controlled <= 64 or len(used) * width * (controlled + 1) > DECODED_LIMIT:
+        raise ValueError(f"{len(used)} worlds of {width} phases of {controlled} vehicles are beyond what is kept")
+    inside = np.arange(width) < used[:, np.newaxis]
+    ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, controlled))
+    ends[inside] = arrays[f"{harm_count}_ends"]
+    commands[inside] = flat
+    last = np.maximum(used - 1, 0)
+    rows = np.arange(len(used))
+    ends = np.where(inside, ends, ends[rows, last][:, np.newaxis])
+    commands = np.where(inside[..., np.newaxis], commands, commands[rows, last][:, np.newaxis])
+    if not ((np.diff(ends, axis=1) >= 0).all() and ((ends[:, -1] > 0) == (used > 0)).all()):
+        raise ValueError(f"{harm_count}_ends: the phases of a world must end in order, the last one after step 0")
+    return BestKnown(harm, Profiles(ends, commands))
+
+
+def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many phases each profile uses, [n]; 0 where there is none."""
+    used: NDArray[np.int64] = np.argmax(ends == ends[:, -1:], axis=1) + 1
+    return np.where(ends[:, -1] > 0, used, 0)
+
+
+# The least harm known in each world: search over whole profiles of the controlled vehicles, in the engine's physics.
+#
+# What is found is realised harm: an upper bound of the true minimum, never below it. See docs/best-harm.md.
 
 # Profiles of full drive and full braking from which a search starts: drive, brake to the leader, drive; or the mirror.
 #
@@ -135,8 +370,8 @@ def fill_extreme(
 
     In the step of the change the command leads to the speed that the change would. ``early``: so many steps earlier.
     """
-    low, high, step = world.bounds[0, 0], world.bounds[0, 1], world.episode.clock[TIME_STEP]
-    last = int(world.episode.clock[LAST_STEP])
+    low, high, step = world.bounds[0, 0], world.bounds[0, 1], world.episode.clock[CLOCK.TIME_STEP]
+    last = int(world.episode.clock[CLOCK.LAST_STEP])
     first, second = (high, low) if kind == FRONT_FIRST else (low, high)
     turn = min(int(change / step), last)
     back = max(int(min(meeting / step, last)) - early, turn + 1)
@@ -377,7 +612,7 @@ class _Search:
 
     def extremes(self, problem: ProfileProblem, vehicle: int) -> Profiles:
         """Profiles of full drive and full braking of one vehicle, to start from."""
-        at, _ = advance(self.worlds, self.others, until_s=problem.clock[:, START])
+        at, _ = advance(self.worlds, self.others, until_s=problem.clock[:, CLOCK.START])
         forward = np.all(at.speeds_mps >= 0.0, axis=1)
         neighbours = (forward & there for there in (vehicle > 0, vehicle < at.N - 1))
         return extreme_profiles(problem, onset_states(at, vehicle, None), *neighbours)

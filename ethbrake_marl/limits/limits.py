@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.defaults import HARM_COUNTS
-from ethbrake_marl.limits.avoidability import avoidability
 from ethbrake_marl.limits.best_harm import best_known
-from ethbrake_marl.limits.lower_bound import lower_bound
+from ethbrake_marl.limits.lower_bound import avoidability, lower_bound
 from ethbrake_marl.limits.team_bound import team_bound
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.physics.kernel import stopping_distances

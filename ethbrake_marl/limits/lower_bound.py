@@ -1,17 +1,10 @@
-"""A proven lower bound on the harm of every world, whatever the controlled vehicle does.
+"""Contacts that nobody could have avoided: exact, world by world, with a witness or the reason.
 
-Three bounds, each proven in docs/avoidability.md, under both counting rules and with velocity exchange, bounces and
-pushing as the physics has them:
-
-* front pair alone: the closing speed of full braking, since a push from behind only makes it worse;
-* rear pair alone: the closing speed of full drive;
-* both together, where contact is unavoidable: whichever neighbour is met first, whenever and however softly, what
-  follows at the other one is bounded by the motion of the centre of mass.
-
-To these comes what has happened, for certain, before the vehicle may act.
-
-The proofs are about exact arithmetic; the bound and the harm that it is compared with are made of doubles. So every
-part is rounded outward: lowered by ``rounding``, more than both can be off together.
+One vehicle is controlled, its neighbours brake with their whole capacity from their latencies on. Let z be the
+pointwise largest trajectory behind the vehicle in front: coast to the own latency, drive as long as possible, brake at
+capacity so as to just touch the front vehicle (or stop behind it), then follow it. Contact is avoidable if and only if
+full braking avoids the front vehicle and z stays ahead of the rear one. docs/avoidability.md has the proof, says what a
+touch is, and what the claim does not cover.
 """
 
 from __future__ import annotations
@@ -21,58 +14,1199 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.harm import check_harm_count, empty_ledger
-from ethbrake_marl.limits.avoidability import (
-    Avoidability,
-    avoidability,
-    empty_plan,
-    fill_braking,
-    fill_drive_then_brake,
-    largest_behind,
-    spare_gap,
-    walk,
-)
-from ethbrake_marl.limits.meetings import (
-    A_F,
-    A_L,
-    A_R,
-    CELL_WIDTH,
-    CELLS,
-    FRONT_FIRST,
-    FRONT_SHARE,
-    GAP_L,
-    GAP_R,
-    LIMIT_F,
-    OBSTACLE,
-    ONSET_R,
-    REAR_FIRST,
-    REAR_SHARE,
-    RESTITUTION,
-    TIME_STEP,
-    U_F,
-    V_F,
-    V_L,
-    V_R,
-    WIDTH,
-    after_front,
-    after_rear,
-    braking_to_rear,
-    gentlest_front,
-    least_harm,
-    meet_front,
-    meet_rear,
-    stays_ahead,
-    stays_behind,
-)
-from ethbrake_marl.physics import Bools, Floats, Worlds, advance
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance
 from ethbrake_marl.physics.compiled import by_parts, compiled, compiled_apart
-from ethbrake_marl.physics.kernel import TOUCH_SPEED_MPS, solo_motion
+from ethbrake_marl.physics.kernel import TOUCH_SPEED_MPS, contact, solo_motion, stopping_distances
+
+# Two vehicles on plans of piecewise constant acceleration: how close they come, and where they first meet.
+#
+# A plan is an array [2, PIECES]: row ENDS holds the end of each piece (seconds from now, the last one infinite), row
+# ACCELERATIONS its acceleration (m/s2). Braking ends at rest and then holds. No time step: each piece is closed form.
+
+ENDS, ACCELERATIONS = 0, 1
+PIECES = 4
+
+
+@compiled
+def empty_plan() -> Floats:
+    """Memory of a plan."""
+    return np.empty((2, PIECES))
+
+
+@compiled
+def fill_plan(
+    plan: Floats, end_0: float, u_0: float, end_1: float, u_1: float, end_2: float, u_2: float, u_3: float
+) -> None:
+    """Acceleration ``u_0`` until ``end_0``, then ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, ``u_3`` for ever."""
+    plan[ENDS, 0], plan[ENDS, 1], plan[ENDS, 2], plan[ENDS, 3] = end_0, end_1, end_2, math.inf
+    plan[ACCELERATIONS, 0], plan[ACCELERATIONS, 1] = u_0, u_1
+    plan[ACCELERATIONS, 2], plan[ACCELERATIONS, 3] = u_2, u_3
+
+
+@compiled
+def fill_braking(plan: Floats, onset: float, braking: float) -> None:
+    """Coast until ``onset``, then brake to rest."""
+    fill_plan(plan, onset, 0.0, onset, 0.0, onset, 0.0, -braking)
+
+
+@compiled
+def fill_window(plan: Floats, u: float, late: float, end: float, change: float, turn: float, step: float) -> None:
+    """Acceleration ``u``, from ``turn`` on ``step`` more, and from ``late`` to ``end`` also ``change`` more."""
+    first, second, third = min(turn, late), min(max(turn, late), end), max(turn, end)
+    u_1 = u + step if turn < late else u + change
+    u_2 = u + step + change if turn < end else u
+    fill_plan(plan, first, u, second, u_1, third, u_2, u + step)
+
+
+@compiled
+def time_to_limit(v: float, u: float, limit: float) -> float:
+    """How long ``u`` accelerates from ``v`` to the speed limit; 0 at or beyond it, or without drive. [s]"""
+    return (limit - v) / u if u > 0.0 and v < limit else 0.0
+
+
+@compiled
+def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive: float, braking: float) -> None:
+    """Drive for ``drive`` (at most to the speed limit), then brake to rest."""
+    cap = min(time_to_limit(v, u, limit), drive)
+    fill_plan(plan, cap, u, drive, 0.0, drive, 0.0, -braking)
+
+
+@compiled
+def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake: float, braking: float) -> None:
+    """Brake for ``brake`` (at most to rest), then drive to the speed limit and stay there."""
+    cap = brake + time_to_limit(max(v - braking * brake, 0.0), u, limit)
+    fill_plan(plan, brake, -braking, cap, u, cap, 0.0, 0.0)
+
+
+@compiled
+def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
+    """Acceleration in force at ``now`` and speed ``v``, until when, and whether it ends at rest."""
+    k = 0
+    while now >= plan[ENDS, k]:
+        k += 1
+    u, end = plan[ACCELERATIONS, k], plan[ENDS, k]
+    if u < 0.0:
+        if v <= 0.0:
+            return 0.0, end, False
+        rest = now + v / -u
+        if rest < end:
+            return u, rest, True
+    return u, end, False
+
+
+@compiled
+def walk(
+    gap: float, v_front: float, front: Floats, v_rear: float, rear: Floats, until: float
+) -> tuple[float, float, float]:
+    """Follow a pair to ``until``: smallest gap [m]; time [s] and squared closing speed of the first meeting, or inf, 0.
+
+    The two pass through each other, so a negative smallest gap is the depth of the overlap. A graze, after which they
+    part again, is no meeting; a touch that would turn into an overlap is one, with closing speed 0. Speeds >= 0.
+    """
+    lowest, now, met_at, squared = gap, 0.0, math.inf, 0.0
+    while now < until:
+        u_f, end_f, stops_f = piece_at(front, now, v_front)
+        u_r, end_r, stops_r = piece_at(rear, now, v_rear)
+        end = min(end_f, end_r, until)
+        w, b, step = v_rear - v_front, u_r - u_f, end - now
+        if met_at == math.inf:
+            after, speed = contact(max(gap, 0.0), w, b)
+            if after <= step and (speed > 0.0 or b > 0.0):
+                met_at, squared = now + after, speed * speed
+        if b < 0.0 and 0.0 < w < -b * step:
+            lowest = min(lowest, gap - w * w / (-2.0 * b))
+        if step == math.inf:
+            break
+        gap -= (w + 0.5 * b * step) * step
+        lowest = min(lowest, gap)
+        v_front = 0.0 if stops_f and end == end_f else max(v_front + u_f * step, 0.0)
+        v_rear = 0.0 if stops_r and end == end_r else max(v_rear + u_r * step, 0.0)
+        now = end
+    return lowest, met_at, squared
+
+
+# Compiled decision of one world: the largest trajectory behind the front vehicle, and whether the rear one meets it.
+#
+# Symbols: l the front vehicle (leader), f the controlled one (follower), r the rear one; gap [m], speed v [m/s],
+# braking
+# capacity a > 0, driving capacity u >= 0 [m/s2]. Times count from the moment at which the controlled vehicle may act;
+# by
+# then the leader brakes. docs/avoidability.md derives every formula. Only + - * / and sqrt.
+
+ROUNDING_M = 1e-12  # an overlap up to this is the rounding of a touch, not an impact
+SQUEEZE_M = 1e-9  # with less room than this between both neighbours, contact counts as unavoidable
+TOUCHING_M = 1e-5  # the same where the front vehicle cannot but be touched: a touch may cost that much of the way
+AVOIDABLE, EARLY, FRONT, REAR = 0, 1, 2, 3
+REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, RESULT_WIDTH = range(7)  # columns of a decision
+
+
+@compiled
+def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> float:
+    """Gap beyond what full braking from now needs to stay behind a leader that brakes from now; negative: they meet.
+
+    If the follower stops last, its stopping distance counts, else the moment of equal speeds. [m]
+    """
+    if v_f * a_l >= v_l * a_f:
+        return gap - max(0.0, v_f * v_f / (2.0 * a_f) - v_l * v_l / (2.0 * a_l))
+    if v_f > v_l:
+        return gap - (v_f - v_l) * (v_f - v_l) / (2.0 * (a_f - a_l))
+    return gap
+
+
+@compiled
+def drive_before_braking(
+    gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float
+) -> tuple[float, float, bool]:
+    """Longest drive with constant ``u >= 0`` after which full braking still stays behind the braking leader.
+
+    Returns its duration, the time of the touch, and whether both move there (then ``a_f > a_l``, equal speeds; else the
+    follower comes to rest at the standing leader). Infinite where the follower never moves. Assumes ``spare_gap >= 0``.
+    """
+    w, closing, relief = v_f - v_l, u + a_l, a_f - a_l
+    if relief > 0.0 and v_l > 0.0:
+        both = u + a_f
+        root = math.sqrt(both * relief * (w * w + 2.0 * closing * gap))
+        if w > 0.0:
+            drive = max(2.0 * relief * gap - w * w, 0.0) / (w * both + root)
+        else:
+            drive = (root - w * both) / (closing * both)
+        touch = drive + (w + closing * drive) / relief
+        if touch * a_l <= v_l:
+            return drive, touch, True
+    ratio = 1.0 + u / a_f
+    room = max(v_l * v_l / (2.0 * a_l) + gap - v_f * v_f / (2.0 * a_f), 0.0)
+    pace = ratio * v_f + math.sqrt(ratio * ratio * v_f * v_f + 2.0 * u * ratio * room)
+    if v_f == 0.0 and u == 0.0:
+        return math.inf, math.inf, False
+    drive = 2.0 * room / pace if room > 0.0 else 0.0
+    return drive, drive + (v_f + u * drive) / a_f, False
+
+
+@compiled
+def largest_behind(
+    gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float, limit: float
+) -> tuple[float, float, bool]:
+    """As ``drive_before_braking``, for a drive that ends at the speed limit."""
+    cap = time_to_limit(v_f, u, limit)
+    if cap > 0.0:
+        found = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
+        if found[0] <= cap:
+            return found
+        after_l, way_l, _ = solo_motion(v_l, -a_l, 0.0, math.inf, cap)
+        gap = gap + (way_l - 0.5 * (v_f + limit) * cap)
+        v_l, v_f = after_l, limit
+    drive, touch, moving = drive_before_braking(gap, v_l, a_l, v_f, a_f, 0.0)
+    return cap + drive, cap + touch, moving
+
+
+@compiled
+def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_r: float, until: float) -> float:
+    """Smallest gap behind a vehicle that coasts until then. The gap is convex: at equal speeds or at an end. [m]"""
+    w = v_r - v_f
+    if w <= 0.0:
+        return gap
+    if onset_r + w / a_r < until:
+        return gap - w * onset_r - w * w / (2.0 * a_r)
+    return gap + v_f * until - solo_motion(v_r, -a_r, onset_r, math.inf, until)[1]
+
+
+@compiled
+def met(gap: float, closing: float) -> bool:
+    """Whether a pair with this gap and closing speed has met, or meets at this very moment, with an impact."""
+    return gap < -ROUNDING_M or (gap <= 0.0 and closing > TOUCH_SPEED_MPS)
+
+
+@compiled
+def leader_at_onset(
+    gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, start: float
+) -> tuple[float, float]:
+    """Gap to the leader and its speed when the follower, coasting until then, may act; the leader brakes by then.
+
+    The gap is concave until then: if it is not negative at the end, it never was.
+    """
+    after, way, _ = solo_motion(v_l, -a_l, onset_l, math.inf, start)
+    return gap + (way - v_f * start), after
+
+
+@compiled
+def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
+    """The front pair of vehicle ``i``: False if it surely meets. REASON, MARGIN and SPARE in ``out``; no drive yet."""
+    a_l, v_f, a_f = braking[i - 1], speed[i], braking[i]
+    ahead, v_l = leader_at_onset(gap[i - 1], speed[i - 1], a_l, onset[i - 1], v_f, onset[i])
+    out[REASON], out[MARGIN] = EARLY, ahead
+    if met(ahead, v_f - v_l):
+        return False
+    spare = spare_gap(max(ahead, 0.0), v_l, a_l, v_f, a_f)
+    out[REASON], out[MARGIN], out[SPARE], out[DRIVE] = FRONT, spare, max(spare, 0.0), 0.0
+    if spare < -ROUNDING_M:
+        return False
+    out[REASON] = AVOIDABLE
+    return True
+
+
+@compiled
+def plan_behind(
+    gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, keep: float,
+    plan: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """The largest trajectory that keeps ``keep`` metres to the leader, if there is one, into ``plan`` and ``out``."""
+    a_f, u = braking[i], driving[i]
+    if i > 0:
+        a_l = braking[i - 1]
+        ahead, v_l = leader_at_onset(gap[i - 1], speed[i - 1], a_l, onset[i - 1], speed[i], onset[i])
+        ahead = max(ahead - keep, 0.0)
+        out[DRIVE], out[TOUCH], moving = largest_behind(ahead, v_l, a_l, speed[i], a_f, u, limit[i])
+        out[FOLLOW] = -a_l if moving else -a_f
+    cap = min(time_to_limit(speed[i], u, limit[i]), out[DRIVE])
+    fill_plan(plan, cap, u, out[DRIVE], 0.0, out[TOUCH], -a_f, out[FOLLOW])
+
+
+@compiled
+def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
+    """Whether the rear pair of vehicle ``i`` meets before the vehicle may act; then the reason is in ``out``."""
+    v_f, v_r, a_r, start = speed[i], speed[i + 1], braking[i + 1], onset[i]
+    lowest = lowest_while_coasting(gap[i], v_f, v_r, a_r, onset[i + 1], start)
+    after, way, _ = solo_motion(v_r, -a_r, onset[i + 1], math.inf, start)
+    if met(lowest, 0.0) or met(gap[i] + (v_f * start - way), after - v_f):
+        out[REASON], out[MARGIN] = EARLY, lowest
+        return True
+    return False
+
+
+@compiled
+def decide_rear(
+    gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, plan: Floats,
+    rear: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """Whether the rear vehicle stays behind the largest trajectory of vehicle ``i``; plan and rear are scratch."""
+    v_f, a_r, start = speed[i], braking[i + 1], onset[i]
+    v_r, way, _ = solo_motion(speed[i + 1], -a_r, onset[i + 1], math.inf, start)
+    behind = max(gap[i] + (v_f * start - way), 0.0)
+    onset_r = max(onset[i + 1] - start, 0.0)
+    fill_braking(rear, onset_r, a_r)
+    plan_behind(gap, speed, onset, braking, driving, limit, i, 0.0, plan, out)
+    margin = walk(behind, v_f, plan, v_r, rear, onset_r + v_r / a_r)[0]
+    out[MARGIN] = margin
+    if margin < -ROUNDING_M:
+        out[REASON] = REAR
+    elif i > 0:
+        if behind > SQUEEZE_M and margin < (SQUEEZE_M if out[SPARE] >= SQUEEZE_M else TOUCHING_M):
+            out[REASON] = REAR
+        keep = 0.5 * min(SQUEEZE_M, out[SPARE], max(margin, 0.0))
+        plan_behind(gap, speed, onset, braking, driving, limit, i, keep, plan, out)
+
+
+@compiled
+def decide_world(
+    gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, plan: Floats,
+    rear: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """Decide one world into ``out`` [RESULT_WIDTH]; plan and rear are scratch. Times count from the onset of ``i``."""
+    out[REASON], out[MARGIN], out[SPARE] = AVOIDABLE, math.inf, math.inf
+    out[DRIVE], out[TOUCH], out[FOLLOW] = math.inf, math.inf, -braking[i]
+    has_rear = i < gap.shape[0]
+    if i > 0 and not decide_front(gap, speed, onset, braking, i, out) and out[REASON] == EARLY:
+        return
+    if has_rear and meets_rear_early(gap, speed, onset, braking, i, out):
+        return
+    if has_rear and out[REASON] == AVOIDABLE:
+        decide_rear(gap, speed, onset, braking, driving, limit, i, plan, rear, out)
+
+
+@compiled
+def decide_worlds(
+    gaps: Floats, speeds: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, out: Floats
+) -> None:
+    """Decide every world into ``out`` [n, RESULT_WIDTH]."""
+    plan, rear = empty_plan(), empty_plan()
+    for k in range(gaps.shape[0]):
+        decide_world(gaps[k], speeds[k], onset[k], braking[k], driving[k], limit[k], i, plan, rear, out[k])
+
+
+REASONS = ("", "early", "front", "rear")  # the name of each code; "" where contact is avoidable
+
+
+@dataclass(frozen=True, slots=True)
+class Avoidability:
+    """The verdict on each world [n].
+
+    ``reason``: 0 avoidable; 1 early, a pair meets before the controlled vehicle may act; 2 front, even full braking
+    meets the front vehicle; 3 rear, the rear vehicle meets the largest trajectory that spares the front one.
+
+    ``margin_m``: the smallest gap between that trajectory and the rear vehicle (of two vehicles with the rear one
+    controlled: what full braking leaves of the gap). Where contact is unavoidable it is negative and says by how much:
+    for *front* the gap that full braking lacks, for *early* the overlap before the vehicle may act.
+
+    ``switch_s``, ``command_mps2``: the witness, a profile of the controlled vehicle: each command from its absolute
+    time to the next (infinite: never). Played in the physics it has no impact. NaN where contact is unavoidable.
+    """
+
+    reason: Ints
+    margin_m: Floats
+    switch_s: Floats  # [n, 3]
+    command_mps2: Floats  # [n, 3]
+
+    @property
+    def avoidable(self) -> Bools:
+        """Whether some profile avoids all contact, hence every impact, [n]."""
+        yes: Bools = self.reason == 0
+        return yes
+
+    @property
+    def reason_name(self) -> NDArray[np.str_]:
+        """The reason in words, [n]: one of ``REASONS``."""
+        return np.array(REASONS)[self.reason]
+
+
+def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str] | None = None) -> Avoidability:
+    """Decide in every world whether ``vehicle`` (index from 0) could have avoided all contact from now on.
+
+    Elsewhere every profile leads to contact, but not always to an impact: see ``LowerBound.impact_proven``.
+    Three vehicles with the middle one controlled, or two with either. The others brake with their whole capacity from
+    their latencies on. ``scripts`` (index -> name, as ``scenario.roles``) is only checked to say the same. An overlap
+    of the deciding trajectories of up to 1e-12 m counts as a touch, hence as avoided.
+
+    Raises ``InvalidInput`` for another line, another script than full_brake, a front vehicle that may brake only after
+    the controlled one acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1 could
+    reach before any contact.
+    """
+    _check(worlds, vehicle, scripts or {})
+    v = worlds.vehicles
+    onset = np.maximum(v.latency_s - worlds.time_s[:, None], 0.0)
+    out = np.empty((worlds.n, RESULT_WIDTH))
+    decide_worlds(
+        worlds.gaps_m, worlds.speeds_mps, onset, v.braking_capacity_mps2, v.driving_capacity_mps2, v.speed_limit_mps,
+        vehicle, out,
+    )  # fmt: skip
+    reason = out[:, REASON].astype(np.int64)
+    start = worlds.time_s + onset[:, vehicle]
+    switch = np.column_stack([worlds.time_s, start + out[:, DRIVE], start + out[:, TOUCH]])
+    braking = -v.braking_capacity_mps2[:, vehicle]
+    command = np.column_stack([v.driving_capacity_mps2[:, vehicle], braking, out[:, FOLLOW]])
+    switch[reason > 0] = np.nan
+    command[reason > 0] = np.nan
+    return Avoidability(reason, out[:, MARGIN].copy(), switch, command)
+
+
+def _check(worlds: Worlds, vehicle: int, scripts: Mapping[int, str]) -> None:
+    """Refuse what the theorem does not cover.
+
+    An obstacle that Vehicle 1 cannot reach by braking fully changes nothing: only a push could bring it there, and that
+    is an impact already.
+    """
+    check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)
+    own = np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
+    way = stopping_distances(worlds.speeds_mps[:, 0], own, worlds.vehicles.braking_capacity_mps2[:, 0])
+    _refuse(
+        ~(way < worlds.obstacle_gap_m),
+        worlds.obstacle_gap_m,
+        "obstacle_gap_m",
+        None,
+        "beyond full braking of vehicle_1",
+    )
+    if vehicle == 0 and np.isfinite(worlds.obstacle_gap_m).any():
+        raise InvalidInput("avoidability: vehicle_1 controlled, with an obstacle ahead (obstacle_gap_m): not decided")
+    if (worlds.N, vehicle) not in ((3, 1), (2, 0), (2, 1)):
+        raise InvalidInput(
+            f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles; it is decided exactly for vehicle_2 of 3 and"
+            " for either vehicle of 2, otherwise use avoidable_by_lp"
+        )
+    for index, script in scripts.items():
+        if index != vehicle and script != "full_brake":
+            raise InvalidInput(f"avoidability: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
+    if vehicle == 1:
+        latency = np.maximum(worlds.vehicles.latency_s, worlds.time_s[:, None])
+        _refuse(latency[:, 0] > latency[:, 1], worlds.vehicles.latency_s[:, 0], "latency_s", 0, "not above vehicle_2's")
+    for i in range(worlds.N):
+        _refuse(~(worlds.speeds_mps[:, i] >= 0.0), worlds.speeds_mps[:, i], "speeds_mps", i, ">= 0")
+
+
+def _refuse(bad: Bools, values: Floats, name: str, i: int | None, right: str) -> None:
+    if bad.any():
+        k = int(np.argmax(bad))
+        place = f"{k}" if i is None else f"{k}, {i}"
+        raise InvalidInput(f"avoidability: {name}[{place}] = {values[k]:g}: must be {right}")
+
+
+# Compiled: the gentlest first meeting of the controlled vehicle with a neighbour at a given time.
+#
+# Times count from the moment at which the controlled vehicle may act; the front vehicle (leader, l) brakes by then, f
+# is
+# the controlled one, the rear vehicle (r) coasts to its onset and then brakes. All speeds and gaps are >= 0.
+# docs/avoidability.md has the proofs.
+
+
+class _Line(NamedTuple):
+    """Entries of one world when the controlled vehicle, the follower, may act."""
+
+    GAP_L: int = 0
+    V_L: int = 1
+    A_L: int = 2
+    V_F: int = 3
+    A_F: int = 4
+    U_F: int = 5
+    LIMIT_F: int = 6
+    GAP_R: int = 7
+    V_R: int = 8
+    A_R: int = 9
+    ONSET_R: int = 10
+    FRONT_SHARE: int = 11  # m_l / (m_l + m_f)
+    REAR_SHARE: int = 12  # m_r / (m_f + m_r)
+    RESTITUTION: int = 13
+    TIME_STEP: int = 14  # between two decisions (s), the first one now; 0 where commands may change at any time
+    OBSTACLE: int = (
+        15  # gap from the leader to an obstacle ahead of it (m), which it does not reach by itself; inf without
+    )
+    WIDTH: int = 16
+
+
+LINE = _Line()
+
+
+FRONT_FIRST, REAR_FIRST = 0, 1
+_HALVINGS = 60
+_GUARD = 2.0**-46  # of the positions: a way that rounding shortens must not make a meeting look harder
+AHEAD_M = 1e-9  # an overlap up to this is no meeting with the other vehicle
+
+
+@compiled
+def leader(at: Floats, time: float) -> tuple[float, float]:
+    """Speed and way of the front vehicle, left alone until ``time``."""
+    speed, way, _ = solo_motion(at[LINE.V_L], -at[LINE.A_L], 0.0, math.inf, time)
+    return speed, way
+
+
+@compiled
+def follower(at: Floats, time: float) -> tuple[float, float]:
+    """Speed and way of the rear vehicle, left alone until ``time``."""
+    speed, way, _ = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, time)
+    return speed, way
+
+
+@compiled_apart
+def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
+    """Least closing speed of a meeting with the leader at ``time``, and how long it must be driven before braking.
+
+    The slowest way to be there then: drive, then brake.
+    """
+    v_l, way = leader(at, time)
+    place, v, u, a = at[LINE.GAP_L] + way, at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
+    cap = time_to_limit(v, u, at[LINE.LIMIT_F])
+    drive = u if cap > 0.0 else 0.0
+    driven = (v + 0.5 * drive * time) * time
+    beyond = 0.5 * drive * max(time - cap, 0.0) * max(time - cap, 0.0)
+    guard = _GUARD * (driven + place)
+    brake = math.sqrt(2.0 * max(driven - beyond - place + guard, 0.0) / a)
+    top = v + drive * cap
+    if time - brake < cap:
+        brake = math.sqrt(2.0 * max(driven - place + guard, 0.0) / (drive + a))
+        top = v + drive * (time - brake)
+    if brake > time:
+        brake, top = time, v
+    return max(top - a * brake - v_l, 0.0), time - brake
+
+
+@compiled
+def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, float]:
+    """Way and speed at ``time`` of one that brakes for ``brake`` (at most to rest), then drives."""
+    v, u, a = at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
+    braking = min(brake, v / a)
+    slow = max(v - a * brake, 0.0)
+    cap = time_to_limit(slow, u, at[LINE.LIMIT_F])
+    drive = u if cap > 0.0 else 0.0
+    left = time - brake
+    beyond = max(left - cap, 0.0)
+    way = (v - 0.5 * a * braking) * braking + (slow + 0.5 * drive * left) * left - 0.5 * drive * beyond * beyond
+    return way, slow + drive * (left - beyond)
+
+
+@compiled_apart
+def braking_to_rear(at: Floats, time: float) -> float:
+    """How long it must be braked to be met by the rear vehicle at ``time``, if it is driven from then on."""
+    place = follower(at, time)[1] - at[LINE.GAP_R]
+    low, high = 0.0, time
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        if braked_then_driven(at, middle, time)[0] >= place:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@compiled_apart
+def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
+    """Least closing speed of a meeting with the rear vehicle at ``time``, and how long it must be braked before.
+
+    The fastest way to be there then: brake, then drive. The braking is infinite where that is at its speed limit.
+    """
+    brake = braking_to_rear(at, time)
+    speed = braked_then_driven(at, brake, time)[1]
+    return max(follower(at, time)[0] - speed, 0.0), brake if speed < at[LINE.LIMIT_F] else math.inf
+
+
+@compiled_apart
+def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
+    """``gentlest_front`` or ``gentlest_rear``."""
+    return gentlest_front(at, time) if kind == FRONT_FIRST else gentlest_rear(at, time)
+
+
+@compiled_apart
+def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
+    """When one that drives for ``drive``, then brakes, meets the leader."""
+    fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
+    fill_braking(other, 0.0, at[LINE.A_L])
+    return walk(at[LINE.GAP_L], at[LINE.V_L], other, at[LINE.V_F], plan, math.inf)[1]
+
+
+@compiled_apart
+def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
+    """When the rear vehicle meets one that brakes for ``brake``, then drives."""
+    fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    return walk(
+        at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
+    )[1]
+
+
+@compiled_apart
+def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Floats) -> bool:
+    """Whether one that drives for ``drive``, then brakes, is not met from behind until then."""
+    fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    return walk(at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, until)[0] >= -AHEAD_M
+
+
+@compiled_apart
+def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Floats) -> bool:
+    """Whether one that brakes for ``brake``, then drives, does not meet the leader until then."""
+    fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
+    fill_braking(other, 0.0, at[LINE.A_L])
+    return walk(at[LINE.GAP_L], at[LINE.V_L], other, at[LINE.V_F], plan, until)[0] >= -AHEAD_M
+
+
+# Compiled: how much faster than the common speed of two touching vehicles one of them can be, and what that costs.
+#
+# ``share`` is the partner's share of both masses; ``press`` the acceleration with which they close under the best
+# command
+# (m/s2), ``reach`` how much of it a command can hold back. docs/avoidability.md has the proofs.
+
+
+@compiled
+def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
+    """How far ahead of the common speed a flight of this length can bring the controlled vehicle, less what it costs.
+
+    ``share (press L - o) - G``, where G is the least loss of command, at most ``reach`` a second, that keeps the two
+    apart for L: ``G L - G^2 / 2 reach >= press L^2 / 2 - o L``. -inf where nothing keeps them apart. [m/s]
+    """
+    relative = share * (press * flight - opening)
+    if press * flight <= 2.0 * opening:
+        return relative
+    if reach == math.inf:
+        return relative - (0.5 * press * flight - opening)
+    inside = reach * (reach - press) * flight * flight + 2.0 * reach * opening * flight
+    if inside < 0.0:
+        return -math.inf
+    return relative - reach * flight + math.sqrt(inside)
+
+
+@compiled
+def best_flight(share: float, press: float, reach: float, opening: float) -> float:
+    """The length of the flight of the largest ``flight_lead``; inf if it rises for ever."""
+    if press <= 0.0:
+        return math.inf
+    if share <= 0.5:
+        return 2.0 * opening / press
+    if reach == math.inf:
+        return math.inf
+    slope = reach - share * press
+    left = slope * slope - reach * (reach - press)
+    if left <= 0.0:
+        return math.inf
+    root = math.sqrt(left)
+    return max(reach * opening / (root * (slope + root)), 2.0 * opening / press)
+
+
+@compiled_apart
+def lead(
+    share: float, press: float, reach: float, opening: float, shortest: float, longest: float, lost: float
+) -> float:
+    """Largest ``flight_lead`` of lengths from ``shortest`` to ``longest``, of which ``lost`` is lost in any case.
+
+    Of all openings up to ``opening``: where flights are cut short, a smaller one may lead further.
+    """
+    if press > 0.0:
+        opening = min(opening, 0.5 * press * longest)
+    flight = best_flight(share, press, reach, opening)
+    if lost > 0.0 and press > 0.0:
+        both = opening + lost
+        flight = max(flight, (both + math.sqrt(max(both * both - press * lost * lost / reach, 0.0))) / press)
+    flight = min(max(flight, shortest), longest)
+    most = share * press * flight - lost if press > 0.0 else -lost
+    if flight < longest and press > 0.0:
+        most -= share * opening
+    return min(flight_lead(share, press, reach, opening, flight), most) if press > 0.0 else most
+
+
+@compiled
+def decays(share: float, press: float, reach: float, bounce: float) -> bool:
+    """Whether no loss of command pays that makes a later bounce larger; ``reach`` then bounds what flights gain."""
+    if share <= 0.5:
+        return True
+    if reach == math.inf or press <= 0.0:
+        return False
+    if reach > press:
+        return bounce * (math.sqrt(reach / (reach - press)) - share) <= 1.0 - share
+    return bounce * flight_lead(share, press, reach, 1.0, best_flight(share, press, reach, 1.0)) <= 1.0 - share
+
+
+@compiled_apart
+def largest_lead(
+    share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
+    since: float, until: float,
+) -> float:  # fmt: skip
+    """How much faster than the common speed, without loss, it can be between ``since`` and ``until``. [m/s]
+
+    The last flight before the rear meeting began with the first impact, after the window from ``late`` to ``end`` in
+    which ``lost`` is lost, or within it. ``reach`` is inf where ``press`` is not constant.
+    """
+    if since < end:
+        lost, end = 0.0, late
+    if not decays(share, press, reach, bounce):
+        return lead(share, press, math.inf, opening, 0.0, until, lost)
+    shortest = 0.0 if reach == math.inf else max(since - late, 0.0)
+    longest = math.inf if share > 0.5 and reach <= press else until
+    first = lead(share, press, reach, opening, shortest, longest, lost)
+    again = bounce * (opening + lost)
+    result = max(first, lead(share, press, reach, again, 0.0, longest, 0.0) - (1.0 - share) * lost)
+    if lost > 0.0:
+        gain = max((1.0 + bounce) * share - 1.0, 2.0 * share - 1.0)
+        within = lead(share, press, reach, bounce * opening, 0.0, longest, 0.0) + gain * lost
+        shortest = 0.0 if reach == math.inf else since - end
+        within = min(within, lead(share, press, reach, again, shortest, longest, 0.0))
+        result = max(result, min(within, share * press * until - (1.0 - share) * lost))
+    return result
+
+
+@compiled
+def widest_flight(
+    share: float, slack: float, press: float, drive: float, bounce: float, closing: float, back: float, time: float
+) -> float:
+    """Most of ``sqrt(p^2 + 2 press s)`` in every flight from a partner that brakes harder by ``slack``; inf if unknown.
+
+    p is the speed with which the two part, s their gap. The first impact had ``closing`` and left the vehicle with
+    speed ``-back``. All within ``time``; ``drive`` is the most that a command accelerates. [m/s]
+    """
+    if not slack > 0.0 or not bounce * bounce * press < slack:
+        return math.inf
+    grow = bounce * bounce * press / slack
+    roll = max(share * (1.0 + bounce) - 1.0, 0.0)
+    return max(
+        math.sqrt(grow * closing * closing + 2.0 * drive * back * time), 2.0 * drive * roll * time / (1.0 - grow)
+    )
+
+
+# Compiled: the harm at the other pair that must follow a first meeting, whatever the controlled vehicle does then.
+#
+# A first meeting at ``time`` with ``closing`` leaves a state that is known exactly. From it on, the centre of mass of
+# the
+# two moves on a path that no command improves but the extreme one, and the controlled vehicle is faster (slower) than
+# the
+# centre only while it comes back to its partner. ``lead`` bounds that. docs/avoidability.md has the proofs.
+#
+# A cell of meetings lies between ``early`` and ``late``; its state is taken at ``early``. From ``late`` to ``end`` the
+# command of the decision before is still in force, which lacks at least ``lack`` of the extreme one (m/s2).
+
+STRUCK_M = 1e-6  # nearer than this a leader counts as touching the obstacle
+HELD_M = 1e-6  # more room than rounding can make of the gap to the leader
+LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting at which the time is divided, to bound both parts
+
+
+@compiled
+def least_of_line(
+    start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, since: float,
+    until: float,
+) -> float:  # fmt: skip
+    """Least value of ``start + slope t + bend (t - turn)+ + other_bend (t - other_turn)+`` from since to until."""
+    least = math.inf
+    for time in (since, until, min(max(turn, since), until), min(max(other_turn, since), until)):
+        value = start + slope * time + bend * max(time - turn, 0.0) + other_bend * max(time - other_turn, 0.0)
+        least = min(least, value)
+    return least
+
+
+@compiled_apart
+def least_closing(
+    start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
+    press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
+) -> float:  # fmt: skip
+    """Least closing speed of a second meeting at most ``until``: that of the common speed, less the lead.
+
+    The time is divided at one of a few moments: what was lost in the window counts only after it.
+    """
+    best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
+    best -= largest_lead(share, press, reach, bounce, opening, lost, late, end, 0.0, until)
+    for k in range(len(LEADS)):
+        since = until - LEADS[k]
+        if since <= 0.0:
+            break
+        near = least_of_line(start, slope, turn, bend, other_turn, other_bend, since, until)
+        near -= largest_lead(share, press, reach, bounce, opening, lost, late, end, since, until)
+        far = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, since)
+        far -= largest_lead(share, press, reach, bounce, opening, 0.0, late, late, 0.0, since)
+        best = max(best, min(near, far))
+    return max(best, 0.0)
+
+
+@compiled_apart
+def pushed_by_leader(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Least closing speed at the rear, from the centre of mass of leader and controlled vehicle; 0: not proven.
+
+    A leader that stands keeps its place, so a later meeting is the same one later: only what holds for all counts.
+    """
+    share, rest, press = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.U_F] + at[LINE.A_L]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    bounce = at[LINE.RESTITUTION]
+    speed, push = v_l + rest * closing, rest * at[LINE.U_F] - share * at[LINE.A_L]
+    stand = (speed + rest * bounce * closing) / at[LINE.A_L]
+    late, end, lost = late - early, end - early, lack * (end - late)
+    if v_l <= 0.0:
+        late, end, lack, lost = 0.0, 0.0, 0.0, 0.0
+    fill_window(plan, push, late, end, -rest * lack, stand, share * at[LINE.A_L])
+    onset = max(at[LINE.ONSET_R] - early, 0.0)
+    fill_braking(other, onset, at[LINE.A_R])
+    behind = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    until = walk(behind, speed, plan, v_r, other, onset + v_r / at[LINE.A_R])[1]
+    if until == math.inf:
+        return 0.0
+    reach = (
+        at[LINE.U_F] + at[LINE.A_F] if until * at[LINE.A_L] <= v_l else math.inf
+    )  # the leader moves, however soft the impact
+    if v_l <= 0.0:
+        slowest = max(v_r - at[LINE.A_R] * max(until - onset, 0.0), 0.0)
+        least = least_of_line(slowest - speed, -push, 0.0, 0.0, stand, -share * at[LINE.A_L], 0.0, until)
+        return max(least - largest_lead(share, press, reach, bounce, bounce * closing, 0.0, 0.0, 0.0, 0.0, until), 0.0)
+    return least_closing(
+        v_r - speed, -push, onset, -at[LINE.A_R], stand, -share * at[LINE.A_L],
+        share, press, reach, bounce, bounce * closing, lost, late, end, until,
+    )  # fmt: skip
+
+
+@compiled_apart
+def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
+    """Least closing speed at the rear of one that cannot fall far behind a leader of harder brakes; 0: not proven."""
+    share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    back = max((share * bounce - rest) * closing - leader(at, late)[0], 0.0)
+    thrown = share * (1.0 + bounce) > 1.0
+    drive = max(at[LINE.U_F], at[LINE.A_F]) if thrown else at[LINE.U_F]
+    press, push, speed = drive + at[LINE.A_L], rest * drive - share * at[LINE.A_L], v_l + rest * closing
+    behind = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    onset = max(at[LINE.ONSET_R] - early, 0.0)
+    until, most, start = onset + v_r / at[LINE.A_R], 0.0, speed
+    fill_braking(other, onset, at[LINE.A_R])
+    for _ in range(2):
+        most = widest_flight(share, at[LINE.A_L] - at[LINE.A_F], press, drive, bounce, closing, back, until)
+        if most == math.inf:
+            return 0.0
+        start = max(speed, rest * most)
+        turn = (start - rest * most) / -push if push < 0.0 else math.inf
+        fill_plan(plan, turn, push, turn, 0.0, turn, 0.0, 0.0)
+        until = walk(behind, start, plan, v_r, other, math.inf)[1]
+        if until == math.inf:
+            return 0.0
+    final = max(start + push * until, rest * most)
+    slowest = max(v_r - at[LINE.A_R] * max(until - onset, 0.0), 0.0)
+    if v_l <= 0.0:
+        return float(max(slowest - max(start, final) - share * most, 0.0))
+    room = 0.5 * most * most / (drive if thrown else press) + HELD_M if press > 0.0 else math.inf
+    since = 0.0
+    if behind > room:
+        fill_braking(plan, 0.0, at[LINE.A_L])
+        since = min(walk(behind - room, v_l, plan, v_r, other, math.inf)[1], until)
+    fast = max(v_r - at[LINE.A_R] * max(since - onset, 0.0), 0.0) - max(start + push * since, rest * most)
+    return float(max(min(fast, slowest - final) - share * most, 0.0))
+
+
+@compiled_apart
+def after_front(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Least squared closing speed at the rear after the leader was met from ``early`` on with at most ``closing``.
+
+    What is known of the centre of mass does not hold where an obstacle may throw both back.
+    """
+    share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    speed = v_l + rest * closing
+    if share * (1.0 + at[LINE.RESTITUTION]) <= 1.0:
+        speed -= share * at[LINE.RESTITUTION] * closing
+    onset = max(at[LINE.ONSET_R] - early, 0.0)
+    fill_drive_then_brake(plan, speed, at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
+    fill_braking(other, onset, at[LINE.A_R])
+    behind = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    squared = walk(behind, speed, plan, v_r, other, onset + v_r / at[LINE.A_R])[2]
+    if at[LINE.OBSTACLE] < math.inf:
+        return squared
+    held = held_by_leader(at, early, late, closing, plan, other)
+    squared = max(squared, held * held)
+    if rest < at[LINE.RESTITUTION] * share:
+        return squared
+    pushed = pushed_by_leader(at, early, late, closing, end, lack, plan, other)
+    return max(squared, pushed * pushed)
+
+
+@compiled
+def obstacle_harm(at: Floats, early: float, late: float, closing: float) -> float:
+    """Least squared speed at which the leader then meets the obstacle ahead: only its own brakes slow it down.
+
+    None is certain where it stands at the obstacle already: all three are one cluster then.
+    """
+    if not STRUCK_M < at[LINE.OBSTACLE] - at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) < math.inf:
+        return 0.0
+    free = at[LINE.OBSTACLE] - leader(at, early)[1]
+    speed = leader(at, late)[0] + (1.0 - at[LINE.FRONT_SHARE]) * (1.0 + at[LINE.RESTITUTION]) * closing
+    harm: float = max(speed * speed - 2.0 * at[LINE.A_L] * free, 0.0)
+    return harm
+
+
+@compiled_apart
+def braking_after(
+    gap: float, least_gap: float, v_l: float, a_l: float, v_f: float, a_f: float, plan: Floats, other: Floats
+) -> float:
+    """Least squared closing speed with the leader of one that brakes at most with ``a_f``; 0 if none is certain.
+
+    Its gap is at most ``gap``, and at least ``least_gap`` where it matters: behind a leader that brakes harder.
+    """
+    fill_braking(plan, 0.0, a_l)
+    fill_braking(other, 0.0, a_f)
+    squared = walk(gap, v_l, plan, v_f, other, v_f / a_f)[2]
+    if a_f < a_l:
+        w = max(v_f - v_l, 0.0)
+        squared = min(squared, w * w + 2.0 * (a_l - a_f) * max(least_gap, 0.0))
+    return squared
+
+
+@compiled_apart
+def pushed_by_rear(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """Least closing speed at the front, from the centre of mass of both other vehicles; for ``a_f >= a_r``."""
+    share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
+    v_l = leader(at, early)[0]
+    bounce = at[LINE.RESTITUTION]
+    speed = max(follower(at, early)[0] - rest * closing, 0.0)
+    onset = max(at[LINE.ONSET_R] - early, 0.0)
+    late, end, lost = late - early, end - early, lack * (end - late)
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_window(other, -rest * at[LINE.A_F], late, end, rest * lack, onset, -share * at[LINE.A_R])
+    until = walk(gap, v_l, plan, speed, other, math.inf)[1]
+    if until == math.inf:
+        return 0.0
+    press, reach = at[LINE.A_F] - at[LINE.A_R], at[LINE.U_F] + at[LINE.A_F]
+    if onset > 0.0:
+        press, reach = at[LINE.A_F], math.inf
+    return least_closing(
+        speed - v_l, at[LINE.A_L] - rest * at[LINE.A_F], onset, -share * at[LINE.A_R], v_l / at[LINE.A_L],
+        -at[LINE.A_L], share, press, reach, bounce, bounce * closing, lost, late, end, until,
+    )  # fmt: skip
+
+
+@compiled_apart
+def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
+    """Least closing speed at the front of one that stays ahead of both; for ``a_f >= a_r``. 0 where it may rise."""
+    share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]
+    pooled = (1.0 - share) * at[LINE.A_F] + share * at[LINE.A_R]
+    mean = 0.5 * (at[LINE.A_F] + pooled)
+    speed = follower(at, early)[0] - (1.0 - share) * closing
+    if not (mean >= at[LINE.A_L] and speed > 0.0):
+        return 0.0
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_braking(other, 0.0, pooled)
+    until = walk(gap, v_l, plan, speed, other, speed / pooled)[1]
+    return max(speed - mean * until - max(v_l - at[LINE.A_L] * until, 0.0), 0.0) if until < math.inf else 0.0
+
+
+@compiled_apart
+def after_rear(
+    at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
+) -> float:
+    """Least squared closing speed at the front after the rear vehicle was met from ``early`` on with ``closing``."""
+    share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    speed = v_r - rest * closing
+    if share * (1.0 + at[LINE.RESTITUTION]) <= 1.0:
+        speed += share * at[LINE.RESTITUTION] * closing
+    speed = max(speed - max(at[LINE.A_R] - at[LINE.A_F], 0.0) * (late - early), 0.0)
+    gap = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    least = gap - max(follower(at, late)[1] - way_r - (leader(at, late)[1] - way_l), 0.0)
+    squared = braking_after(gap, least, v_l, at[LINE.A_L], speed, at[LINE.A_F], plan, other)
+    if at[LINE.A_F] < at[LINE.A_R]:
+        return squared
+    pushed = pushed_by_rear(at, early, late, closing, end, lack, gap, plan, other)
+    pushed = max(pushed, slowed_by_rear(at, early, closing, gap, plan, other))
+    return max(squared, pushed * pushed)
+
+
+@compiled_apart
+def after(
+    kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """``after_front`` or ``after_rear``."""
+    if kind == FRONT_FIRST:
+        return after_front(at, early, late, closing, end, lack, plan, other)
+    return after_rear(at, early, late, closing, end, lack, plan, other)
+
+
+# Compiled: the least harm over all first meetings with one neighbour, by branch and bound.
+#
+# A meeting is a time and a closing speed. What it costs is its own closing speed squared and what must follow
+# (``aftermath``). Cells of time and closing speed are halved until their bounds come close to the best meeting seen.
+# docs/avoidability.md has the proof.
+
+CELL = 1e-3  # a minimum over meetings is bounded this closely, relative to 1 m2/s2 and to itself
+CELLS = 600  # room on the heap: after that many divisions a minimum stays as loose as it is
+
+
+class _Cell(NamedTuple):
+    """Columns of the heap, of a cell of meetings: bound, times (s), closing speeds (m/s)."""
+
+    HARM: int = 0
+    EARLY: int = 1
+    LATE: int = 2
+    SOFT: int = 3
+    HARD: int = 4
+    WIDTH: int = 5
+
+
+CELL_OF = _Cell()
+_SPLITS = 64  # parts at most into which decisions divide the times
+_TRIED = 8  # meetings tried before the search, to have something to compare with
+
+
+@compiled_apart
+def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
+    """Least closing speed of the meetings between two times.
+
+    It falls with the time, but for a leader that brakes harder than the controlled vehicle: it may then rise by the
+    difference.
+    """
+    least = gentlest(kind, at, late)[0]
+    if kind == FRONT_FIRST and at[LINE.A_L] > at[LINE.A_F] and early * at[LINE.A_L] < at[LINE.V_L]:
+        least -= (at[LINE.A_L] - at[LINE.A_F]) * (late - early)
+    return max(least, 0.0)
+
+
+@compiled
+def decision_around(at: Floats, early: float, late: float) -> tuple[float, float]:
+    """Start and end of the step that holds these times; both ``late`` without decisions or over more than one."""
+    step = at[LINE.TIME_STEP]
+    if step <= 0.0:
+        return late, late
+    begin = math.floor(0.5 * (early + late) / step) * step
+    if early < begin - 1e-9 or late > begin + step + 1e-9:
+        return late, late
+    return begin, begin + step
+
+
+@compiled_apart
+def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
+    """How much the command in force at the meetings of a cell lacks, at least, of the extreme one that follows best.
+
+    To meet gently the vehicle brakes (drives) before a meeting, and to soften what follows it drives (brakes) after it;
+    the command is one and the same in the whole step. Meetings of at most ``hard``, where ``softest`` is the least.
+    """
+    whole = at[LINE.U_F] + at[LINE.A_F]
+    turn = gentlest(kind, at, early)[1]
+    if early <= begin:
+        return 0.0
+    if kind == FRONT_FIRST:
+        if leader(at, early)[0] + hard >= at[LINE.LIMIT_F]:
+            return 0.0
+    elif follower(at, late)[0] <= hard:
+        return 0.0
+    softer = max(hard - softest, 0.0) / (early - begin)
+    if turn >= begin:
+        share = (turn - begin) / (early - begin)
+        lack: float = max(whole - 2.0 * softer - whole * share * share, 0.0)
+        return lack
+    steep = (late - begin) / (begin - turn)
+    lack = max(whole - softer * (1.0 + steep) / (1.0 + 0.5 * steep), 0.0)
+    return lack
+
+
+@compiled_apart
+def harm_of(
+    kind: int, at: Floats, early: float, late: float, soft: float, hard: float, floor: float, plan: Floats,
+    other: Floats,
+) -> float:  # fmt: skip
+    """Lower bound of the harm of the meetings of a cell."""
+    begin, end = decision_around(at, early, late)
+    lack = 0.0
+    if end > late:
+        lack = lacking(kind, at, early, late, gentlest_between(kind, at, early, late), hard, begin)
+    follows = after(kind, at, early, late, hard, max(end, late), lack, plan, other)
+    harm = soft * soft + max(follows, floor)
+    return harm + obstacle_harm(at, early, late, soft) if kind == FRONT_FIRST else harm
+
+
+@compiled_apart
+def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
+    """Put a cell on the heap, whose first cell is the one of least harm; the new number of cells."""
+    at = count
+    while at > 0 and heap[(at - 1) // 2, CELL_OF.HARM] > harm:
+        for c in range(heap.shape[1]):  # numba compiles the copy of a row with the text of an error, for 3 CPU-s
+            heap[at, c] = heap[(at - 1) // 2, c]
+        at = (at - 1) // 2
+    (
+        heap[at, CELL_OF.HARM],
+        heap[at, CELL_OF.EARLY],
+        heap[at, CELL_OF.LATE],
+        heap[at, CELL_OF.SOFT],
+        heap[at, CELL_OF.HARD],
+    ) = (
+        harm,
+        early,
+        late,
+        soft,
+        hard,
+    )
+    return count + 1
+
+
+@compiled_apart
+def drop_first(heap: Floats, count: int) -> int:
+    """Take the first cell off the heap; the new number of cells."""
+    count -= 1
+    at, below = 0, 1
+    while below < count:
+        if below + 1 < count and heap[below + 1, CELL_OF.HARM] < heap[below, CELL_OF.HARM]:
+            below += 1
+        if heap[below, CELL_OF.HARM] >= heap[count, CELL_OF.HARM]:
+            break
+        for c in range(heap.shape[1]):
+            heap[at, c] = heap[below, c]
+        at, below = below, 2 * below + 1
+    for c in range(heap.shape[1]):
+        heap[at, c] = heap[count, c]
+    return count
+
+
+@compiled_apart
+def first_cells(
+    kind: int, at: Floats, first: float, last: float, hard: float, floor: float, plan: Floats, other: Floats,
+    heap: Floats,
+) -> int:  # fmt: skip
+    """Put the meetings between two times, at most ``hard``, on the heap: one cell for each step; their number."""
+    count, time = 0, first
+    while time < last:
+        until = next_split(kind, at, time, last) if count < _SPLITS else last
+        soft = gentlest_between(kind, at, time, until)
+        if soft < hard:
+            harm = harm_of(kind, at, time, until, soft, hard, floor, plan, other)
+            count = put(heap, count, harm, time, until, soft, hard)
+        time = until
+    return count
+
+
+@compiled_apart
+def divide(
+    kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
+) -> tuple[int, float]:
+    """Replace the first cell of the heap by its halves; their number, and the harm of a meeting within."""
+    harm, early, late, soft, hard = (
+        heap[0, CELL_OF.HARM],
+        heap[0, CELL_OF.EARLY],
+        heap[0, CELL_OF.LATE],
+        heap[0, CELL_OF.SOFT],
+        heap[0, CELL_OF.HARD],
+    )
+    count = drop_first(heap, count)
+    middle = 0.5 * (early + late)
+    if (late - early) * (at[LINE.U_F] + at[LINE.A_F] + at[LINE.A_L]) > hard - soft and early < middle < late:
+        closing = max(soft, gentlest(kind, at, middle)[0])
+        met = harm_of(kind, at, middle, middle, closing, closing, floor, plan, other)
+        least = harm_of(kind, at, middle, late, soft, hard, floor, plan, other)
+        count = put(heap, count, max(least, harm), middle, late, soft, hard)
+        soft, late = max(soft, gentlest_between(kind, at, early, middle)), middle
+    else:
+        middle = 0.5 * (soft + hard)
+        met = harm_of(kind, at, late, late, middle, middle, floor, plan, other)
+        least = harm_of(kind, at, early, late, middle, hard, floor, plan, other)
+        count = put(heap, count, max(least, harm), early, late, middle, hard)
+        hard = middle
+    if soft < hard:
+        least = harm_of(kind, at, early, late, soft, hard, floor, plan, other)
+        count = put(heap, count, max(least, harm), early, late, soft, hard)
+    return count, met
+
+
+@compiled_apart
+def least_harm(
+    kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
+    other: Floats, heap: Floats,
+) -> float:  # fmt: skip
+    """Lower bound of the harm of all meetings between two times; ``best`` if none does less than that.
+
+    ``enough`` is proven without it: where some meeting does no more, 0 is returned at once.
+    """
+    for k in range(_TRIED):
+        time = first + (last - first) * k / (_TRIED - 1)
+        closing = gentlest(kind, at, time)[0]
+        best = min(best, harm_of(kind, at, time, time, closing, closing, floor, plan, other))
+    count = first_cells(kind, at, first, last, math.sqrt(best), floor, plan, other, heap)
+    for _ in range(heap.shape[0] - _SPLITS - 2):
+        if best <= enough or count == 0 or heap[0, CELL_OF.HARM] >= best - CELL * (1.0 + best):
+            break
+        count, met = divide(kind, at, floor, count, plan, other, heap)
+        best = min(best, met)
+    if best <= enough:
+        return 0.0
+    return min(best, heap[0, CELL_OF.HARM]) if count > 0 else best
+
+
+@compiled
+def next_split(kind: int, at: Floats, time: float, last: float) -> float:
+    """The next time at which a decision falls or the leader comes to rest, at most ``last``."""
+    until = last
+    if at[LINE.TIME_STEP] > 0.0:
+        until = min(until, (math.floor(time / at[LINE.TIME_STEP] + 1e-6) + 1.0) * at[LINE.TIME_STEP])
+    stand = at[LINE.V_L] / at[LINE.A_L]
+    if kind == FRONT_FIRST and time < stand:
+        until = min(until, stand)
+    return until
+
+
+# A proven lower bound on the harm of every world, whatever the controlled vehicle does.
+#
+# Three bounds, each proven in docs/avoidability.md, under both counting rules and with velocity exchange, bounces and
+# pushing as the physics has them:
+#
+# * front pair alone: the closing speed of full braking, since a push from behind only makes it worse;
+# * rear pair alone: the closing speed of full drive;
+# * both together, where contact is unavoidable: whichever neighbour is met first, whenever and however softly, what
+#   follows at the other one is bounded by the motion of the centre of mass.
+#
+# To these comes what has happened, for certain, before the vehicle may act.
+#
+# The proofs are about exact arithmetic; the bound and the harm that it is compared with are made of doubles. So every
+# part is rounded outward: lowered by ``rounding``, more than both can be off together.
 
 # Compiled proven lower bounds on the harm of one world; docs/avoidability.md has the proofs.
 
@@ -80,7 +1214,6 @@ FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
 LARGE = 1e6  # m2/s2: more harm than any impact of vehicles does
 _TOUCH_HARM = 2.0 * TOUCH_SPEED_MPS * TOUCH_SPEED_MPS  # what two touches may hide
 _TOUCHING_M = 1e-9  # more than rounding leaves between two that touch
-_HALVINGS = 60
 _GRAZE_S = 1e-3  # more than rounding can move a graze
 _PARTS = 8  # into which the times of soft meetings are divided
 
@@ -88,20 +1221,22 @@ _PARTS = 8  # into which the times of soft meetings are divided
 @compiled
 def front_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
     """Least squared closing speed at the front pair's first contact, whoever pushes; and its latest time."""
-    fill_braking(plan, 0.0, at[A_L])
-    fill_braking(other, 0.0, at[A_F])
-    _, time, squared = walk(at[GAP_L], at[V_L], plan, at[V_F], other, at[V_F] / at[A_F])
-    if at[A_F] < at[A_L] and at[V_F] < at[V_L]:
-        squared = min(squared, 2.0 * (at[A_L] - at[A_F]) * at[GAP_L])
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_braking(other, 0.0, at[LINE.A_F])
+    _, time, squared = walk(at[LINE.GAP_L], at[LINE.V_L], plan, at[LINE.V_F], other, at[LINE.V_F] / at[LINE.A_F])
+    if at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_F] < at[LINE.V_L]:
+        squared = min(squared, 2.0 * (at[LINE.A_L] - at[LINE.A_F]) * at[LINE.GAP_L])
     return squared, time
 
 
 @compiled
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
     """Least squared closing speed at the rear pair's first contact, that under full drive; and its latest time."""
-    fill_drive_then_brake(plan, at[V_F], at[U_F], at[LIMIT_F], math.inf, at[A_F])
-    fill_braking(other, at[ONSET_R], at[A_R])
-    _, time, squared = walk(at[GAP_R], at[V_F], plan, at[V_R], other, at[ONSET_R] + at[V_R] / at[A_R])
+    fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    _, time, squared = walk(
+        at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
+    )
     return squared, time
 
 
@@ -149,25 +1284,29 @@ def front_first(
     can be met as late as that.
     """
     first = meet_front(at, math.inf, plan, other)
-    if first == math.inf and at[GAP_L] <= _TOUCHING_M:  # it stands at the leader, and stays: both are struck at once
+    if (
+        first == math.inf and at[LINE.GAP_L] <= _TOUCHING_M
+    ):  # it stands at the leader, and stays: both are struck at once
         return min(best, rear_bound(at, plan, other)[0])
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
         return best
-    touches = spare_gap(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F]) >= 0.0
+    touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
     last = meet_front(at, 0.0, plan, other)
     if touches:
-        last = largest_behind(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F], at[U_F], at[LIMIT_F])[1]
+        last = largest_behind(
+            at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F], at[LINE.U_F], at[LINE.LIMIT_F]
+        )[1]
     end = last_ahead(at, first, last, plan, other)
     best = least_harm(FRONT_FIRST, at, first, end, floor, best, enough, plan, other, heap)
     leans = touches and end == last
     if leans:
         best = leaning_harm(at, last, floor, best, plan, other)
-        stand = at[V_L] / at[A_L]
+        stand = at[LINE.V_L] / at[LINE.A_L]
         if last < stand:
             best = leaning_harm(at, stand, floor, best, plan, other)
-    fill_braking(plan, 0.0, at[A_L])
-    fill_braking(other, at[ONSET_R], at[A_R])
-    _, time, squared = walk(at[GAP_L] + at[GAP_R], at[V_L], plan, at[V_R], other, math.inf)
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    _, time, squared = walk(at[LINE.GAP_L] + at[LINE.GAP_R], at[LINE.V_L], plan, at[LINE.V_R], other, math.inf)
     if time == math.inf or (time > end + _GRAZE_S and not leans):
         return best
     least = gentlest_front(at, min(time, last))[0] if time > first else 0.0
@@ -193,7 +1332,7 @@ def rear_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
     """Least harm, if below ``best``, where the rear vehicle is met first."""
-    high = max(at[V_F] / at[A_F], at[ONSET_R] + at[V_R] / at[A_R])
+    high = max(at[LINE.V_F] / at[LINE.A_F], at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R])
     first = meet_rear(at, high, plan, other)
     if first == math.inf or not stays_behind(at, first, first, plan, other):
         return best
@@ -227,14 +1366,17 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     It has then passed neither the leader nor the controlled vehicle; where it brakes harder than this one, by b, it was
     faster by ``b t`` a time t before the meeting, from its onset on.
     """
-    fill_braking(plan, 0.0, at[A_L])
-    fill_braking(other, at[ONSET_R], at[A_R])
-    last = min(max(rest, at[V_L] / at[A_L]), walk(at[GAP_L] + at[GAP_R], at[V_L], plan, at[V_R], other, math.inf)[1])
-    if at[A_F] >= at[A_R]:
+    fill_braking(plan, 0.0, at[LINE.A_L])
+    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
+    last = min(
+        max(rest, at[LINE.V_L] / at[LINE.A_L]),
+        walk(at[LINE.GAP_L] + at[LINE.GAP_R], at[LINE.V_L], plan, at[LINE.V_R], other, math.inf)[1],
+    )
+    if at[LINE.A_F] >= at[LINE.A_R]:
         return float(last)
-    harder, onset, closing = at[A_R] - at[A_F], at[ONSET_R], at[V_R] - at[V_F]
-    gap = max(at[GAP_R] + (0.5 * at[U_F] * onset - closing) * onset, 0.0)
-    ahead = max(closing + at[A_F] * onset, 0.0)
+    harder, onset, closing = at[LINE.A_R] - at[LINE.A_F], at[LINE.ONSET_R], at[LINE.V_R] - at[LINE.V_F]
+    gap = max(at[LINE.GAP_R] + (0.5 * at[LINE.U_F] * onset - closing) * onset, 0.0)
+    ahead = max(closing + at[LINE.A_F] * onset, 0.0)
     return float(min(last, onset + min(ahead / harder, math.sqrt(2.0 * gap / harder))))
 
 
@@ -260,15 +1402,15 @@ def combined_bound(
 
     ``front`` and ``rear`` are the pairs' own bounds.
     """
-    stand = at[ONSET_R] + at[V_R] / at[A_R]
-    way = solo_motion(at[V_R], -at[A_R], at[ONSET_R], math.inf, stand)[1]
-    room = at[GAP_L] + at[V_L] * at[V_L] / (2.0 * at[A_L]) + at[GAP_R] - way
-    rest = at[ONSET_R] + at[V_R] / min(at[A_R], at[A_F])
-    if not max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[A_F])) < until:
+    stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
+    way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
+    room = at[LINE.GAP_L] + at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) + at[LINE.GAP_R] - way
+    rest = at[LINE.ONSET_R] + at[LINE.V_R] / min(at[LINE.A_R], at[LINE.A_F])
+    if not max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[LINE.A_F])) < until:
         return 0.0
-    step, least = at[TIME_STEP], 0.0
+    step, least = at[LINE.TIME_STEP], 0.0
     for time_step in (0.0, step):  # what holds for any command holds for one that changes at decisions only
-        at[TIME_STEP] = time_step
+        at[LINE.TIME_STEP] = time_step
         best = front_first(at, rear, LARGE, front + rear, plan, other, heap)
         best = rear_first(at, front, best, front + rear, plan, other, heap)
         least = max(least, best - _TOUCH_HARM if best < LARGE else 0.0)
@@ -285,7 +1427,7 @@ def bound_worlds(
 
     Each pair's where it exists, both together where contact is unavoidable.
     """
-    plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, CELL_WIDTH))
+    plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, CELL_OF.WIDTH))
     for k in range(states.shape[0]):
         front, rear = 0.0, 0.0
         if has_front[k]:
@@ -420,27 +1562,27 @@ def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> 
     Columns of a neighbour that is not there stay 0, as does the time step where there is none.
     """
     v = worlds.vehicles
-    at = np.zeros((worlds.n, WIDTH))
+    at = np.zeros((worlds.n, LINE.WIDTH))
     columns = {
-        V_F: worlds.speeds_mps[:, i],
-        A_F: v.braking_capacity_mps2[:, i],
-        U_F: v.driving_capacity_mps2[:, i],
-        LIMIT_F: v.speed_limit_mps[:, i],
-        RESTITUTION: v.restitution,
-        OBSTACLE: worlds.obstacle_gap_m if i == 1 else np.inf,
-        TIME_STEP: 0.0 if time_step_s is None else time_step_s,
+        LINE.V_F: worlds.speeds_mps[:, i],
+        LINE.A_F: v.braking_capacity_mps2[:, i],
+        LINE.U_F: v.driving_capacity_mps2[:, i],
+        LINE.LIMIT_F: v.speed_limit_mps[:, i],
+        LINE.RESTITUTION: v.restitution,
+        LINE.OBSTACLE: worlds.obstacle_gap_m if i == 1 else np.inf,
+        LINE.TIME_STEP: 0.0 if time_step_s is None else time_step_s,
     }
     if i > 0:
-        columns[GAP_L] = worlds.gaps_m[:, i - 1]
-        columns[V_L] = worlds.speeds_mps[:, i - 1]
-        columns[A_L] = v.braking_capacity_mps2[:, i - 1]
-        columns[FRONT_SHARE] = v.mass_t[:, i - 1] / (v.mass_t[:, i - 1] + v.mass_t[:, i])
+        columns[LINE.GAP_L] = worlds.gaps_m[:, i - 1]
+        columns[LINE.V_L] = worlds.speeds_mps[:, i - 1]
+        columns[LINE.A_L] = v.braking_capacity_mps2[:, i - 1]
+        columns[LINE.FRONT_SHARE] = v.mass_t[:, i - 1] / (v.mass_t[:, i - 1] + v.mass_t[:, i])
     if i < worlds.N - 1:
-        columns[GAP_R] = worlds.gaps_m[:, i]
-        columns[V_R] = worlds.speeds_mps[:, i + 1]
-        columns[A_R] = v.braking_capacity_mps2[:, i + 1]
-        columns[ONSET_R] = np.maximum(v.latency_s[:, i + 1] - worlds.time_s, 0.0)
-        columns[REAR_SHARE] = v.mass_t[:, i + 1] / (v.mass_t[:, i + 1] + v.mass_t[:, i])
+        columns[LINE.GAP_R] = worlds.gaps_m[:, i]
+        columns[LINE.V_R] = worlds.speeds_mps[:, i + 1]
+        columns[LINE.A_R] = v.braking_capacity_mps2[:, i + 1]
+        columns[LINE.ONSET_R] = np.maximum(v.latency_s[:, i + 1] - worlds.time_s, 0.0)
+        columns[LINE.REAR_SHARE] = v.mass_t[:, i + 1] / (v.mass_t[:, i + 1] + v.mass_t[:, i])
     for column, values in columns.items():
         at[:, column] = values
     return at

@@ -22,48 +22,35 @@ import numpy as np
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.limits.avoidability import (
+from ethbrake_marl.limits.lower_bound import (
+    BOUND_EPS,
+    CELL_OF,
+    CELLS,
+    EPS,
+    FRONT_FIRST,
+    LARGE,
+    LINE,
     avoidability,
+    braked_then_driven,
+    braking_after,
+    check_asked,
+    drop_first,
     empty_plan,
     fill_braking,
     fill_plan,
-    largest_behind,
-    spare_gap,
-    time_to_limit,
-    walk,
-)
-from ethbrake_marl.limits.lower_bound import BOUND_EPS, EPS, LARGE, check_asked, front_first, last_ahead, onset_states
-from ethbrake_marl.limits.meetings import (
-    A_F,
-    A_L,
-    A_R,
-    CELL_WIDTH,
-    CELLS,
-    FRONT_FIRST,
-    FRONT_SHARE,
-    GAP_L,
-    GAP_R,
-    HARM,
-    LIMIT_F,
-    OBSTACLE,
-    ONSET_R,
-    REAR_SHARE,
-    RESTITUTION,
-    TIME_STEP,
-    U_F,
-    V_F,
-    V_L,
-    V_R,
-    WIDTH,
-    braked_then_driven,
-    braking_after,
-    drop_first,
     follower,
+    front_first,
     gentlest_between,
+    largest_behind,
+    last_ahead,
     leader,
     meet_front,
+    onset_states,
     pushed_by_rear,
+    spare_gap,
     stays_ahead,
+    time_to_limit,
+    walk,
 )
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance
 from ethbrake_marl.physics.compiled import compiled, compiled_apart
@@ -177,7 +164,7 @@ def closing_behind(at: Floats, time: float, further: float) -> float:
     At ``time``, by the fastest way to be there: brake, then drive. Negative where that is faster.
     """
     v_r, way = follower(at, time)
-    place = way - at[GAP_R] + further
+    place = way - at[LINE.GAP_R] + further
     low, high = 0.0, time
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -206,7 +193,9 @@ def gained(near: float, time: float, since: float, power: float) -> float:
 @compiled
 def behind_full_braking(at: Floats, early: float, late: float) -> float:
     """Gap behind, at least, where both brake fully: the controlled one until ``early``, the rear one until ``late``."""
-    gap: float = at[GAP_R] + solo_motion(at[V_F], -at[A_F], 0.0, math.inf, early)[1] - follower(at, late)[1]
+    gap: float = (
+        at[LINE.GAP_R] + solo_motion(at[LINE.V_F], -at[LINE.A_F], 0.0, math.inf, early)[1] - follower(at, late)[1]
+    )
     return gap
 
 
@@ -230,20 +219,20 @@ def after_behind(
     further = near - faster * (late - early)
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
-    gap = max(at[GAP_L] + at[GAP_R] + way_l - way_r - further, 0.0)
+    gap = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r - further, 0.0)
     passed = max(follower(at, late)[1] - way_r - (leader(at, late)[1] - way_l), 0.0)
-    for column in range(WIDTH):
+    for column in range(LINE.WIDTH):
         moved[column] = at[column]
-    moved[V_L], moved[GAP_L], moved[GAP_R] = v_l, gap, 0.0
-    moved[V_R], moved[ONSET_R] = v_r + faster, max(at[ONSET_R] - early, 0.0)
-    share, rest = at[REAR_SHARE], 1.0 - at[REAR_SHARE]
-    speed = moved[V_R] - rest * hard
-    if share * (1.0 + at[RESTITUTION]) <= 1.0:
-        speed += share * at[RESTITUTION] * hard
-    speed = max(speed - max(at[A_R] - at[A_F], 0.0) * (late - early), 0.0)
+    moved[LINE.V_L], moved[LINE.GAP_L], moved[LINE.GAP_R] = v_l, gap, 0.0
+    moved[LINE.V_R], moved[LINE.ONSET_R] = v_r + faster, max(at[LINE.ONSET_R] - early, 0.0)
+    share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
+    speed = moved[LINE.V_R] - rest * hard
+    if share * (1.0 + at[LINE.RESTITUTION]) <= 1.0:
+        speed += share * at[LINE.RESTITUTION] * hard
+    speed = max(speed - max(at[LINE.A_R] - at[LINE.A_F], 0.0) * (late - early), 0.0)
     least = gap - passed - (far - further)
-    squared = braking_after(gap, least, v_l, at[A_L], speed, at[A_F], plan, other)
-    if at[A_F] < at[A_R]:
+    squared = braking_after(gap, least, v_l, at[LINE.A_L], speed, at[LINE.A_F], plan, other)
+    if at[LINE.A_F] < at[LINE.A_R]:
         return squared
     pushed = pushed_by_rear(moved, 0.0, late - early, hard, late - early, 0.0, gap, plan, other)
     return max(squared, pushed * pushed)
@@ -256,7 +245,7 @@ def put_behind(
 ) -> int:  # fmt: skip
     """Put a cell of meetings behind on the heap if it may hold less harm than the best; the new number of cells."""
     since, power, floor = search[SINCE], search[POWER], search[FLOOR]
-    room = at[GAP_L] + at[GAP_R] + leader(at, late)[1] - follower(at, early)[1]
+    room = at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, late)[1] - follower(at, early)[1]
     span = max(late - since, 0.0)
     if near > room or behind_full_braking(at, early, late) > far or 2.0 * near > power * span * span:
         return count
@@ -268,10 +257,10 @@ def put_behind(
     if harm >= search[BEST]:
         return count
     k = count
-    while k > 0 and heap[(k - 1) // 2, HARM] > harm:
+    while k > 0 and heap[(k - 1) // 2, CELL_OF.HARM] > harm:
         heap[k] = heap[(k - 1) // 2]
         k = (k - 1) // 2
-    heap[k, HARM], heap[k, _EARLY], heap[k, _LATE] = harm, early, late
+    heap[k, CELL_OF.HARM], heap[k, _EARLY], heap[k, _LATE] = harm, early, late
     heap[k, _NEAR], heap[k, _FAR], heap[k, _SOFT], heap[k, _HARD] = near, far, soft, hard
     return count + 1
 
@@ -282,7 +271,7 @@ def try_behind(
 ) -> None:
     """Lower the best to the bound of the gentlest meeting behind at ``time`` that is about ``near`` further."""
     near = max(near, behind_full_braking(at, time, time))
-    if near > far or near > at[GAP_L] + at[GAP_R] + leader(at, time)[1] - follower(at, time)[1]:
+    if near > far or near > at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, time)[1] - follower(at, time)[1]:
         return
     since, power = search[SINCE], search[POWER]
     soft = soft_behind(at, time, time, near, near, since, power)
@@ -299,7 +288,7 @@ def divide_behind(
     soft, hard = heap[0, _SOFT], min(heap[0, _HARD], math.sqrt(search[BEST]))
     count = drop_first(heap, count)
     try_behind(at, early, near, far, search, moved, plan, other)
-    by_time = (late - early) * (at[U_F] + at[A_F] + at[A_R])
+    by_time = (late - early) * (at[LINE.U_F] + at[LINE.A_F] + at[LINE.A_R])
     by_place = (far - near) / max(late - search[SINCE], _SHORT_S)
     for half in range(2):
         times, places, speeds = (early, late), (near, far), (soft, hard)
@@ -327,13 +316,13 @@ def meetings_behind(
     if since > 0.0:
         count = put_behind(at, 0.0, since, 0.0, 0.0, 0.0, hard, search, count, moved, plan, other, heap)
     if last > since:
-        far = at[GAP_L] + at[GAP_R] + leader(at, last)[1] if search[POWER] > 0.0 else 0.0
+        far = at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, last)[1] if search[POWER] > 0.0 else 0.0
         count = put_behind(at, since, last, 0.0, far, 0.0, hard, search, count, moved, plan, other, heap)
     for _ in range(SEARCHED):
-        if count == 0 or heap[0, HARM] >= search[BEST] - _CELL * (1.0 + search[BEST]):
+        if count == 0 or heap[0, CELL_OF.HARM] >= search[BEST] - _CELL * (1.0 + search[BEST]):
             break
         count = divide_behind(at, search, count, moved, plan, other, heap)
-    least: float = min(search[BEST], heap[0, HARM]) if count > 0 else search[BEST]
+    least: float = min(search[BEST], heap[0, CELL_OF.HARM]) if count > 0 else search[BEST]
     return least
 
 
@@ -350,8 +339,18 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
 
     The front pair has at least the least closing speed of its meetings, the other one what is left.
     """
-    pair[PAIR_GAP], pair[LEADER_V], pair[LEADER_ONSET], pair[LEADER_A] = at[GAP_L] + at[GAP_R], at[V_L], 0.0, at[A_L]
-    pair[LEADER_FREE], pair[FOLLOWER_V], pair[FOLLOWER_ONSET], pair[FOLLOWER_A] = 0.0, at[V_R], at[ONSET_R], at[A_R]
+    pair[PAIR_GAP], pair[LEADER_V], pair[LEADER_ONSET], pair[LEADER_A] = (
+        at[LINE.GAP_L] + at[LINE.GAP_R],
+        at[LINE.V_L],
+        0.0,
+        at[LINE.A_L],
+    )
+    pair[LEADER_FREE], pair[FOLLOWER_V], pair[FOLLOWER_ONSET], pair[FOLLOWER_A] = (
+        0.0,
+        at[LINE.V_R],
+        at[LINE.ONSET_R],
+        at[LINE.A_R],
+    )
     both, met = least_closing_of_pair(pair, math.inf, plan, other)
     if met == math.inf:
         return math.inf
@@ -371,10 +370,12 @@ def last_first_meeting(at: Floats, first: float, plan: Floats, other: Floats) ->
     """
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
         return -math.inf
-    touches = spare_gap(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F]) >= 0.0
+    touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
     last = meet_front(at, 0.0, plan, other)
     if touches:
-        last = largest_behind(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F], at[U_F], at[LIMIT_F])[1]
+        last = largest_behind(
+            at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F], at[LINE.U_F], at[LINE.LIMIT_F]
+        )[1]
     end = last_ahead(at, first, last, plan, other)
     return math.inf if touches and end == last else end
 
@@ -387,8 +388,10 @@ def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: F
     """
     if last_first_meeting(at, first, plan, other) <= stand:
         return 0
-    leader_moves = at[A_F] < at[A_L] and at[V_L] > at[A_L] * stand
-    thrown_back = 1.0 - at[FRONT_SHARE] < at[RESTITUTION] * at[FRONT_SHARE] or at[OBSTACLE] < math.inf
+    leader_moves = at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_L] > at[LINE.A_L] * stand
+    thrown_back = (
+        1.0 - at[LINE.FRONT_SHARE] < at[LINE.RESTITUTION] * at[LINE.FRONT_SHARE] or at[LINE.OBSTACLE] < math.inf
+    )
     return 2 if leader_moves or thrown_back else 1
 
 
@@ -401,22 +404,22 @@ def combined_bound_of_team(
 
     ``front`` and ``rear`` are the pairs' own bounds. The rear vehicle may hold back from ``since`` on, by ``power``.
     """
-    stand = at[ONSET_R] + at[V_R] / at[A_R]
-    way = solo_motion(at[V_R], -at[A_R], at[ONSET_R], math.inf, stand)[1]
-    room = at[GAP_L] + at[V_L] * at[V_L] / (2.0 * at[A_L]) + at[GAP_R] - way
-    rest = at[ONSET_R] + at[V_R] / min(at[A_R], at[A_F])
-    if not max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[A_F])) < until:
+    stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
+    way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
+    room = at[LINE.GAP_L] + at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) + at[LINE.GAP_R] - way
+    rest = at[LINE.ONSET_R] + at[LINE.V_R] / min(at[LINE.A_R], at[LINE.A_F])
+    if not max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[LINE.A_F])) < until:
         return 0.0
     first = meet_front(at, math.inf, plan, other)
     late = late_meetings(at, first, stand, plan, other)
     if late == 2:
         return 0.0
-    step, least, any_time = at[TIME_STEP], 0.0, 0.0
+    step, least, any_time = at[LINE.TIME_STEP], 0.0, 0.0
     once = all_at_once(at, first, meet_front(at, 0.0, plan, other), pair, plan, other)
     search = np.empty(SEARCH)
     search[SINCE], search[POWER], search[FLOOR] = since, power, front
     for time_step in (0.0, step):  # what holds for any command holds for one that changes at decisions only
-        at[TIME_STEP] = time_step
+        at[LINE.TIME_STEP] = time_step
         best = min(front_first(at, rear, LARGE, front + rear, plan, other, heap), once)
         if time_step <= 0.0:
             any_time = best
@@ -437,8 +440,8 @@ def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, po
 
     ``pairs`` [n, 2] are the bounds of their two pairs.
     """
-    plan, other, pair, moved = empty_plan(), empty_plan(), np.empty(PAIR_WIDTH), np.empty(WIDTH)
-    heap, heap_behind = np.empty((CELLS, CELL_WIDTH)), np.empty((SEARCHED + 4, HEAP_WIDTH))
+    plan, other, pair, moved = empty_plan(), empty_plan(), np.empty(PAIR_WIDTH), np.empty(LINE.WIDTH)
+    heap, heap_behind = np.empty((CELLS, CELL_OF.WIDTH)), np.empty((SEARCHED + 4, HEAP_WIDTH))
     for k in range(states.shape[0]):
         out[k] = combined_bound_of_team(
             states[k], until[k], pairs[k, 0], pairs[k, 1], since[k], power[k], pair, moved, plan, other, heap,

@@ -8,7 +8,7 @@ from ethbrake_marl.physics.advance import (
     leaving_out_failed,
     measured_without_failed,
 )
-from ethbrake_marl.physics.forecast import forecast
+from ethbrake_marl.physics.kernel import forecast
 from ethbrake_marl.physics.sampled import advance_sampled
 from ethbrake_marl.physics.worlds import (
     Bools,

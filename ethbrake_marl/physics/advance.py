@@ -18,34 +18,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError, renumbered
 from ethbrake_marl.physics.compiled import by_parts, compiled
-from ethbrake_marl.physics.episode import command_in_force, onset_s
 from ethbrake_marl.physics.kernel import (
-    COMMAND,
-    COUNT,
-    DONE,
-    FIRST_HARM,
-    GAP,
-    HIT,
-    LIMIT,
-    MASS,
+    FLAG,
+    LISTED,
     MOST_EVENTS,
-    ONSET,
-    PENETRATED,
-    ROW_CLOSING,
-    ROW_FIRST,
-    ROW_FRONT_CHANGE,
-    ROW_PAIR,
-    ROW_REAR_CHANGE,
-    ROW_TIME,
-    ROW_WIDTH,
-    ROW_WORLD,
-    SPEED,
-    STUCK,
-    TABLE_ROWS,
-    TOTAL_HARM,
+    ROW,
     advance_table,
     ahead,
+    command_in_force,
     obstacle_ahead,
+    onset_s,
     with_obstacle,
     without_obstacle,
 )
@@ -67,7 +49,7 @@ Result = TypeVar("Result")
 
 
 LeftOutRows = tuple[tuple[int, str], ...]  # row of the batch that was given, why its world counts nowhere
-_REASONS = {PENETRATED: "a contact was missed", STUCK: f"more than {MOST_EVENTS} events"}
+_REASONS = {FLAG.PENETRATED: "a contact was missed", FLAG.STUCK: f"more than {MOST_EVENTS} events"}
 
 
 def failure(status: Ints, from_s: Floats, until_s: Floats) -> PhysicsError:
@@ -75,7 +57,7 @@ def failure(status: Ints, from_s: Floats, until_s: Floats) -> PhysicsError:
     return PhysicsError(
         {
             k: f"{_REASONS[int(status[k])]} between {from_s[k]:g} s and {until_s[k]:g} s"
-            for k in np.flatnonzero(status != DONE).tolist()
+            for k in np.flatnonzero(status != FLAG.DONE).tolist()
         }
     )
 
@@ -146,12 +128,12 @@ def advance_worlds(
 ) -> tuple[int, int, int]:  # fmt: skip
     """Advance every world to its ``until``, in place (the first five arrays and the harm).
 
-    ``rows`` [capacity, ROW_WIDTH] receives the impacts that fit. Returns their whole number, the world whose end or
+    ``rows`` [capacity, LISTED.WIDTH] receives the impacts that fit. Returns their whole number, the world whose end or
     command is refused (or -1) and why. A world in which a check fails is marked with its status in ``failed`` [n] (else
     DONE) and stays where it was; the others go on.
     """
     n, vehicles = speeds.shape
-    table = np.zeros((TABLE_ROWS, vehicles))
+    table = np.zeros((ROW.OF_SEGMENT, vehicles))
     recorded = 0
     for k in range(n):
         duration = until[k] - time[k]
@@ -161,29 +143,29 @@ def advance_worlds(
             wanted = command[k, i]
             if not -braking[k, i] <= wanted <= driving[k, i]:
                 return recorded, k, _BAD_COMMAND
-            table[COMMAND, i] = wanted
-            table[SPEED, i] = speeds[k, i]
-            table[MASS, i] = mass[k, i]
-            table[LIMIT, i] = limit[k, i]
-            table[ONSET, i] = onset_s(latency[k, i], time[k])
+            table[ROW.COMMAND, i] = wanted
+            table[ROW.SPEED, i] = speeds[k, i]
+            table[ROW.MASS, i] = mass[k, i]
+            table[ROW.LIMIT, i] = limit[k, i]
+            table[ROW.ONSET, i] = onset_s(latency[k, i], time[k])
             in_force[k, i] = command_in_force(wanted, latency[k, i], until[k])
         for p in range(vehicles - 1):
-            table[GAP, p] = gaps[k, p]
-            table[HIT, p] = 1.0 if hit[k, p] else 0.0
+            table[ROW.GAP, p] = gaps[k, p]
+            table[ROW.HIT, p] = 1.0 if hit[k, p] else 0.0
         recorded, status = advance_table(table, restitution[k], duration, time[k], k, rows, recorded)
         failed[k] = status
-        if status != DONE:
+        if status != FLAG.DONE:
             continue
         time[k] = until[k]
         for i in range(vehicles):
-            speeds[k, i] = table[SPEED, i]
+            speeds[k, i] = table[ROW.SPEED, i]
         for p in range(vehicles - 1):
-            gaps[k, p] = table[GAP, p]
-            hit[k, p] = table[HIT, p] == 1.0
-            first_harm[k, p] = table[FIRST_HARM, p]
-            total_harm[k, p] = table[TOTAL_HARM, p]
-            count[k, p] = int(table[COUNT, p])
-    return recorded, -1, DONE
+            gaps[k, p] = table[ROW.GAP, p]
+            hit[k, p] = table[ROW.HIT, p] == 1.0
+            first_harm[k, p] = table[ROW.FIRST_HARM, p]
+            total_harm[k, p] = table[ROW.TOTAL_HARM, p]
+            count[k, p] = int(table[ROW.COUNT, p])
+    return recorded, -1, FLAG.DONE
 
 
 def advance(
@@ -243,9 +225,9 @@ def _advance(worlds: Worlds, command: Floats, until: Floats, record: bool, threa
         )  # fmt: skip
         parts = by_parts(partial(_advance_part, arrays, capacity), worlds.n, threads)
         for part in parts:
-            if part.status != DONE:
+            if part.status != FLAG.DONE:
                 raise _refusal(worlds, command, until, part.world, part.status)
-        if (failed != DONE).any():
+        if (failed != FLAG.DONE).any():
             raise failure(failed, worlds.time_s, until)
         impacts = Impacts(first_harm, total_harm, count, *no_obstacle_harm(worlds.n))
         if not record:
@@ -316,7 +298,7 @@ class _Part(NamedTuple):
 def _advance_part(arrays: tuple[NDArray[Any], ...], capacity: int, part: slice) -> _Part:
     """Advance the worlds of ``part`` in place."""
     whole = part.stop - part.start == len(arrays[0])
-    rows = np.empty((capacity, ROW_WIDTH))
+    rows = np.empty((capacity, LISTED.WIDTH))
     mine = (*arrays, rows) if whole else (*(array[part] for array in arrays), rows)
     recorded, world, status = advance_worlds(*mine)
     return _Part(part.start, rows, recorded, part.start + world, status)
@@ -358,13 +340,13 @@ def _impact_rows(parts: list[_Part]) -> ImpactRows:
     rows = np.concatenate([part.rows[: part.recorded] for part in parts])
     first = np.repeat([part.first for part in parts], [part.recorded for part in parts])
     return ImpactRows(
-        first + rows[:, ROW_WORLD].astype(np.int64),
-        rows[:, ROW_PAIR].astype(np.int64),
-        rows[:, ROW_TIME].copy(),
-        rows[:, ROW_CLOSING].copy(),
-        rows[:, ROW_FIRST] > 0.0,
-        rows[:, ROW_FRONT_CHANGE].copy(),
-        rows[:, ROW_REAR_CHANGE].copy(),
+        first + rows[:, LISTED.WORLD].astype(np.int64),
+        rows[:, LISTED.PAIR].astype(np.int64),
+        rows[:, LISTED.TIME].copy(),
+        rows[:, LISTED.CLOSING].copy(),
+        rows[:, LISTED.FIRST] > 0.0,
+        rows[:, LISTED.FRONT_CHANGE].copy(),
+        rows[:, LISTED.REAR_CHANGE].copy(),
     )
 
 
@@ -568,4 +550,4 @@ def obstacle_ledger_columns(state: Floats, vehicles: int) -> tuple[Floats, Float
     return first, total, count.astype(np.int64)
 
 
-NO_ROWS = np.empty((0, ROW_WIDTH))  # for kernels that keep no list of impacts
+NO_ROWS = np.empty((0, LISTED.WIDTH))  # for kernels that keep no list of impacts

@@ -8,13 +8,16 @@ table of one world whose first rows ``impact`` names.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.physics.compiled import compiled, compiled_bare
-from ethbrake_marl.physics.worlds import Bools, Floats, Vehicles, Worlds, sum_rows, vehicles_at_once
+from ethbrake_marl.errors import InvalidInput, PhysicsError, renumbered
+from ethbrake_marl.physics.compiled import compiled, compiled_apart, compiled_bare, compiled_within
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, sum_rows, vehicles_at_once
 
 # Closed-form times of the events that end a segment of constant acceleration.
 #
@@ -163,22 +166,55 @@ def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats) ->
 # The kernels work on one table of floats for one world, ``table[row, vehicle or pair]``; the rows are named here. (One
 # array is cheap to hand from function to function; twenty small ones cost more than the physics.)
 
-# per vehicle
-SPEED = 0
-MASS = 1
-BEFORE = 2  # speed before an impact
-POOLED = 3
-# per pair
-GAP = 4
-CLOSING = 5  # closing speed before an impact, 0 where the pair does not touch
-CONTACT_SPEED = 6  # exact closing speed of a pair that has just met, else 0
-STRUCK = 7  # 1 where the last round was an impact (not a touch)
-# per pooled block
-BLOCK_MASS = 8
-BLOCK_LOW = 9
-BLOCK_HIGH = 10
-BLOCK_FIRST = 11
-IMPACT_ROWS = 12
+
+class _Rows(NamedTuple):
+    """Rows of the table of one world: of its vehicles, its pairs, its pooled blocks."""
+
+    # per vehicle
+    SPEED: int = 0
+    MASS: int = 1
+    BEFORE: int = 2  # speed before an impact
+    POOLED: int = 3
+    # per pair
+    GAP: int = 4
+    CLOSING: int = 5  # closing speed before an impact, 0 where the pair does not touch
+    CONTACT_SPEED: int = 6  # exact closing speed of a pair that has just met, else 0
+    STRUCK: int = 7  # 1 where the last round was an impact (not a touch)
+    # per pooled block
+    BLOCK_MASS: int = 8
+    BLOCK_LOW: int = 9
+    BLOCK_HIGH: int = 10
+    BLOCK_FIRST: int = 11
+    # per vehicle: of motion
+    COMMAND: int = 12
+    ONSET: int = 13  # when the command takes effect, seconds from the start of the segment
+    LIMIT: int = 14
+    ACTIVE: int = 15  # 1 once the command is in effect
+    ACCELERATION: int = 16
+    FORCE_LOW: int = 17
+    FORCE_HIGH: int = 18
+    SPEED_TIME: int = 19  # time to the next speed event
+    SPEED_VALUE: int = 20  # the speed there
+    WAY: int = 21
+    # per pair: of motion
+    JOINED: int = 22  # 1 where the pair moves as one body
+    CONTACT_TIME: int = 23
+    HIT: int = 24  # 1 once the pair has had an impact
+    FIRST_HARM: int = 25  # harm of this segment
+    TOTAL_HARM: int = 26
+    COUNT: int = 27  # impacts of this segment
+    # of an episode: per vehicle
+    LATENCY: int = 28  # when its command takes effect (s since Vehicle 1 began to brake)
+    # of an episode: per pair
+    SUM_FIRST_HARM: int = 29  # harm since the episode began (m2/s2)
+    SUM_TOTAL_HARM: int = 30
+    # how many of them
+    OF_IMPACT: int = 12  # rows of the table that an impact needs, a segment, an episode
+    OF_SEGMENT: int = 28
+    OF_EPISODE: int = 31
+
+
+ROW = _Rows()
 
 
 @compiled_bare
@@ -191,26 +227,26 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
     """
     count = 0
     for i in range(first, last + 1):
-        mass = table[MASS, i]
-        table[BLOCK_MASS, count] = mass
-        table[BLOCK_LOW, count] = mass * table[low, i] if mass < math.inf else 0.0
-        table[BLOCK_HIGH, count] = mass * table[high, i] if mass < math.inf else 0.0
-        table[BLOCK_FIRST, count] = i
+        mass = table[ROW.MASS, i]
+        table[ROW.BLOCK_MASS, count] = mass
+        table[ROW.BLOCK_LOW, count] = mass * table[low, i] if mass < math.inf else 0.0
+        table[ROW.BLOCK_HIGH, count] = mass * table[high, i] if mass < math.inf else 0.0
+        table[ROW.BLOCK_FIRST, count] = i
         top = count + first
         table[out, top] = settle(table[low, i], table[high, i])
         while count > 0 and table[out, top] > table[out, top - 1]:
             count -= 1
             top -= 1
-            table[BLOCK_MASS, count] += table[BLOCK_MASS, count + 1]
-            table[BLOCK_LOW, count] += table[BLOCK_LOW, count + 1]
-            table[BLOCK_HIGH, count] += table[BLOCK_HIGH, count + 1]
-            mass = table[BLOCK_MASS, count]
-            table[out, top] = settle(table[BLOCK_LOW, count] / mass, table[BLOCK_HIGH, count] / mass)
+            table[ROW.BLOCK_MASS, count] += table[ROW.BLOCK_MASS, count + 1]
+            table[ROW.BLOCK_LOW, count] += table[ROW.BLOCK_LOW, count + 1]
+            table[ROW.BLOCK_HIGH, count] += table[ROW.BLOCK_HIGH, count + 1]
+            mass = table[ROW.BLOCK_MASS, count]
+            table[out, top] = settle(table[ROW.BLOCK_LOW, count] / mass, table[ROW.BLOCK_HIGH, count] / mass)
         count += 1
     member = last
     for k in range(count - 1, -1, -1):
         value = table[out, k + first]
-        while member >= table[BLOCK_FIRST, k]:
+        while member >= table[ROW.BLOCK_FIRST, k]:
             table[out, member] = value
             member -= 1
     return count
@@ -230,23 +266,23 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
     """
     largest = 0.0
     for p in range(first, last):
-        largest = max(largest, table[CLOSING, p])
+        largest = max(largest, table[ROW.CLOSING, p])
     bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0
     end = last + 1
-    for block in range(pool(table, SPEED, SPEED, first, last, POOLED) - 1, -1, -1):
-        head = int(table[BLOCK_FIRST, block])
-        pooled = table[POOLED, head]
-        if table[BLOCK_MASS, block] < math.inf:
+    for block in range(pool(table, ROW.SPEED, ROW.SPEED, first, last, ROW.POOLED) - 1, -1, -1):
+        head = int(table[ROW.BLOCK_FIRST, block])
+        pooled = table[ROW.POOLED, head]
+        if table[ROW.BLOCK_MASS, block] < math.inf:
             rest = 0.0
             for i in range(head, end):
-                rest += table[MASS, i] * (table[SPEED, i] - pooled)
-            pooled += rest / table[BLOCK_MASS, block]
+                rest += table[ROW.MASS, i] * (table[ROW.SPEED, i] - pooled)
+            pooled += rest / table[ROW.BLOCK_MASS, block]
         for i in range(head, end):
-            table[SPEED, i] = pooled + bounce * (pooled - table[SPEED, i])
+            table[ROW.SPEED, i] = pooled + bounce * (pooled - table[ROW.SPEED, i])
         end = head
     if bounce == 0.0:
         for i in range(first + 1, last + 1):
-            table[SPEED, i] = min(table[SPEED, i], table[SPEED, i - 1])
+            table[ROW.SPEED, i] = min(table[ROW.SPEED, i], table[ROW.SPEED, i - 1])
 
 
 @compiled_bare
@@ -259,58 +295,62 @@ def resolve_impacts(table: Floats, restitution: float) -> bool:
     approaching = False
     for p in range(pairs):
         closing = 0.0
-        if table[GAP, p] <= 0.0:
-            closing = table[CONTACT_SPEED, p]
+        if table[ROW.GAP, p] <= 0.0:
+            closing = table[ROW.CONTACT_SPEED, p]
             if closing == 0.0:
-                closing = table[SPEED, p + 1] - table[SPEED, p]
-        table[CLOSING, p] = closing
+                closing = table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
+        table[ROW.CLOSING, p] = closing
         approaching = approaching or closing > 0.0
     if not approaching:
         return False
     for i in range(pairs + 1):
-        table[BEFORE, i] = table[SPEED, i]
+        table[ROW.BEFORE, i] = table[ROW.SPEED, i]
     first = 0
     while first < pairs:
         last = first
         approaching = False
-        while last < pairs and table[GAP, last] <= 0.0:
-            approaching = approaching or table[CLOSING, last] > 0.0
+        while last < pairs and table[ROW.GAP, last] <= 0.0:
+            approaching = approaching or table[ROW.CLOSING, last] > 0.0
             last += 1
         if approaching:
             resolve_cluster(table, restitution, first, last)
         first = last + 1
     for p in range(pairs):
-        table[CONTACT_SPEED, p] = 0.0
-        table[STRUCK, p] = 1.0 if table[CLOSING, p] > TOUCH_SPEED_MPS else 0.0
+        table[ROW.CONTACT_SPEED, p] = 0.0
+        table[ROW.STRUCK, p] = 1.0 if table[ROW.CLOSING, p] > TOUCH_SPEED_MPS else 0.0
     return True
 
 
 PENETRATION_TOLERANCE_M = 1e-9  # a gap below minus this means that a contact was missed
 MOST_EVENTS = 1_000_000  # per world and segment; reached by a defect of the kernel. (Cascades of 160,000 were seen.)
 
-# per vehicle, after the rows of impact
-COMMAND = IMPACT_ROWS
-ONSET = IMPACT_ROWS + 1  # when the command takes effect, seconds from the start of the segment
-LIMIT = IMPACT_ROWS + 2
-ACTIVE = IMPACT_ROWS + 3  # 1 once the command is in effect
-ACCELERATION = IMPACT_ROWS + 4
-FORCE_LOW = IMPACT_ROWS + 5
-FORCE_HIGH = IMPACT_ROWS + 6
-SPEED_TIME = IMPACT_ROWS + 7  # time to the next speed event
-SPEED_VALUE = IMPACT_ROWS + 8  # the speed there
-WAY = IMPACT_ROWS + 9
-# per pair
-JOINED = IMPACT_ROWS + 10  # 1 where the pair moves as one body
-CONTACT_TIME = IMPACT_ROWS + 11
-HIT = IMPACT_ROWS + 12  # 1 once the pair has had an impact
-FIRST_HARM = IMPACT_ROWS + 13  # harm of this segment
-TOTAL_HARM = IMPACT_ROWS + 14
-COUNT = IMPACT_ROWS + 15  # impacts of this segment
-TABLE_ROWS = IMPACT_ROWS + 16
 
-IMPACT, DONE, PENETRATED, STUCK = 0, 1, 2, 3
-# columns of the list of impacts
-ROW_WORLD, ROW_PAIR, ROW_TIME, ROW_CLOSING, ROW_FIRST, ROW_FRONT_CHANGE, ROW_REAR_CHANGE, ROW_WIDTH = range(8)
+class _Flags(NamedTuple):
+    """What advancing one world told."""
+
+    IMPACT: int = 0
+    DONE: int = 1
+    PENETRATED: int = 2
+    STUCK: int = 3
+
+
+FLAG = _Flags()
+
+
+class _Listed(NamedTuple):
+    """Columns of the list of impacts."""
+
+    WORLD: int = 0
+    PAIR: int = 1
+    TIME: int = 2
+    CLOSING: int = 3
+    FIRST: int = 4
+    FRONT_CHANGE: int = 5
+    REAR_CHANGE: int = 6
+    WIDTH: int = 7
+
+
+LISTED = _Listed()
 
 
 @compiled_bare
@@ -319,47 +359,47 @@ def advance_table(
 ) -> tuple[int, int]:
     """Take one world through a segment. Returns how many impacts are recorded by now, and a status (DONE if well).
 
-    Harm of the segment is in rows FIRST_HARM, TOTAL_HARM and COUNT. ``rows`` [capacity, ROW_WIDTH] receives the impacts
-    that fit, those beyond are only counted.
+    Harm of the segment is in rows FIRST_HARM, TOTAL_HARM and COUNT. ``rows`` [capacity, LISTED.WIDTH] receives the
+    impacts that fit, those beyond are only counted.
     """
     for p in range(table.shape[1] - 1):
-        table[FIRST_HARM, p] = 0.0
-        table[TOTAL_HARM, p] = 0.0
-        table[COUNT, p] = 0.0
+        table[ROW.FIRST_HARM, p] = 0.0
+        table[ROW.TOTAL_HARM, p] = 0.0
+        table[ROW.COUNT, p] = 0.0
     if move_apart(table, duration):
-        return recorded, DONE
+        return recorded, FLAG.DONE
     start_events(table)
     now = 0.0
     for _ in range(MOST_EVENTS):
         status, now = to_next_impact(table, restitution, now, duration)
-        if status != IMPACT:
+        if status != FLAG.IMPACT:
             return recorded, status
         recorded = record_impacts(table, start_s + now, world, rows, recorded)
-    return recorded, STUCK
+    return recorded, FLAG.STUCK
 
 
 @compiled_bare
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
     """Add the last round of impacts to the harm, and to the list of impacts."""
     for p in range(table.shape[1] - 1):
-        if table[STRUCK, p] == 0.0:
+        if table[ROW.STRUCK, p] == 0.0:
             continue
-        closing = table[CLOSING, p]
+        closing = table[ROW.CLOSING, p]
         harm = closing * closing
         if recorded < rows.shape[0]:
-            rows[recorded, ROW_WORLD] = world
-            rows[recorded, ROW_PAIR] = p
-            rows[recorded, ROW_TIME] = time_s
-            rows[recorded, ROW_CLOSING] = closing
-            rows[recorded, ROW_FIRST] = 1.0 - table[HIT, p]
-            rows[recorded, ROW_FRONT_CHANGE] = table[SPEED, p] - table[BEFORE, p]
-            rows[recorded, ROW_REAR_CHANGE] = table[SPEED, p + 1] - table[BEFORE, p + 1]
+            rows[recorded, LISTED.WORLD] = world
+            rows[recorded, LISTED.PAIR] = p
+            rows[recorded, LISTED.TIME] = time_s
+            rows[recorded, LISTED.CLOSING] = closing
+            rows[recorded, LISTED.FIRST] = 1.0 - table[ROW.HIT, p]
+            rows[recorded, LISTED.FRONT_CHANGE] = table[ROW.SPEED, p] - table[ROW.BEFORE, p]
+            rows[recorded, LISTED.REAR_CHANGE] = table[ROW.SPEED, p + 1] - table[ROW.BEFORE, p + 1]
         recorded += 1
-        table[TOTAL_HARM, p] += harm
-        table[COUNT, p] += 1.0
-        if table[HIT, p] == 0.0:
-            table[HIT, p] = 1.0
-            table[FIRST_HARM, p] += harm
+        table[ROW.TOTAL_HARM, p] += harm
+        table[ROW.COUNT, p] += 1.0
+        if table[ROW.HIT, p] == 0.0:
+            table[ROW.HIT, p] = 1.0
+            table[ROW.FIRST_HARM, p] += harm
     return recorded
 
 
@@ -373,25 +413,27 @@ def move_apart(table: Floats, duration: float) -> bool:
     vehicles = table.shape[1]
     slowest_in_front, front_steady = math.inf, 0.0
     for i in range(vehicles):
-        speed = table[SPEED, i]
+        speed = table[ROW.SPEED, i]
         if speed < 0.0:
             return False
-        after, way, steady = solo_motion(speed, table[COMMAND, i], table[ONSET, i], table[LIMIT, i], duration)
-        table[SPEED_VALUE, i] = after
-        table[WAY, i] = way
+        after, way, steady = solo_motion(
+            speed, table[ROW.COMMAND, i], table[ROW.ONSET, i], table[ROW.LIMIT, i], duration
+        )
+        table[ROW.SPEED_VALUE, i] = after
+        table[ROW.WAY, i] = way
         if i > 0:
             closing = max(speed, after) - slowest_in_front
-            if closing > 0.0 and closing * duration >= table[GAP, i - 1]:
-                closing, pressing = speed - table[SPEED, i - 1], steady - front_steady
-                if math.isnan(pressing) or (table[GAP, i - 1] <= 0.0 and closing >= 0.0):
+            if closing > 0.0 and closing * duration >= table[ROW.GAP, i - 1]:
+                closing, pressing = speed - table[ROW.SPEED, i - 1], steady - front_steady
+                if math.isnan(pressing) or (table[ROW.GAP, i - 1] <= 0.0 and closing >= 0.0):
                     return False
-                if contact(table[GAP, i - 1], closing, pressing)[0] <= duration:
+                if contact(table[ROW.GAP, i - 1], closing, pressing)[0] <= duration:
                     return False
         slowest_in_front, front_steady = min(speed, after), steady
     for i in range(vehicles):
-        table[SPEED, i] = table[SPEED_VALUE, i]
+        table[ROW.SPEED, i] = table[ROW.SPEED_VALUE, i]
     for p in range(vehicles - 1):
-        table[GAP, p] = max(table[GAP, p] + (table[WAY, p] - table[WAY, p + 1]), 0.0)
+        table[ROW.GAP, p] = max(table[ROW.GAP, p] + (table[ROW.WAY, p] - table[ROW.WAY, p + 1]), 0.0)
     return True
 
 
@@ -399,8 +441,8 @@ def move_apart(table: Floats, duration: float) -> bool:
 def start_events(table: Floats) -> None:
     """Make the table ready for ``to_next_impact`` from the start of a segment."""
     for i in range(table.shape[1]):
-        table[ACTIVE, i] = 1.0 if table[ONSET, i] <= 0.0 else 0.0
-        table[CONTACT_SPEED, i] = 0.0
+        table[ROW.ACTIVE, i] = 1.0 if table[ROW.ONSET, i] <= 0.0 else 0.0
+        table[ROW.CONTACT_SPEED, i] = 0.0
 
 
 @compiled_bare
@@ -411,13 +453,13 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
     """
     for _ in range(MOST_EVENTS):
         if resolve_impacts(table, restitution):
-            return IMPACT, now
+            return FLAG.IMPACT, now
         if now >= duration:
-            return DONE, now
+            return FLAG.DONE, now
         sound, now = to_next_event(table, now, duration)
         if not sound:
-            return PENETRATED, now
-    return STUCK, now
+            return FLAG.PENETRATED, now
+    return FLAG.STUCK, now
 
 
 @compiled_bare
@@ -428,8 +470,8 @@ def to_next_event(table: Floats, now: float, duration: float) -> tuple[bool, flo
     if not move(table, passed):
         return False, now
     for i in range(table.shape[1]):
-        if table[ONSET, i] - now <= passed:
-            table[ACTIVE, i] = 1.0
+        if table[ROW.ONSET, i] - now <= passed:
+            table[ROW.ACTIVE, i] = 1.0
     return True, duration if passed >= duration - now else now + passed
 
 
@@ -438,22 +480,24 @@ def accelerate(table: Floats) -> None:
     """Accelerations in force, touching vehicles coupled; marks the pairs that move as one body."""
     vehicles = table.shape[1]
     for i in range(vehicles):
-        wanted = table[COMMAND, i] * table[ACTIVE, i]
-        low, high = force_range(table[SPEED, i], wanted, table[LIMIT, i])
-        table[FORCE_LOW, i] = low
-        table[FORCE_HIGH, i] = high
+        wanted = table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
+        low, high = force_range(table[ROW.SPEED, i], wanted, table[ROW.LIMIT, i])
+        table[ROW.FORCE_LOW, i] = low
+        table[ROW.FORCE_HIGH, i] = high
     first = 0
     while first < vehicles:
         last = first
-        while last < vehicles - 1 and table[GAP, last] <= 0.0 and table[SPEED, last] == table[SPEED, last + 1]:
+        while (
+            last < vehicles - 1 and table[ROW.GAP, last] <= 0.0 and table[ROW.SPEED, last] == table[ROW.SPEED, last + 1]
+        ):
             last += 1
         if last == first:
-            table[ACCELERATION, first] = settle(table[FORCE_LOW, first], table[FORCE_HIGH, first])
+            table[ROW.ACCELERATION, first] = settle(table[ROW.FORCE_LOW, first], table[ROW.FORCE_HIGH, first])
         else:
-            pool(table, FORCE_LOW, FORCE_HIGH, first, last, ACCELERATION)
+            pool(table, ROW.FORCE_LOW, ROW.FORCE_HIGH, first, last, ROW.ACCELERATION)
             for p in range(first, last):
-                table[JOINED, p] = 1.0 if table[ACCELERATION, p] == table[ACCELERATION, p + 1] else 0.0
-        table[JOINED, last] = 0.0
+                table[ROW.JOINED, p] = 1.0 if table[ROW.ACCELERATION, p] == table[ROW.ACCELERATION, p + 1] else 0.0
+        table[ROW.JOINED, last] = 0.0
         first = last + 1
 
 
@@ -463,21 +507,21 @@ def next_event(table: Floats, now: float, end: float) -> float:
     vehicles = table.shape[1]
     soonest = end - now
     for i in range(vehicles):
-        wanted = table[COMMAND, i] * table[ACTIVE, i]
-        time, value = speed_event(table[SPEED, i], table[ACCELERATION, i], wanted, table[LIMIT, i])
-        table[SPEED_TIME, i] = time
-        table[SPEED_VALUE, i] = value
+        wanted = table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
+        time, value = speed_event(table[ROW.SPEED, i], table[ROW.ACCELERATION, i], wanted, table[ROW.LIMIT, i])
+        table[ROW.SPEED_TIME, i] = time
+        table[ROW.SPEED_VALUE, i] = value
         soonest = min(soonest, time)
-        if table[ACTIVE, i] == 0.0:
-            soonest = min(soonest, table[ONSET, i] - now)
+        if table[ROW.ACTIVE, i] == 0.0:
+            soonest = min(soonest, table[ROW.ONSET, i] - now)
     for p in range(vehicles - 1):
         time, speed = math.inf, 0.0
-        if table[JOINED, p] == 0.0:
-            closing = table[SPEED, p + 1] - table[SPEED, p]
-            pressing = table[ACCELERATION, p + 1] - table[ACCELERATION, p]
-            time, speed = contact(table[GAP, p], closing, pressing)
-        table[CONTACT_TIME, p] = time
-        table[CONTACT_SPEED, p] = speed
+        if table[ROW.JOINED, p] == 0.0:
+            closing = table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
+            pressing = table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p]
+            time, speed = contact(table[ROW.GAP, p], closing, pressing)
+        table[ROW.CONTACT_TIME, p] = time
+        table[ROW.CONTACT_SPEED, p] = speed
         soonest = min(soonest, time)
     return soonest
 
@@ -487,16 +531,16 @@ def move(table: Floats, duration: float) -> bool:
     """Move to the next event, putting event values exactly; False when a gap became impossible."""
     sound = True
     for p in range(table.shape[1] - 1):
-        if table[CONTACT_TIME, p] <= duration:
-            table[GAP, p] = 0.0
+        if table[ROW.CONTACT_TIME, p] <= duration:
+            table[ROW.GAP, p] = 0.0
             continue
-        table[CONTACT_SPEED, p] = 0.0
-        if table[JOINED, p] == 0.0:
-            closing = table[SPEED, p + 1] - table[SPEED, p]
-            pressing = table[ACCELERATION, p + 1] - table[ACCELERATION, p]
-            after = drift(table[GAP, p], closing, pressing, duration)
+        table[ROW.CONTACT_SPEED, p] = 0.0
+        if table[ROW.JOINED, p] == 0.0:
+            closing = table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
+            pressing = table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p]
+            after = drift(table[ROW.GAP, p], closing, pressing, duration)
             sound = sound and after >= -PENETRATION_TOLERANCE_M
-            table[GAP, p] = max(after, 0.0)
+            table[ROW.GAP, p] = max(after, 0.0)
     move_speeds(table, duration)
     return sound
 
@@ -507,18 +551,18 @@ def move_speeds(table: Floats, duration: float) -> None:
     vehicles = table.shape[1]
     first = 0
     while first < vehicles:
-        value = table[SPEED, first] + table[ACCELERATION, first] * duration
+        value = table[ROW.SPEED, first] + table[ROW.ACCELERATION, first] * duration
         last = first
-        if table[SPEED_TIME, first] <= duration:
-            value = table[SPEED_VALUE, first]
-        while table[JOINED, last] == 1.0:
+        if table[ROW.SPEED_TIME, first] <= duration:
+            value = table[ROW.SPEED_VALUE, first]
+        while table[ROW.JOINED, last] == 1.0:
             last += 1
-            if table[SPEED_TIME, last] <= duration:
-                value = table[SPEED_VALUE, last]
-        if first > 0 and table[CONTACT_SPEED, first - 1] > 0.0:
-            value = table[SPEED, first - 1] + table[CONTACT_SPEED, first - 1]
+            if table[ROW.SPEED_TIME, last] <= duration:
+                value = table[ROW.SPEED_VALUE, last]
+        if first > 0 and table[ROW.CONTACT_SPEED, first - 1] > 0.0:
+            value = table[ROW.SPEED, first - 1] + table[ROW.CONTACT_SPEED, first - 1]
         for i in range(first, last + 1):
-            table[SPEED, i] = value
+            table[ROW.SPEED, i] = value
         first = last + 1
 
 
@@ -609,6 +653,473 @@ def ahead(value: float, columns: Floats) -> Floats:
 @compiled
 def place_obstacle(table: Floats, gap: float, hit: float) -> None:
     """Write the obstacle into column 0 of a world's table; its speed and command are the zeros of a new table."""
-    table[MASS, 0] = UNMOVABLE_T
-    table[GAP, 0] = gap
-    table[HIT, 0] = hit
+    table[ROW.MASS, 0] = UNMOVABLE_T
+    table[ROW.GAP, 0] = gap
+    table[ROW.HIT, 0] = hit
+
+
+# The step of an episode, compiled: onset of the commands, motion, harm, rest, and the times of the decisions.
+#
+# Search and shield advance an episode by ``step_episode``. The engine, whose loop keeps its worlds in rows, is made of
+# the same rules (``step_end_s``, ``onset_s``, ``command_in_force``, ``stands``) around the same ``advance_table``, so
+# all
+# three agree to the bit (decision 0025). Search and shield copy one world at a time into the table of
+# ``physics.segment``, which is longer here by the rows below.
+#
+# A *profile* holds the commands of the controlled vehicles in each of its phases. Phases begin and end on the grid of
+# decisions, so an agent can drive it. Letters beside those of ``physics.worlds``:
+#
+# ===  ===========================================================
+# C    controlled vehicles
+# K    phases, in order of time; ``ends[k]`` is the step in which phase k ends, the last one reaches the horizon
+# S    columns of a saved state: speeds N, gaps P, hit flags P, first-impact harm P, total harm P
+# ===  ===========================================================
+
+# rows of the table after those of a segment
+
+
+# what a step brought; what is below 0 is a failure: minus the status of the kernel
+GOES_ON, AT_REST, AT_HORIZON = 0, 1, 2
+
+
+class _Clock(NamedTuple):
+    """Entries of an episode's clock."""
+
+    START: int = 0  # first decision (s)
+    TIME_STEP: int = 1  # s
+    LAST_STEP: int = 2  # number of steps
+    HORIZON: int = 3  # s
+    RESTITUTION: int = 4
+    HARM_IS_TOTAL: int = 5  # 1 to minimise total harm
+    STEPWISE: int = 6  # 1 to advance decision by decision
+    WIDTH: int = 7
+
+
+CLOCK = _Clock()
+
+OTHER_WEIGHT = 1e-8  # of the other count in the value that is minimised: it decides between equal harms
+_ROUNDING = 1e-9  # of a step: by less than this the horizon may lie beyond the last whole step
+_ON_GRID = 1e-6  # of a step: a time this close before a decision is that decision
+
+Number = TypeVar("Number", float, Floats)
+
+
+class Grid(NamedTuple):
+    """The decisions of one episode: one every ``time_step_s`` from ``first_s`` on, ``last_step`` of them."""
+
+    first_s: float
+    time_step_s: float
+    last_step: float
+    horizon_s: float  # where the last step ends
+
+
+class Episode(NamedTuple):
+    """One world as its profiles run."""
+
+    table: Floats  # [ROW.OF_EPISODE, N] with latencies, masses, speed limits and the other vehicles' commands
+    clock: Floats  # [CLOCK.WIDTH]
+    controlled: Ints  # [C] vehicles
+
+
+def first_decision_s(worlds: Worlds, deciders: Sequence[int]) -> Floats:
+    """Time of the first decision, [n] s: the least latency of the ``deciders``, or the worlds' time where it is later.
+
+    With nobody to decide it is the worlds' time.
+    """
+    if len(deciders) == 0:
+        return worlds.time_s.copy()
+    first: Floats = np.maximum(worlds.vehicles.latency_s[:, list(deciders)].min(axis=1), worlds.time_s)
+    return first
+
+
+def number_of_decisions(first_s: Floats, time_step_s: float, horizon_s: Floats | float) -> Floats:
+    """How many decisions fall before the horizon, or another time, the first one at ``first_s``, whose shape it has."""
+    return np.ceil((horizon_s - first_s) / time_step_s - _ROUNDING)
+
+
+def decision_at(time_s: Floats, first_s: Floats, time_step_s: Floats | float) -> Ints:
+    """Number of the latest decision at these times, [n]; below 0 before the first one."""
+    return np.floor((time_s - first_s) / time_step_s + _ON_GRID).astype(np.int64)
+
+
+def decision_s(first_s: Number, time_step_s: Any, step: Any) -> Number:
+    """Time at which a step before the last one begins: of one world or of many, s."""
+    time: Number = first_s + step * time_step_s
+    return time
+
+
+_decision_s = compiled(decision_s)
+
+
+@compiled
+def grid_of(clock: Floats) -> Grid:
+    """The decisions that a clock [CLOCK.WIDTH] tells of."""
+    return Grid(clock[CLOCK.START], clock[CLOCK.TIME_STEP], clock[CLOCK.LAST_STEP], clock[CLOCK.HORIZON])
+
+
+@compiled
+def step_end_s(step: float, last_step: float, first_s: float, time_step_s: float, horizon_s: float) -> float:
+    """Time (s) at which the step with this number, from 1, ends; the last one ends at the horizon."""
+    return horizon_s if step >= last_step else _decision_s(first_s, time_step_s, step)
+
+
+@compiled
+def time_of(grid: Grid, step: int) -> float:
+    """Time at which a step, counted from 0, begins (s)."""
+    return step_end_s(step, grid.last_step, grid.first_s, grid.time_step_s, grid.horizon_s)
+
+
+@compiled
+def onset_s(latency_s: float, time_s: float) -> float:
+    """How long after ``time_s`` a command takes effect (s); not above 0: at once."""
+    return latency_s - time_s
+
+
+@compiled
+def stands(speed_mps: float, command_mps2: float) -> bool:
+    """Whether a vehicle stands and its command would not move it."""
+    return speed_mps == 0.0 and command_mps2 <= 0.0
+
+
+@compiled
+def command_in_force(command: float, latency_s: float, time_s: float) -> float:
+    """The command that acts at a time: none before the vehicle's latency has elapsed (m/s2)."""
+    return command if latency_s <= time_s else 0.0
+
+
+@compiled_within
+def at_rest(table: Floats) -> bool:
+    """Whether the episode has ended: everything stands and no command would move it."""
+    for i in range(table.shape[1]):  # noqa: SIM110  # all() is not compiled
+        if not stands(table[ROW.SPEED, i], table[ROW.COMMAND, i]):
+            return False
+    return True
+
+
+@compiled_within
+def step_episode(
+    table: Floats, restitution: float, time: float, until: float, horizon_s: float, no_rows: Floats
+) -> int:
+    """THE step: from ``time`` to ``until`` (s) under the commands in the table, and the harm of it.
+
+    Returns GOES_ON, AT_REST, AT_HORIZON (still moving, or told to move), or minus the kernel's status of a failure; the
+    table is then of no use. ``no_rows`` is an empty list of impacts, as ``table[:0]``. The bits depend on where steps
+    end: what the engine does is a step from each decision to the next one.
+    """
+    status = advance_table(table, restitution, until - time, time, 0, no_rows, 0)[1]
+    if status != FLAG.DONE:
+        return -status
+    for p in range(table.shape[1] - 1):
+        table[ROW.SUM_FIRST_HARM, p] += table[ROW.FIRST_HARM, p]
+        table[ROW.SUM_TOTAL_HARM, p] += table[ROW.TOTAL_HARM, p]
+    if at_rest(table):
+        return AT_REST
+    return AT_HORIZON if until >= horizon_s else GOES_ON
+
+
+@compiled_within
+def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: int, no_rows: Floats) -> int:
+    """``step_episode`` from decision ``step`` to decision ``end`` of a table that stays loaded from step to step."""
+    time = time_of(grid, step)
+    for i in range(table.shape[1]):
+        table[ROW.ONSET, i] = onset_s(table[ROW.LATENCY, i], time)
+    return step_episode(table, restitution, time, time_of(grid, end), grid.horizon_s, no_rows)
+
+
+@compiled
+def harm_so_far(table: Floats, total: float) -> float:
+    """Harm of the line since the episode began, under one count (1: total harm), summed front to rear (m2/s2)."""
+    value, row = 0.0, ROW.SUM_TOTAL_HARM if total == 1.0 else ROW.SUM_FIRST_HARM
+    for p in range(table.shape[1] - 1):
+        value += table[row, p]
+    return value
+
+
+@compiled
+def value_of(table: Floats, total: float) -> float:
+    """What a search minimises: the harm under one count, and a very little of the other one (m2/s2)."""
+    return harm_so_far(table, total) + OTHER_WEIGHT * harm_so_far(table, 1.0 - total)
+
+
+@compiled
+def save(table: Floats, state: Floats) -> None:
+    """Keep a world's state and its harm so far in one row [S]."""
+    vehicles = table.shape[1]
+    pairs = vehicles - 1
+    for i in range(vehicles):
+        state[i] = table[ROW.SPEED, i]
+    for p in range(pairs):
+        state[vehicles + p] = table[ROW.GAP, p]
+        state[vehicles + pairs + p] = table[ROW.HIT, p]
+        state[vehicles + 2 * pairs + p] = table[ROW.SUM_FIRST_HARM, p]
+        state[vehicles + 3 * pairs + p] = table[ROW.SUM_TOTAL_HARM, p]
+
+
+@compiled
+def restore(table: Floats, state: Floats) -> None:
+    """Bring back what ``save`` kept."""
+    vehicles = table.shape[1]
+    pairs = vehicles - 1
+    for i in range(vehicles):
+        table[ROW.SPEED, i] = state[i]
+    for p in range(pairs):
+        table[ROW.GAP, p] = state[vehicles + p]
+        table[ROW.HIT, p] = state[vehicles + pairs + p]
+        table[ROW.SUM_FIRST_HARM, p] = state[vehicles + 2 * pairs + p]
+        table[ROW.SUM_TOTAL_HARM, p] = state[vehicles + 3 * pairs + p]
+
+
+@compiled_apart
+def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
+    """``follow`` a profile from its first phase on."""
+    phase = min(0, ends.shape[0])  # 0, but no literal, for which everything would be compiled a second time
+    return follow(world, ends, commands, states, phase, bound)
+
+
+@compiled
+def follow(world: Episode, ends: Ints, commands: Floats, states: Floats, phase: int, bound: float) -> tuple[float, int]:
+    """Follow a profile from the start of ``phase`` on; ``states[k]`` [K + 1, S] is the state at the start of phase k.
+
+    ``ends`` [K], ``commands`` [K, C]. Gives up as soon as the value is not below ``bound``: harm never falls again.
+    With ``clock[STEPWISE]`` it advances decision by decision, as the engine does, to the same bits; otherwise phase by
+    phase, which is several times faster and differs by rounding. Returns the value and the number of phases up to the
+    end of the episode; -1 for that number if the kernel failed.
+    """
+    table, clock, controlled = world.table, world.clock, world.controlled
+    grid, restitution, total = grid_of(clock), clock[CLOCK.RESTITUTION], clock[CLOCK.HARM_IS_TOTAL]
+    no_rows = table[:0]
+    restore(table, states[phase])
+    value = value_of(table, total)
+    for k in range(phase, ends.shape[0]):
+        begin = ends[k - 1] if k > 0 else 0
+        outcome = GOES_ON
+        if ends[k] > begin:
+            for c in range(controlled.shape[0]):
+                table[ROW.COMMAND, controlled[c]] = commands[k, c]
+            length = 1 if clock[CLOCK.STEPWISE] == 1.0 else ends[k] - begin
+            for step in range(begin, ends[k], length):
+                outcome = step_again(table, restitution, grid, step, step + length, no_rows)
+                if outcome != GOES_ON:
+                    break
+            if outcome < GOES_ON:
+                return value, -1
+            value = value_of(table, total)
+        save(table, states[k + 1])
+        if value >= bound or outcome == AT_REST:
+            return value, k + 1
+    return value, ends.shape[0]
+
+
+# A segment of constant command as pieces of constant acceleration: what a picture needs to be exact between events.
+
+_CAPACITY = 64
+
+
+@compiled
+def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) -> int:
+    """Write down time from the start, gaps, speeds and accelerations at the beginning of each piece; their number.
+
+    Those that do not fit into ``rows`` [capacity, 1 + P + 2 N] are only counted; minus their number where a contact
+    was missed.
+    """
+    vehicles = table.shape[1]
+    start_events(table)
+    now, count = 0.0, 0
+    for _ in range(MOST_EVENTS):
+        if resolve_impacts(table, restitution):
+            continue
+        if now >= duration:
+            break
+        accelerate(table)
+        if count < rows.shape[0]:
+            rows[count, 0] = now
+            for p in range(vehicles - 1):
+                rows[count, 1 + p] = table[ROW.GAP, p]
+            for i in range(vehicles):
+                rows[count, vehicles + i] = table[ROW.SPEED, i]
+                rows[count, 2 * vehicles + i] = table[ROW.ACCELERATION, i]
+        count += 1
+        passed = next_event(table, now, duration)
+        if not move(table, passed):
+            return -count
+        for i in range(vehicles):
+            if table[ROW.ONSET, i] - now <= passed:
+                table[ROW.ACTIVE, i] = 1.0
+        now = duration if passed >= duration - now else now + passed
+    return count
+
+
+def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> list[Floats]:
+    """The motion of each world until a time, under one command: a row per piece of constant acceleration.
+
+    Args:
+        worlds: n, of N vehicles; they stay as they are.
+        command_mps2: signed accelerations wanted, [n, N] m/s2.
+        until_s: where the segments end, [n] s.
+
+    Returns for each world [k, 1 + N + 2 N]: the absolute time at which the piece begins (s), how far Vehicle 1 has come
+    since the segment began, the gaps (m), the speeds (m/s) and the accelerations (m/s2).
+
+    """
+    v, N, durations = worlds.vehicles, worlds.N, until_s - worlds.time_s
+    front_gaps = with_post_ahead(worlds, durations).obstacle_gap_m  # says where Vehicle 1 is
+    latencies, restitutions = v.latency_s, v.restitution
+    wanted = [*range(N + 1), *range(N + 2, 2 * N + 2), *range(2 * N + 3, 3 * N + 3)]  # all but the post's own
+    found = []
+    for k in range(worlds.n):
+        start = float(worlds.time_s[k])
+        table = np.zeros((ROW.OF_SEGMENT, N + 1))
+        place_obstacle(table, float(front_gaps[k]), 0.0)
+        table[ROW.COMMAND, 1:], table[ROW.SPEED, 1:] = command_mps2[k], worlds.speeds_mps[k]
+        table[ROW.MASS, 1:], table[ROW.LIMIT, 1:] = v.mass_t[k], v.speed_limit_mps[k]
+        table[ROW.ONSET, 0], table[ROW.ONSET, 1:] = onset_s(0.0, start), latencies[k] - start
+        table[ROW.GAP, 1:N] = worlds.gaps_m[k]
+        capacity = _CAPACITY
+        while True:
+            rows = np.empty((capacity, 3 * (N + 1)))
+            count = abs(_pieces(table.copy(), float(restitutions[k]), float(durations[k]), rows))
+            if count <= capacity:
+                break
+            capacity = count
+        pieces = rows[:count, wanted]
+        pieces[:, 0] += start
+        pieces[:, 1] = front_gaps[k] - pieces[:, 1]
+        found.append(pieces)
+    return found
+
+
+# The forecast of constant commands: the physics of ``advance``, for many candidate commands of one vehicle.
+#
+# Nothing of the motion is kept, only the harm, so a candidate costs little more than its events.
+
+
+def forecast(
+    worlds: Worlds, command_mps2: Floats, vehicle: int, candidates_mps2: Floats, until_s: float
+) -> tuple[Floats, Floats]:
+    """First-impact and total harm from now to ``until_s`` if ``vehicle`` held each candidate command, [n, K] each.
+
+    Harm is that of all pairs and of the obstacle ahead, if there is one.
+    ``command_mps2`` [n, N] are the other vehicles' commands (the vehicle's own column is ignored);
+    ``candidates_mps2`` [n, K]. Worlds at or beyond ``until_s`` have no harm left. Pairs hit before do not count
+    again in first-impact harm. Raises ``InvalidInput`` for shapes that do not fit or a candidate beyond capacity,
+    ``PhysicsError`` naming the worlds in which a check of the kernel failed.
+    """
+    n, N = worlds.speeds_mps.shape
+    if command_mps2.shape != (n, N) or candidates_mps2.ndim != 2 or candidates_mps2.shape[0] != n:
+        raise InvalidInput(
+            f"forecast: commands {command_mps2.shape} and candidates {candidates_mps2.shape}; ({n}, {N}) and ({n}, K)"
+            " are needed"
+        )
+    if not 0 <= vehicle < N:
+        raise InvalidInput(f"forecast: vehicle index {vehicle}; must be in 0..{N - 1}")
+    v = worlds.vehicles
+    low, high = -v.braking_capacity_mps2[:, [vehicle]], v.driving_capacity_mps2[:, [vehicle]]
+    good = (candidates_mps2 >= low) & (candidates_mps2 <= high)
+    if not good.all():
+        raise InvalidInput(
+            f"forecast: candidate {candidates_mps2[~good][0]:g} m/s2 is beyond vehicle_{vehicle + 1}'s capacity"
+        )
+    obstacle = obstacle_ahead(worlds)
+    if not obstacle.any():
+        return _forecast(worlds, command_mps2, vehicle, candidates_mps2, until_s)
+    first, total = np.empty(candidates_mps2.shape), np.empty(candidates_mps2.shape)
+    with_one, without = np.flatnonzero(obstacle), np.flatnonzero(~obstacle)
+    lines, command = with_obstacle(worlds.take(with_one)), ahead(0.0, command_mps2[with_one])
+    with renumbered(with_one):
+        first[with_one], total[with_one] = _forecast(lines, command, vehicle + 1, candidates_mps2[with_one], until_s)
+    with renumbered(without):
+        first[without], total[without] = _forecast(
+            worlds.take(without), command_mps2[without], vehicle, candidates_mps2[without], until_s
+        )
+    return first, total
+
+
+def _forecast(
+    worlds: Worlds, command_mps2: Floats, vehicle: int, candidates_mps2: Floats, until_s: float
+) -> tuple[Floats, Floats]:
+    """``forecast`` of worlds without an obstacle, or with one that is written out as a vehicle."""
+    v = worlds.vehicles
+    first, total = np.zeros(candidates_mps2.shape), np.zeros(candidates_mps2.shape)
+    failed = np.zeros(worlds.n, np.bool_)
+    forecast_worlds(
+        worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, np.ascontiguousarray(command_mps2), vehicle,
+        np.ascontiguousarray(candidates_mps2), until_s, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, first,
+        total, failed,
+    )  # fmt: skip
+    if failed.any():
+        raise PhysicsError({k: f"a forecast could not reach {until_s:g} s" for k in np.flatnonzero(failed).tolist()})
+    return first, total
+
+
+@compiled
+def forecast_worlds(
+    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, command: Floats, vehicle: int, candidates: Floats,
+    until_s: float, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, first: Floats, total: Floats,
+    failed: Bools,
+) -> None:  # fmt: skip
+    """Fill ``first`` and ``total`` [n, K], and ``failed`` [n] where a check failed."""
+    n, vehicles = speeds.shape
+    table = np.zeros((ROW.OF_SEGMENT, vehicles))
+    no_rows = np.empty((0, LISTED.WIDTH))
+    for k in range(n):
+        duration = until_s - time[k]
+        if not duration > 0.0:
+            continue
+        for c in range(candidates.shape[1]):
+            for i in range(vehicles):
+                table[ROW.SPEED, i] = speeds[k, i]
+                table[ROW.COMMAND, i] = candidates[k, c] if i == vehicle else command[k, i]
+                table[ROW.MASS, i] = mass[k, i]
+                table[ROW.LIMIT, i] = limit[k, i]
+                table[ROW.ONSET, i] = onset_s(latency[k, i], time[k])
+            for p in range(vehicles - 1):
+                table[ROW.GAP, p] = gaps[k, p]
+                table[ROW.HIT, p] = 1.0 if hit[k, p] else 0.0
+            if advance_table(table, restitution[k], duration, 0.0, k, no_rows, 0)[1] != FLAG.DONE:
+                failed[k] = True
+                break
+            for p in range(vehicles - 1):
+                first[k, c] += table[ROW.FIRST_HARM, p]
+                total[k, c] += table[ROW.TOTAL_HARM, p]
+
+
+# The forecast of contacts: when the pairs of a line first meet under commands held constant, and how hard.
+#
+# The physics of ``advance``, on a table that somebody has filled; nothing of the motion is kept.
+
+
+class _Contact(NamedTuple):
+    """Rows of a forecast of the next impact of each pair."""
+
+    TIME: int = 0  # from now to the first impact from now on (s); infinite: none
+    CLOSING: int = 1  # its closing speed (m/s); 0: none
+    WIDTH: int = 2
+
+
+CONTACT = _Contact()
+
+
+@compiled_apart
+def forecast_contacts(table: Floats, restitution: float, duration: float, found: Floats) -> int:
+    """Take one world ``duration`` (s) on; its status. Fills ``found`` [CONTACT_ROWS, N], and the harm of the table.
+
+    A pair that has had an impact before may have another first one from now on; in first-impact harm it counts no more.
+    """
+    for p in range(table.shape[1] - 1):
+        found[CONTACT.TIME, p], found[CONTACT.CLOSING, p] = math.inf, 0.0
+        table[ROW.FIRST_HARM, p] = 0.0
+        table[ROW.TOTAL_HARM, p] = 0.0
+        table[ROW.COUNT, p] = 0.0
+    if move_apart(table, duration):
+        return FLAG.DONE
+    start_events(table)
+    no_rows, now = table[:0], 0.0
+    for _ in range(MOST_EVENTS):
+        status, now = to_next_impact(table, restitution, now, duration)
+        if status != FLAG.IMPACT:
+            return status
+        for p in range(table.shape[1] - 1):
+            if table[ROW.STRUCK, p] == 1.0 and found[CONTACT.TIME, p] == math.inf:
+                found[CONTACT.TIME, p], found[CONTACT.CLOSING, p] = now, table[ROW.CLOSING, p]
+        record_impacts(table, now, 0, no_rows, 0)
+    return FLAG.STUCK

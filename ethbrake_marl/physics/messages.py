@@ -20,6 +20,7 @@ ring    the newest samples: RING_HEAD + 3 N columns each: time, whether Vehicle 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,38 +36,53 @@ from ethbrake_marl.physics.advance import (
     vehicles_in,
 )
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.episode import command_in_force, onset_s
 from ethbrake_marl.physics.kernel import (
-    COMMAND,
-    DONE,
-    GAP,
-    HIT,
-    LIMIT,
-    MASS,
-    ONSET,
-    ROW_WIDTH,
-    SPEED,
-    TABLE_ROWS,
+    FLAG,
+    LISTED,
+    ROW,
     advance_table,
+    command_in_force,
+    onset_s,
     place_obstacle,
     solo_motion,
 )
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds
 
-# the head
-PERIOD, DELAY, LOSS_BEGINS, LOSS_ENDS, KEY, TAKEN, OBSTACLE_PLACE = range(7)
-HEAD = 7
-# of a link
-NEXT_SENT = 0  # when its next message is sent that is not dealt with (s); infinite: it carries none
-NUMBER = 1  # of that message, counted from the first one that arrives, which is 0
-BAD = 2  # 1 while the channel is bad
-SEEN_FROM = 3  # from when on the receiver measures the sender (s); infinite: never
-TOLD_S = 4  # when the newest state that arrived was sampled (s); below 0: none has
-TOLD_PLACE = 5
-TOLD_SPEED = 6
-TOLD_COMMAND = 7
-TOLD_HIT = 8  # whether Vehicle 1 had hit the obstacle by then
-LINK = 9
+
+class _Channel(NamedTuple):
+    """The head: one entry for all links of a world."""
+
+    PERIOD: int = 0
+    DELAY: int = 1
+    LOSS_BEGINS: int = 2
+    LOSS_ENDS: int = 3
+    KEY: int = 4
+    TAKEN: int = 5
+    OBSTACLE_PLACE: int = 6
+    WIDTH: int = 7
+
+
+CHANNEL = _Channel()
+
+
+class _Link(NamedTuple):
+    """Entries of a link, from the vehicle that sends to the one that hears it."""
+
+    NEXT_SENT: int = 0  # when its next message is sent that is not dealt with (s); infinite: it carries none
+    NUMBER: int = 1  # of that message, counted from the first one that arrives, which is 0
+    BAD: int = 2  # 1 while the channel is bad
+    SEEN_FROM: int = 3  # from when on the receiver measures the sender (s); infinite: never
+    TOLD_S: int = 4  # when the newest state that arrived was sampled (s); below 0: none has
+    TOLD_PLACE: int = 5
+    TOLD_SPEED: int = 6
+    TOLD_COMMAND: int = 7
+    TOLD_HIT: int = 8  # whether Vehicle 1 had hit the obstacle by then
+    WIDTH: int = 9
+
+
+LINK = _Link()
+
+
 RING_HEAD = 2
 
 POST_M = 1e6  # so far ahead of Vehicle 1 an obstacle is out of reach; it makes the way of Vehicle 1 the change of a gap
@@ -77,19 +93,19 @@ _ON_GRID = 1e-9
 @compiled
 def place_at(vehicles: int) -> int:
     """First column of the places, counted from the head."""
-    return HEAD
+    return CHANNEL.WIDTH
 
 
 @compiled
 def link_at(receiver: int, sender: int, vehicles: int) -> int:
     """First column of a link, counted from the head."""
-    return HEAD + vehicles + LINK * (receiver * vehicles + sender)
+    return CHANNEL.WIDTH + vehicles + LINK.WIDTH * (receiver * vehicles + sender)
 
 
 @compiled
 def ring_at(vehicles: int) -> int:
     """First column of the ring, counted from the head."""
-    return HEAD + vehicles + LINK * vehicles * vehicles
+    return CHANNEL.WIDTH + vehicles + LINK.WIDTH * vehicles * vehicles
 
 
 def message_columns(vehicles: int, samples: int) -> int:
@@ -126,13 +142,13 @@ def hear_rows(
     """
     N = vehicles_in(moving)
     head = messages_at(N)
-    table = np.zeros((TABLE_ROWS, N + 1))
-    no_rows = np.empty((0, ROW_WIDTH))
+    table = np.zeros((ROW.OF_SEGMENT, N + 1))
+    no_rows = np.empty((0, LISTED.WIDTH))
     for k in range(moving.shape[0]):
-        if params[k, head + PERIOD] == 0.0:
+        if params[k, head + CHANNEL.PERIOD] == 0.0:
             continue
         told = params[k, head:]
-        if told[TAKEN] == 0.0:
+        if told[CHANNEL.TAKEN] == 0.0:
             _start(moving[k], told, N, wanted[k], params[k, params_at(2, N) :])
         while moving[k, TIME] < until_s[k]:
             left = math.ceil((decision_s[k] - moving[k, TIME]) / time_step_s - 1e-6) - 1.0
@@ -145,7 +161,7 @@ def hear_rows(
             _sample(moving[k], told, N)
             _receive(moving[k], told, N)
             if stops:
-                told[TAKEN] -= 1.0
+                told[CHANNEL.TAKEN] -= 1.0
 
 
 @compiled
@@ -153,7 +169,7 @@ def _start(state: Floats, told: Floats, N: int, wanted: Floats, latency: Floats)
     """Places and the first sample, at the alert."""
     place, gap = place_at(N), gap_at(N)
     told[place] = 0.0
-    told[OBSTACLE_PLACE] = state[state_width(N)] if state.shape[0] > state_width(N) else math.inf
+    told[CHANNEL.OBSTACLE_PLACE] = state[state_width(N)] if state.shape[0] > state_width(N) else math.inf
     for p in range(N - 1):
         told[place + p + 1] = told[place + p] - state[gap + p]
     for i in range(N):
@@ -172,29 +188,29 @@ def _move(state: Floats, params: Floats, wanted: Floats, end: float, table: Floa
     place_obstacle(table, ahead, state[obstacle + 1] if with_obstacle else 0.0)
     latency = params_at(2, N)
     for i in range(N):
-        table[SPEED, i + 1] = state[speed + i]
-        table[COMMAND, i + 1] = wanted[i]
-        table[MASS, i + 1] = params[params_at(3, N) + i]
-        table[LIMIT, i + 1] = params[params_at(4, N) + i]
-        table[ONSET, i + 1] = onset_s(params[latency + i], time)
+        table[ROW.SPEED, i + 1] = state[speed + i]
+        table[ROW.COMMAND, i + 1] = wanted[i]
+        table[ROW.MASS, i + 1] = params[params_at(3, N) + i]
+        table[ROW.LIMIT, i + 1] = params[params_at(4, N) + i]
+        table[ROW.ONSET, i + 1] = onset_s(params[latency + i], time)
     for p in range(N - 1):
-        table[GAP, p + 1] = state[gap + p]
-        table[HIT, p + 1] = state[gap + N - 1 + p]
-    if advance_table(table, params[RESTITUTION], end - time, time, 0, no_rows, 0)[1] != DONE:
+        table[ROW.GAP, p + 1] = state[gap + p]
+        table[ROW.HIT, p + 1] = state[gap + N - 1 + p]
+    if advance_table(table, params[RESTITUTION], end - time, time, 0, no_rows, 0)[1] != FLAG.DONE:
         return False
     place = messages_at(N) + place_at(N)
-    params[place] += ahead - table[GAP, 0]
+    params[place] += ahead - table[ROW.GAP, 0]
     state[TIME] = end
     for i in range(N):
-        state[speed + i] = table[SPEED, i + 1]
+        state[speed + i] = table[ROW.SPEED, i + 1]
         state[command + i] = command_in_force(wanted[i], params[latency + i], end)
     for p in range(N - 1):
-        state[gap + p] = table[GAP, p + 1]
-        state[gap + N - 1 + p] = table[HIT, p + 1]
-        params[place + p + 1] = params[place + p] - table[GAP, p + 1]
+        state[gap + p] = table[ROW.GAP, p + 1]
+        state[gap + N - 1 + p] = table[ROW.HIT, p + 1]
+        params[place + p + 1] = params[place + p] - table[ROW.GAP, p + 1]
     if with_obstacle:
-        state[obstacle] = table[GAP, 0]
-        state[obstacle + 1] = table[HIT, 0]
+        state[obstacle] = table[ROW.GAP, 0]
+        state[obstacle + 1] = table[ROW.HIT, 0]
     return True
 
 
@@ -202,14 +218,14 @@ def _move(state: Floats, params: Floats, wanted: Floats, end: float, table: Floa
 def _sample(state: Floats, told: Floats, N: int) -> None:
     """Every vehicle takes a sample of its state, over the oldest one."""
     width, first = RING_HEAD + 3 * N, ring_at(N)
-    at = first + width * (int(told[TAKEN]) % ((told.shape[0] - first) // width))
+    at = first + width * (int(told[CHANNEL.TAKEN]) % ((told.shape[0] - first) // width))
     told[at] = state[TIME]
     told[at + 1] = state[state_width(N) + 1] if state.shape[0] > state_width(N) else 0.0
     for i in range(N):
         told[at + RING_HEAD + i] = told[place_at(N) + i]
         told[at + RING_HEAD + N + i] = state[speed_at(N) + i]
         told[at + RING_HEAD + 2 * N + i] = state[command_at(N) + i]
-    told[TAKEN] += 1.0
+    told[CHANNEL.TAKEN] += 1.0
 
 
 @compiled
@@ -219,16 +235,16 @@ def _receive(state: Floats, told: Floats, N: int) -> None:
     for i in range(N):
         for j in range(N):
             link = link_at(i, j, N)
-            while told[link + NEXT_SENT] + told[DELAY] <= time + _ON_GRID:
-                u, bad = chance(told[KEY], i * N + j, told[link + NUMBER]), told[link + BAD] == 1.0
-                if told[link + NUMBER] > 0.0:  # the first one did arrive
-                    bad = u >= told[LOSS_ENDS] if bad else u < told[LOSS_BEGINS]
-                    told[link + BAD] = 1.0 if bad else 0.0
+            while told[link + LINK.NEXT_SENT] + told[CHANNEL.DELAY] <= time + _ON_GRID:
+                u, bad = chance(told[CHANNEL.KEY], i * N + j, told[link + LINK.NUMBER]), told[link + LINK.BAD] == 1.0
+                if told[link + LINK.NUMBER] > 0.0:  # the first one did arrive
+                    bad = u >= told[CHANNEL.LOSS_ENDS] if bad else u < told[CHANNEL.LOSS_BEGINS]
+                    told[link + LINK.BAD] = 1.0 if bad else 0.0
                 if not bad:
-                    _take(told, link, j, told[link + NEXT_SENT], N)
-                told[link + NUMBER] += 1.0
-                told[link + NEXT_SENT] += told[PERIOD]
-            if told[link + SEEN_FROM] <= time:
+                    _take(told, link, j, told[link + LINK.NEXT_SENT], N)
+                told[link + LINK.NUMBER] += 1.0
+                told[link + LINK.NEXT_SENT] += told[CHANNEL.PERIOD]
+            if told[link + LINK.SEEN_FROM] <= time:
                 _take(told, link, j, time, N)
 
 
@@ -237,16 +253,16 @@ def _take(told: Floats, link: int, sender: int, sent_s: float, N: int) -> None:
     """A message that was sent at ``sent_s`` arrives: the sender's newest sample of then."""
     width, first = RING_HEAD + 3 * N, ring_at(N)
     length = (told.shape[0] - first) // width
-    taken = int(told[TAKEN])
+    taken = int(told[CHANNEL.TAKEN])
     for back in range(min(length, taken)):
         at = first + width * ((taken - 1 - back) % length)
         if told[at] <= sent_s + _ON_GRID:
-            if told[at] >= told[link + TOLD_S]:
-                told[link + TOLD_S] = told[at]
-                told[link + TOLD_HIT] = told[at + 1]
-                told[link + TOLD_PLACE] = told[at + RING_HEAD + sender]
-                told[link + TOLD_SPEED] = told[at + RING_HEAD + N + sender]
-                told[link + TOLD_COMMAND] = told[at + RING_HEAD + 2 * N + sender]
+            if told[at] >= told[link + LINK.TOLD_S]:
+                told[link + LINK.TOLD_S] = told[at]
+                told[link + LINK.TOLD_HIT] = told[at + 1]
+                told[link + LINK.TOLD_PLACE] = told[at + RING_HEAD + sender]
+                told[link + LINK.TOLD_SPEED] = told[at + RING_HEAD + N + sender]
+                told[link + LINK.TOLD_COMMAND] = told[at + RING_HEAD + 2 * N + sender]
             return
 
 
@@ -266,7 +282,7 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
     place, fresh = np.empty(N), np.empty(N, np.bool_)
     out[:] = state
     for k in range(state.shape[0]):
-        if params[k, head + PERIOD] == 0.0:
+        if params[k, head + CHANNEL.PERIOD] == 0.0:
             continue
         told, time = params[k, head:], state[k, TIME]
         place[observer], fresh[observer] = told[place_at(N) + observer], True
@@ -275,14 +291,14 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
             j = observer + way
             while 0 <= j < N:
                 link = link_at(observer, j, N)
-                known = time >= params[k, params_at(6, N) + observer * N + j] and told[link + TOLD_S] >= 0.0
-                fresh[j] = known and told[link + TOLD_S] >= time
+                known = time >= params[k, params_at(6, N) + observer * N + j] and told[link + LINK.TOLD_S] >= 0.0
+                fresh[j] = known and told[link + LINK.TOLD_S] >= time
                 out[k, speed + j], out[k, command + j], place[j] = 0.0, 0.0, last
                 if known:
-                    limit, age = params[k, params_at(4, N) + j], time - told[link + TOLD_S]
-                    after, passed = moved_on(told[link + TOLD_SPEED], told[link + TOLD_COMMAND], limit, age)
-                    out[k, speed + j], out[k, command + j] = after, told[link + TOLD_COMMAND]
-                    place[j] = told[link + TOLD_PLACE] + passed
+                    limit, age = params[k, params_at(4, N) + j], time - told[link + LINK.TOLD_S]
+                    after, passed = moved_on(told[link + LINK.TOLD_SPEED], told[link + LINK.TOLD_COMMAND], limit, age)
+                    out[k, speed + j], out[k, command + j] = after, told[link + LINK.TOLD_COMMAND]
+                    place[j] = told[link + LINK.TOLD_PLACE] + passed
                     last = place[j]
                 j += way
         for p in range(N - 1):
@@ -291,8 +307,8 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
             if p != observer and p + 1 != observer:
                 out[k, gap + N - 1 + p] = 0.0
         if observer > 0 and state.shape[1] > state_width(N):
-            out[k, state_width(N)] = max(told[OBSTACLE_PLACE] - place[0], 0.0)
-            out[k, state_width(N) + 1] = told[link_at(observer, 0, N) + TOLD_HIT]
+            out[k, state_width(N)] = max(told[CHANNEL.OBSTACLE_PLACE] - place[0], 0.0)
+            out[k, state_width(N) + 1] = told[link_at(observer, 0, N) + LINK.TOLD_HIT]
 
 
 @compiled
@@ -310,14 +326,14 @@ def is_periodic(worlds: Worlds) -> Bools:
     """In which worlds messages go on after the first one, so that what is known grows old, [n]."""
     if worlds.messages.shape[1] == 0:
         return np.zeros(worlds.n, np.bool_)
-    periodic: Bools = worlds.messages[:, PERIOD] > 0.0
+    periodic: Bools = worlds.messages[:, CHANNEL.PERIOD] > 0.0
     return periodic
 
 
 def links_of(worlds: Worlds) -> Floats:
     """The columns of every link, [n, N, N, LINK], of worlds with columns of messages."""
     n, N = worlds.speeds_mps.shape
-    return worlds.messages[:, link_at(0, 0, N) : ring_at(N)].reshape(n, N, N, LINK)
+    return worlds.messages[:, link_at(0, 0, N) : ring_at(N)].reshape(n, N, N, LINK.WIDTH)
 
 
 def age_s(worlds: Worlds) -> Floats:
@@ -334,8 +350,8 @@ def age_by_rows(time_s: Floats, messages: Floats, vehicles: int) -> Floats:
     age = np.zeros((len(time_s), vehicles, vehicles))
     if messages.shape[1] == 0:
         return age
-    links = messages[:, link_at(0, 0, vehicles) : ring_at(vehicles)].reshape(-1, vehicles, vehicles, LINK)
-    periodic, told_s = messages[:, PERIOD] > 0.0, links[..., TOLD_S]
+    links = messages[:, link_at(0, 0, vehicles) : ring_at(vehicles)].reshape(-1, vehicles, vehicles, LINK.WIDTH)
+    periodic, told_s = messages[:, CHANNEL.PERIOD] > 0.0, links[..., LINK.TOLD_S]
     age[periodic] = np.where(told_s >= 0.0, time_s[:, np.newaxis, np.newaxis] - told_s, np.inf)[periodic]
     age[:, np.arange(vehicles), np.arange(vehicles)] = 0.0
     return age

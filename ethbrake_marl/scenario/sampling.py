@@ -12,8 +12,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.physics.advance import advance
-from ethbrake_marl.physics.episode import first_decision_s
-from ethbrake_marl.physics.kernel import stopping_distances
+from ethbrake_marl.physics.kernel import first_decision_s, stopping_distances
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, make_worlds
 from ethbrake_marl.scenario.lines import ScenarioFields, constant_command
 from ethbrake_marl.scenario.quantities import (

@@ -32,21 +32,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics.messages import (
-    DELAY,
-    KEY,
-    LINK,
-    LOSS_BEGINS,
-    LOSS_ENDS,
-    NEXT_SENT,
-    PERIOD,
-    SEEN_FROM,
-    TOLD_S,
-    link_at,
-    message_columns,
-    ring_at,
-    ring_length,
-)
+from ethbrake_marl.physics.messages import CHANNEL, LINK, link_at, message_columns, ring_at, ring_length
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds
 
 PER_LINK = 4  # uniform numbers of one link: wait, burst, loss, hop; one Philox counter
@@ -322,13 +308,13 @@ def with_channel(v2x: V2X, worlds: Worlds, u: Floats, key: Floats, time_step_s: 
     heard, seen = heard_and_seen(v2x, worlds.vehicles, u)
     itself = np.eye(N, dtype=np.bool_)
     columns = np.zeros((n, message_columns(N, channel.samples(time_step_s))))
-    columns[:, PERIOD], columns[:, DELAY] = channel.message_period_s, channel.delay_s
-    columns[:, LOSS_BEGINS], columns[:, LOSS_ENDS] = channel.loss_begins, channel.loss_ends
-    columns[:, KEY] = key * 2.0**53
-    links = columns[:, link_at(0, 0, N) : ring_at(N)].reshape(n, N, N, LINK)
-    links[..., NEXT_SENT] = np.where(itself, np.inf, heard - channel.delay_s)
-    links[..., SEEN_FROM] = np.where(itself, np.inf, seen)
-    links[..., TOLD_S] = -1.0
+    columns[:, CHANNEL.PERIOD], columns[:, CHANNEL.DELAY] = channel.message_period_s, channel.delay_s
+    columns[:, CHANNEL.LOSS_BEGINS], columns[:, CHANNEL.LOSS_ENDS] = channel.loss_begins, channel.loss_ends
+    columns[:, CHANNEL.KEY] = key * 2.0**53
+    links = columns[:, link_at(0, 0, N) : ring_at(N)].reshape(n, N, N, LINK.WIDTH)
+    links[..., LINK.NEXT_SENT] = np.where(itself, np.inf, heard - channel.delay_s)
+    links[..., LINK.SEEN_FROM] = np.where(itself, np.inf, seen)
+    links[..., LINK.TOLD_S] = -1.0
     return replace(worlds, messages=columns)
 
 

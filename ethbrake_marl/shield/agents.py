@@ -17,8 +17,8 @@ from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.worlds import vehicles_at_once
 from ethbrake_marl.scenario import Scenario, Task
+from ethbrake_marl.shield.enclosure import CORNERS, checked_robust
 from ethbrake_marl.shield.guard import BelievedGuard, Bound, HybridAgent, ShieldOptions, StepGuard
-from ethbrake_marl.shield.interior import CORNERS, checked_robust
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import check_scenario, mode_uncertainty
 

@@ -24,9 +24,9 @@ from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.profiles import state_columns, worlds_at
+from ethbrake_marl.search import state_columns, worlds_at
 from ethbrake_marl.shield.certify import Decision, Proposer
-from ethbrake_marl.shield.interior import CORNERS, INTERIOR, checked_robust
+from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.shield.step_shield import Held, StepShield, held_in, hold_better
 from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty
 

@@ -50,17 +50,9 @@ from ethbrake_marl.errors import InvalidInput, PhysicsError, renumbered
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.advance import Packed, command_at, gap_at, has_obstacle, speed_at, state_width, vehicles_in
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.episode import (
-    EPISODE_ROWS,
-    HARM_IS_TOTAL,
-    START,
-    TIME_STEP,
-    at_rest,
-    decision_at,
-    decision_s,
-)
+from ethbrake_marl.physics.kernel import CLOCK, ROW, at_rest, decision_at, decision_s
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.profiles import ProfileProblem, worlds_at
+from ethbrake_marl.search import ProfileProblem, worlds_at
 from ethbrake_marl.shield.certify_kernel import (
     ENDED,
     NO_CERTIFICATE,
@@ -120,7 +112,7 @@ class Running(NamedTuple):
     def time_s(self) -> Floats:
         """Time of the decision in the nominal member, [n] s."""
         clock = self.problem.clock[:: self.members]
-        return decision_s(clock[:, START], clock[:, TIME_STEP], self.steps)
+        return decision_s(clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP], self.steps)
 
     def rows_of(self, worlds: Ints) -> Ints:
         """The rows of the members of some worlds."""
@@ -332,7 +324,7 @@ def rests_after_plans(
 ) -> None:  # fmt: skip
     """Fill ``rests`` [n]: under the plan every member of the world comes to rest before the horizon, and stays so."""
     N, n = mass.shape[1], steps.shape[0]
-    table, critical = np.zeros((EPISODE_ROWS, N)), np.zeros(1, np.int64)
+    table, critical = np.zeros((ROW.OF_EPISODE, N)), np.zeros(1, np.int64)
     M = states.shape[0] // max(n, 1)
     lines = np.empty((states.shape[0], rows_of(caps), N))
     gather(lines, 0, command, latency, mass, limit, caps)
@@ -377,7 +369,7 @@ def borne_under_plans(
 ) -> None:  # fmt: skip
     """Fill ``borne`` [n * M, N]."""
     N, n = mass.shape[1], steps.shape[0]
-    table, critical = np.zeros((EPISODE_ROWS, N)), np.zeros(1, np.int64)
+    table, critical = np.zeros((ROW.OF_EPISODE, N)), np.zeros(1, np.int64)
     M = states.shape[0] // max(n, 1)
     lines = np.empty((states.shape[0], rows_of(caps), N))
     gather(lines, 0, command, latency, mass, limit, caps)
@@ -386,7 +378,7 @@ def borne_under_plans(
         for m in range(k * M, k * M + M):
             follow_plan(world, m, states[m], ended[m], steps[k], plans[k], math.inf)
             for i in range(N):
-                borne[m, i] = borne_by(table, clock[m, HARM_IS_TOTAL], i)
+                borne[m, i] = borne_by(table, clock[m, CLOCK.HARM_IS_TOTAL], i)
 
 
 # The log of a step shield: every decision in which something else than the proposal was applied.
@@ -551,7 +543,7 @@ def _apart(policies: Mapping[int, Agent], rows: Ints, n: int) -> tuple[dict[int,
 def harm_so_far(running: Running) -> Floats:
     """Harm of the episodes up to now under the count that is guaranteed, [n] m2/s2."""
     pairs = (running.states.shape[1] - 1) // 5  # the width is N + 4 (N - 1)
-    group = 1 if running.problem.clock[0, HARM_IS_TOTAL] == 1.0 else 0
+    group = 1 if running.problem.clock[0, CLOCK.HARM_IS_TOTAL] == 1.0 else 0
     last = running.states.shape[1] - (1 - group) * pairs
     harm: Floats = running.states[:, last - pairs : last].sum(axis=1)
     return harm
@@ -582,7 +574,7 @@ class _Recorder(AgentAround):
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The policy's action, rounded as it is written."""
         action = _or_braking(proposed_action(self.policy, worlds, vehicle))
-        step = decision_at(worlds.time_s, self._clock[:, START], self._clock[:, TIME_STEP])
+        step = decision_at(worlds.time_s, self._clock[:, CLOCK.START], self._clock[:, CLOCK.TIME_STEP])
         rows = np.flatnonzero((step >= 0) & (step < self.actions.shape[1]))
         self.actions[rows, step[rows]] = action[rows]
         return action_to_command(action, worlds.vehicles, vehicle)

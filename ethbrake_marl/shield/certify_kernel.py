@@ -18,22 +18,7 @@ from ethbrake_marl.actions import command_of
 from ethbrake_marl.harm import front_share
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.physics.compiled import compiled, compiled_apart
-from ethbrake_marl.physics.episode import (
-    EPISODE_ROWS,
-    GOES_ON,
-    HARM_IS_TOTAL,
-    LAST_STEP,
-    LATENCY,
-    RESTITUTION,
-    SUM_FIRST_HARM,
-    SUM_TOTAL_HARM,
-    grid_of,
-    harm_so_far,
-    restore,
-    save,
-    step_again,
-)
-from ethbrake_marl.physics.kernel import COMMAND, LIMIT, MASS
+from ethbrake_marl.physics.kernel import CLOCK, GOES_ON, ROW, grid_of, harm_so_far, restore, save, step_again
 
 # The members of a world, advanced decision by decision under the actions of the vehicles that are shielded.
 #
@@ -81,8 +66,8 @@ def enter(world: Members, m: int, state: Floats) -> None:
     """Member ``m`` in a saved state."""
     table, lines = world.table, world.lines
     for i in range(table.shape[1]):
-        table[COMMAND, i], table[LATENCY, i] = lines[m, OF_COMMAND, i], lines[m, OF_LATENCY, i]
-        table[MASS, i], table[LIMIT, i] = lines[m, OF_MASS, i], lines[m, OF_LIMIT, i]
+        table[ROW.COMMAND, i], table[ROW.LATENCY, i] = lines[m, OF_COMMAND, i], lines[m, OF_LATENCY, i]
+        table[ROW.MASS, i], table[ROW.LIMIT, i] = lines[m, OF_MASS, i], lines[m, OF_LIMIT, i]
     restore(table, state)
 
 
@@ -91,7 +76,7 @@ def act(world: Members, m: int, action: Floats) -> None:
     """The shielded vehicles' commands of an action [K], in member ``m``."""
     for c in range(world.vehicles.shape[0]):
         braking, driving = -world.bounds[m, c, 0], world.bounds[m, c, 1]
-        world.table[COMMAND, world.vehicles[c]] = command_of(action[c], braking, driving)
+        world.table[ROW.COMMAND, world.vehicles[c]] = command_of(action[c], braking, driving)
 
 
 @compiled_apart
@@ -100,7 +85,7 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
     enter(world, m, state)
     act(world, m, action)
     outcome = step_again(
-        world.table, world.clock[m, RESTITUTION], grid_of(world.clock[m]), step, step + 1, world.table[:0]
+        world.table, world.clock[m, CLOCK.RESTITUTION], grid_of(world.clock[m]), step, step + 1, world.table[:0]
     )
     save(world.table, after)
     return outcome
@@ -132,14 +117,14 @@ def borne_by(table: Floats, total: float, i: int) -> float:
 
     An obstacle ahead, the vehicle 0 of infinite mass, bears none; who hits it bears it all.
     """
-    row, value = SUM_TOTAL_HARM if total == 1.0 else SUM_FIRST_HARM, 0.0
-    if table[MASS, i] == math.inf:
+    row, value = ROW.SUM_TOTAL_HARM if total == 1.0 else ROW.SUM_FIRST_HARM, 0.0
+    if table[ROW.MASS, i] == math.inf:
         return value
-    behind_obstacle = i > 0 and table[MASS, i - 1] == math.inf
+    behind_obstacle = i > 0 and table[ROW.MASS, i - 1] == math.inf
     if i > 0 and not behind_obstacle:
-        value += table[row, i - 1] - front_share(table[row, i - 1], table[MASS, i - 1], table[MASS, i])
+        value += table[row, i - 1] - front_share(table[row, i - 1], table[ROW.MASS, i - 1], table[ROW.MASS, i])
     if i < table.shape[1] - 1:
-        value += front_share(table[row, i], table[MASS, i], table[MASS, i + 1])
+        value += front_share(table[row, i], table[ROW.MASS, i], table[ROW.MASS, i + 1])
     return value + table[row, 0] if behind_obstacle else value
 
 
@@ -148,7 +133,7 @@ def within_caps(world: Members, m: int) -> bool:
     """Whether no vehicle of member ``m``, as it is in the table, has borne more than it may."""
     if world.lines.shape[1] > OF_CAP:
         for i in range(world.lines.shape[2]):
-            if borne_by(world.table, world.clock[m, HARM_IS_TOTAL], i) > world.lines[m, OF_CAP, i]:
+            if borne_by(world.table, world.clock[m, CLOCK.HARM_IS_TOTAL], i) > world.lines[m, OF_CAP, i]:
                 return False
     return True
 
@@ -159,7 +144,7 @@ def worst_so_far(world: Members, states: Floats) -> float:
     worst = 0.0
     for m in range(states.shape[0]):
         enter(world, m, states[m])
-        worst = max(worst, harm_so_far(world.table, world.clock[m, HARM_IS_TOTAL]))
+        worst = max(worst, harm_so_far(world.table, world.clock[m, CLOCK.HARM_IS_TOTAL]))
         if not within_caps(world, m):
             return math.inf
     return worst
@@ -172,14 +157,14 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
     Gives up with infinity as soon as it is above ``most`` (harm never falls), where a vehicle bears more than it may,
     or where the physics fails.
     """
-    table, no_rows, total = world.table, world.table[:0], world.clock[m, HARM_IS_TOTAL]
-    restitution, grid = world.clock[m, RESTITUTION], grid_of(world.clock[m])
+    table, no_rows, total = world.table, world.table[:0], world.clock[m, CLOCK.HARM_IS_TOTAL]
+    restitution, grid = world.clock[m, CLOCK.RESTITUTION], grid_of(world.clock[m])
     vehicles, bounds = world.vehicles, world.bounds
     enter(world, m, state)
     goes_on, value = not ended, harm_so_far(table, total)
     while goes_on:
         for c in range(vehicles.shape[0]):
-            table[COMMAND, vehicles[c]] = command_of(plan[step, c], -bounds[m, c, 0], bounds[m, c, 1])
+            table[ROW.COMMAND, vehicles[c]] = command_of(plan[step, c], -bounds[m, c, 0], bounds[m, c, 1])
         outcome = step_again(table, restitution, grid, step, step + 1, no_rows)
         value = harm_so_far(table, total)
         if outcome < GOES_ON or value > most:
@@ -208,12 +193,12 @@ def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int,
     table, clock, vehicles, bounds = world.table, world.clock[m], world.vehicles, world.bounds
     enter(world, m, state)
     for i in range(vehicles.shape[0]):
-        table[COMMAND, vehicles[i]] = command_of(constants[c, i], -bounds[m, i, 0], bounds[m, i, 1])
+        table[ROW.COMMAND, vehicles[i]] = command_of(constants[c, i], -bounds[m, i, 0], bounds[m, i, 1])
     if not ended:
-        last, grid = int(clock[LAST_STEP]), grid_of(clock)
-        if step_again(table, clock[RESTITUTION], grid, step, last, table[:0]) < GOES_ON:
+        last, grid = int(clock[CLOCK.LAST_STEP]), grid_of(clock)
+        if step_again(table, clock[CLOCK.RESTITUTION], grid, step, last, table[:0]) < GOES_ON:
             return math.inf
-    return harm_so_far(table, clock[HARM_IS_TOTAL])
+    return harm_so_far(table, clock[CLOCK.HARM_IS_TOTAL])
 
 
 # reasons of a decision, in the order of REASONS of shield.certify
@@ -387,7 +372,7 @@ def certify_worlds(
     World k's members are the rows from k * M on, M of them.
     """
     N, n = mass.shape[1], steps.shape[0]
-    table, critical = np.zeros((EPISODE_ROWS, N)), np.zeros(1, np.int64)
+    table, critical = np.zeros((ROW.OF_EPISODE, N)), np.zeros(1, np.int64)
     room, tried = np.zeros((2, plans.shape[1], plans.shape[2])), np.zeros((2, plans.shape[2]))
     M = states.shape[0] // max(n, 1)
     lines = np.empty((M, rows_of(caps), N))
@@ -421,7 +406,7 @@ def harm_of_plans(
     Where one of the ``constants`` is better, it replaces the plan (in place) first.
     """
     N, n = mass.shape[1], steps.shape[0]
-    table, critical = np.zeros((EPISODE_ROWS, N)), np.zeros(1, np.int64)
+    table, critical = np.zeros((ROW.OF_EPISODE, N)), np.zeros(1, np.int64)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
     M = states.shape[0] // max(n, 1)
     lines = np.empty((M, rows_of(caps), N))

@@ -1,68 +1,723 @@
-"""An upper bound on the first-impact harm of a plan over a whole box of worlds.
+"""Motion of a whole box of worlds through one piece of time: each vehicle on its own, and pairs that stay in contact.
 
-Every way in which impacts may follow each other in the box is a path. In each piece of time a path goes on without an
-impact, and another one branches off for each pair that may have one then. The harm of a path that has ended is a form;
-the bound is the largest value of any. Lines of at most three vehicles: once two pairs were hit, harm is final.
+A *cell* is a box of worlds whose uncertain numbers are affine forms (``shield.forms``). A *path* is one way in which
+impacts may follow each other in it: speeds and gaps of all worlds of the cell that go this way, as forms. Time runs in
+*pieces*, between two neighbouring decisions or onsets, in which every command is constant.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.engine.stream import Script
+from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.compiled import compiled_apart
-from ethbrake_marl.physics.kernel import PLASTIC_SPEED_MPS, TOUCH_SPEED_MPS
-from ethbrake_marl.shield.enclosure_motion import (
-    CLOSING,
-    FREE,
-    HARDEST,
-    MAY_STOP,
-    MOVES,
-    OPENING,
-    PARTS,
-    REACH,
-    ROUNDING,
-    SINCE,
-    SOFTEST,
-    SPREAD,
-    STANDS,
-    TOUCH_WIDTH,
-    TOUCHES,
-    WIDE,
-    Cell,
-    Motion,
-    Path,
-    add,
-    apart,
-    begin_touch,
-    between,
-    blur,
-    common,
-    creep,
-    cut,
-    difference,
-    driven,
-    embrace,
-    high,
-    is_blurred,
-    low,
-    move_alone,
-    move_together,
-    negative,
-    own_pulls,
-    positive_part,
-    pressing_together,
-    product,
-    radius,
-    reciprocal,
-    rough_harm,
-    square,
-    square_root,
-    stray,
-)
+from ethbrake_marl.physics.kernel import PLASTIC_SPEED_MPS, TOUCH_SPEED_MPS, obstacle_ahead
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.shield.certify import Backup, Decision, Running, as_predicted, certify, put
+from ethbrake_marl.shield.certify_kernel import NO_CERTIFICATE
+
+# Affine forms: numbers that depend on where in a box a world lies, with a bound on what is not linear in it.
+#
+# A form [W] of a box with K uncertain numbers, W = K + 2, stands for ``c + g_1 e_1 + ... + g_K e_K + r e``: the centre,
+# one slope for each uncertain number, and a remainder. ``e_k`` in [-1, 1] says where in the box the world lies, the
+# same
+# in every form; ``e`` in [-1, 1] is any, another one in every form. What two forms share in ``e_k`` cancels when they
+# are
+# subtracted, which plain intervals cannot do.
+#
+# Each operation encloses: for every world of the box there are values of ``e`` for which the result stands for what the
+# operation makes of the operands. Rounding is not part of an operation; ``shield.enclosure`` adds it (``ROUNDING``).
+
+
+@compiled_apart
+def radius(x: Floats) -> float:
+    """Largest distance from the centre."""
+    whole: float = x[-1]
+    for k in range(1, x.shape[0] - 1):
+        whole += abs(x[k])
+    return whole
+
+
+@compiled_apart
+def low(x: Floats) -> float:
+    """Least value."""
+    least: float = x[0] - radius(x)
+    return least
+
+
+@compiled_apart
+def high(x: Floats) -> float:
+    """Largest value."""
+    most: float = x[0] + radius(x)
+    return most
+
+
+@compiled_apart
+def add(out: Floats, share: float, x: Floats) -> None:
+    """``out += share * x``; exact but for rounding."""
+    for k in range(x.shape[0] - 1):
+        out[k] += share * x[k]
+    out[-1] += abs(share) * x[-1]
+
+
+@compiled_apart
+def difference(x: Floats, y: Floats) -> Floats:
+    """``x - y``."""
+    out = x.copy()
+    add(out, -1.0, y)
+    return out
+
+
+@compiled_apart
+def negative(x: Floats) -> Floats:
+    """``-x``."""
+    return linear(x, -1.0, 0.0, 0.0)
+
+
+@compiled_apart
+def between(least: float, most: float, width: int) -> Floats:
+    """The form [width] of any number in an interval."""
+    out = np.zeros(width)
+    out[0], out[-1] = 0.5 * (least + most), 0.5 * (most - least)
+    return out
+
+
+@compiled_apart
+def product(x: Floats, y: Floats) -> Floats:
+    """``x * y``: what is of second order goes to the remainder."""
+    out = np.empty_like(x)
+    for k in range(x.shape[0] - 1):
+        out[k] = x[0] * y[k] + y[0] * x[k]
+    out[0] = x[0] * y[0]
+    out[-1] = abs(x[0]) * y[-1] + abs(y[0]) * x[-1] + radius(x) * radius(y)
+    return out
+
+
+@compiled_apart
+def square(x: Floats) -> Floats:
+    """``x * x``: its part of second order is at least 0, which halves the remainder."""
+    out = np.empty_like(x)
+    for k in range(x.shape[0] - 1):
+        out[k] = 2.0 * x[0] * x[k]
+    half = 0.5 * radius(x) * radius(x)
+    out[0] = x[0] * x[0] + half
+    out[-1] = 2.0 * abs(x[0]) * x[-1] + half
+    return out
+
+
+@compiled_apart
+def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
+    """``start + slope * x``, and an error of at most ``error`` on either side."""
+    out = np.empty_like(x)
+    for k in range(x.shape[0] - 1):
+        out[k] = slope * x[k]
+    out[0] += start
+    out[-1] = abs(slope) * x[-1] + error
+    return out
+
+
+@compiled_apart
+def square_root(x: Floats) -> Floats:
+    """Square root wherever ``x >= 0``; nothing is said where it is below. ``high(x) >= 0``.
+
+    On [a, b] the root lies between its chord, of slope 1 / (sqrt a + sqrt b), and the parallel tangent.
+    """
+    least, most = math.sqrt(max(low(x), 0.0)), math.sqrt(high(x))
+    if most <= 0.0:
+        return np.zeros_like(x)
+    slope = 1.0 / (least + most)
+    start = least - slope * least * least
+    error = 0.5 * (0.25 / slope - start)
+    return linear(x, slope, start + error, error)
+
+
+@compiled_apart
+def reciprocal(x: Floats) -> Floats:
+    """``1 / x`` for ``low(x) > 0``: between the chord, of slope -1 / (a b), and the parallel tangent."""
+    least, most = low(x), high(x)
+    slope = -1.0 / (least * most)
+    chord = 1.0 / least + 1.0 / most
+    error = 0.5 * (chord - 2.0 / math.sqrt(least * most))
+    return linear(x, slope, chord - error, error)
+
+
+@compiled_apart
+def positive_part(x: Floats) -> Floats:
+    """``max(x, 0)``: between its chord and the parallel line through 0."""
+    least, most = low(x), high(x)
+    if least >= 0.0:
+        return x.copy()
+    if most <= 0.0:
+        return np.zeros_like(x)
+    slope = most / (most - least)
+    error = -0.5 * slope * least
+    return linear(x, slope, error, error)
+
+
+@compiled_apart
+def cut(x: Floats, least: float, most: float) -> Floats:
+    """A form of the same number, known to lie in an interval: that interval where it says more than the form."""
+    inside_low, inside_high = max(low(x), least), min(high(x), most)
+    if inside_high - inside_low < radius(x):
+        return between(min(inside_low, inside_high), max(inside_low, inside_high), x.shape[0])
+    return x
+
+
+MOVES, MAY_STOP, STANDS = 0, 1, 2  # in this piece of time
+FREE, TOUCHES, PARTS = 0, 1, 2  # what a pair does; the last: it was in contact when this piece of time began
+ROUNDING = 1e-12  # of a number and of 1: added to the remainders in each piece of time, far above the engine's own
+# columns of Path.touch, of a pair in contact: by how much it opens and closes at most (m/s), its largest gap (m), least
+# and largest pressing acceleration (m/s2) since it is pressed together, and the time since then (s); the largest speed
+# of the rear one in the worlds that creep (m/s, 0: none do); in this piece the largest difference of speeds, and gap
+OPENING, CLOSING, WIDE, SOFTEST, HARDEST, SINCE, CREEP, SPREAD, REACH = range(9)
+TOUCH_WIDTH = 9
+
+
+class Cell(NamedTuple):
+    """A box of worlds of one line, what is commanded in it, and the pieces of time."""
+
+    speed: Floats  # [N, W] at the first piece
+    gap: Floats  # [P, W]
+    brake: Floats  # [N, W] capacities
+    drive: Floats  # [W] of the shielded vehicle
+    share: Floats  # [P, 2, W] of a pair's change of relative speed that is the front's, and the rear's; together 1
+    onset: Floats  # [N, W] of the other vehicles' commands, s after the first decision
+    constant: Floats  # [N] command of each other vehicle; NaN: full braking
+    limit: Floats  # [N] speed limits
+    vehicle: int
+    restitution: float
+    times: Floats  # [J + 1] s after the first decision
+    action: Floats  # [J] of the shielded vehicle
+
+
+class Path(NamedTuple):
+    """Worlds of a cell that have gone one way so far."""
+
+    forms: Floats  # [N + P + 1, W] speeds, gaps, harm so far
+    # [P, TOUCH_WIDTH] of pairs in contact, else meaningless. Their two speeds are that of their common centre of mass,
+    # from which their neighbours' gaps are counted
+    touch: Floats
+    marks: Ints  # [2 P + 1] 1 where the pair had an impact; FREE, TOUCHES or PARTS; number of the piece of time
+
+
+class Motion(NamedTuple):
+    """Each vehicle on its own through one piece of time: filled by ``move_alone``."""
+
+    pull: Floats  # [N, W] acceleration of its command
+    onward: Floats  # [N, W] speed at the end if nothing but the command acted, not even standstill
+    reach: Floats  # [N, W] way likewise
+    speed: Floats  # [N, W] speed at the end
+    way: Floats  # [N, W]
+    rest: Ints  # [N] MOVES, MAY_STOP or STANDS
+    vague: Floats  # [N] by how much its acceleration may differ from ``pull`` within the piece
+
+
+@compiled_apart
+def new_motion(N: int, width: int) -> Motion:
+    """Room for ``move_alone``."""
+    return Motion(
+        np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)),
+        np.zeros(N, np.int64), np.zeros(N),
+    )  # fmt: skip
+
+
+@compiled_apart
+def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
+    """Every vehicle through one piece of time under its command, as if it were alone."""
+    for i in range(cell.speed.shape[0]):
+        command(cell, i, piece, motion)
+    for i in range(cell.speed.shape[0]):
+        speed, length = path.forms[i], cell.times[piece + 1] - cell.times[piece]
+        drift(cell, speed, i, piece, motion)
+        if high(motion.pull[i]) + motion.vague[i] > 0.0:
+            fastest = high(speed) + length * high(motion.pull[i]) + beside(cell, path, motion, i, length)
+            if fastest > cell.limit[i]:
+                stop_driving(i, length, motion)
+        motion.onward[i, -1] += ROUNDING * (1.0 + abs(motion.onward[i, 0]))
+        motion.reach[i, -1] += ROUNDING * (1.0 + abs(motion.reach[i, 0]))
+        motion.speed[i], motion.way[i] = motion.onward[i], motion.reach[i]
+        if _stands(speed) and high(motion.pull[i]) + motion.vague[i] <= 0.0:
+            motion.rest[i] = STANDS
+            motion.speed[i], motion.way[i] = 0.0, 0.0
+        elif low(motion.onward[i]) < 0.0 and low(motion.pull[i]) - motion.vague[i] < 0.0:
+            stop(speed, i, length, motion)
+
+
+@compiled_apart
+def beside(cell: Cell, path: Path, motion: Motion, i: int, length: float) -> float:
+    """By how much a vehicle in contact with another one may be faster than its form within the piece."""
+    P, most = cell.gap.shape[0], 0.0
+    for p in range(max(i - 1, 0), min(i + 1, P)):
+        if path.marks[P + p] == TOUCHES:
+            touch = path.touch[p]
+            most += max(touch[OPENING], touch[CLOSING], 0.0) + 5.0 * touch[CREEP]
+            for k in range(p, p + 2):
+                most += length * (abs(motion.pull[k, 0]) + radius(motion.pull[k]) + motion.vague[k])
+    return most
+
+
+@compiled_apart
+def stop_driving(i: int, length: float, motion: Motion) -> None:
+    """The speed limit may end a vehicle's drive anywhere within the piece: it gives any part of it then."""
+    drive = high(motion.pull[i]) + motion.vague[i]
+    motion.onward[i] = between_shifted(motion.onward[i], -length * drive)
+    motion.reach[i] = between_shifted(motion.reach[i], -0.5 * length * length * drive)
+    motion.vague[i] = 0.5 * drive
+    motion.pull[i] = between(0.5 * drive, 0.5 * drive, motion.pull.shape[1])
+
+
+@compiled_apart
+def between_shifted(x: Floats, shift: float) -> Floats:
+    """A number between what ``x`` stands for and that plus ``shift``."""
+    out = x.copy()
+    add(out, 1.0, between(min(shift, 0.0), max(shift, 0.0), x.shape[0]))
+    return out
+
+
+@compiled_apart
+def _stands(speed: Floats) -> bool:
+    return speed[0] == 0.0 and radius(speed) == 0.0
+
+
+@compiled_apart
+def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
+    """``pull`` of vehicle ``i``, 0 before its latency has elapsed."""
+    pull = motion.pull[i]
+    pull[:] = 0.0
+    motion.rest[i], motion.vague[i] = MOVES, 0.0
+    if i == cell.vehicle:
+        action = cell.action[piece]
+        if action < 0.0:
+            add(pull, action, cell.brake[i])
+        elif action > 0.0:
+            add(pull, action, cell.drive)
+    elif high(cell.onset[i]) <= cell.times[piece] or low(cell.onset[i]) < cell.times[piece + 1]:
+        if math.isnan(cell.constant[i]):
+            add(pull, -1.0, cell.brake[i])
+        else:
+            pull[0] = cell.constant[i]
+
+
+@compiled_apart
+def drift(cell: Cell, speed: Floats, i: int, piece: int, motion: Motion) -> None:
+    """``onward`` and ``reach`` of vehicle ``i``."""
+    onward, reach, pull = motion.onward[i], motion.reach[i], motion.pull[i]
+    length = cell.times[piece + 1] - cell.times[piece]
+    onward[:], reach[:] = speed, 0.0
+    add(reach, length, speed)
+    if i != cell.vehicle and high(cell.onset[i]) > cell.times[piece]:
+        begin_later(cell, i, piece, motion)
+    else:
+        add(onward, length, pull)
+        add(reach, 0.5 * length * length, pull)
+
+
+@compiled_apart
+def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
+    """``onward`` and ``reach`` of a vehicle whose command begins somewhere within this piece, or after it."""
+    pull = motion.pull[i]
+    if pull[0] == 0.0 and radius(pull) == 0.0:
+        return
+    acting = cut(
+        difference(_since(cell, i, cell.times[piece + 1]), _since(cell, i, cell.times[piece])),
+        0.0,
+        cell.times[piece + 1] - cell.times[piece],
+    )
+    add(motion.onward[i], 1.0, product(pull, acting))
+    add(motion.reach[i], 0.5, product(pull, square(acting)))
+    least, most = min(low(pull), 0.0), max(high(pull), 0.0)
+    motion.vague[i] = 0.5 * (most - least)
+    pull[:] = between(0.5 * (least + most), 0.5 * (least + most), pull.shape[0])
+
+
+@compiled_apart
+def _since(cell: Cell, i: int, time: float) -> Floats:
+    """How long a command has acted at a time, s."""
+    since = negative(cell.onset[i])
+    since[0] += time
+    return positive_part(since)
+
+
+@compiled_apart
+def stop(speed: Floats, i: int, length: float, motion: Motion) -> None:
+    """A braking vehicle that stops in this piece, or may: it stands from then on."""
+    pull, vague, width = motion.pull[i], motion.vague[i], speed.shape[0]
+    beyond = negative(motion.onward[i])
+    least, most = max(low(beyond), 0.0), max(high(beyond), 0.0)
+    motion.rest[i] = MAY_STOP
+    motion.speed[i] = positive_part(motion.onward[i])
+    if vague > 0.0 or not high(pull) < 0.0:
+        fastest = max(high(speed), 0.0) + max(high(pull) + vague, 0.0) * length
+        motion.way[i] = between(0.0, fastest * length, width)
+    elif least > 0.0:
+        add(motion.way[i], 0.5, product(square(beyond), reciprocal(negative(pull))))
+    else:
+        add(motion.way[i], 1.0, between(0.0, 0.5 * most * most / -high(pull), width))
+
+
+# Pairs of a box of worlds that stay in contact: they bounce a little, then move as one, then part.
+#
+# A pair in contact is told by the motion of its centre of mass, as forms, and by bounds on how far the two are from it.
+# While both of them move forward, their commands are the only forces on the pair, so its centre of mass moves by the
+# commands alone, however often the two collide. A world *creeps* once one of the two stands or moves backwards: its
+# brakes then hold instead of pulling, and nothing but bounds on its speeds is known of it.
+
+SHARP = 0.1  # m/s: a pair that opens moves alone once its speeds are known to this
+
+
+@compiled_apart
+def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
+    """Of two quantities of a pair, that of its centre of mass."""
+    out = product(cell.share[p, 1], front)
+    add(out, 1.0, product(cell.share[p, 0], rear))
+    return out
+
+
+@compiled_apart
+def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
+    """Least and largest closing acceleration of a pair whose commands act on both."""
+    vague = motion.vague[p] + motion.vague[p + 1]
+    least = low(motion.pull[p + 1]) - high(motion.pull[p]) - vague
+    return least, high(motion.pull[p + 1]) - low(motion.pull[p]) + vague
+
+
+@compiled_apart
+def apart(touch: Floats) -> float:
+    """Largest difference of speeds of a pair in contact."""
+    most: float = max(touch[OPENING], touch[CLOSING], 0.0)
+    return most
+
+
+@compiled_apart
+def largest_share(cell: Cell, p: int) -> float:
+    """Of a difference of speeds, the most that one of a pair has against their centre of mass."""
+    share: float = max(high(cell.share[p, 0]), high(cell.share[p, 1]))
+    return share
+
+
+@compiled_apart
+def faster(cell: Cell, p: int) -> float:
+    """How many times the rear one's speed its impacts may give the front one, at least 1."""
+    times: float = max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0]))
+    return times
+
+
+@compiled_apart
+def backwards(cell: Cell, p: int) -> float:
+    """How many times its speed the rear one may have backwards after an impact, at least 0."""
+    times: float = max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0)
+    return times
+
+
+@compiled_apart
+def stray(cell: Cell, touch: Floats, p: int) -> float:
+    """Largest difference between the speed of a pair's centre of mass and its form.
+
+    In a world that creeps the form's speed is between 0 and ``CREEP``, the rear one's between minus ``backwards`` and 1
+    times that, the front one's between 0 and ``faster`` times that: no impact makes a rear one faster.
+    """
+    most: float = max(faster(cell, p), 1.0 + backwards(cell, p)) * touch[CREEP]
+    return most
+
+
+@compiled_apart
+def blur(cell: Cell, path: Path, p: int, side: int) -> float:
+    """By how much the speed of one of a pair may differ from the form at any time in the present piece."""
+    most: float = high(cell.share[p, side]) * path.touch[p, SPREAD] + stray(cell, path.touch[p], p)
+    return most
+
+
+@compiled_apart
+def begin_touch(touch: Floats) -> None:
+    """Forget what a pair did when it was in contact before."""
+    spread, reach = touch[SPREAD], touch[REACH]  # of the present piece
+    touch[:] = 0.0
+    touch[SPREAD], touch[REACH], touch[SOFTEST] = spread, reach, math.inf
+
+
+@compiled_apart
+def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
+    """A pair in contact through one piece of time; ``motion`` holds both as if alone, and then as one."""
+    touch, front, rear = path.touch[p], p, p + 1
+    touch[SPREAD], touch[REACH] = apart(touch), touch[WIDE]
+    if motion.rest[front] == STANDS and motion.rest[rear] == STANDS:
+        come_to_rest(cell, path, motion, p, length)
+        return
+    least, most = pressing_together(motion, p)
+    opens = most < 0.0 and touch[CLOSING] <= 0.0 and touch[OPENING] + touch[CLOSING] <= SHARP
+    if opens and (touch[CREEP] <= 0.0 or backwards(cell, p) <= 0.0):
+        part(cell, path, motion, p, length)
+        return
+    vague = max(motion.vague[front], motion.vague[rear])
+    weakest, hardest = own_pulls(motion, p)
+    for rows in (motion.pull, motion.onward, motion.reach):
+        rows[front] = common(cell, p, rows[front], rows[rear])
+    slowest = min(low(path.forms[front]), low(motion.onward[front]))
+    bounce(cell, touch, p, least, most, length, vague)
+    creep(cell, touch, p, slowest, weakest, hardest, length)
+    settle(touch, cell.restitution, length)
+    motion.rest[front], motion.vague[front] = MOVES, vague
+    motion.speed[front], motion.way[front] = motion.onward[front], motion.reach[front]
+    if low(motion.onward[front]) < 0.0 and weakest < 0.0:
+        stop(path.forms[front], front, length, motion)
+    motion.way[front, -1] += stray(cell, touch, p) * length
+    for rows in (motion.pull, motion.onward, motion.reach, motion.speed, motion.way):
+        rows[rear] = rows[front]
+    motion.rest[rear], motion.vague[rear] = motion.rest[front], vague
+
+
+@compiled_apart
+def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
+    """Least and largest acceleration that a command of a pair gives."""
+    weakest = min(low(motion.pull[p]) - motion.vague[p], low(motion.pull[p + 1]) - motion.vague[p + 1])
+    return weakest, max(high(motion.pull[p]) + motion.vague[p], high(motion.pull[p + 1]) + motion.vague[p + 1])
+
+
+@compiled_apart
+def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, hardest: float, length: float) -> None:
+    """Note that worlds may creep by now, the pair's centre of mass being as slow as ``slowest`` in this piece."""
+    if weakest < 0.0 and touch[SPREAD] > 0.0 and slowest <= largest_share(cell, p) * touch[SPREAD]:
+        touch[CREEP] = max(touch[CREEP], touch[SPREAD])
+    if touch[CREEP] > 0.0:
+        touch[CREEP] += max(hardest, 0.0) * length
+        touch[CLOSING] = max(touch[CLOSING], 0.0)
+        if backwards(cell, p) > 0.0:
+            most = (faster(cell, p) + backwards(cell, p)) * touch[CREEP]
+            touch[OPENING] = max(touch[OPENING], most)
+            touch[CLOSING], touch[SPREAD] = max(touch[CLOSING], touch[CREEP]), max(touch[SPREAD], most)
+            touch[WIDE] = max(touch[WIDE], touch[REACH] + most * length)
+            touch[SOFTEST] = math.inf
+    touch[REACH] = max(touch[REACH], touch[WIDE])
+
+
+@compiled_apart
+def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
+    """A pair whose form stands: each of its worlds stands, or creeps and is braked.
+
+    The rear one's speed falls by the brakes b, the front one's is at most ``faster`` times what the rear one's was.
+    """
+    touch = path.touch[p]
+    touch[CREEP] = max(touch[CREEP], touch[SPREAD])
+    for i in range(p, p + 2):
+        motion.way[i, -1] += stray(cell, touch, p) * length
+    touch[WIDE] += max(touch[OPENING], 0.0) * length
+    touch[REACH], touch[SOFTEST] = touch[WIDE], math.inf
+    brakes = max(-own_pulls(motion, p)[1], 0.0)
+    touch[CREEP] = max(touch[CREEP] - brakes * length / faster(cell, p), 0.0)
+    touch[OPENING] = min(touch[OPENING], (faster(cell, p) + backwards(cell, p)) * touch[CREEP])
+    touch[CLOSING] = min(max(touch[CLOSING], 0.0), touch[CREEP])
+
+
+@compiled_apart
+def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
+    """A pair that was in contact opens in this piece: from now on each moves alone."""
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    touch, width = path.touch[p], cell.speed.shape[1]
+    opening, wide, astray = max(touch[OPENING], 0.0), touch[WIDE], stray(cell, touch, p)
+    path.marks[P + p] = PARTS
+    touch[REACH] = wide + opening * length
+    path.forms[N + p] = between(0.0, touch[REACH], width)  # by its speeds alone; commands act on top
+    for side in range(2):
+        share = (2.0 * side - 1.0) * high(cell.share[p, side])
+        speed = between(min(-share * opening, 0.0) - astray, max(-share * opening, 0.0) + astray, width)
+        for rows in (motion.onward, motion.speed):
+            add(rows[p + side], 1.0, speed)
+        for rows in (motion.reach, motion.way):
+            rows[p + side, -1] += (abs(share) * opening + astray) * length
+        neighbour = p - 1 + 2 * side
+        if 0 <= neighbour < P:
+            add(path.forms[N + neighbour], 1.0, between(-abs(share) * wide, 0.0, width))
+
+
+@compiled_apart
+def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length: float, vague: float) -> None:
+    """What becomes of the difference of speeds and of the gap of a pair in contact within one piece.
+
+    Its closing acceleration is between ``least`` and ``most``. No impact makes the difference larger, so it grows by
+    what the commands give. While the pair is pressed together by b between b- and b+, it does not grow: from gap g and
+    difference w a flight is never higher than h = g + w^2 / (2 b-), and closes with at most sqrt(2 b+ h), which leaves
+    the share e of it: less than before, if e sqrt(b+ / b-) < 1. (Where a vehicle creeps, its brakes that hold make a
+    flight lower and slower.)
+    """
+    e, fastest, wide = cell.restitution, apart(touch), touch[WIDE]
+    if fastest == 0.0 and wide == 0.0 and least >= 0.0:
+        touch[CLOSING], touch[OPENING] = 0.0, 0.0
+        return
+    if least > 0.0 and vague == 0.0 and (touch[CREEP] <= 0.0 or backwards(cell, p) <= 0.0):
+        if least < touch[SOFTEST] or most > touch[HARDEST]:
+            begin_run(touch, e, min(least, touch[SOFTEST]), max(most, touch[HARDEST]), least, most)
+        if touch[SOFTEST] < math.inf:
+            fastest = apart(touch)
+            height = 0.5 * fastest * fastest / touch[HARDEST]
+            touch[SPREAD] = fastest
+            touch[WIDE] = max(wide, min(height, wide + fastest * length))
+            touch[SINCE] += length
+            return
+    closing = max(touch[CLOSING] + most * length, 0.0) if most > 0.0 else touch[CLOSING]
+    struck = max(touch[CLOSING], closing, 0.0)
+    opening = max(touch[OPENING], e * struck) - min(least, 0.0) * length
+    touch[CLOSING] = closing if most > 0.0 else touch[CLOSING] + most * length
+    touch[OPENING], touch[SOFTEST], touch[HARDEST] = opening, math.inf, 0.0
+    touch[SPREAD] = max(touch[SPREAD], struck, opening)
+    touch[WIDE] += max(opening, 0.0) * length
+
+
+@compiled_apart
+def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
+    """A pair is pressed together in another way than before: between both ways, or if need be in the new one alone."""
+    if not e * math.sqrt(hardest / softest) < 1.0:
+        softest, hardest = least, most
+    fastest = apart(touch)
+    if not e * math.sqrt(hardest / softest) < 1.0:
+        touch[SOFTEST], touch[HARDEST] = math.inf, 0.0
+        return
+    height = touch[WIDE] + 0.5 * fastest * fastest / softest
+    touch[SOFTEST], touch[HARDEST], touch[SINCE] = softest, hardest, 0.0
+    touch[OPENING] = math.sqrt(2.0 * hardest * height)
+    touch[CLOSING] = touch[OPENING]
+
+
+@compiled_apart
+def settle(touch: Floats, e: float, length: float) -> None:
+    """Whether a pair moves as one by the end of the piece.
+
+    A flight that begins with separating speed s ends after at most 2 s / b-, with a closing speed of at most
+    s sqrt(b+ / b-). So after 2 s / (b- (1 - e sqrt(b+ / b-))) the two move as one, if none of them creeps.
+    """
+    if touch[SOFTEST] == math.inf or touch[CREEP] > 0.0:
+        touch[SINCE] = 0.0
+        return
+    fastest = touch[OPENING]
+    ratio = 0.0 if fastest < PLASTIC_SPEED_MPS else e * math.sqrt(touch[HARDEST] / touch[SOFTEST])
+    if touch[SINCE] * touch[SOFTEST] * (1.0 - ratio) > 2.0 * fastest * (1.0 + 1e-9) + 1e-9:
+        begin_touch(touch)
+
+
+@compiled_apart
+def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> bool:
+    """Whether a moving pair may meet again at so many different times that they are better taken together."""
+    if motion.rest[p] != MOVES or motion.rest[p + 1] != MOVES:
+        return False
+    closing = difference(path.forms[p + 1], path.forms[p])
+    return radius(path.forms[N + p]) > max(high(closing), 0.0) * length
+
+
+@compiled_apart
+def embrace(cell: Cell, path: Path, p: int) -> None:
+    """Take a pair that may or may not be in contact as one that is."""
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    front, rear, gap = path.forms[p].copy(), path.forms[p + 1].copy(), path.forms[N + p]
+    closing = difference(rear, front)
+    touch = path.touch[p]
+    begin_touch(touch)
+    touch[OPENING], touch[CLOSING], touch[WIDE] = max(-low(closing), 0.0), high(closing), max(high(gap), 0.0)
+    path.forms[p] = common(cell, p, front, rear)
+    path.forms[p + 1] = path.forms[p]
+    inside = cut(gap, 0.0, math.inf)
+    if p > 0:
+        add(path.forms[N + p - 1], 1.0, product(cell.share[p, 0], inside))
+    if p < P - 1:
+        add(path.forms[N + p + 1], 1.0, product(cell.share[p, 1], inside))
+    path.marks[P + p] = TOUCHES
+
+
+# A bound on harm that needs no path: by the speeds that the vehicles of a line may still have.
+#
+# Where a path cannot be followed, this is what is said of the worlds that go it, so that no bound is ever infinite.
+#
+# A vehicle on its own is at most as fast as it is, or as it drives up to its limit. In an impact of a pair whose
+# closing
+# speed is w each one's speed changes by its share of (1 + e) w. Let u be the largest of all own speeds, e restitution,
+# and nobody move backwards yet. A rear vehicle is slowed by an impact, and left with at least -e times its speed; a
+# front
+# one that was at rest has at most (1 + e) times the rear one's. So the middle one of three is between -e u and (1 + e)
+# u
+# until its second pair meets. (Three that touch are one cluster, in which each ends with P + e (P - v) for a mean P of
+# their speeds v: between the same bounds.)
+
+
+@compiled_apart
+def driven(cell: Cell, i: int, speed: float, since: float) -> float:
+    """Largest speed of a vehicle that is at most as fast as this at a time, by its own drive from then on."""
+    drive, rest = 0.0, cell.times[-1] - since
+    if i == cell.vehicle:
+        for j in range(cell.action.shape[0]):
+            if cell.times[j + 1] > since:
+                drive = max(drive, cell.action[j] * high(cell.drive))
+    elif cell.constant[i] > 0.0:
+        drive = cell.constant[i]
+    most: float = max(speed, min(cell.limit[i], speed + drive * rest)) if drive > 0.0 else speed
+    return most
+
+
+@compiled_apart
+def rough_harm(cell: Cell, path: Path, hit: int) -> float:
+    """Upper bound on the harm of all worlds of a path, from the present piece on, if pair ``hit`` was hit by now.
+
+    ``hit`` -1: by the marks of the path.
+    """
+    N, P = cell.speed.shape[0], cell.gap.shape[0]
+    since = cell.times[path.marks[2 * P]]
+    own, backwards = np.zeros(N), 0.0
+    for i in range(N):
+        around = 0.0
+        for p in range(max(i - 1, 0), min(i + 1, P)):
+            if path.marks[P + p] != FREE:
+                around += blur(cell, path, p, i - p)
+        own[i] = driven(cell, i, max(high(path.forms[i]) + around, 0.0), since)
+        backwards = max(backwards, around - low(path.forms[i]))
+    return high(path.forms[-1]) + rough_rest(cell, own, backwards, since, path, hit)
+
+
+@compiled_apart
+def rough_at_alert(cell: Cell, late: Floats) -> float:
+    """Upper bound on the harm of all worlds of a cell whose first piece of time begins ``late`` after the alert."""
+    N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
+    path = Path(np.zeros((N + P + 1, width)), np.zeros((P, TOUCH_WIDTH)), np.zeros(2 * P + 1, np.int64))
+    for i in range(N):
+        path.forms[i] = cell.speed[i]
+        if i != cell.vehicle and cell.constant[i] > 0.0:
+            path.forms[i, -1] += cell.constant[i] * high(late)
+    return rough_harm(cell, path, -1)
+
+
+@compiled_apart
+def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Path, hit: int) -> float:
+    """Largest sum of the squared closing speeds of first impacts that are still to come."""
+    P, e = cell.gap.shape[0], cell.restitution
+    first = path.marks[0] == 1 or hit == 0
+    if P == 1:
+        alone: float = 0.0 if first else own[1] * own[1]
+        return alone
+    second = path.marks[1] == 1 or hit == 1
+    fastest = max(own[1], own[2])
+    ahead = driven(cell, 1, (1.0 + e) * fastest, since)  # closing speed of the front pair, its rear one pushed
+    back: float = own[2] + max(
+        e * driven(cell, 1, fastest, since), backwards
+    )  # of the rear pair, its front one thrown back
+    if first and second:
+        return 0.0
+    if first:
+        return back * back
+    if second:
+        return ahead * ahead
+    most: float = max(fastest * fastest + back * back, own[2] * own[2] + ahead * ahead)
+    return most
+
+
+# An upper bound on the first-impact harm of a plan over a whole box of worlds.
+#
+# Every way in which impacts may follow each other in the box is a path. In each piece of time a path goes on without an
+# impact, and another one branches off for each pair that may have one then. The harm of a path that has ended is a
+# form;
+# the bound is the largest value of any. Lines of at most three vehicles: once two pairs were hit, harm is final.
 
 # Impacts of a box of worlds within one piece of time, and pairs that stay in contact.
 #
@@ -614,3 +1269,406 @@ def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
     for i in range(N):
         path.forms[i] = motion.speed[i]
     return True
+
+
+# Robust mode for every world of the box of intervals: which boxes, and an upper bound on the harm of plans over them.
+#
+# What is certified is a whole plan, from the alert on: nothing that is seen later narrows a box. So the proof is short.
+# The plan that is held has a bound over all worlds of the box; it is replaced by another one, with the same past, only
+# if
+# that one's bound is at most the budget. What was applied at the end is the plan that is held then.
+
+# Branch and bound: an upper bound on the harm of a plan over a box, refined where it is largest.
+
+# groups of the numbers of a box, N of each but P gaps
+BRAKING, DRIVING, LATENCY, MASS, SPEED, GAP = range(6)
+LONGEST_PIECE_S = 0.25  # before the first decision
+
+
+class Known(NamedTuple):
+    """What is certain about the worlds of a box."""
+
+    vehicle: int
+    constant: Floats  # [N] command of each other vehicle; NaN: full braking
+    limit: Floats  # [N]
+    restitution: float
+    begin_s: float  # of the worlds
+    time_step_s: float
+    horizon_s: float
+
+
+@compiled_apart
+def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
+    """The form of number ``which`` of a box whose uncertain ones are ``free`` [K]."""
+    out = np.zeros(free.shape[0] + 2)
+    out[0] = 0.5 * (low_[which] + high_[which])
+    half = 0.5 * (high_[which] - low_[which])
+    for k in range(free.shape[0]):
+        if free[k] == which:
+            out[1 + k] = half
+            half = 0.0
+    out[-1] = half + 1e-15 * abs(out[0])
+    return out
+
+
+@compiled_apart
+def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
+    """The cell of a box [Q], its worlds at the alert, and how long after it the first piece of time begins (s).
+
+    The first decision falls at another time in each world where the shielded vehicle's latency is uncertain: time is
+    counted from it, and the first piece begins as long before it as the earliest one comes after the alert.
+    """
+    N, W = known.limit.shape[0], free.shape[0] + 2
+    P, v = N - 1, known.vehicle
+    speed, gap, brake, onset = np.empty((N, W)), np.empty((P, W)), np.empty((N, W)), np.empty((N, W))
+    share = np.empty((P, 2, W))
+    first = form_of(low_, high_, LATENCY * N + v, free)
+    first[0] -= known.begin_s
+    first = positive_part(first)
+    earliest = known.begin_s + max(low(first), 0.0)
+    first[0] += known.begin_s
+    for i in range(N):
+        speed[i] = form_of(low_, high_, SPEED * N + i, free)
+        brake[i] = form_of(low_, high_, BRAKING * N + i, free)
+        onset[i] = difference(form_of(low_, high_, LATENCY * N + i, free), first)
+    for p in range(P):
+        gap[p] = form_of(low_, high_, GAP * N + p, free)
+        front, rear = form_of(low_, high_, MASS * N + p, free), form_of(low_, high_, MASS * N + p + 1, free)
+        whole = front.copy()
+        add(whole, 1.0, rear)
+        share[p, 0] = product(rear, reciprocal(whole))
+        share[p, 1] = -share[p, 0]
+        share[p, 1, 0] += 1.0
+        share[p, 1, -1] = share[p, 0, -1]
+    drive = form_of(low_, high_, DRIVING * N + v, free)
+    times, action = pieces(known, onset, earliest, plan)
+    cell = Cell(
+        speed, gap, brake, drive, share, onset, known.constant, known.limit, v, known.restitution, times, action
+    )  # fmt: skip
+    first[0] -= earliest
+    return cell, first
+
+
+@compiled_apart
+def wait(cell: Cell, late: Floats) -> bool:
+    """Move a cell's worlds on by ``late`` (s), each by its own; False where that may not be all that happens."""
+    if high(late) <= 1e-12:
+        return True
+    if low(late) < -1e-12:
+        return False
+    N = cell.speed.shape[0]
+    slowest, way = np.empty(N), np.empty_like(cell.speed)
+    for i in range(N):
+        pull, certain = early_pull(cell, i, late)
+        begin = cell.speed[i].copy()
+        way[i] = product(begin, late)
+        add(way[i], 0.5, product(pull, square(late)))
+        add(cell.speed[i], 1.0, product(pull, late))
+        slowest[i], fastest = min(low(begin), low(cell.speed[i])), max(high(begin), high(cell.speed[i]))
+        limited = high(pull) > 0.0 and fastest >= cell.limit[i]
+        if not certain or limited or slowest[i] < 0.0:
+            return False
+        if i > 0 and low(cell.gap[i - 1]) <= max(fastest - slowest[i - 1], 0.0) * high(late) + 1e-9:
+            return False
+    for p in range(N - 1):
+        add(cell.gap[p], 1.0, way[p])
+        add(cell.gap[p], -1.0, way[p + 1])
+    return True
+
+
+@compiled_apart
+def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
+    """Acceleration of a vehicle until ``late`` after the alert; False where it may begin within that time."""
+    pull = np.zeros_like(late)
+    if i == cell.vehicle:
+        return pull, True
+    acts = cell.onset[i].copy()  # after the alert
+    add(acts, 1.0, late)
+    acts[0] -= cell.times[0]
+    if high(acts) > 1e-12:
+        return pull, low(acts) >= high(late)
+    if math.isnan(cell.constant[i]):
+        return negative(cell.brake[i]), True
+    pull[0] = cell.constant[i]
+    return pull, True
+
+
+@compiled_apart
+def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
+    """Where commands may change, s after the first decision, and the shielded vehicle's action between."""
+    N = onset.shape[0]
+    before = earliest - known.begin_s
+    first = math.ceil(before / LONGEST_PIECE_S) if before > 0.0 else 0
+    last = math.ceil((known.horizon_s - earliest) / known.time_step_s - 1e-9)
+    points = np.empty(first + last + 1 + 2 * N)
+    count = 0
+    for k in range(first):
+        points[count] = -before + before * k / first
+        count += 1
+    for k in range(last + 1):
+        points[count] = k * known.time_step_s
+        count += 1
+    for i in range(N):
+        if i != known.vehicle:
+            for at in (low(onset[i]), high(onset[i])):
+                if -before < at < last * known.time_step_s:
+                    points[count] = at
+                    count += 1
+    times = np.unique(points[:count])
+    action = np.zeros(times.shape[0] - 1)
+    for j in range(action.shape[0]):
+        middle = 0.5 * (times[j] + times[j + 1])
+        if middle > 0.0:
+            action[j] = plan[min(int(middle / known.time_step_s), plan.shape[0] - 1)]
+    return times, action
+
+
+@compiled_apart
+def bound_of(
+    low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, stack: Stack, motion: Motion, out: Floats,
+    most: float,
+) -> float:  # fmt: skip
+    """Upper bound on the harm of a plan over one box, unless it is above ``most``."""
+    cell, late = cell_of(low_, high_, free, known, plan)
+    rough = rough_at_alert(cell, late)
+    if wait(cell, late):
+        harm = most_harm(cell, stack, motion, out, most)
+        if harm <= rough:
+            return harm
+    out[:] = 0.0
+    out[0] = rough
+    return rough
+
+
+@compiled_apart
+def bound_box(
+    low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
+) -> tuple[float, int]:
+    """Upper bound on the harm of a plan [L] over a box [Q], and the cells looked at.
+
+    The box is halved where the bound is largest, until that is at most ``enough`` or ``cells`` were looked at. With
+    ``only_enough`` a part is given up once its harm is above ``enough``: a larger result is then no bound.
+    """
+    N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
+    stack, motion = new_stack(N, K + 2), new_motion(N, K + 2)
+    lows, highs = np.empty((cells + 1, Q)), np.empty((cells + 1, Q))
+    bounds, slopes = np.full(cells + 1, -math.inf), np.zeros((cells + 1, K + 2))
+    lows[0], highs[0] = low_, high_
+    most, size, looked = enough if only_enough else math.inf, 1, 1
+    bounds[0] = bound_of(low_, high_, free, known, plan, stack, motion, slopes[0], most)
+    while looked + 2 <= cells and K > 0:
+        at = int(np.argmax(bounds[:size]))
+        if bounds[at] <= enough:
+            break
+        share = (highs[at] - lows[at])[free] / (high_ - low_)[free]
+        weight = np.abs(slopes[at, 1:-1])
+        which = free[int(np.argmax(weight if weight.max() > 0.0 else share))]
+        middle = 0.5 * (lows[at, which] + highs[at, which])
+        lows[size], highs[size] = lows[at], highs[at]
+        highs[at, which], lows[size, which] = middle, middle
+        bounds[at] = bound_of(lows[at], highs[at], free, known, plan, stack, motion, slopes[at], most)
+        bounds[size] = bound_of(lows[size], highs[size], free, known, plan, stack, motion, slopes[size], most)
+        size += 1
+        looked += 2
+    return bounds[:size].max(), looked
+
+
+MOST_VEHICLES = 3
+CELLS_AT_ALERT, CELLS = 200, 40  # looked at for the bound at the alert, and for one later certificate
+NEAR = 1.02  # times the largest harm in a corner: a bound this good is not refined any further
+NEARLY_NOTHING = 0.1  # m2/s2, likewise
+CORNERS, INTERIOR = "corners", "interior"  # which worlds of a box robust mode certifies
+CERTAINTIES = (CORNERS, INTERIOR)
+PER_BOX = ("low", "high", "limit", "restitution", "begin_s", "constant")  # arrays of Boxes
+SCRIPTS = ("full_brake", "coast", "constant")
+
+
+class Boxes(NamedTuple):
+    """The boxes of n worlds: each uncertain number from ``low`` to ``high``."""
+
+    low: Floats  # [n, Q] braking, driving, latency, mass, speed of each vehicle, then the gaps
+    high: Floats  # [n, Q]
+    limit: Floats  # [n, N] m/s
+    restitution: Floats  # [n]
+    begin_s: Floats  # [n]
+    constant: Floats  # [n, N] m/s2; NaN: full braking
+    vehicle: int
+    time_step_s: float
+    horizon_s: float
+
+    def put(self, rows: Ints, new: Boxes) -> Boxes:
+        """A copy with the boxes of ``new`` in these rows."""
+        columns: dict[str, Any] = {name: put(getattr(self, name), rows, getattr(new, name)) for name in PER_BOX}
+        return self._replace(**columns)
+
+    def take(self, rows: Ints) -> Boxes:
+        """Those of some worlds."""
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in PER_BOX}
+        return self._replace(**columns)
+
+
+def placed(old: Boxes | None, new: Boxes, rows: Ints) -> Boxes:
+    """The boxes of a batch in which episodes begin in these rows: all of them, or some of the ``old`` ones."""
+    return new.take(np.argsort(rows)) if old is None or len(rows) >= len(old.low) else old.put(rows, new)
+
+
+def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
+    """Raise ``InvalidInput`` for a setting that interior mode cannot certify, whatever its worlds.
+
+    That is: total harm, more than three vehicles, an obstacle ahead, or others that do anything else than brake fully,
+    coast, or hold one deceleration.
+    """
+    if robust != INTERIOR:
+        return
+    if harm_count == "total":
+        raise _refusal("total harm")
+    if scenario.vehicles > MOST_VEHICLES:
+        raise _refusal(f"{scenario.vehicles} vehicles")
+    if scenario.has_obstacle:
+        raise _refusal("an obstacle ahead")
+    for i, script in sorted(others.items()):
+        name = getattr(script, "name", type(script).__name__)
+        if name.split(":")[0] not in SCRIPTS:
+            raise InvalidInput(
+                f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, which it cannot enclose; full_brake,"
+                " coast and constant:A are possible; robust corners takes every script"
+            )
+
+
+def _refusal(what: str) -> InvalidInput:
+    return InvalidInput(
+        f"shield: robust interior: {what}: it certifies first-impact harm of at most {MOST_VEHICLES} vehicles without"
+        " an obstacle; robust corners takes every scenario"
+    )
+
+
+def boxes_of(possible: Worlds, running: Running, scenario: Scenario, others: Mapping[int, Script]) -> Boxes:
+    """The boxes of the n worlds of ``running`` at the alert, their members being ``possible`` [n * M].
+
+    Raises ``InvalidInput`` for worlds that interior mode cannot certify: with an obstacle ahead, or in which another
+    vehicle's command is not the same in the whole box. ``check_possible`` says what no world of a scenario changes.
+    """
+    n, vehicle = running.n, int(running.problem.vehicles[0])
+    v, N = possible.vehicles, possible.N
+    command = running.problem.command[:, running.problem.command.shape[1] - N :]
+    if obstacle_ahead(possible).any():
+        raise _refusal("an obstacle ahead")
+    numbers = np.concatenate(
+        [v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, possible.speeds_mps, possible.gaps_m],
+        axis=1,
+    ).reshape(n, -1, 6 * N - 1)
+    members = len(v.mass_t) // n
+    return Boxes(
+        numbers.min(axis=1), numbers.max(axis=1), v.speed_limit_mps[::members], v.restitution[::members],
+        possible.time_s[::members], _constants(others, vehicle, command.reshape(n, members, N)), vehicle,
+        scenario.time_step_s, scenario.horizon_s,
+    )  # fmt: skip
+
+
+def _constants(others: Mapping[int, Script], vehicle: int, command: Floats) -> Floats:
+    """Command of each other vehicle [n, N], NaN where it brakes fully; [n, M, N] in the members."""
+    constant = np.full((command.shape[0], command.shape[2]), np.nan)
+    for i, script in others.items():
+        name = getattr(script, "name", type(script).__name__)
+        kind = name.split(":")[0]
+        if i == vehicle or kind == "full_brake":
+            continue
+        if not (command[:, :, i] == command[:, :1, i]).all():
+            raise InvalidInput(
+                f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, whose command is another one in each"
+                " world of the box; full_brake, coast and constant:A are possible, A being at most every capacity of"
+                " the box"
+            )
+        constant[:, i] = command[:, 0, i]
+    return constant
+
+
+def expects(boxes: Boxes | None, running: Running, seen: Floats) -> Bools:
+    """Where what is seen now [n, columns] may be, as far as is known, [n].
+
+    Where the own latency of a box is uncertain a decision falls at another time in each of its worlds. No range of the
+    corners holds them then: any finite numbers may be.
+    """
+    expected = as_predicted(running, seen)
+    if boxes is not None:
+        own = 2 * boxes.limit.shape[1] + boxes.vehicle
+        expected |= (boxes.high[:, own] > boxes.low[:, own]) & np.isfinite(seen).all(axis=1)
+    return expected
+
+
+def bounds_at_alert(boxes: Boxes, plans: Floats, harm: Floats) -> Floats:
+    """Upper bound on the harm of each plan [n, L] over its box, ``harm`` being its largest in a corner, [n] m2/s2."""
+    return bound_plans(boxes, plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
+
+
+def bound_plans(boxes: Boxes, plans: Floats, enough: Floats, cells: int, *, only_enough: bool = False) -> Floats:
+    """Upper bound on the harm of each plan [n, L], from the alert on, over all worlds of its box, [n] m2/s2.
+
+    A bound at most ``enough`` [n] is not refined any further, and no more than ``cells`` parts of a box are looked at.
+    With ``only_enough`` what is above ``enough`` is no bound: it says that none at most that was found.
+    """
+    bounds = np.empty(len(plans))
+    for k in range(len(plans)):
+        low, high = boxes.low[k], boxes.high[k]
+        known = Known(
+            boxes.vehicle, boxes.constant[k], boxes.limit[k], float(boxes.restitution[k]), float(boxes.begin_s[k]),
+            boxes.time_step_s, boxes.horizon_s,
+        )  # fmt: skip
+        plan = np.ascontiguousarray(plans[k], np.float64)
+        bounds[k] = bound_box(low, high, np.flatnonzero(high > low), known, plan, float(enough[k]), cells, only_enough)[
+            0
+        ]
+    return bounds
+
+
+def checked_robust(robust: object, where: str) -> str:
+    """``corners`` or ``interior``; raises ``UnknownName`` for anything else."""
+    if robust not in CERTAINTIES:
+        raise unknown_name(f"{where}: robust", robust, CERTAINTIES)
+    return str(robust)
+
+
+def certify_inside(
+    boxes: Boxes | None, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
+) -> Decision:
+    """A decision that the corners allow, refused where its plan is not certified for every world of the box, if any.
+
+    ``held`` is the backup before it. A plan without a certificate never replaces the held one. Episodes end at the
+    horizon: that all corners rest does not mean that every world does.
+    """
+    if boxes is None:
+        return decision
+    plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)
+    bound = np.where(asked & ~other, held.harm, decision.bound)  # of the corners alone, where the plan is the same
+    changed = np.flatnonzero(asked & other)
+    found = bound_plans(boxes.take(changed), plan[changed], budget[changed], CELLS, only_enough=True)
+    least = np.where(decision.intervened, held.harm, budget)[changed]
+    good = found <= least
+    bound[changed[good]] = found[good]
+    known = np.isfinite(found)
+    decision.margin[changed[known]] = (budget[changed] - found)[known]
+    bad = changed[~good]
+    plan[bad], bound[bad] = held.plan[bad], held.harm[bad]
+    decision = decision._replace(bound=bound, backup=decision.backup._replace(plan=plan, harm=bound))
+    refused = bad[~decision.intervened[bad]]
+    if refused.size:
+        decision = _refuse(running, held, decision, refused)
+    after = decision.after
+    over = np.repeat(after.steps, after.members) >= after.problem.last_step
+    each = np.repeat(asked, after.members)
+    return decision._replace(after=after._replace(ended=np.where(each, over, after.ended)))
+
+
+def _refuse(running: Running, held: Backup, decision: Decision, rows: Ints) -> Decision:
+    """The decision with the held plan's action in these rows."""
+    part = running.take(rows)
+    action = held.plan[rows, part.steps]
+    kept = Backup(held.plan[rows], held.harm[rows], held.constants)
+    with renumbered(rows):
+        instead = certify(part, action, kept, held.harm[rows])
+    at, after = running.rows_of(rows), decision.after
+    states, ended = after.states.copy(), after.ended.copy()
+    states[at], ended[at] = instead.after.states, instead.after.ended
+    decision.applied[rows], decision.intervened[rows] = instead.applied, True
+    decision.reason[rows] = NO_CERTIFICATE
+    return decision._replace(after=after._replace(states=states, ended=ended))

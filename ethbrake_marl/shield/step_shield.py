@@ -20,11 +20,11 @@ from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
 from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.episode import EPISODE_ROWS, number_of_decisions
+from ethbrake_marl.physics.kernel import ROW, number_of_decisions
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.profiles import PER_WORLD as OF_PROBLEM
-from ethbrake_marl.search.profiles import ProfileProblem, profile_problem
-from ethbrake_marl.shield import interior
+from ethbrake_marl.search import PER_WORLD as OF_PROBLEM
+from ethbrake_marl.search import ProfileProblem, profile_problem
+from ethbrake_marl.shield import enclosure
 from ethbrake_marl.shield.certify import (
     CONSTANTS,
     Backup,
@@ -202,7 +202,7 @@ def descend_constants(
     mass: Floats, limit: Floats, caps: Floats, vehicles: Ints, grid: Floats, rounds: int, action: Floats,
 ) -> None:  # fmt: skip
     """Replace each vehicle's constant action [n, K] in turn by the best of the grid, by harm in one segment."""
-    table, critical = np.zeros((EPISODE_ROWS, mass.shape[1])), np.zeros(1, np.int64)
+    table, critical = np.zeros((ROW.OF_EPISODE, mass.shape[1])), np.zeros(1, np.int64)
     lines = np.empty((states.shape[0], rows_of(caps), mass.shape[1]))
     gather(lines, 0, command, latency, mass, limit, caps)
     world = Members(table, clock, bounds, lines, vehicles, critical)
@@ -254,7 +254,7 @@ class StepShield:
         others: Mapping[int, Script] | None = None,
         uncertainty: Uncertainty | None = None,
         cap: Cap | None = None,
-        robust: str = interior.CORNERS,
+        robust: str = enclosure.CORNERS,
         logging: bool = False,
     ) -> None:
         check_harm_count(harm_count)
@@ -269,8 +269,8 @@ class StepShield:
             raise unknown_name("shield cap", cap, CAPS)
         self.scenario, self.harm_count, self.allowance = scenario, harm_count, allowance
         self.uncertainty, self.cap = uncertainty, cap
-        self.robust = interior.checked_robust(robust, "shield")
-        self.boxes: interior.Boxes | None = None  # where every world of them is certified
+        self.robust = enclosure.checked_robust(robust, "shield")
+        self.boxes: enclosure.Boxes | None = None  # where every world of them is certified
         self.logging = logging
         self._entries: list[Intervention] = []  # shared with copies; the first ``_logged`` of them are of this one
         self._logged = 0
@@ -285,7 +285,7 @@ class StepShield:
         self.baseline_shares: Floats = np.zeros((0, 0))  # [n, N] what each vehicle bears under the best constants
         scripts = script_agents(scenario, except_for=self.vehicles) if others is None else others
         self._others = {i: script for i, script in scripts.items() if i not in self.vehicles}
-        interior.check_possible(self.robust, scenario, harm_count, self._others)
+        enclosure.check_possible(self.robust, scenario, harm_count, self._others)
         self._width = int(number_of_decisions(np.zeros(1), scenario.time_step_s, scenario.horizon_s)[0]) + 1
 
     @property
@@ -345,12 +345,12 @@ class StepShield:
         )
         new = copy.copy(self)
         start = start_of(settings, worlds, policies_of(policy, self.vehicle))
-        if start.running.members > 1 and self.robust == interior.INTERIOR:
+        if start.running.members > 1 and self.robust == enclosure.INTERIOR:
             assert self.uncertainty is not None
-            boxes = interior.boxes_of(self.uncertainty.members(worlds), start.running, self.scenario, self._others)
-            harm = interior.bounds_at_alert(boxes, start.backup.plan, start.backup.harm)
+            boxes = enclosure.boxes_of(self.uncertainty.members(worlds), start.running, self.scenario, self._others)
+            harm = enclosure.bounds_at_alert(boxes, start.backup.plan, start.backup.harm)
             start = start._replace(backup=start.backup._replace(harm=harm))
-            new.boxes = interior.placed(self.boxes, boxes, rows)
+            new.boxes = enclosure.placed(self.boxes, boxes, rows)
         new._place(rows, start)
         self.__dict__.update(new.__dict__)
 
@@ -392,7 +392,7 @@ class StepShield:
         rejected = (decision.reason == NO_CERTIFICATE).reshape(len(asked), -1).any(axis=1)
         if proposer is not None and (rows := np.flatnonzero(rejected)).size:
             decision = merged(decision, rows, certify_rollouts(now, given, rows, budget, held.plan, proposer))
-        decision = interior.certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
+        decision = enclosure.certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
         decision.reason[asked & self.distrusted] = BROKEN
         self.replaced = self.replaced + (decision.intervened.T & asked).T
         self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
@@ -409,7 +409,7 @@ class StepShield:
         """Find the worlds that did not do what was predicted, and choose anew there from what is seen."""
         assert self.running is not None
         running, columns = self.running, seen.shape[1]
-        surprising = asked & ~interior.expects(self.boxes, running, seen)
+        surprising = asked & ~enclosure.expects(self.boxes, running, seen)
         if not surprising.any():
             return
         self.distrusted = self.distrusted | surprising

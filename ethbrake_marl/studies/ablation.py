@@ -36,6 +36,7 @@ from ethbrake_marl.learning.team_file import load_team
 from ethbrake_marl.learning.training import RunDirectory, check_same, read_object, resolve
 from ethbrake_marl.limits.best_harm import (
     CHUNK,
+    BestHarmTable,
     best_harm,
     chunk_file,
     kept_chunk,
@@ -43,9 +44,8 @@ from ethbrake_marl.limits.best_harm import (
     search_list,
     world_identity,
 )
-from ethbrake_marl.limits.best_harm_table import BestHarmTable
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.episode import first_decision_s
+from ethbrake_marl.physics.kernel import first_decision_s
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.shield.agents import Shielded, drive_chunks, stack
 from ethbrake_marl.studies.trainings import (

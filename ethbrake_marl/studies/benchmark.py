@@ -37,8 +37,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate, relative_decrease
 from ethbrake_marl.files.store import parse_strict_json, read_plain
 from ethbrake_marl.files.yaml import first_mistake
-from ethbrake_marl.limits.best_harm import world_identity
-from ethbrake_marl.limits.best_harm_table import load_table
+from ethbrake_marl.limits.best_harm import load_table, world_identity
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.policies.bundle import Policy
 from ethbrake_marl.scenario import Sample, Scenario, Task

@@ -13,20 +13,9 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import script_agents, set_others
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.messages import (
-    KEY,
-    LINK,
-    TAKEN,
-    TOLD_S,
-    age_s,
-    is_periodic,
-    link_at,
-    links_of,
-    place_at,
-    ring_at,
-)
+from ethbrake_marl.physics.messages import CHANNEL, LINK, age_s, is_periodic, link_at, links_of, place_at, ring_at
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.profiles import state_columns
+from ethbrake_marl.search import state_columns
 from ethbrake_marl.shield import ShieldedDriver
 from ethbrake_marl.shield.certify import Proposer, proposed_action
 
@@ -160,11 +149,11 @@ def _alter_messages(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> F
         return columns
     kept = links_of(worlds)[:, vehicle].copy()
     own = columns[:, place_at(N) + vehicle].copy()
-    columns[:, [KEY, TAKEN]] += 5.0
+    columns[:, [CHANNEL.KEY, CHANNEL.TAKEN]] += 5.0
     columns[:, place_at(N) :] += rng.uniform(0.5, 3.0, columns[:, place_at(N) :].shape)
-    links = columns[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK)
+    links = columns[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK.WIDTH)
     heard = (worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis])[..., np.newaxis]
-    told = np.arange(LINK) >= TOLD_S
+    told = np.arange(LINK.WIDTH) >= LINK.TOLD_S
     links[:, vehicle] = np.where(heard & told, kept, links[:, vehicle])
     columns[:, place_at(N) + vehicle] = own
     return columns

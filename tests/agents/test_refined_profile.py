@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl import search
 from ethbrake_marl.agents.refined import RefinedProfile
 from ethbrake_marl.agents.rollout import drive, record_commands
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search import refine
-from ethbrake_marl.search.profiles import profile_problem
-from ethbrake_marl.search.refine import refine_commands
+from ethbrake_marl.search import profile_problem, refine_commands
 
 SCENARIO = load_scenario("paper-random")
 WORLDS = SCENARIO.sample(150, 3).worlds
@@ -106,7 +105,7 @@ def test_refine__refuses_what_it_cannot_search(monkeypatch):
     def fail(*arguments):
         arguments[-1][4] = True
 
-    monkeypatch.setattr(refine, "_refine_worlds", fail)
+    monkeypatch.setattr(search, "_refine_worlds", fail)
     with pytest.raises(PhysicsError, match="world 4: its commands could not be played"):
         refine_commands(problem, np.zeros((150, steps)), budget=5)
 

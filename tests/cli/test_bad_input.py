@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.search.profiles import search_profiles
+from ethbrake_marl.search import search_profiles
 
 
 def refused(answer, *fragments: str) -> None:

@@ -10,8 +10,7 @@ import pytest
 
 from ethbrake_marl.evaluation import regret
 from ethbrake_marl.evaluation.regret import between, bounds_of, proven_of_table, shipped_bounds, shipped_lines
-from ethbrake_marl.limits.best_harm import shipped_tables
-from ethbrake_marl.limits.best_harm_table import BestHarmTable
+from ethbrake_marl.limits.best_harm import BestHarmTable, shipped_tables
 from ethbrake_marl.scenario import Task, load_scenario
 
 

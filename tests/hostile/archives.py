@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.limits.best_harm import best_harm
-from ethbrake_marl.limits.best_harm_table import table_bytes
+from ethbrake_marl.limits.best_harm import best_harm, table_bytes
 from ethbrake_marl.scenario import load_scenario
 
 SHAPE_TEXTS = (

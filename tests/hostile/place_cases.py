@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.limits.best_harm_table import load_table
+from ethbrake_marl.limits.best_harm import load_table
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.scenario import load_scenario, read_initial_states

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.limits.best_harm_table import load_table
+from ethbrake_marl.limits.best_harm import load_table
 from tests.hostile.archives import (
     DTYPES,
     NUMBERS,

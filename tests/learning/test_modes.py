@@ -26,8 +26,7 @@ from ethbrake_marl.learning.recipe import algorithm_named, load_recipe
 from ethbrake_marl.learning.train import TrainResult, _environment, make_model, resume, train
 from ethbrake_marl.learning.training import resolve
 from ethbrake_marl.policies.bundle import load_policy
-from ethbrake_marl.search.profiles import profile_problem
-from ethbrake_marl.search.refine import best_templates
+from ethbrake_marl.search import best_templates, profile_problem
 
 SCENARIO = eb.load_scenario("paper-random")
 SHIPPED = load_recipe("modes")

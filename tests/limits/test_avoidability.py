@@ -9,7 +9,7 @@ import pytest
 
 from ethbrake_marl import load_scenario
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.limits.avoidability import REASONS, avoidability
+from ethbrake_marl.limits.lower_bound import REASONS, avoidability
 from ethbrake_marl.physics import advance, concatenate, make_worlds
 from tests.limits.avoidability_worlds import random_profiles, wide_worlds, with_gap
 from tests.reference.play_profile import play_profile

@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl import load_scenario
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.limits.avoidability import avoidability
+from ethbrake_marl.limits.lower_bound import avoidability
 from ethbrake_marl.physics import advance, concatenate, make_worlds
 from tests.limits.avoidability_worlds import wide_worlds
 from tests.reference.avoidability_lp import avoidable_by_lp, default_horizon_s

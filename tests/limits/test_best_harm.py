@@ -15,18 +15,20 @@ from ethbrake_marl.evaluation.outcome import TESTS
 from ethbrake_marl.limits.best_harm import (
     LEFT_OUT,
     TABLES,
+    BestHarmTable,
     best_harm,
     best_known,
+    load_table,
     realised_harm,
+    save_table,
     search_list,
     shipped_profiles,
     shipped_tables,
     world_identity,
 )
-from ethbrake_marl.limits.best_harm_table import BestHarmTable, load_table, save_table
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
-from ethbrake_marl.search.profiles import (
+from ethbrake_marl.search import (
     Profiles,
     constant_profiles,
     even_grid,

@@ -7,8 +7,7 @@ import pytest
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation.inputs import LADDER
-from ethbrake_marl.limits.best_harm import TABLES, realised_harm
-from ethbrake_marl.limits.best_harm_table import load_table
+from ethbrake_marl.limits.best_harm import TABLES, load_table, realised_harm
 from ethbrake_marl.scenario import Task, load_scenario
 
 SMALL = ["best-harm", "--scenario", "paper-random", "--episodes", "4", "--budget", "60", "--threads", "1"]

@@ -9,7 +9,7 @@ from ethbrake_marl import load_scenario
 from ethbrake_marl.limits.best_harm import KEPT, best_harm, extreme_profiles
 from ethbrake_marl.limits.lower_bound import lower_bound, onset_states
 from ethbrake_marl.physics import advance
-from ethbrake_marl.search.profiles import follow_profiles, profile_problem
+from ethbrake_marl.search import follow_profiles, profile_problem
 
 
 def of_worlds(worlds, vehicle, *, front=True, rear=True):

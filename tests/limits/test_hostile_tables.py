@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
-from ethbrake_marl.limits.best_harm import search_list
-from ethbrake_marl.limits.best_harm_table import load_table
+from ethbrake_marl.limits.best_harm import load_table, search_list
 from ethbrake_marl.scenario import load_scenario
 from tests.hostile.archives import bomb, good, good_bytes, packed
 from tests.hostile.table_cases import CERTAIN, ONLY_A_PROBLEM_KNOWS

@@ -10,35 +10,21 @@ import pytest
 from ethbrake_marl import load_scenario
 from ethbrake_marl.agents import optimise_coupled
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.limits.avoidability import avoidability, empty_plan
 from ethbrake_marl.limits.best_harm import best_known
-from ethbrake_marl.limits.lower_bound import lower_bound, rounding
-from ethbrake_marl.limits.meetings import (
-    A_F,
-    A_L,
-    A_R,
+from ethbrake_marl.limits.lower_bound import (
     FRONT_FIRST,
-    FRONT_SHARE,
-    GAP_L,
-    GAP_R,
-    LIMIT_F,
-    OBSTACLE,
-    ONSET_R,
+    LINE,
     REAR_FIRST,
-    REAR_SHARE,
-    RESTITUTION,
-    TIME_STEP,
-    U_F,
-    V_F,
-    V_L,
-    V_R,
-    WIDTH,
     after,
+    avoidability,
+    empty_plan,
     follower,
     gentlest,
     leader,
+    lower_bound,
     meet_front,
     meet_rear,
+    rounding,
 )
 from ethbrake_marl.physics import concatenate, make_worlds
 from ethbrake_marl.scenario import Task
@@ -244,26 +230,26 @@ def test_many_searched_profiles__are_never_below_the_bound(harm_count):
 def random_states(n, seed):
     """States at the onset in which vehicle 2 brakes at least as hard as the others, as the combined bound asks."""
     rng = np.random.default_rng(seed)
-    at = np.empty((n, WIDTH))
-    for column in (GAP_L, GAP_R):
+    at = np.empty((n, LINE.WIDTH))
+    for column in (LINE.GAP_L, LINE.GAP_R):
         at[:, column] = rng.uniform(1, 20, n)
-    for column in (V_L, V_F, V_R):
+    for column in (LINE.V_L, LINE.V_F, LINE.V_R):
         at[:, column] = rng.uniform(0, 32, n)
-    for column in (A_L, A_R, U_F):
+    for column in (LINE.A_L, LINE.A_R, LINE.U_F):
         at[:, column] = rng.uniform(2, 8, n)
-    at[:, A_F] = np.maximum(at[:, A_L], at[:, A_R]) * rng.choice([1.0, 1.3], n)
-    at[:, LIMIT_F] = rng.uniform(32, 45, n)
-    at[:, ONSET_R] = rng.uniform(0, 1.5, n)
-    for column in (FRONT_SHARE, REAR_SHARE):
+    at[:, LINE.A_F] = np.maximum(at[:, LINE.A_L], at[:, LINE.A_R]) * rng.choice([1.0, 1.3], n)
+    at[:, LINE.LIMIT_F] = rng.uniform(32, 45, n)
+    at[:, LINE.ONSET_R] = rng.uniform(0, 1.5, n)
+    for column in (LINE.FRONT_SHARE, LINE.REAR_SHARE):
         at[:, column] = rng.uniform(0.1, 0.9, n)
-    at[:, RESTITUTION] = rng.uniform(0, 0.4, n)
-    at[:, TIME_STEP], at[:, OBSTACLE] = 0.0, np.inf
+    at[:, LINE.RESTITUTION] = rng.uniform(0, 0.4, n)
+    at[:, LINE.TIME_STEP], at[:, LINE.OBSTACLE] = 0.0, np.inf
     return at
 
 
 def outer_gap(at, time):
     """Gap between the outer two vehicles, both left alone."""
-    return at[GAP_L] + at[GAP_R] + leader(at, time)[1] - follower(at, time)[1]
+    return at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, time)[1] - follower(at, time)[1]
 
 
 def follows(kind, at, time, closing):
@@ -291,7 +277,7 @@ def test_gentlest_meeting__is_driven_and_falls_with_the_time():
 def test_what_follows__falls_with_the_closing_speed_and_rises_with_the_time():
     some = 0
     for at in random_states(300, seed=44):
-        stand = at[V_L] / at[A_L]
+        stand = at[LINE.V_L] / at[LINE.A_L]
         for kind in (FRONT_FIRST, REAR_FIRST):
             times = [t for t in (0.1, 0.4, 0.8, 1.6) if outer_gap(at, t) > 0 and (kind == REAR_FIRST or t < stand)]
             if not times:
@@ -318,14 +304,21 @@ def three(gaps, speeds, braking, driving):
 
 def row(worlds):
     """The state of ``worlds`` as the compiled bounds take it."""
-    at = np.empty(WIDTH)
+    at = np.empty(LINE.WIDTH)
     v = worlds.vehicles
-    (at[GAP_L], at[GAP_R]), (at[V_L], at[V_F], at[V_R]) = worlds.gaps_m[0], worlds.speeds_mps[0]
-    at[A_L], at[A_F], at[A_R] = v.braking_capacity_mps2[0]
-    at[U_F], at[LIMIT_F], at[ONSET_R] = v.driving_capacity_mps2[0, 1], v.speed_limit_mps[0, 1], v.latency_s[0, 2]
-    at[FRONT_SHARE] = at[REAR_SHARE] = 0.5
-    at[RESTITUTION] = v.restitution[0]
-    at[TIME_STEP], at[OBSTACLE] = 0.0, np.inf
+    (at[LINE.GAP_L], at[LINE.GAP_R]), (at[LINE.V_L], at[LINE.V_F], at[LINE.V_R]) = (
+        worlds.gaps_m[0],
+        worlds.speeds_mps[0],
+    )
+    at[LINE.A_L], at[LINE.A_F], at[LINE.A_R] = v.braking_capacity_mps2[0]
+    at[LINE.U_F], at[LINE.LIMIT_F], at[LINE.ONSET_R] = (
+        v.driving_capacity_mps2[0, 1],
+        v.speed_limit_mps[0, 1],
+        v.latency_s[0, 2],
+    )
+    at[LINE.FRONT_SHARE] = at[LINE.REAR_SHARE] = 0.5
+    at[LINE.RESTITUTION] = v.restitution[0]
+    at[LINE.TIME_STEP], at[LINE.OBSTACLE] = 0.0, np.inf
     return at
 
 

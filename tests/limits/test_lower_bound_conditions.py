@@ -7,23 +7,25 @@ import math
 import numpy as np
 import pytest
 
-from ethbrake_marl.limits import meetings
-from ethbrake_marl.limits.avoidability import empty_plan
-from ethbrake_marl.limits.lower_bound import LARGE, front_first, last_soft, rear_first
-from ethbrake_marl.limits.meetings import (
-    CELL_WIDTH,
+from ethbrake_marl.limits import lower_bound
+from ethbrake_marl.limits.lower_bound import (
+    CELL_OF,
     CELLS,
     FRONT_FIRST,
-    OBSTACLE,
+    LARGE,
+    LINE,
     REAR_FIRST,
-    WIDTH,
     after_front,
     after_rear,
+    empty_plan,
+    front_first,
     gentlest_front,
     held_by_leader,
     lacking,
+    last_soft,
     lead,
     obstacle_harm,
+    rear_first,
     slowed_by_rear,
     widest_flight,
 )
@@ -31,10 +33,10 @@ from ethbrake_marl.limits.meetings import (
 
 def state(**given):
     """A state at the onset, all else 0; no obstacle."""
-    at = np.zeros(WIDTH)
-    at[OBSTACLE] = math.inf
+    at = np.zeros(LINE.WIDTH)
+    at[LINE.OBSTACLE] = math.inf
     for name, value in given.items():
-        at[getattr(meetings, name)] = value
+        at[getattr(LINE, name)] = value
     return at
 
 
@@ -42,27 +44,27 @@ def test_obstacle__is_met_by_a_leader_that_was_pushed_on():
     # 12 against 10 m/s, equal masses, no bounce: both at 11. Brakes of 5 take 2 * 5 * 11 of 121 on the way of 11 m.
     at = state(V_L=10, A_L=5, FRONT_SHARE=0.5, OBSTACLE=11)
     assert obstacle_harm(at, 0.0, 0.0, 2.0) == pytest.approx(11)
-    at[OBSTACLE] = 13
+    at[LINE.OBSTACLE] = 13
     assert obstacle_harm(at, 0.0, 0.0, 2.0) == 0
-    at[OBSTACLE] = 10  # the leader stops at the obstacle itself: all three are one cluster
+    at[LINE.OBSTACLE] = 10  # the leader stops at the obstacle itself: all three are one cluster
     assert obstacle_harm(at, 0.0, 0.0, 2.0) == 0
 
 
 def test_obstacle__takes_the_centre_of_mass_from_the_proof():
     at = state(GAP_R=4, V_L=10, A_L=5, V_F=12, A_F=7, U_F=7, LIMIT_F=40, V_R=20, A_R=6, FRONT_SHARE=0.5)
     free = after_front(at, 0.0, 0.0, 2.0, 0.0, 0.0, empty_plan(), empty_plan())
-    at[OBSTACLE] = 11
+    at[LINE.OBSTACLE] = 11
     assert after_front(at, 0.0, 0.0, 2.0, 0.0, 0.0, empty_plan(), empty_plan()) < free
 
 
 def test_command_in_force__the_way_to_meet_gently_is_the_wrong_one_after_it():
     # In the step from 1 to 2 s; the gentlest meeting at 1.5 s drives for the first second, then brakes with 8.
     at = state(GAP_L=1.5, V_L=0, A_L=1, V_F=2, A_F=8, U_F=0, LIMIT_F=40, V_R=9, A_R=1)
-    at[meetings.GAP_L] = 2 * 1.5 - 0.5 * 8 * 0.25
+    at[lower_bound.LINE.GAP_L] = 2 * 1.5 - 0.5 * 8 * 0.25
     closing, drive = gentlest_front(at, 1.5)
     assert (closing, drive) == (pytest.approx(0.0, abs=1e-9), pytest.approx(1.0))
-    at[meetings.GAP_L] = 10.0
-    at[meetings.V_F] = 8.0
+    at[lower_bound.LINE.GAP_L] = 10.0
+    at[lower_bound.LINE.V_F] = 8.0
     closing, drive = gentlest_front(at, 1.5)
     assert drive == pytest.approx(1.5 - math.sqrt(2 * (12 - 10) / 8)) and closing == pytest.approx(
         8 - 8 * math.sqrt(0.5)
@@ -116,9 +118,9 @@ def test_held__without_a_bounce_it_keeps_the_common_speed():
     # 20 against 10 m/s, nine tenths of the mass in front, no bounce: both at 11, slowing by 0.9 * 8 - 0.1 * 2 = 7, and
     # rest after 11^2 / 14 m. The rear one, at 30 m/s with 4, comes there after 100 m in all: 900 - 800.
     at = state(V_L=10, A_L=8, V_F=20, A_F=4, U_F=2, LIMIT_F=40, V_R=30, A_R=4, FRONT_SHARE=0.9)
-    at[meetings.GAP_R] = 100 - 121 / 14
+    at[lower_bound.LINE.GAP_R] = 100 - 121 / 14
     assert held_by_leader(at, 0.0, 0.0, 10.0, empty_plan(), empty_plan()) == pytest.approx(10.0, abs=1e-3)
-    at[meetings.A_F] = 9.0
+    at[lower_bound.LINE.A_F] = 9.0
     assert held_by_leader(at, 0.0, 0.0, 10.0, empty_plan(), empty_plan()) == 0
 
 
@@ -128,7 +130,7 @@ def test_slowed__is_the_common_speed_less_the_way_it_must_stay_ahead():
     until = (19 - math.sqrt(19**2 - 2 * 6 * 7)) / 6
     found = slowed_by_rear(at, 0.0, 2.0, 7.0, empty_plan(), empty_plan())
     assert found == pytest.approx(19 - 7 * until)
-    at[meetings.A_L] = 7.5  # harder than 7: the closing speed may rise
+    at[lower_bound.LINE.A_L] = 7.5  # harder than 7: the closing speed may rise
     assert slowed_by_rear(at, 0.0, 2.0, 7.0, empty_plan(), empty_plan()) == 0
 
 
@@ -136,27 +138,27 @@ def test_soft_meetings__with_one_that_brakes_harder_end_where_it_would_have_been
     # It was faster by 2 t a time t before, over 1 m: t is at most 1 s, and 1.5 s for 3 m/s.
     at = state(V_L=30, A_L=1, V_F=18, A_F=5, U_F=4, V_R=21, A_R=7, GAP_L=50, GAP_R=1)
     assert last_soft(at, 9.0, empty_plan(), empty_plan()) == pytest.approx(1.0)
-    at[meetings.GAP_R] = 90
+    at[lower_bound.LINE.GAP_R] = 90
     assert last_soft(at, 9.0, empty_plan(), empty_plan()) == pytest.approx(1.5)
-    at[meetings.ONSET_R] = 0.2  # till then it can be left behind by up to 4, or be come towards by up to 5
+    at[lower_bound.LINE.ONSET_R] = 0.2  # till then it can be left behind by up to 4, or be come towards by up to 5
     assert last_soft(at, 9.0, empty_plan(), empty_plan()) == pytest.approx(0.2 + 4 / 2)
 
 
 def room():
-    return empty_plan(), empty_plan(), np.empty((CELLS, CELL_WIDTH))
+    return empty_plan(), empty_plan(), np.empty((CELLS, CELL_OF.WIDTH))
 
 
 def test_rear_first__is_impossible_where_the_leader_must_be_met_before():
     # One stands 5 m ahead, the other comes from 100 m behind; 60 m ahead it may come in time.
     at = state(GAP_L=5, V_L=0, A_L=5, V_F=20, A_F=6, U_F=4, LIMIT_F=40, GAP_R=100, V_R=40, A_R=4, FRONT_SHARE=0.9)
     assert rear_first(at, 0.0, LARGE, -1.0, *room()) == LARGE
-    at[meetings.GAP_L] = 60
+    at[lower_bound.LINE.GAP_L] = 60
     assert rear_first(at, 0.0, LARGE, -1.0, *room()) < LARGE
 
 
 def test_all_at_once__is_impossible_where_the_leader_must_be_met_before():
     # As above: 400 - 2 * 6 * 5 = 340 in front; the rear one has 400 - 2 * 4 * 105 < 0 left, or 60 with weaker brakes.
     at = state(GAP_L=5, V_L=0, A_L=5, V_F=20, A_F=4.5, U_F=0, LIMIT_F=40, GAP_R=100, V_R=30, A_R=4, FRONT_SHARE=0.98)
-    at[meetings.REAR_SHARE] = 0.5
+    at[lower_bound.LINE.REAR_SHARE] = 0.5
     front = 400 - 2 * 4.5 * 5
     assert front_first(at, 0.0, LARGE, -1.0, *room()) > front + 30  # 900 - 840 less what is pushed on

@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl.limits.lower_bound import lower_bound
 from ethbrake_marl.physics import make_worlds
-from ethbrake_marl.search.profiles import constant_profiles, even_grid, profile_problem, search_profiles
+from ethbrake_marl.search import constant_profiles, even_grid, profile_problem, search_profiles
 
 HORIZON_S, TIME_STEP_S = 60.0, 0.1
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ethbrake_marl.limits.meetings import A_F, A_R, GAP_R, LIMIT_F, ONSET_R, U_F, V_F, V_R, WIDTH
+from ethbrake_marl.limits.lower_bound import LINE
 from ethbrake_marl.limits.team_bound import behind_full_braking, gained, soft_behind
 from ethbrake_marl.physics import advance, make_worlds
 
@@ -25,11 +25,15 @@ def pairs(n, seed):
 
 
 def rows_of(worlds):
-    at, v = np.zeros((worlds.n, WIDTH)), worlds.vehicles
-    at[:, V_F], at[:, V_R], at[:, GAP_R] = worlds.speeds_mps[:, 1], worlds.speeds_mps[:, 2], worlds.gaps_m[:, 1]
-    at[:, A_F], at[:, A_R] = v.braking_capacity_mps2[:, 1], v.braking_capacity_mps2[:, 2]
-    at[:, U_F], at[:, LIMIT_F] = v.driving_capacity_mps2[:, 1], v.speed_limit_mps[:, 1]
-    at[:, ONSET_R] = v.latency_s[:, 2]
+    at, v = np.zeros((worlds.n, LINE.WIDTH)), worlds.vehicles
+    at[:, LINE.V_F], at[:, LINE.V_R], at[:, LINE.GAP_R] = (
+        worlds.speeds_mps[:, 1],
+        worlds.speeds_mps[:, 2],
+        worlds.gaps_m[:, 1],
+    )
+    at[:, LINE.A_F], at[:, LINE.A_R] = v.braking_capacity_mps2[:, 1], v.braking_capacity_mps2[:, 2]
+    at[:, LINE.U_F], at[:, LINE.LIMIT_F] = v.driving_capacity_mps2[:, 1], v.speed_limit_mps[:, 1]
+    at[:, LINE.ONSET_R] = v.latency_s[:, 2]
     return at
 
 
@@ -62,12 +66,12 @@ def test_played_meetings__lie_within_the_bounds_of_every_cell_that_holds_them():
     v = worlds.vehicles
     for world, time, closing, there in played(worlds, np.random.default_rng(4)):
         row = rows_of(worlds.take([world]))[0]
-        since, power = row[ONSET_R], row[A_R] + v.driving_capacity_mps2[world, 2]
-        if time > since + row[V_R] / row[A_R]:
+        since, power = row[LINE.ONSET_R], row[LINE.A_R] + v.driving_capacity_mps2[world, 2]
+        if time > since + row[LINE.V_R] / row[LINE.A_R]:
             continue  # the one that brakes fully stands by then
-        way, speed = full_braking(row[V_R], row[A_R], since, time)
+        way, speed = full_braking(row[LINE.V_R], row[LINE.A_R], since, time)
         way_l, _ = full_braking(worlds.speeds_mps[world, 0], v.braking_capacity_mps2[world, 0], 0.0, time)
-        further = max(FAR_M + way_l - there.gaps_m[0, 0] + row[GAP_R] - way, 0.0)
+        further = max(FAR_M + way_l - there.gaps_m[0, 0] + row[LINE.GAP_R] - way, 0.0)
         faster = there.speeds_mps[0, 2] - speed
         for reach in (power, math.inf):
             assert faster >= gained(further - 1e-6, time, since, reach) - 1e-3

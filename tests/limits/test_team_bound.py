@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.limits.avoidability import avoidability
-from ethbrake_marl.limits.lower_bound import lower_bound
+from ethbrake_marl.limits.lower_bound import avoidability, lower_bound
 from ethbrake_marl.limits.team_bound import team_bound
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search.profiles import (
+from ethbrake_marl.search import (
     Profiles,
     constant_profiles,
     even_grid,

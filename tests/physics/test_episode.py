@@ -7,14 +7,15 @@ import inspect
 import numpy as np
 import pytest
 
+from ethbrake_marl import search as search_kernel
 from ethbrake_marl.agents.protocol import fixed_commands
 from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.engine import step as engine_step
-from ethbrake_marl.physics import episode, kernel
-from ethbrake_marl.physics.episode import decision_at, first_decision_s, number_of_decisions
+from ethbrake_marl.physics import kernel
+from ethbrake_marl.physics import kernel as episode
+from ethbrake_marl.physics.kernel import decision_at, first_decision_s, number_of_decisions
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search import kernel as search_kernel
-from ethbrake_marl.search.profiles import Profiles, follow_profiles, profile_problem
+from ethbrake_marl.search import Profiles, follow_profiles, profile_problem
 from ethbrake_marl.shield import certify_kernel
 from ethbrake_marl.shield import certify_kernel as members
 

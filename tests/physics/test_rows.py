@@ -24,7 +24,7 @@ from ethbrake_marl.physics.advance import (
     unpack,
     with_news_columns,
 )
-from ethbrake_marl.physics.kernel import ROW_WIDTH
+from ethbrake_marl.physics.kernel import LISTED
 
 
 def worlds(n, vehicles):
@@ -87,7 +87,7 @@ def test_columns__follow_each_other_without_a_hole():
     at = [speed_at(3), command_at(3), previous_at(3), gap_at(3), harm_at(3)]
     assert at == [1, 4, 7, 10, 14] and state_width(3) == 20
     assert [params_at(group, 3) for group in range(7)] == [1, 4, 7, 10, 13, 16, 19]
-    assert pack(worlds(1, 3)).state.shape == (1, 20) and NO_ROWS.shape == (0, ROW_WIDTH)
+    assert pack(worlds(1, 3)).state.shape == (1, 20) and NO_ROWS.shape == (0, LISTED.WIDTH)
 
 
 def test_ledger_columns__are_those_of_the_harm():

@@ -166,7 +166,7 @@ BUGS: dict[str, Bug] = {
         ("tests/envs/test_parallel.py",),
     ),
     "one step more where the division rounds up": Bug(
-        "ethbrake_marl/physics/episode.py", " / time_step_s - _ROUNDING)", " / time_step_s)", OF_ENGINE
+        "ethbrake_marl/physics/kernel.py", " / time_step_s - _ROUNDING)", " / time_step_s)", OF_ENGINE
     ),
     "rows that have ended are paid again": Bug(TERMS, "        extra[standing] = 0.0\n", "", OF_ENGINE),
     "the last observation taken from the next episode": Bug(

@@ -64,6 +64,7 @@ PHYSICS = Suite(
             'tests/physics/test_clusters.py',
             'tests/physics/test_against_exact.py',
             'tests/physics/test_segment.py',
+            'tests/physics/test_forecast.py',
         ),
         'physics/advance.py': (
             'tests/physics/test_rows.py',
@@ -81,7 +82,6 @@ PHYSICS = Suite(
             "tests/physics/test_sampled_edges.py", "tests/physics/test_sampled.py",
             "tests/physics/test_sampled_input.py", "tests/physics/test_obstacle.py",
         ),
-        "physics/forecast.py": ("tests/physics/test_forecast.py", "tests/physics/test_obstacle.py"),
         "harm.py": ("tests/test_harm.py", "tests/physics/test_ledger.py", "tests/physics/test_obstacle.py"),
     },
     otherwise=KERNEL,
@@ -194,10 +194,19 @@ EVALUATION = Suite(
         "evaluation/rollout.py": ("tests/evaluation/test_rollout.py", "tests/agents/test_team.py"),
         "evaluation/outcome.py": ("tests/evaluation/test_rollout.py", "tests/evaluation/test_left_out.py"),
         "evaluation/regret.py": ("tests/evaluation/test_regret.py",),
-        'evaluation/episodes.py': ('tests/evaluation/test_record.py', 'tests/evaluation/test_film.py',),
+        'evaluation/episodes.py': (
+            'tests/evaluation/test_record.py',
+            'tests/evaluation/test_film.py',
+        ),
         "evaluation/summary.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
-        'evaluation/curves.py': ('tests/figures/test_criticality.py', 'tests/figures/test_deceleration.py',),
-        'figures/evaluation.py': ('tests/figures/test_criticality.py', 'tests/figures/test_deceleration.py',),
+        'evaluation/curves.py': (
+            'tests/figures/test_criticality.py',
+            'tests/figures/test_deceleration.py',
+        ),
+        'figures/evaluation.py': (
+            'tests/figures/test_criticality.py',
+            'tests/figures/test_deceleration.py',
+        ),
         "evaluation/shield_modes.py": ("tests/evaluation/test_shield_modes.py",),
         "evaluation/results.py": ("tests/evaluation/test_report.py", "tests/evaluation/test_per_world.py"),
     },

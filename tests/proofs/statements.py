@@ -92,11 +92,11 @@ def _cluster(vehicles: int, closing: float) -> tuple[list[Symbol], list[Symbol],
     known = [exact(m) > 0 for m in mass] + [exact(restitution) >= 0, exact(restitution) <= 1]
 
     def resolve() -> list[Symbol]:
-        table = np.zeros((kernel.IMPACT_ROWS, vehicles), dtype=object)
-        table[kernel.MASS], table[kernel.SPEED] = mass, speed
-        table[kernel.CLOSING, : vehicles - 1] = closing
+        table = np.zeros((kernel.ROW.OF_IMPACT, vehicles), dtype=object)
+        table[kernel.ROW.MASS], table[kernel.ROW.SPEED] = mass, speed
+        table[kernel.ROW.CLOSING, : vehicles - 1] = closing
         kernel.resolve_cluster(table, restitution, 0, vehicles - 1)
-        return list(table[kernel.SPEED])
+        return list(table[kernel.ROW.SPEED])
 
     return mass, speed, restitution, list(_run(kernel, resolve, known))
 

@@ -16,7 +16,7 @@ from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import worlds_sha256
 from ethbrake_marl.observations import choose_observation
-from ethbrake_marl.physics.messages import KEY, TOLD_PLACE, TOLD_S, TOLD_SPEED, age_s, chance, is_periodic, links_of
+from ethbrake_marl.physics.messages import CHANNEL, LINK, age_s, chance, is_periodic, links_of
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.v2x import CHANNELS
 
@@ -82,9 +82,9 @@ def test_fixed_delay_without_loss__by_hand() -> None:
         time = 0.5 + 0.1 * step
         link = links_of(engine.worlds)[0, 1, 0]
         assert engine.worlds.time_s[0] == pytest.approx(time)
-        assert link[TOLD_S] == pytest.approx(time - 0.2)
-        assert link[TOLD_SPEED] == pytest.approx(20.0 - 6.0 * (time - 0.2))
-        assert link[TOLD_PLACE] == pytest.approx(20.0 * (time - 0.2) - 3.0 * (time - 0.2) ** 2)
+        assert link[LINK.TOLD_S] == pytest.approx(time - 0.2)
+        assert link[LINK.TOLD_SPEED] == pytest.approx(20.0 - 6.0 * (time - 0.2))
+        assert link[LINK.TOLD_PLACE] == pytest.approx(20.0 * (time - 0.2) - 3.0 * (time - 0.2) ** 2)
         seen = engine.observe(1)[0]  # moved on with the command of then, it is where Vehicle 1 is
         assert seen[8] == pytest.approx(engine.worlds.gaps_m[0, 0] / 10.0, abs=1e-6)
         engine.step(np.full((1, 1), -0.5))
@@ -188,7 +188,7 @@ def test_interfaces__see_the_same() -> None:
     env = parallel_env(scenario=scenario)
     seen, _ = env.reset(seed=5)
     engine = env.unwrapped.engine
-    assert is_periodic(engine.worlds).all() and not (engine.worlds.messages[:, KEY] == 0.0).any()
+    assert is_periodic(engine.worlds).all() and not (engine.worlds.messages[:, CHANNEL.KEY] == 0.0).any()
     for _ in range(5):
         seen, *_, infos = env.step({"vehicle_2": np.array([-0.5], np.float32)})
     np.testing.assert_array_equal(seen["vehicle_2"], engine.observe(1)[0])

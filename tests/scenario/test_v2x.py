@@ -16,7 +16,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import full_state, observation_for, observe, state_features
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.physics.advance import Packed, pack, unpack, with_news_columns
-from ethbrake_marl.physics.episode import CLOCK_WIDTH
+from ethbrake_marl.physics.kernel import CLOCK
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
 from ethbrake_marl.scenario.v2x import (
     CHANNELS,
@@ -28,7 +28,7 @@ from ethbrake_marl.scenario.v2x import (
     link_delays,
     with_news,
 )
-from ethbrake_marl.search.profiles import identities
+from ethbrake_marl.search import identities
 
 PAPER = load_scenario("paper-random")
 MESSAGES = [name for name in PRESETS if CHANNELS[name].timing == "messages"]
@@ -441,7 +441,7 @@ def test_v2x__declared_is_the_same_scenario(name):
 
 def test_identities__do_not_depend_on_the_news():
     worlds = PAPER.sample(5, 7).worlds
-    clock, command = np.zeros((5, CLOCK_WIDTH)), -worlds.vehicles.braking_capacity_mps2
+    clock, command = np.zeros((5, CLOCK.WIDTH)), -worlds.vehicles.braking_capacity_mps2
     late = replace(worlds.vehicles, known_from_s=worlds.vehicles.known_from_s + 1.0)
     by_link = replace(worlds, vehicles=late)
     plain, told = (identities(w, command, clock, np.array([1])) for w in (worlds, by_link))

@@ -14,20 +14,25 @@ import numpy as np
 from ethbrake_marl.agents.protocol import fixed_commands
 from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.physics import Worlds, advance
-from ethbrake_marl.shield.enclosure import go_on, may_meet_unseen, meet, new_stack
-from ethbrake_marl.shield.enclosure_motion import (
+from ethbrake_marl.shield.enclosure import (
     CLOSING,
     OPENING,
     TOUCHES,
     WIDE,
+    Known,
     Path,
     backwards,
+    cell_of,
+    go_on,
     high,
+    may_meet_unseen,
+    meet,
     move_alone,
     new_motion,
+    new_stack,
     stray,
+    wait,
 )
-from ethbrake_marl.shield.interior import Known, cell_of, wait
 
 ROOM = 1e-7  # for what two ways to compute a state differ by
 MOST = 20_000  # states of paths

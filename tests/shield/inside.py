@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search.profiles import profile_problem
+from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield.certify import begin_running, plan_harm
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import parse_uncertainty

@@ -54,12 +54,12 @@ KERNEL, MEMBERS, CERTIFY, ALERT, GUARD, ROLLOUTS, ATTACHED, COMPARISON, TEAM = (
 )  # fmt: skip
 ENGINE = "ethbrake_marl/engine/engine.py"
 FORMS, INSIDE, WAIT, MOTION, TOUCH, ROUGH = (
-    "ethbrake_marl/shield/enclosure_motion.py",
-    "ethbrake_marl/shield/interior.py",
-    "ethbrake_marl/shield/interior.py",
-    "ethbrake_marl/shield/enclosure_motion.py",
-    "ethbrake_marl/shield/enclosure_motion.py",
-    "ethbrake_marl/shield/enclosure_motion.py",
+    "ethbrake_marl/shield/enclosure.py",
+    "ethbrake_marl/shield/enclosure.py",
+    "ethbrake_marl/shield/enclosure.py",
+    "ethbrake_marl/shield/enclosure.py",
+    "ethbrake_marl/shield/enclosure.py",
+    "ethbrake_marl/shield/enclosure.py",
 )
 
 BUGS: dict[str, tuple[Patch, ...]] = {
@@ -88,9 +88,10 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     ),
     "an impact counted again where the pair was hit before": (
         Patch(
-            MEMBERS, "    save(world.table, after)\n", "    world.table[HIT, 0] = 0.0\n    save(world.table, after)\n"
+            MEMBERS,
+            "    save(world.table, after)\n",
+            "    world.table[ROW.HIT, 0] = 0.0\n    save(world.table, after)\n",
         ),
-        Patch(MEMBERS, "import COMMAND, LIMIT, MASS\n", "import COMMAND, HIT, LIMIT, MASS\n"),
     ),
     "harm so far forgotten": (
         Patch(MEMBERS, "    save(world.table, after)\n", "    world.table[-2:] = 0.0\n    save(world.table, after)\n"),
@@ -224,7 +225,8 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "what the rear one of a pair bears is forgotten by its cap": (
         Patch(
             MEMBERS,
-            "        value += table[row, i - 1] - front_share(table[row, i - 1], table[MASS, i - 1], table[MASS, i])\n",
+            "        value += table[row, i - 1] - "
+            "front_share(table[row, i - 1], table[ROW.MASS, i - 1], table[ROW.MASS, i])\n",
             "        value += 0.0\n",
         ),
     ),

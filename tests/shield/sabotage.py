@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ethbrake_marl.physics.episode import RESTITUTION
+from ethbrake_marl.physics.kernel import CLOCK
 from ethbrake_marl.shield import StepShield
 from ethbrake_marl.shield.certify import Decision, Running
 
@@ -82,7 +82,7 @@ def belief(name: str, factor: float) -> Leak:
 def restitution_wrong(shield: StepShield, last: Decision | None) -> None:
     if last is None:
         clock = shield.running.problem.clock.copy()
-        clock[:, RESTITUTION] *= 0.5
+        clock[:, CLOCK.RESTITUTION] *= 0.5
         _with_problem(shield, clock=clock)
 
 

@@ -11,9 +11,9 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield import ShieldedDriver, interior
+from ethbrake_marl.shield import ShieldedDriver, enclosure
 from ethbrake_marl.shield.believed import BelievedShield
-from ethbrake_marl.shield.interior import Boxes, boxes_of
+from ethbrake_marl.shield.enclosure import Boxes, boxes_of
 from tests.shield import corners
 from tests.shield.corners import ABOVE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded
 
@@ -58,7 +58,7 @@ def test_interior__a_box_that_is_the_middle_alone_is_found(monkeypatch: pytest.M
         half = 0.5 * (boxes.low + boxes.high)
         return boxes._replace(low=half, high=half)
 
-    monkeypatch.setattr(interior, "boxes_of", middle)
+    monkeypatch.setattr(enclosure, "boxes_of", middle)
     monkeypatch.setattr(BelievedShield, "_corners", lambda self, vehicle: [{}])
     harm, bound, _ = shielded("coast", INSIDE["never heard"], 12, 7, robust="interior")
     assert (harm > bound + 1.0).any()

@@ -10,7 +10,7 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import make_worlds
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.profiles import profile_problem
+from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield.certify import CONSTANTS, REASONS, Backup, begin_running, certify, plan_harm
 from tests.shield.lines import line
 

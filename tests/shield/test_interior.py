@@ -10,19 +10,19 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.physics.episode import number_of_decisions
+from ethbrake_marl.physics.kernel import number_of_decisions
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search.profiles import profile_problem
+from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import (
     HybridShield,
     ShieldedDriver,
     ShieldOptions,
     StepShield,
-    enclosure_motion,
+    enclosure,
     parse_uncertainty,
 )
 from ethbrake_marl.shield.certify import begin_running, plan_harm
-from ethbrake_marl.shield.interior import Known, bound_plans, boxes_of, cell_of, wait
+from ethbrake_marl.shield.enclosure import Known, bound_plans, boxes_of, cell_of, wait
 from tests.shield.enclosed import outside
 from tests.shield.lines import line
 from tests.shield.test_certify import STEPS, two
@@ -64,12 +64,12 @@ def width(scenario):
 
 
 OPERATIONS = {
-    "product": (lambda x, y: enclosure_motion.product(x, y), lambda a, b: a * b),
-    "square": (lambda x, y: enclosure_motion.square(x), lambda a, b: a * a),
-    "square_root": (lambda x, y: enclosure_motion.square_root(x), lambda a, b: np.sqrt(a)),
-    "reciprocal": (lambda x, y: enclosure_motion.reciprocal(x), lambda a, b: 1.0 / a),
-    "positive_part": (lambda x, y: enclosure_motion.positive_part(y), lambda a, b: np.maximum(b, 0.0)),
-    "difference": (lambda x, y: enclosure_motion.difference(x, y), lambda a, b: a - b),
+    "product": (lambda x, y: enclosure.product(x, y), lambda a, b: a * b),
+    "square": (lambda x, y: enclosure.square(x), lambda a, b: a * a),
+    "square_root": (lambda x, y: enclosure.square_root(x), lambda a, b: np.sqrt(a)),
+    "reciprocal": (lambda x, y: enclosure.reciprocal(x), lambda a, b: 1.0 / a),
+    "positive_part": (lambda x, y: enclosure.positive_part(y), lambda a, b: np.maximum(b, 0.0)),
+    "difference": (lambda x, y: enclosure.difference(x, y), lambda a, b: a - b),
 }
 
 

@@ -15,7 +15,7 @@ from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.search.profiles import profile_problem
+from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, StepShield, shielded_aec
 from ethbrake_marl.shield.certify import REASONS, Backup, begin_running, borne_under, certify, plan_harm
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv

@@ -13,7 +13,7 @@ from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search.profiles import profile_problem
+from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, StepShield, parse_uncertainty
 from ethbrake_marl.shield.certify import REASONS, Backup, begin_running, certify, plan_harm
 from tests.shield.lines import line

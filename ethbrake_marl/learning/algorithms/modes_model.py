@@ -46,8 +46,7 @@ from ethbrake_marl.learning.recipe import ActorShape
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.policies.actor import Float32s
-from ethbrake_marl.search.profiles import profile_problem
-from ethbrake_marl.search.refine import best_templates
+from ethbrake_marl.search import best_templates, profile_problem
 
 # The gate between several networks: what it has learned, the average that decides, and what it remembers.
 

@@ -22,11 +22,11 @@ from ethbrake_marl.limits.limits import Unproven, prove
 from ethbrake_marl.pages.frame import shown
 from ethbrake_marl.pages.player import played_episode, played_world
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.physics.episode import decision_at, first_decision_s, number_of_decisions
+from ethbrake_marl.physics.kernel import decision_at, first_decision_s, number_of_decisions
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.scenario.initial_states import initial_state_worlds
 from ethbrake_marl.scenario.quantities import OPTIONAL, QUANTITIES, SYMBOLS, QuantityRule
-from ethbrake_marl.search.profiles import (
+from ethbrake_marl.search import (
     ProfileProblem,
     Profiles,
     constant_profiles,

@@ -11,7 +11,7 @@ import pytest
 from ethbrake_marl.agents.e_v2x_bm_kernel import Line, Samples, make_line, share_start, simulate, will_stay_apart
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.kernel import ACTIVE, COMMAND, DONE, GAP, SPEED
+from ethbrake_marl.physics.kernel import FLAG, ROW
 from tests.agents.e_v2x_bm.recorded import line_worlds
 
 HORIZON_S = 7.0
@@ -24,14 +24,14 @@ def line(worlds: Worlds, k: int, vehicle: int, command: Floats, *, total: bool =
         command[k], v.latency_s[k], v.mass_t[k], v.speed_limit_mps[k], worlds.time_s[k], v.restitution[k], HORIZON_S,
         vehicle, total,
     )  # fmt: skip
-    assert share_start(made) == DONE
+    assert share_start(made) == FLAG.DONE
     return made
 
 
 def harms(made: Line, decelerations: Floats, bound: float = math.inf) -> Samples:
     n = len(decelerations)
     found = Samples(decelerations.copy(), np.full(n, np.nan), np.full(n, np.nan), np.full(n, np.nan))
-    assert simulate(made, found, 0, n, bound) == DONE
+    assert simulate(made, found, 0, n, bound) == FLAG.DONE
     return found
 
 
@@ -105,8 +105,8 @@ def stays_apart(speeds, commands, gaps, *, active=True) -> bool:
         mass_t=1, restitution=0.1,
     )  # fmt: skip
     table = line(worlds, 0, 0, np.array([commands], float)).table
-    table[ACTIVE], table[COMMAND] = float(active), commands
-    table[SPEED], table[GAP, :-1] = speeds, gaps
+    table[ROW.ACTIVE], table[ROW.COMMAND] = float(active), commands
+    table[ROW.SPEED], table[ROW.GAP, :-1] = speeds, gaps
     return bool(_will_stay_apart(table))
 
 

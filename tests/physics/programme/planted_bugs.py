@@ -37,22 +37,22 @@ EVENTS, IMPACT, SEGMENT, ADVANCE = (
 )
 HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/kernel.py"
 FLIGHTS, LOWER_BOUND = (
-    "ethbrake_marl/limits/meetings.py",
+    "ethbrake_marl/limits/lower_bound.py",
     "ethbrake_marl/limits/lower_bound.py",
 )
-PROFILES = "ethbrake_marl/search/profiles.py"
+PROFILES = "ethbrake_marl/search.py"
 
 
 BUGS: dict[str, tuple[Patch, ...]] = {
     "wrong sign in eq. (13)": (
         Patch(
             IMPACT,
-            "table[SPEED, i] = pooled + bounce * (pooled - table[SPEED, i])",
-            "table[SPEED, i] -= (1.0 + bounce) * (pooled - table[SPEED, i])",
+            "table[ROW.SPEED, i] = pooled + bounce * (pooled - table[ROW.SPEED, i])",
+            "table[ROW.SPEED, i] -= (1.0 + bounce) * (pooled - table[ROW.SPEED, i])",
         ),
     ),
     "masses swapped in an impact": (
-        Patch(IMPACT, "rest += table[MASS, i] *", "rest += table[MASS, head + end - 1 - i] *"),
+        Patch(IMPACT, "rest += table[ROW.MASS, i] *", "rest += table[ROW.MASS, head + end - 1 - i] *"),
     ),
     "root missed: a pair that opens now never meets": (
         Patch(EVENTS, "    if pressing > 0.0:\n        speed =", "    if pressing > 1e9:\n        speed ="),
@@ -67,26 +67,28 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "bounce-back clamped at standstill": (
         Patch(
             IMPACT,
-            "table[SPEED, i] = pooled + bounce * (pooled - table[SPEED, i])",
-            "table[SPEED, i] = max(pooled + bounce * (pooled - table[SPEED, i]), 0.0)",
+            "table[ROW.SPEED, i] = pooled + bounce * (pooled - table[ROW.SPEED, i])",
+            "table[ROW.SPEED, i] = max(pooled + bounce * (pooled - table[ROW.SPEED, i]), 0.0)",
         ),
     ),
     "late latency: counted from the segment's start": (
-        Patch(ADVANCE, "table[ONSET, i] = onset_s(latency[k, i], time[k])", "table[ONSET, i] = latency[k, i]"),
+        Patch(ADVANCE, "table[ROW.ONSET, i] = onset_s(latency[k, i], time[k])", "table[ROW.ONSET, i] = latency[k, i]"),
     ),
     "latency rounded up to the end of the step": (
         Patch(
             ADVANCE,
-            "table[ONSET, i] = onset_s(latency[k, i], time[k])",
-            "table[ONSET, i] = latency[k, i] - time[k] if latency[k, i] <= time[k] else duration",
+            "table[ROW.ONSET, i] = onset_s(latency[k, i], time[k])",
+            "table[ROW.ONSET, i] = latency[k, i] - time[k] if latency[k, i] <= time[k] else duration",
         ),
     ),
-    "every impact counted as a first one": (Patch(SEGMENT, "if table[HIT, p] == 0.0:", "if table[HIT, p] >= 0.0:"),),
+    "every impact counted as a first one": (
+        Patch(SEGMENT, "if table[ROW.HIT, p] == 0.0:", "if table[ROW.HIT, p] >= 0.0:"),
+    ),
     "harm counted while vehicles merely touch": (
         Patch(
             IMPACT,
-            "table[STRUCK, p] = 1.0 if table[CLOSING, p] > TOUCH_SPEED_MPS else 0.0",
-            "table[STRUCK, p] = 1.0 if table[GAP, p] <= 0.0 else 0.0",
+            "table[ROW.STRUCK, p] = 1.0 if table[ROW.CLOSING, p] > TOUCH_SPEED_MPS else 0.0",
+            "table[ROW.STRUCK, p] = 1.0 if table[ROW.GAP, p] <= 0.0 else 0.0",
         ),
     ),
     "plastic threshold ignored": (
@@ -94,7 +96,7 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     ),
     "holding brake slips": (Patch(EVENTS, "        return command, -command\n", "        return 0.0, 0.0\n"),),
     "common acceleration of a block not weighted by mass": (
-        Patch(IMPACT, "        mass = table[MASS, i]\n", "        mass = 1.0\n"),
+        Patch(IMPACT, "        mass = table[ROW.MASS, i]\n", "        mass = 1.0\n"),
     ),
     "braking passes through standstill": (
         Patch(EVENTS, "        if after <= 0.0:\n", "        if after <= -1e9:\n"),
@@ -105,15 +107,17 @@ BUGS: dict[str, tuple[Patch, ...]] = {
         Patch(EVENTS, "reach = (limit - speed) / acceleration", "reach = (2.0 * limit - speed) / acceleration"),
     ),
     "gap not put to zero at contact": (
-        Patch(SEGMENT, "table[GAP, p] = 0.0\n            continue", "table[GAP, p] = 1e-9\n            continue"),
+        Patch(
+            SEGMENT, "table[ROW.GAP, p] = 0.0\n            continue", "table[ROW.GAP, p] = 1e-9\n            continue"
+        ),
     ),
     "contact at the very end of a segment dropped": (
         Patch(
             SEGMENT,
-            "        if resolve_impacts(table, restitution):\n            return IMPACT, now\n"
-            "        if now >= duration:\n            return DONE, now\n",
-            "        if now >= duration:\n            return DONE, now\n"
-            "        if resolve_impacts(table, restitution):\n            return IMPACT, now\n",
+            "        if resolve_impacts(table, restitution):\n            return FLAG.IMPACT, now\n"
+            "        if now >= duration:\n            return FLAG.DONE, now\n",
+            "        if now >= duration:\n            return FLAG.DONE, now\n"
+            "        if resolve_impacts(table, restitution):\n            return FLAG.IMPACT, now\n",
         ),
     ),
     "restitution e used as 1 - e": (
@@ -125,8 +129,8 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "simultaneous impacts resolved pair after pair": (
         Patch(
             IMPACT,
-            "while last < pairs and table[GAP, last] <= 0.0:",
-            "while last < pairs and table[GAP, last] <= 0.0 and last == first:",
+            "while last < pairs and table[ROW.GAP, last] <= 0.0:",
+            "while last < pairs and table[ROW.GAP, last] <= 0.0 and last == first:",
         ),
     ),
     "shares of harm given to the wrong vehicle": (

@@ -7,8 +7,7 @@ import pytest
 from ethbrake_marl.defaults import LIST_SEED
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.limits.best_harm import realised_harm
-from ethbrake_marl.limits.best_harm_table import load_table
+from ethbrake_marl.limits.best_harm import load_table, realised_harm
 from ethbrake_marl.studies.benchmark import load_suite, suite_names
 
 V2 = load_suite("v2")
