@@ -101,14 +101,14 @@ if TYPE_CHECKING:
 
     # Registration of your own parts
     from ethbrake_marl.agents.registry import register_agent as register_agent
-    from ethbrake_marl.evaluation.harm_metrics import register_harm_metric as register_harm_metric
+    from ethbrake_marl.evaluation.measures import register_measure as register_measure
     from ethbrake_marl.files.plugins import load_plugin as load_plugin
     from ethbrake_marl.learning.recipe import register_algorithm as register_algorithm
     from ethbrake_marl.harm import register_objective as register_objective
     from ethbrake_marl.scenario.features import register_feature as register_feature
     from ethbrake_marl.rewards import register_term as register_term
-    from ethbrake_marl.scenario.catalogue import register_scenarios as register_scenarios
-    from ethbrake_marl.scenario.catalogue import register_preset as register_preset
+    from ethbrake_marl.scenario.schema import register_scenarios as register_scenarios
+    from ethbrake_marl.scenario.schema import register_preset as register_preset
 
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError

@@ -22,15 +22,15 @@ import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NoReturn, Self, TypeVar
+from operator import not_
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, WithoutEffect, describe_error, unknown_name
-from ethbrake_marl.files.yaml import first_mistake
+from ethbrake_marl.files.yaml import UNSHOWN, FileModel, first_mistake, refuse
 from ethbrake_marl.harm import Declared, Objective, check_declared, objectives_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, forecast
 from ethbrake_marl.physics.compiled import logistic
@@ -167,15 +167,7 @@ NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
-def _none(value: dict[str, float]) -> bool:
-    return not value
-
-
-def _refuse(key: str, right: str) -> NoReturn:
-    raise PydanticCustomError("reward", "{right}", {"right": right, "value": "", "at": (key,)})
-
-
-class RewardParams(BaseModel):
+class RewardParams(FileModel):
     """Weights of the terms and their constants; a weight of 0 switches a term off.
 
     Args:
@@ -196,8 +188,6 @@ class RewardParams(BaseModel):
 
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
     harm: NonNegative = 1.0
     harm_count: HarmCount = "first"
     objective: str | Annotated[tuple[str, ...], Field(strict=False)] | None = None  # None: the scenario's
@@ -213,7 +203,7 @@ class RewardParams(BaseModel):
     target_gap_m: NonNegative = 3.0
     distance_slope_per_m: Positive = 1.0
     # weights of terms that somebody registered; in a file or a mapping they may stand beside the others
-    terms: dict[str, NonNegative] = Field(default_factory=dict, validate_default=True, exclude_if=_none)
+    terms: dict[str, NonNegative] = Field(default_factory=dict, validate_default=True, exclude_if=not_)
 
     @model_validator(mode="before")
     @classmethod
@@ -250,9 +240,13 @@ class RewardParams(BaseModel):
         given = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         beside = [name for name, weight in self.weights.items() if weight > 0.0 and name in given]
         if beside and "harm" not in given:
-            _refuse("harm", f"is left out, and would weigh 1 beside {beside[0]}; say harm: 1, or 0 for none")
+            refuse(("harm",), UNSHOWN, f"is left out, and would weigh 1 beside {beside[0]}; say harm: 1, or 0 for none")
         if self.objective is not None and self.harm == 0.0:
-            _refuse("objective", "changes the term harm alone, whose weight is 0; give that a weight, or leave it out")
+            refuse(
+                ("objective",),
+                UNSHOWN,
+                "changes the term harm alone, whose weight is 0; give that a weight, or leave it out",
+            )
         return self
 
     def weight(self, term: str) -> float:

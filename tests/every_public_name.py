@@ -36,7 +36,7 @@ def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str
     eb.register_feature("load", lambda worlds, i: worlds.vehicles.mass_t[:, i], unit="t", scale=10.0, low=0.0, high=6.0)
     eb.register_preset("deaf", {"preset": "nominal", "lost": 0.5})
     eb.register_objective("front", lambda harm, vehicle: harm.borne[:, 0])
-    eb.register_harm_metric("delta_v", lambda episodes: episodes.largest_speed_change_mps, unit="m/s")
+    eb.register_measure("delta_v", lambda episodes: episodes.largest_speed_change_mps, unit="m/s")
     eb.register_scenarios("my_scenarios")
     return eb.agent_names()
 

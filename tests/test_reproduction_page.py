@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -11,22 +12,20 @@ import pytest
 from ethbrake_marl.studies.reproduction.folder import FIGURES, ITEMS, PREFIX, checked_result, choose_items, docs_page
 from ethbrake_marl.studies.reproduction.item import (
     FULL_BRAKE,
-    GAPS,
     NAMES,
     PERCENT,
     READINGS,
+    Result,
     Settings,
-    Verdict,
-    collision_rate,
     drive_list,
     lineup,
-    read_scenario,
     summarise_verdicts,
 )
+from ethbrake_marl.studies.reproduction.lists import GAPS, collision_rate
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGE = (DOCS / "reproduction.md").read_text("utf-8")
-RESULTS = {
+RESULTS: dict[str, Result] = {
     each["name"]: checked_result(each, each["name"])
     for each in json.loads((DOCS / "reproduction.json").read_text("utf-8"))
 }
@@ -39,41 +38,39 @@ def test_page__is_made_of_the_committed_data() -> None:
 
 def test_page__has_every_item_and_every_gap() -> None:
     assert list(RESULTS) == [item.name for item in ITEMS]
-    rows = RESULTS["gaps"]["tables"][0]["rows"]
+    rows = RESULTS["gaps"].tables[0].rows
     assert [row[0] for row in rows] == [gap.name for gap in GAPS]
 
 
 def test_page__every_figure_is_there_and_small_and_no_other() -> None:
     shown = set(re.findall(rf"\]\({FIGURES}/({PREFIX}[a-z0-9-]+\.svg)\)", PAGE))
     assert shown == {path.name for path in (DOCS / FIGURES).glob(f"{PREFIX}*")}
-    assert {f"{PREFIX}{each['stem']}.svg" for result in RESULTS.values() for each in result["figures"]} == shown
+    assert {f"{PREFIX}{each.stem}.svg" for result in RESULTS.values() for each in result.figures} == shown
     for name in shown:
         assert 1_000 < (DOCS / FIGURES / name).stat().st_size < MOST_BYTES, name
 
 
 @pytest.mark.parametrize("name", [item.name for item in ITEMS])
 def test_verdict__is_that_of_the_comparisons(name: str) -> None:
-    result = RESULTS[name]
-    again = summarise_verdicts([Verdict(**each) for each in result["comparisons"]])
-    assert {"outcome": again.outcome, "because": again.because} == {
-        key: result["verdict"][key] for key in ("outcome", "because")
-    }
+    assert summarise_verdicts(RESULTS[name].comparisons) == RESULTS[name].verdict
 
 
 def test_trajectories__are_as_committed(tmp_path: Path) -> None:
     (item,) = choose_items(["trajectories"])
     made = item.make(Settings("quick", tmp_path))
-    assert [table.to_json() for table in made.tables] == RESULTS["trajectories"]["tables"]
-    assert [verdict.to_json() for verdict in made.verdicts] == RESULTS["trajectories"]["comparisons"]
+    committed = RESULTS["trajectories"]
+    assert made.verdicts == committed.comparisons
+    told = [asdict(table) for tables in (made.tables, committed.tables) for table in tables]
+    assert len(told) == 2 and json.dumps(told[0]) == json.dumps(told[1])
 
 
 def test_random_table__full_braking_is_as_committed(tmp_path: Path) -> None:
-    tables = {table["title"]: table for table in RESULTS["random-table"]["tables"]}
+    tables = {table.title: table for table in RESULTS["random-table"].tables}
     for reading in READINGS:
-        scenario = read_scenario("paper-random", reading)
+        scenario = reading.scenario("paper-random")
         evaluation = drive_list(scenario, lineup((FULL_BRAKE,), scenario), 10_000, Settings("quick", tmp_path))
         outcome = evaluation.outcome(NAMES[FULL_BRAKE])
-        (row,) = (row for row in tables[reading.name]["rows"] if row[0] == NAMES[FULL_BRAKE])
+        (row,) = (row for row in tables[reading.name].rows if row[0] == NAMES[FULL_BRAKE])
         assert row[1] == PERCENT.estimate(collision_rate(outcome.collided))
 
 

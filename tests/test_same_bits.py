@@ -30,10 +30,8 @@ TRAINED = "training: torch's own sums differ by machine, too"
 SEARCHED = "a search, whose finds are written down as numbers"
 PRINTED = "drawn or printed, with few digits"
 REMAINS = {
-    ("envs/drawing/animation.py", "math.cos"): PRINTED,
-    ("envs/drawing/animation.py", "math.sin"): PRINTED,
-    ("envs/drawing/frame.py", "math.cos"): PRINTED,
-    ("envs/drawing/frame.py", "math.sin"): PRINTED,
+    ("envs/drawing/scene.py", "math.cos"): PRINTED,
+    ("envs/drawing/scene.py", "math.sin"): PRINTED,
     ("envs/drawing/scene.py", "**"): SQUARES,
     ("evaluation/statistics.py", "**"): SQUARES,
     ("evaluation/seed_statistics.py", "scipy.stats"): "resampling and sorting: sums and products alone",

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
-from ethbrake_marl.learning.algorithms.ppo import PpoRecipe
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.recipe import PpoRecipe, load_recipe
 
 
 def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:

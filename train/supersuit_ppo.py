@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.learning.algorithms.networks import tensors_of
+from ethbrake_marl.learning.algorithms import tensors_of
 from ethbrake_marl.learning.training import resolve
 from ethbrake_marl.policies.actor import NetworkSpec, installed_versions, observation_schema
 from ethbrake_marl.policies.bundle import Policy, make_policy, save_policy

@@ -23,7 +23,7 @@ from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, des
 from ethbrake_marl.files.plugins import load_function, note_file
 from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.lines import parse_agent_spec
+from ethbrake_marl.scenario.fields import parse_agent_spec
 
 # The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
 #
@@ -188,7 +188,7 @@ class Entry:
         return getattr(import_module(f"ethbrake_marl.{module}"), function)
 
 
-_SCRIPTS, _POLICIES = "agents.scripts", "learning.team_file:make_policy_agent"
+_SCRIPTS, _POLICIES = "agents.scripts", "learning.training:make_policy_agent"
 _FROM_FILE = "agents.registry:make_from_file"
 _ENTRIES: dict[str, Entry] = {
     "coast": Entry("coast", "nothing at all", (Source.SENSORS,), f"{_SCRIPTS}:make_state_free"),

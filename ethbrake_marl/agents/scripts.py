@@ -9,7 +9,7 @@ from ethbrake_marl.agents.protocol import Agent, Source, place, recall
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.scenario.lines import constant_command, is_state_free
+from ethbrake_marl.scenario.fields import constant_command, is_state_free
 
 
 class StateFree:

@@ -23,7 +23,7 @@ if TYPE_CHECKING or LATE:
     from ethbrake_marl.agents.protocol import Agent
     from ethbrake_marl.evaluation import check_target
     from ethbrake_marl.evaluation.inputs import load_runnable, make_agents, result_identity
-    from ethbrake_marl.evaluation.regret import proven_of_table, shipped_bounds, shipped_lines
+    from ethbrake_marl.evaluation.measures import proven_of_table, shipped_bounds, shipped_lines
     from ethbrake_marl.learning.recipe import read_settings
     from ethbrake_marl.limits.best_harm import LEFT_OUT, BestHarmTable, fold_agent, load_table, save_table, search_list
     from ethbrake_marl.physics import Worlds

@@ -33,7 +33,7 @@ if TYPE_CHECKING or LATE:
     from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
     from ethbrake_marl.physics import Worlds, advance, make_worlds
     from ethbrake_marl.scenario import list_scenarios, scenario_folder
-    from ethbrake_marl.scenario.catalogue import SHIPPED
+    from ethbrake_marl.scenario.schema import SHIPPED
 
 DISTRIBUTION = "ethbrake-marl"
 EXTRAS = ("train", "marl", "export", "data", "render", "explore", "cluster", "tune")

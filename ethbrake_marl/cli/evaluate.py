@@ -57,7 +57,7 @@ if TYPE_CHECKING or LATE:
     from ethbrake_marl.evaluation.summary import check_group, summarise_by
     from ethbrake_marl.learning.recipe import read_settings
     from ethbrake_marl.scenario import Sample, Scenario, Task
-    from ethbrake_marl.scenario.quantities import kind_columns
+    from ethbrake_marl.scenario.fields import kind_columns
     from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 ReportOption = Annotated[

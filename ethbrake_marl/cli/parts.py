@@ -23,7 +23,7 @@ def shown_parts() -> list[tuple[str, str]]:
 
 def part_names() -> list[tuple[str, str]]:
     """Kinds of parts, each with its names; what is registered is among them."""
-    from ethbrake_marl.evaluation.harm_metrics import METRICS
+    from ethbrake_marl.evaluation.measures import REGISTERED
     from ethbrake_marl.harm import KINDS
     from ethbrake_marl.learning.recipe import algorithm_names
     from ethbrake_marl.rewards import TERMS
@@ -37,7 +37,7 @@ def part_names() -> list[tuple[str, str]]:
         ("V2X presets", ", ".join(CHANNELS)),
         ("Objectives", ", ".join(kind.form for kind in KINDS.values())),
         ("Algorithms", ", ".join(algorithm_names())),
-        *([("Harm metrics", ", ".join(METRICS))] if METRICS else []),
+        *([("Measures", ", ".join(REGISTERED))] if REGISTERED else []),
     ]
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich import box
@@ -14,6 +15,9 @@ from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.cli.options import ForceOption, JsonOption
 from ethbrake_marl.cli.terminal import INTERRUPTED, interruptible, progress_bars, result_console, say, write_json
 from ethbrake_marl.errors import InvalidInput, need
+
+if TYPE_CHECKING:
+    from ethbrake_marl.studies.reproduction.item import Result
 
 KEPT = "the same command goes on with what is in the folder"
 EPISODES = 10_000
@@ -53,36 +57,34 @@ def reproduce_command(
         # matplotlib and the statistics take seconds to load
         from ethbrake_marl.studies.reproduction.folder import (
             PAGE,
-            ReproductionFolder,
             check_docs,
             choose_items,
             reproduce,
             tell_cost,
             write_docs,
         )
-        from ethbrake_marl.studies.reproduction.item import FULL, QUICK, Mode, Settings
+        from ethbrake_marl.studies.reproduction.item import Settings
 
         chosen = choose_items(names or ())
         if listed:
             _list([(item.name, ", ".join(item.labels), item.title) for item in chosen], as_json)
             return
         _check(quick=quick, full=full, episodes=episodes)
-        mode: Mode = FULL if full else QUICK
         folder = output or Path("runs") / "reproduction"
         if full:
             need("torch")
         if docs is not None:
             check_docs(docs)
         with progress_bars() as bars:
-            settings = Settings(mode, folder, episodes, bars.show_progress, str(this_machine()))
+            settings = Settings("full" if full else "quick", folder, episodes, bars.show_progress, str(this_machine()))
             say(tell_cost(chosen, settings))
             if cost:
                 return
             results, finished = reproduce(chosen, settings, force=force)
         if docs is not None:
-            write_docs(docs, ReproductionFolder(folder), results)
+            write_docs(docs, folder, results)
     if as_json:
-        write_json(results)
+        write_json([asdict(result) for result in results])
     else:
         _show(results)
     say(f"page: {folder / PAGE}")
@@ -109,11 +111,11 @@ def _list(items: list[tuple[str, str, str]], as_json: bool) -> None:
     result_console().print(table)
 
 
-def _show(results: list[dict[str, Any]]) -> None:
+def _show(results: list[Result]) -> None:
     """One line per item."""
     table = _table("Item", "Verdict", "Because")
     for result in results:
-        table.add_row(Text(result["name"]), Text(result["verdict"]["outcome"]), Text(result["verdict"]["because"]))
+        table.add_row(Text(result.name), Text(result.verdict.outcome), Text(result.verdict.because))
     result_console().print(table)
 
 

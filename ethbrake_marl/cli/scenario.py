@@ -27,9 +27,8 @@ if TYPE_CHECKING or LATE:
         scenario_json_schema,
         scenario_path,
     )
-    from ethbrake_marl.scenario.catalogue import SHIPPED
-    from ethbrake_marl.scenario.lines import LEARNER, is_state_free
-    from ethbrake_marl.scenario.quantities import count_kinds
+    from ethbrake_marl.scenario.fields import LEARNER, count_kinds, is_state_free
+    from ethbrake_marl.scenario.schema import SHIPPED
 
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
 

@@ -37,7 +37,7 @@ from ethbrake_marl.physics.messages import age_by_rows
 from ethbrake_marl.rewards import Reward, RewardParams
 from ethbrake_marl.scenario import Sample, Scenario, initial_state_worlds, load_scenario, read_scenario
 from ethbrake_marl.scenario.features import Feature
-from ethbrake_marl.scenario.quantities import join_samples, kind_columns, quantity_columns
+from ethbrake_marl.scenario.fields import join_samples, kind_columns, quantity_columns
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping: what a file would say
 

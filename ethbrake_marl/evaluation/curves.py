@@ -20,7 +20,7 @@ from ethbrake_marl.limits.limits import Limits, Unproven, known_limits, undecide
 from ethbrake_marl.limits.lower_bound import avoidability
 from ethbrake_marl.physics import Bools, Floats, Worlds, advance, forecast, make_worlds
 from ethbrake_marl.scenario import Scenario, Task, worlds_from_table
-from ethbrake_marl.scenario.quantities import QUANTITIES
+from ethbrake_marl.scenario.fields import QUANTITIES
 
 CELLS = 81  # along each gap
 CHUNK = 500  # worlds between two reports of progress

@@ -40,7 +40,8 @@ from ethbrake_marl.errors import (
 from ethbrake_marl.evaluation.inputs import policy_sha256, result_versions, scenario_sha256
 from ethbrake_marl.evaluation.outcome import LeftOut
 from ethbrake_marl.evaluation.results import PARQUET, check_target
-from ethbrake_marl.files.store import check_writable, new_file, new_folder
+from ethbrake_marl.files.sheet import parquet_file
+from ethbrake_marl.files.store import check_writable, new_folder
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation, observation_for
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance, leaving_out_failed
@@ -239,33 +240,21 @@ Columns = dict[str, NDArray[Any]]
 
 
 @contextmanager
-def parquet_file(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[Recording], None]]:
+def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[Recording], None]]:
     """Give what adds recordings to the file, which appears at ``path`` when the block ends well.
 
     ``told`` is read at the end, and stands in the file's metadata under ``KEY``. Raises ``MissingExtra``.
     """
     with naming_extras():
         import pyarrow
-        from pyarrow.parquet import ParquetWriter
 
-    writer = None
-    with new_file(path) as partial:
+    with parquet_file(path, told=lambda: {KEY: json.dumps(told)}) as write:
 
         def add(recording: Recording) -> None:
-            nonlocal writer
-            columns = {name: pyarrow.array(values) for name, values in decision_columns(recording).items()}
-            columns["agent"] = columns["agent"].dictionary_encode()
-            table = pyarrow.table(columns)
-            if writer is None:
-                writer = ParquetWriter(partial, table.schema)
-            writer.write_table(table, row_group_size=max(table.num_rows, 1))
+            columns = decision_columns(recording)
+            write(columns | {"agent": pyarrow.array(columns["agent"]).dictionary_encode()}, together=True)
 
-        try:
-            yield add
-        finally:
-            if writer is not None:
-                writer.add_key_value_metadata({KEY: json.dumps(told)})
-                writer.close()
+        yield add
 
 
 def decision_columns(recording: Recording) -> Columns:
@@ -564,7 +553,7 @@ def _sink(
     path: Path, format: DatasetFormat, task: Task, told: Mapping[str, Any], *, force: bool
 ) -> AbstractContextManager[Callable[[Recording], None]]:
     if format == "parquet":
-        return parquet_file(path, told)
+        return parquet_dataset(path, told)
     return minari_folder(path, task, told, force=force)
 
 

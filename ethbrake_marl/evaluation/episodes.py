@@ -17,8 +17,7 @@ from ethbrake_marl.agents.protocol import Agent, Driver, Team, team_of
 from ethbrake_marl.agents.rollout import Episodes, episode_engine, play
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.envs.drawing.animation import animate_films
-from ethbrake_marl.envs.drawing.scene import Scene, Trace, kept_motions, scenes
+from ethbrake_marl.envs.drawing.scene import Scene, Trace, animate_films, kept_motions, scenes
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, need
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.harm import Ledger

@@ -27,7 +27,7 @@ from ethbrake_marl.files.yaml import Override, changed_parts, flow_text
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.policies.bundle import Policy
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml, worlds_from_table
-from ethbrake_marl.scenario.quantities import QUANTITIES, quantity_columns
+from ethbrake_marl.scenario.fields import QUANTITIES, quantity_columns
 from ethbrake_marl.shield import ShieldedDriver
 from ethbrake_marl.shield.uncertainty import Uncertainty
 

@@ -16,13 +16,13 @@ from ethbrake_marl.agents.protocol import Knowledge, Source
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import IncompleteTable, InvalidInput, PhysicsError, count_of
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.files.html import html_table
+from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.limits.limits import Limits, Unproven, known_limits
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.messages import is_periodic
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
-from ethbrake_marl.scenario.quantities import DECLARED, Texts, quantity, quantity_rules
+from ethbrake_marl.scenario.fields import DECLARED, Texts, quantity, quantity_rules
 from ethbrake_marl.scenario.v2x import hidden_from
 
 _SHOWN_AGENTS = 5  # by name, in ``repr``
@@ -50,7 +50,7 @@ class Outcome:
     shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself, see ``travel``
     sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands, see ``sampled_harm``
     policies: Mapping[int, str] = field(default_factory=dict)  # vehicle (0 = front) -> SHA-256 of its policy's manifest
-    metrics: Mapping[str, Floats] = field(default_factory=dict)  # registered harm metrics by column, [n]
+    metrics: Mapping[str, Floats] = field(default_factory=dict)  # registered measures by column, [n]
 
     def __repr__(self) -> str:
         return f"Outcome({count_of(len(self.collided), 'world')}, {int(self.collided.sum()):,} collided, {self._means})"
@@ -208,7 +208,7 @@ class Evaluation:
             means = [mean(getattr(outcome, name)).in_words() for name in harms.values()]
             rows.append((agent, collided.in_words(digits=1, scale=100.0, unit=" %"), *means))
         note = "Means per world in m²/s², with their 95 % intervals. eb.summarise tells more."
-        return html_table(("Agent", "Collisions", *harms), rows, caption=repr(self), note=note)
+        return Sheet(repr(self), ("Agent", "Collisions", *harms), rows, note).html()
 
     def complete(self) -> Evaluation:
         """The evaluation itself, for who needs every world; raises ``PhysicsError`` if some were left out."""

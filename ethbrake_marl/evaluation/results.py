@@ -21,16 +21,15 @@ from numpy.typing import NDArray
 from ethbrake_marl.agents.protocol import knowledge_text
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, count_of, naming_extras, need, unknown_name
-from ethbrake_marl.evaluation.harm_metrics import COLUMN
 from ethbrake_marl.evaluation.inputs import Kind
+from ethbrake_marl.evaluation.measures import COLUMN, Regrets, assess
 from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
-from ethbrake_marl.evaluation.regret import Regrets, assess
 from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, paired_difference, unpaired_difference
 from ethbrake_marl.evaluation.summary import Rescored, SummaryRow
 from ethbrake_marl.files.store import check_writable, parse_strict_json, read_plain, write_file
 from ethbrake_marl.harm import Declared, scored
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.scenario.quantities import quantity, quantity_rules
+from ethbrake_marl.scenario.fields import quantity, quantity_rules
 
 # One row per agent and world: its columns, and its file, written whole and never over another by accident.
 
@@ -108,16 +107,20 @@ def write_per_world_csv(
     write_output(path, text.getvalue().encode(), force=force)
 
 
-def per_world_columns(evaluation: Evaluation, objectives: Sequence[Declared] = ()) -> Columns:
-    """The columns of ``write_per_world_csv``, agent by agent, then world by world; None where there is no value."""
+def per_world_columns(evaluation: Evaluation, objectives: Sequence[Declared] = (), *, limits: bool = True) -> Columns:
+    """The columns of ``write_per_world_csv``, agent by agent, then world by world; None where there is no value.
+
+    Without ``limits`` those of the best known harm are left out, every quantity is told, and no world that was left
+    out: the rows of a shard, which have the same columns as those of any other.
+    """
     found: Columns = {}
-    initial, regrets = initial_columns(evaluation), assess(evaluation)
+    initial, regrets = initial_columns(evaluation, every=not limits), assess(evaluation) if limits else None
     hidden: Columns = {"hidden": evaluation.hidden.astype(int).tolist()}
     for agent, outcome in evaluation.outcomes.items():
         columns = {"agent": [agent] * evaluation.worlds.n, **initial, **outcome_columns(outcome)}
-        columns |= regret_columns(outcome, regrets) | objective_columns(outcome, objectives)
+        columns |= (regret_columns(outcome, regrets) if limits else {}) | objective_columns(outcome, objectives)
         columns |= {"knows": [knowledge_text(outcome.knows)] * evaluation.worlds.n, **hidden}
-        for left in evaluation.left_out:
+        for left in evaluation.left_out if limits else ():
             told = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
             columns = {name: [*values, told.get(name)] for name, values in columns.items()}
         found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
@@ -169,15 +172,17 @@ def objective_columns(outcome: Outcome, objectives: Sequence[Declared]) -> Colum
     }
 
 
+def vehicle_columns(outcome: Outcome) -> Columns:
+    """What each vehicle bears under both counts (m2/s2): ``total_harm_2``."""
+    harms = {"first_impact_harm": outcome.vehicle_harm("first"), "total_harm": outcome.vehicle_harm("total")}
+    return {f"{name}_{i + 1}": harm[:, i].tolist() for name, harm in harms.items() for i in range(harm.shape[1])}
+
+
 def outcome_columns(outcome: Outcome) -> Columns:
     """What happened in each world; a column that the agent says nothing about is empty."""
     n = len(outcome.collided)
     columns: Columns = {"collided": outcome.collided.astype(int).tolist(), "impacts": outcome.impacts.tolist()}
-    for name, harm in (
-        ("first_impact_harm", outcome.vehicle_harm("first")),
-        ("total_harm", outcome.vehicle_harm("total")),
-    ):
-        columns |= {f"{name}_{i + 1}": harm[:, i].tolist() for i in range(harm.shape[1])}
+    columns |= vehicle_columns(outcome)
     columns |= {"first_impact_harm": outcome.first_impact_harm.tolist(), "total_harm": outcome.total_harm.tolist()}
     for name, column in (("sampled_harm", outcome.sampled_harm), ("vehicle_1_shoved_m", outcome.shoved_m)):
         columns[name] = [None] * n if column is None else column.tolist()
@@ -192,7 +197,7 @@ def outcome_columns(outcome: Outcome) -> Columns:
     predicted, chosen = outcome.predicted_harm, outcome.chosen_policy
     columns["predicted_harm"] = [None] * n if predicted is None else predicted.tolist()
     columns["chosen_policy"] = [None] * n if chosen is None else chosen.astype(int).tolist()
-    columns |= {f"{COLUMN}{name}": column.tolist() for name, column in outcome.metrics.items()}
+    columns |= {COLUMN + name: (column + 0).tolist() for name, column in outcome.metrics.items()}  # truths as 0 and 1
     return columns
 
 
@@ -205,13 +210,18 @@ _HARMS = ("agent", "world", "first_impact_harm", "total_harm")
 _TEXTS = {"agent", "scenario", "unavoidable_reason", "best_known_source", "ended", "knows"}
 
 
+def is_text(column: str) -> bool:
+    """Whether a column with every world holds texts."""
+    return column in _TEXTS or (column.startswith("vehicle_") and column.endswith("_type"))
+
+
 def typed_columns(evaluation: Evaluation, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
     """The columns of ``per_world_columns`` as arrays: NaN for no number, the empty text for no text."""
     return {name: _typed(name, values) for name, values in per_world_columns(evaluation, objectives).items()}
 
 
 def _typed(name: str, values: list[Any]) -> NDArray[Any]:
-    if name in _TEXTS or (name.startswith("vehicle_") and name.endswith("_type")):
+    if is_text(name):
         return np.array([value or "" for value in values])
     return np.array([np.nan if value is None else value for value in values])
 

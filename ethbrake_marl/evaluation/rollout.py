@@ -23,8 +23,8 @@ from ethbrake_marl.errors import (
     naming_agent,
     unknown_name,
 )
-from ethbrake_marl.evaluation.harm_metrics import ImpactWatch
 from ethbrake_marl.evaluation.inputs import policy_sha256
+from ethbrake_marl.evaluation.measures import ImpactWatch
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate, leaving_out_failed
@@ -46,8 +46,7 @@ from ethbrake_marl.physics.kernel import (
 from ethbrake_marl.physics.sampled import sample_numbers, sample_worlds
 from ethbrake_marl.physics.worlds import sum_rows
 from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.scenario.lines import constant_command
-from ethbrake_marl.scenario.quantities import kind_columns
+from ethbrake_marl.scenario.fields import constant_command, kind_columns
 
 # The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
 #

@@ -18,7 +18,6 @@ import numpy as np
 from ethbrake_marl.agents.protocol import Driver, Knowledge, knowledge_of, knowledge_text, team_of
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number, naming_extras
-from ethbrake_marl.evaluation.harm_metrics import COLUMN, METRICS
 from ethbrake_marl.evaluation.inputs import (
     make_lineup,
     policies_by_name,
@@ -27,35 +26,30 @@ from ethbrake_marl.evaluation.inputs import (
     scenario_sha256,
     worlds_sha256,
 )
+from ethbrake_marl.evaluation.measures import COUNTED, KNOWN, REGISTERED, AgentTally, added, measures, tally_agents
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome, is_papers_list, parameters_of
-from ethbrake_marl.evaluation.regret import Distance, Regrets, assess
 from ethbrake_marl.evaluation.results import (
     Columns,
-    initial_columns,
+    is_text,
     objective_columns,
-    outcome_columns,
+    per_world_columns,
     results_to_json,
+    vehicle_columns,
 )
 from ethbrake_marl.evaluation.rollout import evaluate_block
 from ethbrake_marl.evaluation.statistics import (
     VALUE_BITS,
-    Estimate,
     Moments,
-    decrease_of,
-    difference,
     estimates_to_json,
-    exact_products,
     exact_rate,
     mean_of,
-    moments,
 )
-from ethbrake_marl.evaluation.summary import BASELINE, FAR_M, Rescored, SummaryRow
-from ethbrake_marl.files.store import new_file
-from ethbrake_marl.harm import scored
+from ethbrake_marl.evaluation.summary import Rescored, SummaryRow, summarise_tallies
+from ethbrake_marl.files.sheet import parquet_file
 from ethbrake_marl.limits.limits import Unproven, known_limits
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.scenario.quantities import DECLARED, quantity, quantity_rules
+from ethbrake_marl.scenario.fields import DECLARED, quantity, quantity_rules
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 # The statistics of some worlds of a list: counts and exact sums, which merge in any order to the same bits.
@@ -64,45 +58,6 @@ HASHES = 1 << 256  # sums of hashes are kept modulo this
 _MOST = 1 << 64
 _ALWAYS = ("first_impact_harm", "total_harm")  # numbers that every agent has in every world
 Range = tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class AgentTally:
-    """What one agent did in some worlds. What it does not have in all worlds of a list is told of none."""
-
-    counts: Mapping[str, int] = field(default_factory=dict)  # worlds in which something was so
-    moments: Mapping[str, Moments] = field(default_factory=dict)  # of a number that each world has
-    products: Mapping[str, int] = field(default_factory=dict)  # of a number with the baseline's of the same name
-
-    def __add__(self, other: AgentTally) -> AgentTally:
-        return AgentTally(
-            {name: self.counts.get(name, 0) + other.counts.get(name, 0) for name in {**self.counts, **other.counts}},
-            {
-                name: self.moments.get(name, Moments()) + other.moments.get(name, Moments())
-                for name in {**self.moments, **other.moments}
-            },
-            {
-                name: self.products.get(name, 0) + other.products.get(name, 0)
-                for name in {**self.products, **other.products}
-            },
-        )
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain data; whole numbers of any size are hexadecimal texts."""
-        return {
-            "counts": dict(self.counts),
-            "moments": {name: [m.count, hex(m.total), hex(m.squares)] for name, m in self.moments.items()},
-            "products": {name: hex(value) for name, value in self.products.items()},
-        }
-
-    @classmethod
-    def from_json(cls, told: Mapping[str, Any]) -> AgentTally:
-        """What ``to_json`` gave; raises ``KeyError``, ``TypeError`` or ``ValueError`` for anything else."""
-        return cls(
-            {name: _whole(value) for name, value in told["counts"].items()},
-            {name: _moments(*parts) for name, parts in told["moments"].items()},
-            {name: int(value, 16) for name, value in told["products"].items()},
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +81,7 @@ class Tally:
             (self.worlds_hash + other.worlds_hash) % HASHES,
             {name: _joined(self.ranges, other.ranges, name) for name in {**self.ranges, **other.ranges}},
             tuple(sorted((*self.left_out, *other.left_out))),
-            {
-                name: self.agents.get(name, AgentTally()) + other.agents.get(name, AgentTally())
-                for name in {**self.agents, **other.agents}
-            },
+            added(self.agents, other.agents, AgentTally()),
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -153,7 +105,7 @@ class Tally:
                 int(told["worlds_hash"], 16) % HASHES,
                 {name: tuple((float(a), float(b)) for a, b in entries) for name, entries in told["ranges"].items()},
                 tuple(_left_out(*left) for left in told["left_out"]),
-                {name: AgentTally.from_json(agent) for name, agent in told["agents"].items()},
+                {name: _agent_tally(agent) for name, agent in told["agents"].items()},
             )
             for agent in tally.agents.values() if tally.worlds else ():
                 if any(agent.moments[name].count != tally.worlds for name in _ALWAYS):
@@ -167,6 +119,20 @@ def _whole(value: Any) -> int:
     if type(value) is not int or not 0 <= value < _MOST:
         raise ValueError(f"{value!r} is no whole number from 0 on")
     return value
+
+
+def _agent_tally(told: Mapping[str, Any]) -> AgentTally:
+    return AgentTally(
+        {name: _count(*pair) for name, pair in told["counts"].items()},
+        {name: _moments(*parts) for name, parts in told["moments"].items()},
+        {name: int(value, 16) for name, value in told["products"].items()},
+    )
+
+
+def _count(so: Any, of: Any) -> tuple[int, int]:
+    if _whole(so) > _whole(of):
+        raise ValueError(f"{so} of {of} worlds")
+    return so, of
 
 
 def _moments(count: Any, total: str, squares: str) -> Moments:
@@ -194,105 +160,24 @@ def _joined(
     return tuple((min(a[0], b[0]), max(a[1], b[1])) for a, b in zip(first, second, strict=True))
 
 
-# The numbers of an evaluation that are counted and summed: one tally for each agent.
-
-HARM_NAMES: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
-REGRET_NAMES: dict[HarmCount, str] = {"first": "regret_first", "total": "regret_total"}
-
-
-def objective_column(objective: str, harm_count: HarmCount, vehicle: int) -> str:
-    """The name of an objective under one count, of a vehicle (from 0)."""
-    return f"objective {objective} {harm_count} {vehicle + 1}"
-
-
-def agent_tallies(evaluation: Evaluation, objectives: Sequence[str], *, limits: bool) -> dict[str, AgentTally]:
-    """The tally of every agent; ``limits``: with what needs the best known harm of each world."""
-    regrets = assess(evaluation) if limits else None
-    reference = evaluation.outcomes.get(BASELINE)
-    paired = {} if reference is None else _paired(reference, regrets)
-    found = {}
-    for agent, outcome in evaluation.outcomes.items():
-        counts, columns, against = _counts(outcome), dict(_columns(outcome, objectives)), _paired(outcome, regrets)
-        if regrets is not None:
-            counts |= _limit_counts(outcome, regrets)
-            columns |= _limit_columns(regrets)
-        found[agent] = AgentTally(
-            counts,
-            {name: moments(column) for name, column in (columns | against).items()},
-            {name: exact_products(against[name], baseline) for name, baseline in paired.items()},
-        )
-    return found
-
-
-def _paired(outcome: Outcome, regrets: Regrets | None) -> dict[str, Floats]:
-    """What is compared with the baseline, world by world."""
-    found = {name: outcome.world_harm(harm_count) for harm_count, name in HARM_NAMES.items()}
-    if regrets is not None:
-        found |= {name: regrets.regret(outcome, harm_count) for harm_count, name in REGRET_NAMES.items()}
-    return found
-
-
-def _counts(outcome: Outcome) -> dict[str, int]:
-    found = {"collisions": int(outcome.collided.sum()), "horizon_ends": int((~outcome.at_rest).sum())}
-    if outcome.shoved_m is not None:
-        found["shoved_far"] = int((outcome.shoved_m > FAR_M).sum())
-    if outcome.chosen_policy is not None:
-        found |= {"policy": int(outcome.chosen_policy.sum()), "hybrid": len(outcome.chosen_policy)}
-    return found
-
-
-def _columns(outcome: Outcome, objectives: Sequence[str]) -> Iterator[tuple[str, Floats]]:
-    """Name and values [n] of every number that each world has, but those that are compared."""
-    for harm_count, name in HARM_NAMES.items():
-        yield from ((f"{name}_{i + 1}", column) for i, column in enumerate(outcome.vehicle_harm(harm_count).T))
-        for objective in objectives:
-            for values in scored(outcome.ledger, harm_count, [objective]).values():
-                yield from ((objective_column(objective, harm_count, i), column) for i, column in enumerate(values.T))
-    for name in ("predicted_harm", "shoved_m", "sampled_harm"):
-        if getattr(outcome, name) is not None:
-            yield name, getattr(outcome, name)
-    yield from ((f"{COLUMN}{name}", column) for name, column in outcome.metrics.items())
-
-
-def _limit_counts(outcome: Outcome, regrets: Regrets) -> dict[str, int]:
-    proof, known = regrets.limits.proof, regrets.limits.known
-    found = {
-        "known": int(known.sum()),
-        "below_best_known": int(regrets.below(outcome).sum()),
+def _further(objectives: Sequence[str]) -> Callable[[Outcome], Mapping[str, Floats]]:
+    """What gives, beside the measures, the harm of each vehicle and its part under each objective."""
+    return lambda outcome: {
+        name: np.asarray(values)
+        for name, values in (vehicle_columns(outcome) | objective_columns(outcome, objectives)).items()
     }
-    if proof.avoidable is not None:
-        found["unavoidable"] = int((~proof.avoidable).sum())
-        found["avoidable_collisions"] = int((outcome.collided & proof.avoidable).sum())
-    if proof.impact is not None:
-        found["impact_proven"] = int(proof.impact.sum())
-    return found
-
-
-def _limit_columns(regrets: Regrets) -> dict[str, Floats]:
-    first, total, proven = regrets.first_impact_harm, regrets.total_harm, regrets.limits.proof.harm
-    found = {"best_known_first": first, "best_known_total": total}
-    if proven is not None:
-        found |= {"proven_harm": proven, "gap_first": first - proven, "gap_total": total - proven}
-    return {name: np.asarray(column) for name, column in found.items()}
 
 
 # One row per world and agent of a shard, as a Parquet file: world by world, whatever the shards and blocks are.
 
-_TEXTS = {"agent", "scenario", "ended", "knows"}
 _WHOLE = {"world", "collided", "impacts", "chosen_policy", "hidden"}
 
 
 def row_columns(evaluation: Evaluation, objectives: Sequence[str]) -> Columns:
-    """The columns of ``--per-world`` but those of the best known harm, and with every quantity; world by world."""
-    n, agents = evaluation.worlds.n, evaluation.outcomes
-    initial, hidden = initial_columns(evaluation, every=True), evaluation.hidden.astype(int).tolist()
-    found: Columns = {}
-    for agent, outcome in agents.items():
-        columns: Columns = {"agent": [agent] * n, **initial, **outcome_columns(outcome)}
-        columns |= objective_columns(outcome, objectives)
-        columns |= {"knows": [knowledge_text(outcome.knows)] * n, "hidden": hidden}
-        found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
-    order = np.arange(n * len(agents)).reshape(len(agents), n).T.ravel().tolist()
+    """The columns of a shard's rows, world by world."""
+    found = per_world_columns(evaluation, objectives, limits=False)
+    n, agents = evaluation.worlds.n, len(evaluation.outcomes)
+    order = np.arange(n * agents).reshape(agents, n).T.ravel().tolist()
     return {name: [values[k] for k in order] for name, values in found.items()}
 
 
@@ -304,29 +189,18 @@ def rows_file(path: Path, objectives: Sequence[str]) -> Iterator[Callable[[Evalu
     """
     with naming_extras():
         import pyarrow
-        from pyarrow.parquet import ParquetWriter
 
-    def type_of(name: str) -> Any:
-        if name in _TEXTS or (name.startswith("vehicle_") and name.endswith("_type")):
-            return pyarrow.string()
-        return pyarrow.int64() if name in _WHOLE else pyarrow.float64()
+    def array(name: str, values: Sequence[Any]) -> Any:
+        whole = pyarrow.int64() if name in _WHOLE else pyarrow.float64()
+        return pyarrow.array(values, pyarrow.string() if is_text(name) else whole)
 
-    writer = None
-    with new_file(path) as partial:
+    with parquet_file(path, compression="zstd") as write:
 
         def add(evaluation: Evaluation) -> None:
-            nonlocal writer
             columns = row_columns(evaluation, objectives)
-            table = pyarrow.table({name: pyarrow.array(values, type_of(name)) for name, values in columns.items()})
-            if writer is None:
-                writer = ParquetWriter(partial, table.schema, compression="zstd")
-            writer.write_table(table)
+            write({name: array(name, values) for name, values in columns.items()})
 
-        try:
-            yield add
-        finally:
-            if writer is not None:
-                writer.close()
+        yield add
 
 
 LEAF = 1_000  # worlds that are hashed together; shards and blocks begin at a multiple of it
@@ -412,7 +286,7 @@ def ask(question: Question) -> Asked:
     ]
     because = next((each.because for each in found if isinstance(each, Unproven)), None)
     identity = {
-        "format": 1,
+        "format": 2,
         "scenario": scenario.name,
         "scenario_sha256": scenario_sha256(scenario),
         "seed": question.seed,
@@ -423,7 +297,7 @@ def ask(question: Question) -> Asked:
         "harm_count": question.harm_count,
         "uncertainty": question.uncertainty,
         "objectives": list(question.objectives),
-        "metrics": sorted(METRICS),
+        "metrics": sorted(REGISTERED),
         "versions": result_versions(),
     }
     limits = all(not isinstance(each, Unproven) and bool(each.known.all()) for each in found)
@@ -494,7 +368,7 @@ def _answer_block(
         for name in quantity_rules(worlds)
     }
     hidden = int(evaluation.hidden.sum())
-    agents = agent_tallies(evaluation, question.objectives, limits=asked.limits)
+    agents = tally_agents(evaluation, limits=asked.limits, extra=_further(question.objectives))
     kept = Sample(worlds, evaluation.index, 0)
     return Tally(worlds.n, hidden, _worlds_hash(kept), ranges, left_out, agents)
 
@@ -514,127 +388,43 @@ def _worlds_hash(kept: Sample) -> int:
 INTERVALS = {"rates": "Clopper-Pearson", "means": "Student's t, of exact sums"}
 
 
-class _Agent:
-    """What one agent did in all worlds of a list; what only some worlds have is not told."""
-
-    def __init__(self, tally: AgentTally, baseline: AgentTally | None, worlds: int) -> None:
-        self._tally, self._baseline, self._worlds = tally, baseline, worlds
-
-    def count(self, name: str) -> int:
-        """Worlds in which something was so."""
-        return self._tally.counts.get(name, 0)
-
-    def share(self, name: str) -> Estimate:
-        """Their share, with the exact interval."""
-        return exact_rate(self.count(name), self._worlds)
-
-    def share_if_counted(self, name: str) -> Estimate | None:
-        """Their share; None where nobody counted, not even to 0."""
-        return self.share(name) if name in self._tally.counts else None
-
-    def _whole(self, tally: AgentTally | None, name: str) -> Moments | None:
-        found = None if tally is None else tally.moments.get(name)
-        return found if found is not None and found.count == self._worlds else None
-
-    def mean(self, name: str) -> Estimate | None:
-        """The mean of a number; None unless every world has it."""
-        found = self._whole(self._tally, name)
-        return None if found is None else mean_of(found)
-
-    def needed(self, name: str) -> Estimate:
-        """The mean of a number that every world has."""
-        return mean_of(self._tally.moments[name])
-
-    def against(self, name: str) -> Estimate | None:
-        """The difference to the baseline, paired by world."""
-        one, other = self._whole(self._tally, name), self._whole(self._baseline, name)
-        if one is None or other is None:
-            return None
-        return mean_of(difference(one, other, self._tally.products[name]))
-
-    def decrease(self, name: str) -> Estimate | None:
-        """1 - mean / the baseline's mean, paired by world."""
-        one, other = self._whole(self._tally, name), self._whole(self._baseline, name)
-        return None if one is None or other is None else decrease_of(one, other, self._tally.products[name])
-
-    def distance(self) -> Distance:
-        """What was avoidable, and how far it stayed from the best known; all None unless that is known everywhere."""
-        if self.count("known") != self._worlds:
-            return Distance()
-        return Distance(
-            unavoidable_rate=self.share_if_counted("unavoidable"),
-            impact_proven_rate=None if self.mean("proven_harm") is None else self.share("impact_proven"),
-            avoidable_collision_rate=self.share_if_counted("avoidable_collisions"),
-            best_known_first=self.mean("best_known_first"),
-            best_known_total=self.mean("best_known_total"),
-            proven_harm=self.mean("proven_harm"),
-            gap_first=self.mean("gap_first"),
-            gap_total=self.mean("gap_total"),
-            regret_first=self.mean(REGRET_NAMES["first"]),
-            regret_total=self.mean(REGRET_NAMES["total"]),
-            realised_first=self.decrease(REGRET_NAMES["first"]),
-            realised_total=self.decrease(REGRET_NAMES["total"]),
-            known_best_share=1.0,
-            below_best_known=self.count("below_best_known"),
-        )
-
-
-def _agents(tally: Tally) -> dict[str, _Agent]:
-    baseline = tally.agents.get(BASELINE)
-    return {name: _Agent(each, baseline, tally.worlds) for name, each in tally.agents.items()}
-
-
 def summarise_shards(asked: Asked, tally: Tally) -> list[SummaryRow]:
     """One row per agent, as ``summarise``; rates with exact intervals. Raises ``PhysicsError`` if no world is left."""
     if not tally.worlds:
         raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})
     question = asked.question
     told = {name: _told_range(name, entries) for name, entries in tally.ranges.items()}
-    conditions = parameters_of(question.task, question.seed, tally.worlds, asked.because, told)
-    agents = _agents(tally)
-    return [_row(asked, tally, name, agents[name], conditions) for name in asked.identity["agents"]]
+    shared = {
+        "parameters": parameters_of(question.task, question.seed, tally.worlds, asked.because, told),
+        "left_out": tally.left_out,
+        "beside_paper": is_papers_list(question.scenario, question.seed, question.task.vehicles),
+        "hidden_share": tally.hidden / tally.worlds,
+        "worlds_sha256": f"{tally.worlds_hash:064x}",
+        "scenario_sha256": asked.identity["scenario_sha256"],
+        "versions": asked.identity["versions"],
+    }
+    tallies = {name: _without_limits(tally.agents[name], tally.worlds) for name in asked.identity["agents"]}
+    return summarise_tallies(tallies, tally.worlds, exact_rate, asked.knows, asked.policies, shared)
 
 
-def _row(asked: Asked, tally: Tally, name: str, found: _Agent, conditions: dict[str, Any]) -> SummaryRow:
-    question, shoved, hybrid = asked.question, found.mean("shoved_m"), found.count("hybrid") == tally.worlds
-    columns = [column for column in tally.agents[name].moments if column.startswith(COLUMN)]
-    return SummaryRow(
-        agent=name,
-        episodes=tally.worlds,
-        collisions=found.count("collisions"),
-        horizon_ends=found.count("horizon_ends"),
-        collision_rate=found.share("collisions"),
-        first_impact_harm=found.needed(HARM_NAMES["first"]),
-        total_harm=found.needed(HARM_NAMES["total"]),
-        first_difference=found.against(HARM_NAMES["first"]),
-        total_difference=found.against(HARM_NAMES["total"]),
-        first_decrease=found.decrease(HARM_NAMES["first"]),
-        total_decrease=found.decrease(HARM_NAMES["total"]),
-        predicted_harm=found.mean("predicted_harm"),
-        policy_share=found.count("policy") / tally.worlds if hybrid else None,
-        parameters=conditions,
-        distance=found.distance(),
-        shoved_m=shoved,
-        shoved_far=None if shoved is None else found.share("shoved_far"),
-        sampled_harm=found.mean("sampled_harm"),
-        left_out=tally.left_out,
-        beside_paper=is_papers_list(question.scenario, question.seed, question.task.vehicles),
-        knows=asked.knows[name],
-        hidden_share=tally.hidden / tally.worlds,
-        worlds_sha256=f"{tally.worlds_hash:064x}",
-        scenario_sha256=asked.identity["scenario_sha256"],
-        policy_sha256=asked.policies[name],
-        versions=asked.identity["versions"],
-        metrics={column.removeprefix(COLUMN): found.needed(column) for column in columns},
-    )
+def _without_limits(tally: AgentTally, worlds: int) -> AgentTally:
+    """The tally without what needs the best known harm, unless that is known in every world."""
+    if tally.count(KNOWN) == worlds:
+        return tally
+    names = {measure.name for measure in (*measures(()), *COUNTED) if measure.limits}
+    counts = {name: pair for name, pair in tally.counts.items() if name not in names}
+    return AgentTally(counts, {n: each for n, each in tally.moments.items() if n not in names}, tally.products)
 
 
 def rescore_shards(asked: Asked, tally: Tally) -> list[Rescored]:
     """Every agent under every objective of the question and both counts, as ``rescore``."""
-    agents, vehicles = _agents(tally), range(asked.question.scenario.vehicles)
+    vehicles = range(asked.question.scenario.vehicles)
     return [
         Rescored(
-            name, each, harm_count, tuple(agents[name].needed(objective_column(each, harm_count, i)) for i in vehicles)
+            name,
+            each,
+            harm_count,
+            tuple(mean_of(tally.agents[name].moments[f"{each}_{harm_count}_{i + 1}"]) for i in vehicles),
         )
         for name in asked.identity["agents"]
         for harm_count in HARM_COUNTS
@@ -644,19 +434,16 @@ def rescore_shards(asked: Asked, tally: Tally) -> list[Rescored]:
 
 def shards_to_json(asked: Asked, tally: Tally, rows: Sequence[SummaryRow]) -> list[dict[str, Any]]:
     """What a results file holds: one object per agent, each vehicle's harm and the kind of the intervals among it."""
-    question, agents = asked.question, _agents(tally)
+    question = asked.question
     settings = {"harm_count": question.harm_count, "uncertainty": question.uncertainty}
     found = results_to_json(rows, told=rescore_shards(asked, tally), settings=settings)
-    names = [f"{name}_{i + 1}" for name in HARM_NAMES.values() for i in range(question.scenario.vehicles)]
-    return [
-        {
-            **row,
-            "kind": "evaluate-shards",
-            "intervals": INTERVALS,
-            "vehicle_harm": estimates_to_json({name: agents[row["agent"]].mean(name) for name in names}),
-        }
-        for row in found
-    ]
+    names = [f"{name}_{i + 1}" for name in _ALWAYS for i in range(question.scenario.vehicles)]
+
+    def borne(agent: str) -> dict[str, Any]:
+        return estimates_to_json({name: mean_of(tally.agents[agent].moments[name]) for name in names})
+
+    told = {"kind": "evaluate-shards", "intervals": INTERVALS}
+    return [{**row, **told, "vehicle_harm": borne(row["agent"])} for row in found]
 
 
 def _told_range(name: str, entries: Sequence[tuple[float, float]]) -> Any:

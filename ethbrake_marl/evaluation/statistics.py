@@ -9,14 +9,14 @@ by world, so that the spread between easy and hard worlds cancels. Means and the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.special import betaincinv, ndtri, stdtrit
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.sheet import Estimate as Estimate
+from ethbrake_marl.files.sheet import estimates_to_json as estimates_to_json
 from ethbrake_marl.physics import Floats, Ints
 from ethbrake_marl.physics.compiled import compiled
 
@@ -171,38 +171,6 @@ def root(above: int, below: int) -> float:
 
 
 CONFIDENCE = 0.95
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """A value and its interval; the interval is None where the data cannot give one (a single world)."""
-
-    value: float
-    interval: tuple[float, float] | None
-
-    def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """``24.19 [23.85, 24.53]``: value and interval, each times ``scale``."""
-        value = f"{scale * self.value:z.{digits}f}{unit}"
-        if self.interval is None:
-            return value
-        low, high = (f"{scale * end:z.{digits}f}" for end in self.interval)
-        return f"{value} [{low}, {high}]"
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain data for JSON: ``value``, and ``interval`` as ``[low, high]`` or null."""
-        return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
-
-
-def estimates_to_json(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-    """Estimates by name as plain data, side by side: ``{name: value, name_interval: [low, high]}``.
-
-    What does not exist is null.
-    """
-    found: dict[str, Any] = {}
-    for name, estimate in estimates.items():
-        told = {"value": None, "interval": None} if estimate is None else estimate.to_json()
-        found |= {name: told["value"], f"{name}_interval": told["interval"]}
-    return found
 
 
 def rate(successes: int, count: int, *, confidence: float = CONFIDENCE) -> Estimate:

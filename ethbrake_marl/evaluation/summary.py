@@ -2,44 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
-from rich.table import Table
-from rich.text import Text
 
 from ethbrake_marl.agents.protocol import Knowledge, Source, knowledge_text, sees_through
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, count_of, unknown_name
-from ethbrake_marl.evaluation.harm_metrics import COLUMN, metric_headings, metric_meanings
 from ethbrake_marl.evaluation.inputs import policies_by_name, result_versions, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.measures import (
+    BASELINE,
+    BELOW,
+    CHOSEN,
+    COLUMN,
+    HORIZON,
+    KNOWN,
+    AgentTally,
+    Between,
+    between_of,
+    estimate_all,
+    measures,
+    metric_headings,
+    metric_meanings,
+    tally_agents,
+)
 from ethbrake_marl.evaluation.outcome import (
     PAPER_NOTE,
     PAPER_PARAMETERS,
     PAPER_ROWS,
     Evaluation,
     LeftOut,
-    Outcome,
-    PaperRow,
     is_papers_test,
     parameter_line,
     parameters,
 )
-from ethbrake_marl.evaluation.regret import Between, Distance, assess, distance
-from ethbrake_marl.evaluation.statistics import (
-    Estimate,
-    estimates_to_json,
-    mean,
-    paired_difference,
-    rate,
-    relative_decrease,
-)
-from ethbrake_marl.files.html import html_table
+from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json, mean, rate
+from ethbrake_marl.files.sheet import DASH, Column, Row, Sheet, Shown
 from ethbrake_marl.harm import Declared, objectives_of, scored, standard_objectives
+from ethbrake_marl.limits.limits import Limits
 
 ALL = "standard"
 
@@ -82,58 +85,46 @@ def rescore(evaluation: Evaluation, declared: Sequence[Declared] | None = None) 
     ]
 
 
-def rescored_table(rows: Sequence[Rescored], harm_count: HarmCount) -> Table:
-    """The means under one count for a terminal: one line per agent and objective, one column per vehicle."""
+def rescored_table(rows: Sequence[Rescored], harm_count: HarmCount) -> Sheet:
+    """The means under one count: one line per agent and objective, one column per vehicle."""
     shown = [row for row in rows if row.harm_count == harm_count]
-    harm = "first-impact" if harm_count == "first" else "total"
-    table = Table(
-        box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, title=f"Objectives, {harm} harm", title_justify="left"
-    )
-    table.add_column("Agent", overflow="fold")
-    table.add_column("Objective")
-    for i in range(len(shown[0].each) if shown else 0):
-        table.add_column(f"Vehicle {i + 1}", justify="right", no_wrap=True)
-    for k, row in enumerate(shown):
-        agent = "" if k and shown[k - 1].agent == row.agent else row.agent
-        table.add_row(Text(agent), Text(row.objective), *(f"{estimate.value:.2f}" for estimate in row.each))
-    return table
-
-
-BASELINE = "full_brake"
-FAR_M = 5.0  # Vehicle 1 counts as shoved far beyond this
+    vehicles = range(len(shown[0].each) if shown else 0)
+    columns: list[Column | str] = [
+        "Agent",
+        "Objective",
+        *(Column(f"Vehicle {i + 1}", interval="hidden") for i in vehicles),
+    ]
+    names = ["" if k and shown[k - 1].agent == row.agent else row.agent for k, row in enumerate(shown)]
+    lines = [(name, row.objective, *row.each) for name, row in zip(names, shown, strict=True)]
+    return Sheet(f"Objectives, {'first-impact' if harm_count == 'first' else 'total'} harm", columns, lines)
 
 
 @dataclass(frozen=True, slots=True)
 class SummaryRow:
     """What one agent achieved over the list of worlds; harms are means per world, m2/s2.
 
+    ``row["harm_decrease_total"]`` is the estimate of any measure, by its name in JSON; None where it does not exist.
+
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
     >>> agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
     >>> rows = eb.summarise(eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario))
-    >>> rows[0].agent, rows[0].collisions, round(rows[0].total_harm.value, 2)
-    ('full_brake', 2, 36.99)
+    >>> rows[0].agent, rows[0].collisions, round(rows[0].total_harm.value, 2), rows[0]["predicted_harm"]
+    ('full_brake', 2, 36.99, None)
 
     """
 
     agent: str  # its name
     episodes: int  # worlds
+    estimates: Mapping[str, Estimate | None]  # of every measure, by its name in JSON
     collisions: int  # worlds with at least one impact
     horizon_ends: int  # worlds that the horizon cut off before the line stood
-    collision_rate: Estimate  # share of worlds
-    first_impact_harm: Estimate  # each pair's first impact
-    total_harm: Estimate  # every impact
-    first_difference: Estimate | None  # first-impact harm minus the baseline's, paired by world
-    total_difference: Estimate | None  # the same of total harm
-    first_decrease: Estimate | None  # 1 - harm / the baseline's harm
-    total_decrease: Estimate | None  # the same of total harm
-    predicted_harm: Estimate | None  # where the agent predicts, and a finite harm in every world
-    policy_share: float | None  # share of worlds in which a hybrid drove by its policy
     parameters: dict[str, Any]  # of the test, for JSON
-    distance: Distance = field(default_factory=Distance)  # to the best known harm
-    shoved_m: Estimate | None = None  # how far Vehicle 1 ends beyond where it would by itself
-    shoved_far: Estimate | None = None  # share of worlds in which that is more than ``FAR_M``
-    sampled_harm: Estimate | None = None  # the paper's sum over samples
+    policy_share: float | None = None  # share of worlds in which a hybrid drove by its policy
+    known_best_share: float | None = None  # worlds whose best is known without the agents of this evaluation
+    below_best_known: int | None = None  # worlds in which the agent is below it
+    between: Between | None = None  # the worlds in which contact is proven and no impact
+    warning: str = ""  # a table of best known harm holds some of the worlds, and not the others
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that no row counts: they could not be advanced
     beside_paper: bool = False  # these are results of the test that the paper's rows are about
     knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
@@ -142,7 +133,35 @@ class SummaryRow:
     scenario_sha256: str = ""  # of all that shapes an episode
     policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> its policy's, where one drives
     versions: Mapping[str, str] = field(default_factory=dict)  # of what computed it
-    metrics: Mapping[str, Estimate] = field(default_factory=dict)  # registered harm metrics, mean per world
+
+    def __getitem__(self, measure: str) -> Estimate | None:
+        return self.estimates[measure]
+
+    def _needed(self, measure: str) -> Estimate:
+        found = self.estimates[measure]
+        assert found is not None  # every agent has it in every world
+        return found
+
+    @property
+    def collision_rate(self) -> Estimate:
+        """Share of worlds."""
+        return self._needed("collision_rate")
+
+    @property
+    def first_impact_harm(self) -> Estimate:
+        """Each pair's first impact."""
+        return self._needed("first_impact_harm")
+
+    @property
+    def total_harm(self) -> Estimate:
+        """Every impact."""
+        return self._needed("total_harm")
+
+    @property
+    def metrics(self) -> dict[str, Estimate]:
+        """Registered measures, by column."""
+        found = {name.removeprefix(COLUMN): each for name, each in self.estimates.items() if name.startswith(COLUMN)}
+        return {name: each for name, each in found.items() if each is not None}
 
     @property
     def sees_through(self) -> bool:
@@ -151,6 +170,9 @@ class SummaryRow:
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
+        of_limits = {measure.name for measure in measures(()) if measure.limits}
+        optional = {measure.name for measure in measures(()) if not measure.always}
+        told = {name: each for name, each in self.estimates.items() if each or name not in optional}
         return {
             "kind": "evaluate",
             "agent": self.agent,
@@ -160,9 +182,13 @@ class SummaryRow:
             "episodes": self.episodes,
             "collisions": self.collisions,
             "horizon_ends": self.horizon_ends,
-            **estimates_to_json(self._estimates()),
+            **estimates_to_json({name: each for name, each in told.items() if name not in of_limits}),
             **({"policy_share": self.policy_share} if self.policy_share is not None else {}),
-            **self._distance_to_json(),
+            **estimates_to_json({name: each for name, each in told.items() if name in of_limits}),
+            "known_best_share": self.known_best_share,
+            "best_known_warning": self.warning or None,
+            "below_best_known": self.below_best_known,
+            "impact_unproven": None if self.between is None else asdict(self.between),
             "left_out": [left._asdict() for left in self.left_out],
             "worlds_sha256": self.worlds_sha256,
             "scenario_sha256": self.scenario_sha256,
@@ -170,32 +196,6 @@ class SummaryRow:
             "versions": dict(self.versions),
             **({"metrics": metric_headings(self.metrics)} if self.metrics else {}),
             "parameters": self.parameters,
-        }
-
-    def _estimates(self) -> dict[str, Estimate | None]:
-        """What was measured, by its names in JSON."""
-        return {
-            "collision_rate": self.collision_rate,
-            "first_impact_harm": self.first_impact_harm,
-            "total_harm": self.total_harm,
-            "sampled_harm": self.sampled_harm,
-            "vehicle_1_shoved_m": self.shoved_m,
-            "vehicle_1_shoved_far_rate": self.shoved_far,
-            "first_impact_harm_difference": self.first_difference,
-            "total_harm_difference": self.total_difference,
-            "harm_decrease_first": self.first_decrease,
-            "harm_decrease_total": self.total_decrease,
-            **({"predicted_harm": self.predicted_harm} if self.predicted_harm else {}),
-            **{f"{COLUMN}{name}": estimate for name, estimate in self.metrics.items()},
-        }
-
-    def _distance_to_json(self) -> dict[str, Any]:
-        return {
-            **estimates_to_json(self.distance.estimates()),
-            "known_best_share": self.distance.known_best_share,
-            "best_known_warning": self.distance.warning or None,
-            "below_best_known": self.distance.below_best_known,
-            "impact_unproven": None if self.distance.between is None else asdict(self.distance.between),
         }
 
 
@@ -212,55 +212,79 @@ class SummaryTable(list[SummaryRow]):
     """
 
     def _repr_html_(self) -> str:
-        rows = []
-        for row in self:
-            harms = (row.first_impact_harm, row.total_harm, row.distance.regret_first)
-            shares = (row.collision_rate, row.first_decrease, row.distance.realised_first)
-            cells = [NO_VALUE if each is None else each.in_words() for each in harms]
-            rates = [NO_VALUE if each is None else each.in_words(digits=1, scale=100.0, unit=" %") for each in shares]
-            rows.append((row.agent, knowledge_text(row.knows), *rates[:1], *cells, *rates[1:]))
+        share = partial(Column, digits=1, scale=100.0, unit=" %")
+        columns = (
+            "Agent", "Knows", share("Collisions"), Column("First-impact harm"), Column("Total harm"),
+            Column("Regret, first"), share("Decrease, first"), share("Realised share, first"),
+        )  # fmt: skip
+        names = ("collision_rate", "first_impact_harm", "total_harm", "mean_regret_first", "harm_decrease_first")
+        rows = [
+            (row.agent, knowledge_text(row.knows), *(row[name] for name in (*names, "realised_share_first")))
+            for row in self
+        ]
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
-        note += f" WARNING: {self[0].distance.warning}." if self and self[0].distance.warning else ""
+        note += f" WARNING: {self[0].warning}." if self and self[0].warning else ""
         worlds = f"{self[0].parameters['scenario']}, {count_of(self[0].episodes, 'world')}" if self else "no agent"
-        return html_table(_HEAD, rows, caption=worlds, note=note)
-
-
-NO_VALUE = "–"
-_HEAD = (
-    "Agent",
-    "Knows",
-    "Collisions",
-    "First-impact harm",
-    "Total harm",
-    "Regret, first",
-    "Decrease, first",
-    "Realised share, first",
-)
+        return Sheet(worlds, columns, rows, note).html()
 
 
 def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
     """One row per agent, in the order of the evaluation; compared with ``baseline`` where that was evaluated."""
-    conditions = parameters(evaluation)
-    reference = evaluation.outcomes.get(baseline)
-    beside, regrets, braking = is_papers_test(evaluation), assess(evaluation), evaluation.outcomes.get(BASELINE)
-    hidden = float(evaluation.hidden.mean())
-    worlds, scenario = worlds_sha256(evaluation.worlds, evaluation.index), scenario_sha256(evaluation.scenario)
-    versions = result_versions()
-    rows = [_row(agent, outcome, reference, conditions) for agent, outcome in evaluation.outcomes.items()]
+    limits, outcomes = evaluation.limits, evaluation.outcomes
+    shared = {
+        "parameters": parameters(evaluation),
+        "between": between_of(evaluation),
+        "warning": limits.warning if isinstance(limits, Limits) else "",
+        "left_out": evaluation.left_out,
+        "beside_paper": is_papers_test(evaluation),
+        "hidden_share": float(evaluation.hidden.mean()),
+        "worlds_sha256": worlds_sha256(evaluation.worlds, evaluation.index),
+        "scenario_sha256": scenario_sha256(evaluation.scenario),
+        "versions": result_versions(),
+    }
+    policies = {name: policies_by_name(each.policies, evaluation.scenario) for name, each in outcomes.items()}
+    tallies = tally_agents(evaluation, baseline=baseline)
+    knows = {name: outcome.knows for name, outcome in outcomes.items()}
+    return summarise_tallies(tallies, evaluation.worlds.n, rate, knows, policies, shared, baseline=baseline)
+
+
+def summarise_tallies(
+    tallies: Mapping[str, AgentTally],
+    worlds: int,
+    rate: Callable[[int, int], Estimate],
+    knows: Mapping[str, Knowledge],
+    policies: Mapping[str, Mapping[str, str]],
+    shared: Mapping[str, Any],
+    *,
+    baseline: str = BASELINE,
+) -> SummaryTable:
+    """One row per agent, from exact sums over so many worlds.
+
+    Args:
+        tallies: by agent.
+        worlds: their number.
+        rate: gives a share of so many worlds, of all, with its interval.
+        knows: what each agent says it knows.
+        policies: of each agent, by the vehicle's name.
+        shared: fields of ``SummaryRow`` that are the same for all.
+        baseline: what is compared with.
+
+    """
     return SummaryTable(
-        replace(
-            row,
-            beside_paper=beside,
-            left_out=evaluation.left_out,
-            distance=distance(regrets, evaluation.outcome(row.agent), braking),
-            knows=evaluation.outcome(row.agent).knows,
-            hidden_share=hidden,
-            worlds_sha256=worlds,
-            scenario_sha256=scenario,
-            policy_sha256=policies_by_name(evaluation.outcome(row.agent).policies, evaluation.scenario),
-            versions=versions,
+        SummaryRow(
+            agent=agent,
+            episodes=worlds,
+            estimates=estimate_all(tallies, agent, worlds, rate, baseline=baseline),
+            collisions=tally.count("collision_rate"),
+            horizon_ends=tally.count(HORIZON),
+            policy_share=tally.share(CHOSEN, worlds),
+            known_best_share=tally.share(KNOWN, worlds),
+            below_best_known=tally.count(BELOW) if BELOW in tally.counts else None,
+            knows=knows[agent],
+            policy_sha256=policies[agent],
+            **shared,
         )
-        for row in rows
+        for agent, tally in tallies.items()
     )
 
 
@@ -278,72 +302,11 @@ def horizon_note(moving: Mapping[str, int], worlds: int, horizon_s: float) -> st
     )
 
 
-def _row(agent: str, outcome: Outcome, reference: Outcome | None, conditions: dict[str, Any]) -> SummaryRow:
-    first, total = outcome.first_impact_harm, outcome.total_harm
-    collisions, episodes = int(outcome.collided.sum()), len(first)
-    against = None if reference is None else (reference.first_impact_harm, reference.total_harm)
-    predicted = outcome.predicted_harm
-    return SummaryRow(
-        agent=agent,
-        episodes=episodes,
-        collisions=collisions,
-        horizon_ends=int((~outcome.at_rest).sum()),
-        collision_rate=rate(collisions, episodes),
-        first_impact_harm=mean(first),
-        total_harm=mean(total),
-        first_difference=None if against is None else paired_difference(first, against[0]),
-        total_difference=None if against is None else paired_difference(total, against[1]),
-        first_decrease=None if against is None else relative_decrease(first, against[0]),
-        total_decrease=None if against is None else relative_decrease(total, against[1]),
-        predicted_harm=None if predicted is None or not np.isfinite(predicted).all() else mean(predicted),
-        policy_share=None if outcome.chosen_policy is None else float(outcome.chosen_policy.mean()),
-        parameters=conditions,
-        shoved_m=None if outcome.shoved_m is None else mean(outcome.shoved_m),
-        shoved_far=None if outcome.shoved_m is None else rate(int((outcome.shoved_m > FAR_M).sum()), episodes),
-        sampled_harm=None if outcome.sampled_harm is None else mean(outcome.sampled_harm),
-        metrics={name: mean(column) for name, column in outcome.metrics.items()},
-    )
+# The table, for a terminal and for a document, and the sentences below it.
 
-
-# The cells of the summary table: columns, their meanings, and one line for each agent and row of the paper.
-
-DASH = "–"
 SEES_THROUGH = "† "  # before what an agent knows that no channel brought
-
-
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """One entry of the table: the value, and its 95 % interval or nothing."""
-
-    value: str
-    interval: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """One line of the table."""
-
-    agent: str
-    cells: tuple[Cell, ...]
-    knows: str = DASH
-
-
-COLUMNS = (
-    "Collisions",
-    "First-impact harm",
-    "Total harm",
-    "Sampled harm",
-    "Vehicle 1 shoved (m)",
-    "Vehicle 1 shoved > 5 m",
-    "Decrease, first-impact",
-    "Decrease, total",
-    "Predicted harm",
-    "Regret, first-impact",
-    "Realised share, first-impact",
-)
-
-
-MEANINGS = {
+_NAMED = 10  # worlds left out that are named one by one; all stand in the JSON
+_HEAD = {
     "Agent": "What drives the controlled vehicle; all other vehicles follow the scenario. full_brake is the paper's"
     " non-ethical strategy (Non-E). e_v2x_bm is the best constant deceleration found in this simulation;"
     " e_v2x_bm:pairwise is the paper's closed form, which treats the pairs as independent.",
@@ -352,203 +315,92 @@ MEANINGS = {
     " received or not. true model: also masses, restitution and scripts, enough to simulate the line ahead. Of a policy"
     " behind a shield, or a refined one, both parts are told. † marks agents that see through a channel that hides"
     " something here.",
-    "Collisions": "Share of worlds with at least one impact; Wilson's interval. Every agent meets the same worlds, each"
-    " once.",
-    "First-impact harm": "Squared closing speed (m²/s²), summed over the pairs, each pair's first impact only (the"
-    " paper's protocol); mean per world.",
-    "Total harm": "The same over every impact. A light early touch makes a later, harder impact of the same pair free"
-    " under the first count, so both are shown.",
-    "Sampled harm": "The paper's own sum (its eq. Jharm): the agent's commands replayed through the paper's fixed-step"
-    " map at the time step; at every sample each pair that overlaps and closes adds its squared closing speed (m²/s²),"
-    " so pushing costs harm for as long as it lasts.",
-    "Vehicle 1 shoved (m)": "How far Vehicle 1 ends beyond the point where it would stop by itself, mean per world; and"
-    " the share of worlds in which that is more than 5 m. Both counts of harm leave pushing free unless something"
-    " stands ahead; Vehicle 1 brakes for something.",
-    "Decrease": "1 − harm / harm of full braking in the same worlds; interval by the delta method, paired by world.",
-    "Predicted harm": "What the agent itself expected at the alert, under the count that it minimises.",
-    "Regret": "First-impact harm minus the best known first-impact harm of the same world; mean per world. The best"
-    " known is 0 where contact is proven avoidable, else the result of a search over whole profiles of Vehicle 2,"
-    " or of an agent in this table that did better. With ≥: the best of some world is known from these agents alone.",
-    "Realised share": "(Full braking − agent) / (full braking − best known), first-impact harm: how much of the"
-    " reduction of harm that is known to be possible the agent brings.",
 }
-
-
-def table_columns(rows: Sequence[SummaryRow]) -> tuple[str, ...]:
-    """The columns, those of registered harm metrics last."""
-    return (*COLUMNS, *(metric_headings(rows[0].metrics).values() if rows else ()))
-
-
-def filled_columns(lines: Sequence[Line], columns: Sequence[int]) -> tuple[int, ...]:
-    """Those of the columns in which some line has a value; all of them for no lines."""
-    return tuple(k for k in columns if not lines or any(line.cells[k].value != DASH for line in lines))
+_ALWAYS_SHOWN = ("collision_rate", "first_impact_harm", "total_harm", "sampled_harm", "vehicle_1_shoved_m")
+_NARROW = (  # in a narrow terminal too, where there is no regret to show, and where there is
+    ("harm_decrease_first", "harm_decrease_total"),
+    ("mean_regret_first", "realised_share_first"),
+)
+_BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # a terminal shows their intervals; JSON has all
 
 
 def table_meanings(rows: Sequence[SummaryRow]) -> dict[str, str]:
-    """What the columns mean, those of registered harm metrics last."""
-    return MEANINGS | (metric_meanings(rows[0].metrics) if rows else {})
+    """What the columns mean, by the beginning of their headings; those of registered measures last."""
+    about = {each.heading.partition(",")[0]: each.about for each in measures(()) if each.about}
+    return _HEAD | about | (metric_meanings(rows[0].metrics) if rows else {})
 
 
-def our_lines(rows: Sequence[SummaryRow]) -> list[Line]:
-    """Our results, one line per agent."""
-    return [
-        Line(
+def summary_sheet(rows: Sequence[SummaryRow]) -> Sheet:
+    """The table: agent, what it knows, and every measure that has a heading, those of registered ones last.
+
+    Below it the paper's rows, where they are about the same test.
+    """
+    told = [each for each in measures(()) if each.heading]
+    own = metric_headings(rows[0].metrics) if rows else {}
+    columns = [each.column() for each in told] + [Column(own[name], COLUMN + name, sign="-") for name in own]
+    lines: list[Row] = [
+        (
             row.agent,
-            (
-                percent_cell(row.collision_rate, 1),
-                _number_cell(row.first_impact_harm),
-                _number_cell(row.total_harm),
-                _number_cell(row.sampled_harm),
-                _number_cell(row.shoved_m),
-                percent_cell(row.shoved_far, 1),
-                percent_cell(row.first_decrease, 1),
-                percent_cell(row.total_decrease, 1),
-                _number_cell(row.predicted_harm),
-                _regret(row.distance),
-                percent_cell(row.distance.realised_first, 1),
-                *(_number_cell(estimate) for estimate in row.metrics.values()),
-            ),
             SEES_THROUGH * row.sees_through + knowledge_text(row.knows),
+            *(_regret(row) if column.name == "mean_regret_first" else row[column.name] for column in columns),
         )
         for row in rows
     ]
+    for name, paper in _papers(rows).items():
+        lines += [f"paper, {name}", *((agent, None, *(cells.get(c.name) for c in columns)) for agent, cells in paper)]
+    return Sheet("", ["Agent", "Knows", *columns], lines)
 
 
-def paper_blocks(rows: Sequence[SummaryRow]) -> list[tuple[str, list[Line]]]:
-    """The paper's tables that belong beside these rows, as (table, lines)."""
-    blocks: dict[str, list[Line]] = {}
-    for paper in PAPER_ROWS if rows and rows[0].beside_paper else ():
-        blocks.setdefault(paper.table, []).append(_paper_line(paper, len(rows[0].metrics)))
-    return list(blocks.items())
+def _papers(rows: Sequence[SummaryRow]) -> dict[str, list[tuple[str, dict[str, str]]]]:
+    """The paper's rows that belong beside these, by table, with the digits that it prints."""
+    found: dict[str, list[tuple[str, dict[str, str]]]] = {}
+    for row in PAPER_ROWS if rows and rows[0].beside_paper else ():
+        cells = {"collision_rate": f"{100 * row.collision_rate:.4g} %", "first_impact_harm": f"{row.average_harm:.6g}"}
+        if row.harm_decrease is not None:
+            cells["harm_decrease_first"] = f"{100 * row.harm_decrease:.4g} %"
+        found.setdefault(row.table, []).append((row.agent, cells))
+    return found
 
 
-def _paper_line(row: PaperRow, metrics: int) -> Line:
-    """The paper's figures with the digits that it prints; nothing under the ``metrics`` that somebody registered."""
-    decrease = DASH if row.harm_decrease is None else f"{100 * row.harm_decrease:.4g} %"
-    cells = (
-        f"{100 * row.collision_rate:.4g} %",
-        f"{row.average_harm:.6g}",
-        *[DASH] * 4,
-        decrease,
-        *[DASH] * (4 + metrics),
-    )
-    return Line(row.agent, tuple(Cell(cell) for cell in cells))
+def paper_lines(rows: Sequence[SummaryRow]) -> list[str]:
+    """The conditions of the paper's rows that stand beside these, by table; the last is what must be known of them."""
+    found = [f"{name}: {PAPER_PARAMETERS[name]}." for name in _papers(rows)]
+    return [*found, PAPER_NOTE] if found else []
 
 
-def _regret(distance: Distance) -> Cell:
-    cell = _number_cell(distance.regret_first)
-    lower_bound = distance.known_best_share is not None and distance.known_best_share < 1.0
-    return Cell(f"≥ {cell.value}", cell.interval) if lower_bound else cell
+def _regret(row: SummaryRow) -> Shown:
+    """The regret, marked as a lower bound where the best of some world is not known beforehand."""
+    value, interval = Column("", sign="-").show(row["mean_regret_first"])
+    bound = row.known_best_share is not None and row.known_best_share < 1.0
+    return Shown(f"≥ {value}" if bound else value, interval)
 
 
-def percent_cell(estimate: Estimate | None, digits: int) -> Cell:
-    """A share as per cent; a dash for what does not exist."""
-    return _cell(estimate, 100.0, digits, " %")
-
-
-def _number_cell(estimate: Estimate | None) -> Cell:
-    return _cell(estimate, 1.0, 2, "")
-
-
-def _cell(estimate: Estimate | None, scale: float, digits: int, unit: str) -> Cell:
-    if estimate is None:
-        return Cell(DASH)
-    value = f"{scale * estimate.value:.{digits}f}{unit}"
-    if estimate.interval is None:
-        return Cell(value)
-    low, high = (f"{scale * end:.{digits}f}" for end in estimate.interval)
-    return Cell(value, f"{low}, {high}")
-
-
-# The summary table as text, for a terminal (rich) and for a document (markdown), and the sentences below it.
-
-_TERMINAL_HEADINGS = (
-    "Collisions",
-    "First-impact\nharm",
-    "Total\nharm",
-    "Sampled\nharm",
-    "Shoved\nm",
-    "Shoved\n> 5 m",
-    "Decrease\nfirst",
-    "Decrease\ntotal",
-    "Pre-\ndicted",
-    "Regret\nfirst",
-    "Realised\nfirst",
-)
-_ALL = tuple(range(len(_TERMINAL_HEADINGS)))
-_NARROW, _NARROW_WITHOUT = (0, 1, 2, 3, 4, 9, 10), (0, 1, 2, 3, 4, 6, 7)  # with and without a regret to show
-_NAMED = 10  # worlds left out that are named one by one; all stand in the JSON
-_WIDE = 120  # terminal columns that all of them need
-
-
-def rich_table(rows: Sequence[SummaryRow]) -> RenderableType:
+def rich_table(rows: Sequence[SummaryRow]) -> Sheet:
     """The table for a terminal of 80 columns or more: ours, then the paper's rows, then the conditions of each."""
-    return Group(_TerminalTable(rows), Text(), Text(_conditions(rows), style="dim"))
+    sheet, narrow = summary_sheet(rows), (*_ALWAYS_SHOWN, *_NARROW[bool(limit_lines(rows))])
+    columns = [
+        replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
+        for each in (measure.column() for measure in measures(()) if measure.heading)
+    ]
+    lines = [
+        row
+        if isinstance(row, str)
+        else (row[0] if row[1] is None else f"{row[0]}\n{row[1]}", *row[2 : 2 + len(columns)])
+        for row in sheet.rows
+    ]
+    return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, _conditions(rows), gap=1)
 
 
-def metrics_table(rows: Sequence[SummaryRow]) -> Table:
-    """The registered harm metrics for a terminal: one line per agent, the mean per world with its interval."""
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, title="Harm metrics", title_justify="left")
-    table.add_column("Agent", overflow="fold")
-    for heading in metric_headings(rows[0].metrics).values() if rows else ():
-        table.add_column(Text(heading), justify="right", overflow="fold")
-    for row in rows:
-        table.add_row(Text(row.agent), *(Text(estimate.in_words()) for estimate in row.metrics.values()))
-    return table
-
-
-@dataclass(frozen=True, slots=True)
-class _TerminalTable:
-    """The lines of the table; a narrow terminal gets fewer columns."""
-
-    rows: Sequence[SummaryRow]
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        wide = options.max_width >= _WIDE
-        yield self._table(_ALL if wide else _NARROW if limit_lines(self.rows) else _NARROW_WITHOUT)
-
-    def _table(self, shown: Sequence[int]) -> Table:
-        table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=0, pad_edge=False)
-        table.add_column("Agent,\nwhat it knows", overflow="fold")
-        for k in shown:
-            table.add_column(_TERMINAL_HEADINGS[k], justify="right", no_wrap=True)
-        for line in our_lines(self.rows):
-            table.add_row(
-                Text(line.agent).append(f"\n{line.knows}", style="dim"),
-                *(_terminal_cell(k, line.cells[k]) for k in shown),
-            )
-        for name, lines in paper_blocks(self.rows):
-            table.add_section()
-            table.add_row(Text(f"paper, {name}", style="dim"))
-            for line in lines:
-                table.add_row(line.agent, *(line.cells[k].value for k in shown))
-        return table
-
-
-def _terminal_cell(column: int, cell: Cell) -> Text:
-    """Value, and in the first three columns its interval below; the others' are in the JSON and the report."""
-    text = Text(cell.value)
-    return text.append(f"\n{cell.interval}", style="dim") if cell.interval and column < 3 else text
+def metrics_table(rows: Sequence[SummaryRow]) -> Sheet:
+    """The registered measures: one line per agent, the mean per world with its interval."""
+    headings = metric_headings(rows[0].metrics).values() if rows else ()
+    lines = [(row.agent, *row.metrics.values()) for row in rows]
+    return Sheet("Measures", ["Agent", *map(Column, headings)], lines)
 
 
 def markdown_table(rows: Sequence[SummaryRow]) -> str:
     """The table for a document, with the conditions of ours and of the paper's below it."""
-    columns = table_columns(rows)
-    head = ["Agent", "Knows", *columns]
-    lines = ["| " + " | ".join(head) + " |", "|" + 2 * " --- |" + " ---: |" * len(columns)]
-    lines += [_markdown_line(line) for line in our_lines(rows)]
-    for name, block in paper_blocks(rows):
-        lines += [_markdown_line(Line(f"paper, {name}: {line.agent}", line.cells)) for line in block]
-    return "\n".join([*lines, "", _conditions(rows), ""])
-
-
-def _bracket(cell: Cell) -> str:
-    return f"{cell.value} [{cell.interval}]" if cell.interval else cell.value
-
-
-def _markdown_line(line: Line) -> str:
-    cells = map(_bracket, line.cells)
-    return "| " + " | ".join([line.agent.replace("|", "\\|"), line.knows, *cells]) + " |"
+    return f"{summary_sheet(rows).markdown()}\n\n{_conditions(rows)}\n"
 
 
 def _conditions(rows: Sequence[SummaryRow]) -> str:
@@ -559,9 +411,8 @@ def _conditions(rows: Sequence[SummaryRow]) -> str:
         " below a value: its 95 % interval; decreases are relative to full braking."
     ]
     texts += left_out_lines(rows) + warning_lines(rows) + limit_lines(rows) + knowledge_lines(rows)
-    blocks = paper_blocks(rows)
-    texts += [f"Paper, {name}: {PAPER_PARAMETERS[name]}." for name, _ in blocks]
-    return "\n\n".join([*texts, *([PAPER_NOTE] if blocks else [])])
+    *paper, note = paper_lines(rows) or [""]
+    return "\n\n".join([*texts, *(f"Paper, {line}" for line in paper), *([note] if note else [])])
 
 
 def left_out_lines(rows: Sequence[SummaryRow]) -> list[str]:
@@ -587,7 +438,7 @@ def warning_lines(rows: Sequence[SummaryRow]) -> list[str]:
 
     None where all is well.
     """
-    lines = [f"WARNING: {rows[0].distance.warning}."] if rows and rows[0].distance.warning else []
+    lines = [f"WARNING: {rows[0].warning}."] if rows and rows[0].warning else []
     moving = [f"{row.agent} {row.horizon_ends:,}" for row in rows if row.horizon_ends]
     if moving:
         lines.append(
@@ -599,30 +450,25 @@ def warning_lines(rows: Sequence[SummaryRow]) -> list[str]:
 
 def limit_lines(rows: Sequence[SummaryRow]) -> list[str]:
     """What nobody could avoid in these worlds and the best known harm, as sentences; none where nothing is proven."""
-    found = rows[0].distance if rows else None
-    if found is None or not (found.best_known_first and found.best_known_total):
+    first, total = (rows[0][f"best_known_{name}_harm"] for name in ("first_impact", "total")) if rows else (None, None)
+    if first is None or total is None:
         return []
-    contact = _bracket(percent_cell(found.unavoidable_rate, 1))
-    first, total = found.best_known_first.value, found.best_known_total.value
-    text = f"In {contact} of these worlds no {_command_of(rows[0])} avoids contact"
-    if found.unavoidable_rate is None:
-        impact = _bracket(percent_cell(found.impact_proven_rate, 1))
+    share = Column("", digits=1, scale=100.0, unit=" %", sign="-")
+    contact, impact = (share.show(rows[0][name]).in_words for name in ("unavoidable_rate", "impact_proven_rate"))
+    if rows[0]["unavoidable_rate"] is None:
         text = f"In {impact} of these worlds no {_command_of(rows[0])} avoids an impact (proven)."
-        text += _tell_proven(found, first, total)
     else:
-        impact = _bracket(percent_cell(found.impact_proven_rate, 1))
-        text += f", in {impact} none avoids an impact (both proven).{_tell_gap(found.between)}"
-        text += _tell_proven(found, first, total)
-    if found.known_best_share is not None and found.known_best_share < 1.0:
+        text = f"In {contact} of these worlds no {_command_of(rows[0])} avoids contact"
+        text += f", in {impact} none avoids an impact (both proven).{_tell_gap(rows[0].between)}"
+    text += _tell_proven(rows[0]["proven_harm"], first.value, total.value)
+    known = rows[0].known_best_share
+    if known is not None and known < 1.0:
         text += (
-            f" Found beforehand in {100 * found.known_best_share:.1f} % of the worlds; in the others it is the best of"
+            f" Found beforehand in {100 * known:.1f} % of the worlds; in the others it is the best of"
             " the agents above, so that regrets are lower bounds and no realised share is stated."
         )
-    below = {row.agent: row.distance.below_best_known for row in rows if row.distance.below_best_known}
-    if below:
-        counts = ", ".join(f"{agent} in {count_of(count, 'world')}" for agent, count in below.items())
-        text += f" Below what was known: {counts}."
-    return [text]
+    below = [f"{row.agent} in {count_of(row.below_best_known, 'world')}" for row in rows if row.below_best_known]
+    return [text + (f" Below what was known: {', '.join(below)}." if below else "")]
 
 
 def _command_of(row: SummaryRow) -> str:
@@ -631,9 +477,9 @@ def _command_of(row: SummaryRow) -> str:
     return "joint command" if driven is None else f"command of {str(driven).replace('vehicle_', 'Vehicle ')}"
 
 
-def _tell_proven(found: Distance, first: float, total: float) -> str:
+def _tell_proven(found: Estimate | None, first: float, total: float) -> str:
     """The best known and the proven harm, and what lies between, as a sentence."""
-    proven = 0.0 if found.proven_harm is None else found.proven_harm.value
+    proven = 0.0 if found is None else found.value
     return (
         f" Best known harm: {first:.2f} first-impact, {total:.2f} total; proven: no less than {proven:.2f}; gap:"
         f" {first - proven:.2f} ({_share(first - proven, first)}) and {total - proven:.2f}"

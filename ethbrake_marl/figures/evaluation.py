@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
@@ -19,8 +19,8 @@ from ethbrake_marl.envs.drawing.scene import vehicle_colour
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.curves import NO_REGION, CriticalityMap, DecelerationCurve
 from ethbrake_marl.evaluation.episodes import EpisodeRecord
+from ethbrake_marl.evaluation.measures import assess
 from ethbrake_marl.evaluation.outcome import Evaluation, parameter_line, parameters, quantities, quantity_line
-from ethbrake_marl.evaluation.regret import assess
 from ethbrake_marl.evaluation.shield_modes import NONE, STEP, STEP_ALERT, STEP_CAP, ModeRow, are_teams
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.evaluation.summary import SummaryRow
@@ -28,9 +28,12 @@ from ethbrake_marl.figures.style import (
     COLOURS,
     DASHES,
     GREY,
-    add_caption,
+    ends_of,
+    finish,
     label_text,
+    name_axes,
     new_figure,
+    new_panels,
     series_style,
     style_axes,
 )
@@ -55,32 +58,37 @@ def harm_by_agent(rows: Sequence[SummaryRow]) -> Figure:
     """
     if not rows:
         raise InvalidInput("harm_by_agent: no rows; evaluate at least one agent")
-    figure = new_figure(10.0, 1.2 + 0.36 * len(rows))
-    panels = figure.subplots(1, 2, sharey=True)
+    figure, panels = new_panels((10.0, 1.2 + 0.36 * len(rows)), columns=2, sharey=True)
     for axes, count in zip(panels, HARM_COUNTS, strict=True):
-        style_axes(axes)
         for k, row in enumerate(rows):
             estimate = row.first_impact_harm if count == "first" else row.total_harm
             axes.barh(k, estimate.value, height=0.62, color=COLOURS[2])
-            ends = estimate.interval or (estimate.value, estimate.value)
+            ends = ends_of(estimate)
             axes.hlines(k, *ends, color=COLOURS[0], linewidth=1.6)
             axes.annotate(
                 f"{estimate.value:.2f}", (ends[1], k), xytext=(5, 0), textcoords="offset points", va="center",
                 fontsize=9,
             )  # fmt: skip
-        distance = rows[0].distance
-        best = distance.best_known_first if count == "first" else distance.best_known_total
+        best = rows[0]["best_known_first_impact_harm" if count == "first" else "best_known_total_harm"]
         if best is not None:
             axes.axvline(best.value, color=COLOURS[3], linewidth=1.6, linestyle="--", label="best known")
-        axes.set_xlabel(_TITLES[count], fontsize=9)
+        name_axes(axes, x=_TITLES[count])
         axes.margins(x=0.14)
         axes.set_xlim(left=0.0)
-    panels[0].set_yticks(range(len(rows)), [label_text(row.agent) for row in rows])
-    panels[0].invert_yaxis()
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", frameon=False, fontsize=9)
-    add_caption(figure, f"Mean per world; black lines: 95 % intervals. {parameter_line(rows[0].parameters)}.")
-    return figure
+    _name_rows(panels[0], [row.agent for row in rows])
+    caption = f"Mean per world; black lines: 95 % intervals. {parameter_line(rows[0].parameters)}."
+    return finish(figure, caption, panels[0], columns=1, loc="outside upper right")
+
+
+def _name_rows(axes: Axes, agents: Sequence[str]) -> None:
+    """One row per agent, the first on top."""
+    axes.set_yticks(range(len(agents)), [label_text(agent) for agent in agents])
+    axes.invert_yaxis()
+
+
+def _no_powers(value: float, _: int) -> str:
+    """A tick as it is read."""
+    return f"{value:g}"
 
 
 def regret_distribution(evaluation: Evaluation) -> Figure:
@@ -89,26 +97,22 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
     Where nothing is known to be the best, the same of the harm itself.
     """
     regrets = assess(evaluation)
-    figure = new_figure(10.0, 3.8)
-    panels = figure.subplots(1, 2, sharey=True)
+    figure, panels = new_panels((10.0, 3.8), columns=2, sharey=True)
     for axes, count in zip(panels, HARM_COUNTS, strict=True):
-        style_axes(axes)
         for number, (agent, outcome) in enumerate(evaluation.outcomes.items()):
             values = outcome.ledger.world_harm(count) if regrets is None else regrets.regret(outcome, count)
             style = {**series_style(number), "markevery": 40}
             axes.plot(*_exceeded(values), label=label_text(agent), **style)
         axes.set_xscale("symlog", linthresh=1.0, linscale=0.4)
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_major_formatter(FuncFormatter(_no_powers))
         axes.set_xlim(left=0.0)
         axes.set_ylim(0.0, 1.0)
-        axes.set_xlabel(
-            f"{'Harm' if regrets is None else 'Regret'}, {_TITLES[count][0].lower()}{_TITLES[count][1:]}", fontsize=9
-        )
-    panels[0].set_ylabel("Worlds with more than that", fontsize=9)
+        what = "Harm" if regrets is None else "Regret"
+        name_axes(axes, x=f"{what}, {_TITLES[count][0].lower()}{_TITLES[count][1:]}")
+    name_axes(panels[0], y="Worlds with more than that")
     panels[0].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    _legend(figure, panels[0])
-    add_caption(figure, f"Linear up to 1 m²/s², logarithmic beyond. {parameter_line(parameters(evaluation))}.")
-    return figure
+    caption = f"Linear up to 1 m²/s², logarithmic beyond. {parameter_line(parameters(evaluation))}."
+    return finish(figure, caption, panels[0], columns=5)
 
 
 def harm_in_parts(evaluation: Evaluation) -> Figure:
@@ -122,30 +126,20 @@ def harm_in_parts(evaluation: Evaluation) -> Figure:
     avoidable = regrets.limits.proof.avoidable
     if avoidable is None:
         raise InvalidInput("harm_in_parts: where contact can be avoided is not decided for these vehicles")
-    figure = new_figure(10.0, 1.4 + 0.36 * len(evaluation.outcomes))
-    panels = figure.subplots(1, 2, sharey=True)
+    figure, panels = new_panels((10.0, 1.4 + 0.36 * len(evaluation.outcomes)), columns=2, sharey=True)
     for axes, count in zip(panels, HARM_COUNTS, strict=True):
-        style_axes(axes)
         for k, outcome in enumerate(evaluation.outcomes.values()):
-            regret = regrets.regret(outcome, count)
+            regret, left = regrets.regret(outcome, count), 0.0
             parts = (regrets.best(count).mean(), (regret * ~avoidable).mean(), (regret * avoidable).mean())
-            _stack(axes, k, [float(part) for part in parts])
-        axes.set_xlabel(_TITLES[count], fontsize=9)
-    panels[0].set_yticks(range(len(evaluation.outcomes)), [label_text(agent) for agent in evaluation.outcomes])
-    panels[0].invert_yaxis()
-    _legend(figure, panels[0])
-    add_caption(figure, f"Mean per world. {parameter_line(parameters(evaluation))}.")
-    return figure
-
-
-def _stack(axes: Axes, k: int, parts: Sequence[float]) -> None:
-    left = 0.0
-    for part, (label, colour, hatch) in zip(parts, _PARTS, strict=True):
-        axes.barh(
-            k, part, left=left, height=0.62, color=colour, hatch=hatch, edgecolor="#ffffff", linewidth=0.5,
-            label=label if k == 0 else None,
-        )  # fmt: skip
-        left += part
+            for part, (label, colour, hatch) in zip(map(float, parts), _PARTS, strict=True):
+                axes.barh(
+                    k, part, left=left, height=0.62, color=colour, hatch=hatch, edgecolor="#ffffff", linewidth=0.5,
+                    label=label if k == 0 else None,
+                )  # fmt: skip
+                left += part
+        name_axes(axes, x=_TITLES[count])
+    _name_rows(panels[0], list(evaluation.outcomes))
+    return finish(figure, f"Mean per world. {parameter_line(parameters(evaluation))}.", panels[0], columns=5)
 
 
 def _exceeded(values: Floats) -> tuple[Floats, Floats]:
@@ -154,11 +148,6 @@ def _exceeded(values: Floats) -> tuple[Floats, Floats]:
     chosen = np.unique(np.linspace(0, len(ordered) - 1, min(_POINTS, len(ordered))).astype(np.int64))
     share = np.array([float((ordered > value).mean()) for value in ordered[chosen]])
     return np.concatenate([[0.0], ordered[chosen]]), np.concatenate([[float((ordered > 0.0).mean())], share])
-
-
-def _legend(figure: Figure, axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=min(len(labels), 5), frameon=False, fontsize=9)
 
 
 # The figure of one episode: where the vehicles are, where they hit each other, and what the driven one asked for.
@@ -173,32 +162,28 @@ def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> 
     if not records:
         raise InvalidInput("trajectories: no records given")
     first = next(iter(records.values()))
-    figure = new_figure(max(3.4 * len(records), 6.4), 7.4)
-    panels = figure.subplots(3, len(records), sharex=True, sharey="row", height_ratios=(2.2, 1.0, 1.0), squeeze=False)
-    for (title, record), column in zip(records.items(), panels.T, strict=True):
-        for axes, draw in zip(column, (_positions, _gaps, _command), strict=True):
-            style_axes(axes)
-            draw(axes, record)
-        harms = (float(record.ledger.world_harm(count)[0]) for count in ("first", "total"))
-        column[0].set_title(
-            "{}\nharm {:.2f} first-impact, {:.2f} total".format(label_text(title), *harms), loc="left", fontsize=9.5
-        )
-        column[-1].set_xlabel("Time since Vehicle 1 began to brake (s)", fontsize=9)
-    panels[0, 0].set_xlim(0.0, 1.1 * max(_standstill_s(record) for record in records.values()))
-    panels[1, 0].set_ylim(bottom=0.0)
-    panels[2, 0].yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-    panels[2, 0].set_ylim(*_command_range(list(records.values())))
-    labels = (
-        "Position from Vehicle 1's\nat the alert (m)",
-        "Gap ahead (m)",
-        f"Command of\nVehicle {first.vehicle + 1} (m/s²)",
+    columns = len(records)
+    figure, panels = new_panels(
+        (max(3.4 * columns, 6.4), 7.4), 3, columns, sharex=True, sharey="row", height_ratios=(2.2, 1.0, 1.0)
     )
-    for axes, label in zip(panels[:, 0], labels, strict=True):
-        axes.set_ylabel(label, fontsize=9)
-    handles, names = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper left", ncols=6, frameon=False, fontsize=9)
-    add_caption(figure, caption or f"{first.scenario.name}: {quantity_line(quantities(first.initial))}. {_NOTE}")
-    return figure
+    for k, (title, record) in enumerate(records.items()):
+        for axes, draw in zip(panels[k::columns], (_positions, _gaps, _command), strict=True):
+            draw(axes, record)
+        harms = (float(record.ledger.world_harm(count)[0]) for count in HARM_COUNTS)
+        told = "{}\nharm {:.2f} first-impact, {:.2f} total".format(label_text(title), *harms)
+        panels[k].set_title(told, loc="left", fontsize=9.5)
+        name_axes(axes, x="Time since Vehicle 1 began to brake (s)")
+    positions, gaps, commands = panels[::columns]
+    positions.set_xlim(0.0, 1.1 * max(_standstill_s(record) for record in records.values()))
+    gaps.set_ylim(bottom=0.0)
+    commands.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    commands.set_ylim(*_command_range(list(records.values())))
+    name_axes(positions, y="Position from Vehicle 1's\nat the alert (m)")
+    name_axes(gaps, y="Gap ahead (m)")
+    name_axes(commands, y=f"Command of\nVehicle {first.vehicle + 1} (m/s²)")
+    return finish(
+        figure, caption or f"{first.scenario.name}: {quantity_line(quantities(first.initial))}. {_NOTE}", positions
+    )
 
 
 _NOTE = "Figures at impacts: closing speed in m/s. Vehicles are drawn without length. Harm in m²/s²."
@@ -218,7 +203,10 @@ def _positions(axes: Axes, record: EpisodeRecord) -> None:
     if np.isfinite(record.initial.obstacle_gap_m[0]):
         axes.axhline(float(record.initial.obstacle_gap_m[0]), color="black", linewidth=2.5, label="obstacle")
     rows = record.impacts
-    at = _at(record, rows.time_s, rows.pair)
+    front = np.maximum(rows.pair, 0)  # of each impact's pair; at the obstacle, Vehicle 1
+    at = np.array([
+        np.interp(t, record.time_s, record.positions_m[:, i]) for t, i in zip(rows.time_s, front, strict=True)
+    ])  # fmt: skip
     for first, fill, size, label in ((True, "black", 60.0, "first impact"), (False, "white", 26.0, "later impact")):
         chosen = rows.first == first
         axes.scatter(
@@ -226,8 +214,10 @@ def _positions(axes: Axes, record: EpisodeRecord) -> None:
             zorder=5 if first else 4, label=label,
         )  # fmt: skip
     for k in np.flatnonzero(rows.first):
+        speed_mps = rows.closing_speed_mps[k]
+        words = f"{speed_mps:.1f}" if speed_mps >= 0.05 else "< 0.1"  # an impact never reads 0.0
         axes.annotate(
-            _speed(rows.closing_speed_mps[k]), (rows.time_s[k], at[k]), xytext=(7, -7), textcoords="offset points",
+            words, (rows.time_s[k], at[k]), xytext=(7, -7), textcoords="offset points",
             fontsize=8.5, va="top", zorder=6,
             bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
         )  # fmt: skip
@@ -270,17 +260,6 @@ def _vehicle_style(i: int) -> tuple[str, str | tuple[int, tuple[int, ...]]]:
     return vehicle_colour(i), DASHES[i % len(DASHES)]
 
 
-def _at(record: EpisodeRecord, time_s: Floats, pair: np.ndarray) -> Floats:
-    """Position at which the front vehicle of each impact's pair was at that time; at the obstacle, Vehicle 1."""
-    front = np.maximum(pair, 0)
-    return np.array([np.interp(t, record.time_s, record.positions_m[:, i]) for t, i in zip(time_s, front, strict=True)])
-
-
-def _speed(speed_mps: float) -> str:
-    """One decimal; an impact never reads 0.0."""
-    return f"{speed_mps:.1f}" if speed_mps >= 0.05 else "< 0.1"
-
-
 def _standstill_s(record: EpisodeRecord) -> float:
     """First sampled time from which no vehicle moves any more, or the end."""
     moving = np.flatnonzero((record.speeds_mps != 0.0).any(axis=1))
@@ -309,11 +288,9 @@ def learning_curve(
     """
     if not points:
         raise InvalidInput("learning_curve: no points; evaluate the policy at least once during training")
-    figure = new_figure(10.0, 3.9)
+    figure, panels = new_panels((10.0, 3.9), columns=3)
     steps = [point["steps"] for point in points]
-    panels = figure.subplots(1, 3)
     for axes, (name, label) in zip(panels, _PANELS, strict=True):
-        style_axes(axes)
         axes.plot(steps, [point[name] for point in points], color=_POLICY, marker="o", markersize=3.5, label="policy")
         for number, row in enumerate(references):
             style = series_style(number if number < _POLICY_NUMBER else number + 1)
@@ -321,14 +298,11 @@ def learning_curve(
                 getattr(row, name).value, color=style["color"], linestyle=style["linestyle"], linewidth=1.2,
                 label=label_text(row.agent),
             )  # fmt: skip
-        axes.set_title(label, loc="left", fontsize=10)
-        axes.set_xlabel("Training steps", fontsize=9)
+        name_axes(axes, label, "Training steps")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_ylim(bottom=0.0)
     panels[2].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    _legend_of_panels(figure, panels[0])
-    add_caption(figure, caption)
-    return figure
+    return finish(figure, caption, panels[0])
 
 
 def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | None = None, bins: int = 12) -> Figure:
@@ -340,28 +314,25 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
     if not bins >= 1:
         raise InvalidInput(f"harm_against_total_gap: bins = {bins}; at least 1 is needed")
     gap = evaluation.worlds.gaps_m.sum(axis=1)
-    groups = _groups(gap, bins)
-    figure = new_figure(10.0, 4.6)
-    panels = figure.subplots(1, 2, sharey=True)
+    groups, gaps = _groups(gap, bins), [f"d{p}" for p in range(1, evaluation.worlds.N)]
+    sum_of_gaps = " + ".join(gaps) if len(gaps) <= 3 else f"d1 + … + {gaps[-1]}"
+    figure, panels = new_panels((10.0, 4.6), columns=2, sharey=True)
     for axes, (name, label) in zip(panels, _PANELS[:2], strict=True):
-        style_axes(axes)
         for number, agent in enumerate(evaluation.outcomes if agents is None else agents):
             harm = getattr(evaluation.outcome(agent), name)
             _band(axes, gap, harm, groups, series_style(number), label_text(agent))
-        axes.set_title(label, loc="left", fontsize=10)
-        axes.set_xlabel(f"Total gap at the alert, {_gap_sum(evaluation.worlds.N)} (m)", fontsize=9)
+        name_axes(axes, label, f"Total gap at the alert, {sum_of_gaps} (m)")
         axes.set_ylim(bottom=0.0)
-    _legend_of_panels(figure, panels[0])
-    add_caption(figure, f"Mean per group of worlds; bands: 95 % intervals. {parameter_line(parameters(evaluation))}.")
-    return figure
+    caption = f"Mean per group of worlds; bands: 95 % intervals. {parameter_line(parameters(evaluation))}."
+    return finish(figure, caption, panels[0])
 
 
-def _band(axes: Axes, gap: Floats, harm: Floats, groups: list[Bools], style: dict[str, object], agent: str) -> None:
+def _band(axes: Axes, gap: Floats, harm: Floats, groups: list[Bools], style: dict[str, Any], agent: str) -> None:
     """One agent's mean harm per group, with its intervals where the group has at least two worlds."""
     estimates = [mean(harm[group]) for group in groups]
     at = [float(gap[group].mean()) for group in groups]
-    axes.plot(at, [e.value for e in estimates], label=agent, **style)  # type: ignore[arg-type]
-    ends = np.array([(e.value, e.value) if e.interval is None else e.interval for e in estimates])
+    axes.plot(at, [e.value for e in estimates], label=agent, **style)
+    ends = np.array([ends_of(estimate) for estimate in estimates])
     if len(groups) > 1:
         axes.fill_between(at, ends[:, 0], ends[:, 1], color=str(style["color"]), alpha=0.18, linewidth=0.0)
     else:
@@ -375,17 +346,6 @@ def _groups(values: Floats, bins: int) -> list[Bools]:
         return [np.ones(len(values), np.bool_)]
     part = np.minimum(((values - low) / (high - low) * bins).astype(np.int64), bins - 1)
     return [part == k for k in range(bins) if (part == k).any()]
-
-
-def _gap_sum(vehicles: int) -> str:
-    gaps = [f"d{p}" for p in range(1, vehicles)]
-    return " + ".join(gaps) if len(gaps) <= 3 else f"d1 + … + {gaps[-1]}"
-
-
-def _legend_of_panels(figure: Figure, axes: Axes) -> None:
-    """One legend for all panels, above them."""
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=min(len(labels), 6), frameon=False, fontsize=9)
 
 
 # Criticality map: the harm of one agent over both gaps, and the line between avoidable and unavoidable worlds.
@@ -402,27 +362,21 @@ def criticality_figure(found: CriticalityMap) -> Figure:
     largest = max(float(found.harm(harm_count).max()) for harm_count in HARM_COUNTS)
     (agent,) = found.evaluation.outcomes
     for axes, (harm_count, label) in zip(panels, _HARMS.items(), strict=True):
-        mesh = _draw_harm(axes, found, found.harm(harm_count), largest)
+        harm = found.harm(harm_count)
+        mesh = axes.pcolormesh(  # white where there is no harm
+            found.gap_1_m, found.gap_2_m, np.where(harm > 0.0, harm, np.nan), cmap="viridis_r", vmin=0.0,
+            vmax=max(largest, 1e-9), shading="nearest", rasterized=True,
+        )  # fmt: skip
         _draw_boundary(axes, found)
-        axes.set_title(f"{label} of {label_text(agent)}", loc="left", fontsize=10)
-        axes.set_xlabel("Gap 1, Vehicle 1 to Vehicle 2 (m)", fontsize=9)
-    panels[0].set_ylabel("Gap 2, Vehicle 2 to Vehicle 3 (m)", fontsize=9)
+        axes.tick_params(labelsize=9, color=GREY)
+        name_axes(axes, f"{label} of {label_text(agent)}", "Gap 1, Vehicle 1 to Vehicle 2 (m)")
+    name_axes(panels[0], y="Gap 2, Vehicle 2 to Vehicle 3 (m)")
     bar = figure.colorbar(mesh, ax=panels, label="Harm (m²/s²)", pad=0.015)
     bar.ax.tick_params(labelsize=9)
     line = "Line: above it some command of Vehicle 2 avoids all contact, below it none does (proven)."
     if found.boundary_gap_1_m is None:
         line = "Nothing is proven about avoidability for this line-up."
-    add_caption(figure, f"{line} White: no harm. {parameter_line(parameters(found.evaluation))}.")
-    return figure
-
-
-def _draw_harm(axes: Axes, found: CriticalityMap, harm: Floats, largest: float) -> QuadMesh:
-    """Cells coloured by harm, white where there is none."""
-    axes.tick_params(labelsize=9, color=GREY)
-    return axes.pcolormesh(
-        found.gap_1_m, found.gap_2_m, np.where(harm > 0.0, harm, np.nan), cmap="viridis_r", vmin=0.0,
-        vmax=max(largest, 1e-9), shading="nearest", rasterized=True,
-    )  # fmt: skip
+    return finish(figure, f"{line} White: no harm. {parameter_line(parameters(found.evaluation))}.")
 
 
 def _draw_boundary(axes: Axes, found: CriticalityMap) -> None:
@@ -474,19 +428,16 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
     _mark_chosen(axes, curve)
     _mark_best_known(axes, curve.limits)
     axes.set_xlim(0.0, float(curve.deceleration_mps2[-1]))
-    axes.set_ylabel("Harm (m²/s²)", fontsize=9)
-    axes.set_title(title or f"{scenario.name}: one world", loc="left", fontsize=10)
+    name_axes(axes, title or f"{scenario.name}: one world", y="Harm (m²/s²)")
     _draw_regimes(strips, curve)
-    strips.set_xlabel(f"Constant deceleration of Vehicle {vehicle + 1} (m/s²)", fontsize=9)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False, fontsize=8.5)
+    name_axes(strips, x=f"Constant deceleration of Vehicle {vehicle + 1} (m/s²)")
     conditions = (
         f"{quantity_line(quantities(curve.world))}. Harm until {scenario.horizon_s:g} s."
         " Predicted: each pair alone, all others braking fully."
         " Realised: in the simulation, with velocity exchange and every later impact;"
         f" other vehicles: {_scripts(scenario, vehicle)}. Dotted: where the way changes in which a pair first meets."
     )
-    add_caption(figure, conditions)
-    return figure
+    return finish(figure, conditions, axes, columns=2, fontsize=8.5)
 
 
 def _scripts(scenario: Scenario, vehicle: int) -> str:
@@ -579,23 +530,19 @@ def operating_figure(curves: Sequence[tuple[str, Sequence[OperatingPoint]]], *, 
     """
     if not curves or not all(points for _, points in curves):
         raise InvalidInput("operating_figure: every curve needs at least one point")
-    figure = new_figure(6.4, 4.2)
-    axes = figure.subplots()
-    style_axes(axes)
+    figure, (axes,) = new_panels((6.4, 4.2))
     for number, (name, points) in enumerate(curves):
         rates, harms = [p.intervention_rate for p in points], [p.harm for p in points]
-        axes.plot(rates, harms, label=label_text(name), **series_style(number))  # type: ignore[arg-type]  # a style's values
+        axes.plot(rates, harms, label=label_text(name), **series_style(number))
         for point in (p for p in points if p.intervention_rate >= LABELLED):
             axes.annotate(
                 f"{point.allowance:g}", (point.intervention_rate, point.harm), fontsize=7.5, xytext=(4, 4),
                 textcoords="offset points",
             )  # fmt: skip
     axes.xaxis.set_major_formatter(PercentFormatter(1.0))
-    axes.set_xlabel("Decisions in which the shield intervenes", fontsize=9)
-    axes.set_ylabel("Mean harm (m²/s²)", fontsize=9)
+    name_axes(axes, x="Decisions in which the shield intervenes", y="Mean harm (m²/s²)")
     axes.legend(fontsize=9, frameon=False)
-    add_caption(figure, caption)
-    return figure
+    return finish(figure, caption)
 
 
 _MISMATCH = (("step", "corner"), ("step", "inside"), ("robust", "corner"), ("robust", "inside"))
@@ -610,8 +557,7 @@ def robustness_figure(points: Sequence[RobustnessPoint], *, caption: str = "") -
     """
     if not points:
         raise InvalidInput("robustness_figure: at least one point is needed")
-    figure = new_figure(11.0, 4.0)
-    price, above, excess = figure.subplots(1, 3)
+    figure, (price, above, excess) = new_panels((11.0, 4.0), columns=3)
     for mode, what, number in _PRICE:
         label = f"{mode}: {'harm' if what == 'harm' else 'bound at the alert'}"
         _curve(price, points, mode, "as told", what, number, label)
@@ -623,14 +569,11 @@ def robustness_figure(points: Sequence[RobustnessPoint], *, caption: str = "") -
     titles = ("The world is as told", "The truth differs: above the bound", "The truth differs: excess")
     units = ("Mean over worlds (m²/s²)", "Worlds above the bound at the alert", "Mean excess (m²/s²)")
     for axes, title, unit in zip((price, above, excess), titles, units, strict=True):
-        style_axes(axes)
         axes.set_title(title, fontsize=9.5, loc="left")
-        axes.set_ylabel(unit, fontsize=9)
-        axes.set_xlabel("Width of the intervals (1: as given)", fontsize=9)
+        name_axes(axes, x="Width of the intervals (1: as given)", y=unit)
         axes.set_ylim(bottom=0.0)
         axes.legend(fontsize=8, frameon=False)
-    add_caption(figure, caption)
-    return figure
+    return finish(figure, caption)
 
 
 def robustness_table(points: Sequence[RobustnessPoint]) -> Table:
@@ -649,7 +592,7 @@ def _curve(
 ) -> None:
     chosen = [p for p in points if (p.mode, p.truth) == (mode, truth)]
     values = [float(getattr(p, what)) for p in chosen]
-    axes.plot([p.width for p in chosen], values, label=label, **series_style(number))  # type: ignore[arg-type]
+    axes.plot([p.width for p in chosen], values, label=label, **series_style(number))
 
 
 _OFFSETS = {NONE: -0.2, STEP: 0.0, STEP_ALERT: 0.2, STEP_CAP: 0.35}
@@ -669,29 +612,25 @@ def shield_modes_figure(rows: Sequence[ModeRow], *, caption: str = "") -> Figure
     if not rows:
         raise InvalidInput("shield_modes_figure: at least one agent is needed")
     agents = list(dict.fromkeys(row.agent for row in rows))
-    figure = new_figure(7.2, 1.4 + 0.55 * len(agents))
-    axes = figure.subplots()
-    style_axes(axes)
+    figure, (axes,) = new_panels((7.2, 1.4 + 0.55 * len(agents)))
     for number, mode in enumerate(_OFFSETS):
         for row in (row for row in rows if row.mode == mode):
             against = row.against_none if are_teams(rows) else row.against_episode
             if against is None:
                 continue
-            value, interval = against.value, against.interval
-            low, high = (value, value) if interval is None else interval
+            value, (low, high) = against.value, ends_of(against)
             style = {**series_style(number), "linestyle": "none"}
             place = agents.index(row.agent)
             axes.errorbar(
                 [value], [place + _OFFSETS[mode]], xerr=[[value - low], [high - value]], capsize=2.5,
-                label=_LABELS[mode] if place == 0 else None, **style,  # type: ignore[arg-type]  # a style's values
+                label=_LABELS[mode] if place == 0 else None, **style,
             )  # fmt: skip
     axes.axvline(0.0, color=GREY, linewidth=1.0)
     axes.set_xscale("symlog", linthresh=1.0)
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_major_formatter(FuncFormatter(_no_powers))
     axes.set_yticks(range(len(agents)), agents, fontsize=9)
     axes.invert_yaxis()
     other = "without a shield" if are_teams(rows) else "of episode mode"
-    axes.set_xlabel(f"Harm minus that {other} (m²/s² per world; linear within ±1)", fontsize=9)
+    name_axes(axes, x=f"Harm minus that {other} (m²/s² per world; linear within ±1)")
     axes.legend(fontsize=8.5, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
-    add_caption(figure, caption)
-    return figure
+    return finish(figure, caption)

@@ -18,7 +18,7 @@ from ethbrake_marl.envs.drawing.scene import vehicle_colour
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.episodes import EpisodeRecord
 from ethbrake_marl.evaluation.statistics import Estimate
-from ethbrake_marl.figures.style import COLOURS, GREY, add_caption, new_figure, series_style, style_axes
+from ethbrake_marl.figures.style import COLOURS, GREY, ends_of, finish, name_axes, new_figure, new_panels, series_style
 from ethbrake_marl.physics import Floats
 
 LINEAR = 0.1  # m2/s2; axes are linear up to there and logarithmic beyond: harm falls to a hundredth
@@ -36,10 +36,9 @@ def harm_curve(found: Json, caption: str) -> Figure:
 
     All of it in the worlds in which the joint optimum was searched.
     """
-    figure = new_figure(10.5, 4.8)
+    figure, panels = new_panels((10.5, 4.8), columns=2)
     ladder = list(dict.fromkeys(level["level"] for level in found["levels"] if level["clear"] is None))
-    for axes, harm_count in zip(figure.subplots(1, 2), HARM_COUNTS, strict=True):
-        style_axes(axes)
+    for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
         _limits(axes, found["levels"], ladder, harm_count)
         for number, algorithm in enumerate(_algorithms(found)):
             _reached(axes, found["levels"], ladder, harm_count, algorithm, number)
@@ -47,20 +46,17 @@ def harm_curve(found: Json, caption: str) -> Figure:
         axes.set_yscale("symlog", linthresh=LINEAR)
         axes.yaxis.set_major_formatter(FuncFormatter(_plain))
         axes.set_ylim(0.0, 1.5 * axes.get_ylim()[1])
-        axes.set_title(_TITLES[harm_count], loc="left", fontsize=10)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=4, frameon=False, fontsize=8.5)
+        name_axes(axes, _TITLES[harm_count])
     worlds = found["levels"][0]["first"]["searched"]["worlds"]
-    add_caption(figure, f"{caption} All of this figure: the first {count_of(worlds, 'world')}.")
-    return figure
+    told = f"{caption} All of this figure: the first {count_of(worlds, 'world')}."
+    return finish(figure, told, panels[0], columns=4, fontsize=8.5)
 
 
 def change_figure(found: Json, caption: str) -> Figure:
     """What each step and each worse channel changes, with its interval: left of the line is less harm."""
     changes = found["steps"] + found["channels"]
-    figure = new_figure(10.5, max(_LEAST_IN, 1.6 + 0.6 * len(changes)))
-    for axes, harm_count in zip(figure.subplots(1, 2, sharey=True), HARM_COUNTS, strict=True):
-        style_axes(axes)
+    figure, panels = new_panels((10.5, max(_LEAST_IN, 1.6 + 0.6 * len(changes))), columns=2, sharey=True)
+    for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
         axes.axvline(0.0, color=GREY, linewidth=0.9)
         for row, change in enumerate(changes):
             estimate = change[harm_count]["difference"]
@@ -81,17 +77,19 @@ def change_figure(found: Json, caption: str) -> Figure:
         axes.set_xticks(signed_ticks(*axes.get_xlim()))
         axes.xaxis.set_major_formatter(FuncFormatter(_plain))
         axes.xaxis.set_minor_locator(NullLocator())
-    figure.axes[0].set_yticks(range(len(changes)), [_of_change(change, found) for change in changes], fontsize=8)
-    figure.axes[0].set_ylim(len(changes) - 0.5, -0.8)  # from top to bottom
-    add_caption(figure, caption)
-    return figure
+    panels[0].set_yticks(range(len(changes)), _of_changes(found), fontsize=8)
+    panels[0].set_ylim(len(changes) - 0.5, -0.8)  # from top to bottom
+    return finish(figure, caption)
 
 
 def who_pays(found: Json, caption: str) -> Figure:
     """How harm moved between the vehicles from level to level: a matrix of changes, blue is less."""
     changes = found["steps"] + found["channels"]
     figure = new_figure(10.5, max(_LEAST_IN, 1.8 + 0.42 * len(changes)))
-    grids = {harm_count: _matrix(changes, harm_count) for harm_count in HARM_COUNTS}
+    grids = {
+        count: np.array([[estimate["value"] for estimate in change[count]["vehicles"]] for change in changes])
+        for count in HARM_COUNTS
+    }
     largest = max(float(np.abs(grid).max()) for grid in grids.values()) or 1.0
     every = figure.subplots(1, 2, sharey=True)
     for axes, (harm_count, grid) in zip(every, grids.items(), strict=True):
@@ -103,12 +101,11 @@ def who_pays(found: Json, caption: str) -> Figure:
                 axes.text(column, row, f"{value:+.2f}", ha="center", va="center", fontsize=8, color=colour)
         axes.set_xticks(range(grid.shape[1]), [f"Vehicle {i + 1}" for i in range(grid.shape[1])], fontsize=9)
         axes.set_title(f"Change of {_TITLES[harm_count][0].lower()}{_TITLES[harm_count][1:]}", loc="left", fontsize=10)
-    every[0].set_yticks(range(len(changes)), [_of_change(change, found) for change in changes], fontsize=8)
+    every[0].set_yticks(range(len(changes)), _of_changes(found), fontsize=8)
     bar = figure.colorbar(image, ax=list(every), label="m²/s²", format=FuncFormatter(_plain))
     bar.set_ticks(signed_ticks(-largest, largest))
     bar.ax.yaxis.set_minor_locator(NullLocator())
-    add_caption(figure, caption)
-    return figure
+    return finish(figure, caption)
 
 
 def signed_ticks(low: float, high: float) -> list[float]:
@@ -190,10 +187,6 @@ def _with_intervals(
     axes.errorbar(x, values, yerr=np.abs(ends - values), capsize=3, **style)
 
 
-def _matrix(changes: Sequence[Json], harm_count: HarmCount) -> Any:
-    return np.array([[estimate["value"] for estimate in change[harm_count]["vehicles"]] for change in changes])
-
-
 def _interval(estimate: Mapping[str, Any]) -> tuple[float, float]:
     """The interval; the value itself where one world gives none."""
     low, high = estimate["interval"] or (estimate["value"], estimate["value"])
@@ -209,9 +202,11 @@ def _short(name: str) -> str:
     return name.removeprefix("cooperation-").replace("-", "\n", 1)
 
 
-def _of_change(change: Json, found: Json) -> str:
-    words = f"{_short(change['from'])} → {_short(change['to'])}".replace("\n", " ")
-    return f"{words} ({change['algorithm']})" if len(_algorithms(found)) > 1 else words
+def _of_changes(found: Json) -> list[str]:
+    """What each step and each worse channel is called."""
+    changes, several = found["steps"] + found["channels"], len(_algorithms(found)) > 1
+    words = [f"{_short(change['from'])} → {_short(change['to'])}".replace("\n", " ") for change in changes]
+    return [f"{each} ({c['algorithm']})" if several else each for each, c in zip(words, changes, strict=True)]
 
 
 # Curves of several trainings: harm over training steps, with the spread over seeds.
@@ -235,14 +230,12 @@ def seed_curves(
     """
     if not panels or not all(panels.values()):
         raise InvalidInput("seed_curves: nothing to draw; at least one training with one evaluation is needed")
-    figure = new_figure(5.0 * len(panels), 4.2)
-    every = figure.subplots(1, len(panels), squeeze=False)[0]
+    figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels))
     for axes, (label, curves) in zip(every, panels.items(), strict=True):
-        style_axes(axes)
         for number, (recipe, curve) in enumerate(curves.items()):
             style = series_style(number + 1)
-            mean, spread = curve.values.mean(axis=0), _spread(curve.values)
-            seeds = len(curve.values)
+            mean, seeds = curve.values.mean(axis=0), len(curve.values)
+            spread = curve.values.std(axis=0, ddof=1) if seeds > 1 else mean * 0.0  # of one seed nothing is known
             axes.plot(curve.steps, mean, label=f"{recipe}, {seeds} seed{'s' * (seeds != 1)}", **style)
             axes.fill_between(
                 curve.steps, mean - spread, mean + spread, color=str(style["color"]), alpha=0.18, linewidth=0.0
@@ -252,13 +245,9 @@ def seed_curves(
             axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.set_title(label, loc="left", fontsize=10)
-        axes.set_xlabel("Training steps", fontsize=9)
+        name_axes(axes, label, "Training steps")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    handles, labels = every[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=min(len(labels), 6), frameon=False, fontsize=9)
-    add_caption(figure, caption)
-    return figure
+    return finish(figure, caption, every[0])
 
 
 def at_common_steps(trainings: Sequence[Mapping[int, float]]) -> SeedCurve:
@@ -268,12 +257,6 @@ def at_common_steps(trainings: Sequence[Mapping[int, float]]) -> SeedCurve:
         raise InvalidInput("at_common_steps: the trainings were never evaluated at the same step")
     values = [[training[step] for step in common] for training in trainings]
     return SeedCurve(np.array(common, np.float64), np.array(values, np.float64))
-
-
-def _spread(values: Floats) -> Floats:
-    """Standard deviation over seeds; 0 with one seed, of which nothing is known."""
-    spread: Floats = values.std(axis=0, ddof=1) if len(values) > 1 else values[0] * 0.0
-    return spread
 
 
 # The figures of ``ethbrake reproduce``: harm over a number, bars, vehicles along the road, commands, changes.
@@ -294,38 +277,31 @@ class Line:
     @classmethod
     def of(cls, x: Sequence[float], estimates: Sequence[Estimate]) -> Self:
         """From estimates; one without an interval has a width of 0."""
-        ends = [each.interval or (each.value, each.value) for each in estimates]
+        ends = [ends_of(each) for each in estimates]
         values = tuple(each.value for each in estimates)
         return cls(tuple(x), values, tuple(low for low, _ in ends), tuple(high for _, high in ends))
 
 
 def lines_figure(panels: Mapping[str, Mapping[str, Line]], *, x_label: str, y_label: str, caption: str) -> Figure:
     """One panel per title, one line per label, bands: 95 % intervals."""
-    figure = new_figure(4.6 * len(panels), 4.2)
-    every = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    figure, every = new_panels((4.6 * len(panels), 4.2), columns=len(panels), sharey=True)
     for axes, (title, lines) in zip(every, panels.items(), strict=True):
-        style_axes(axes)
         for number, (label, line) in enumerate(lines.items()):
             style = series_style(number)
             axes.plot(line.x, line.y, label=label, **style)
             axes.fill_between(line.x, line.low, line.high, color=str(style["color"]), alpha=0.18, linewidth=0.0)
-        axes.set_title(title, loc="left", fontsize=10)
-        axes.set_xlabel(x_label, fontsize=9)
+        name_axes(axes, title, x_label)
     every[0].set_ylim(bottom=0.0)
-    every[0].set_ylabel(y_label, fontsize=9)
-    _legend(figure, every[0], 3)
-    add_caption(figure, caption)
-    return figure
+    name_axes(every[0], y=y_label)
+    return finish(figure, caption, every[0], columns=3)
 
 
 def bars_figure(
     panels: Mapping[str, Mapping[str, Sequence[Estimate]]], *, groups: Sequence[str], y_label: str, caption: str
 ) -> Figure:
     """One panel per title: for each group a bar for each label, with its interval where it has one."""
-    figure = new_figure(4.6 * len(panels), 4.2)
-    every = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    figure, every = new_panels((4.6 * len(panels), 4.2), columns=len(panels), sharey=True)
     for axes, (title, bars) in zip(every, panels.items(), strict=True):
-        style_axes(axes)
         width = 0.8 / len(bars)
         for number, (label, estimates) in enumerate(bars.items()):
             offset = (number - 0.5 * (len(bars) - 1)) * width
@@ -334,11 +310,9 @@ def bars_figure(
             axes.bar(line.x, line.y, 0.9 * width, color=colour, label=label)
             axes.vlines(line.x, line.low, line.high, color="black", linewidth=1.0)
         axes.set_xticks(range(len(groups)), list(groups))
-        axes.set_title(title, loc="left", fontsize=10)
-    every[0].set_ylabel(y_label, fontsize=9)
-    _legend(figure, every[0], 3)
-    add_caption(figure, caption)
-    return figure
+        name_axes(axes, title)
+    name_axes(every[0], y=y_label)
+    return finish(figure, caption, every[0], columns=3)
 
 
 def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure:
@@ -346,63 +320,51 @@ def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure
 
     Dashed lines join the vehicles at the same time. One panel per record, two in a row.
     """
-    figure = new_figure(10.0, 1.9 * ((len(records) + 1) // 2) + 1.0)
-    panels = figure.subplots((len(records) + 1) // 2, 2, sharex=True, sharey=True, squeeze=False).ravel()
+    figure, panels = _in_pairs(len(records), 1.9, "Position along the road (m)", "Vehicle")
     for axes, (title, record) in zip(panels, records.items(), strict=False):
-        style_axes(axes)
-        _draw_road(axes, record)
-        axes.set_title(title, loc="left", fontsize=10)
-    for axes in panels[::2]:
-        axes.set_ylabel("Vehicle", fontsize=9)
-    for axes in panels[-2:]:
-        axes.set_xlabel("Position along the road (m)", fontsize=9)
-    add_caption(figure, caption)
-    return figure
+        vehicles = np.arange(1, record.positions_m.shape[1] + 1)
+        times = np.arange(0.0, record.time_s[-1] + 1e-9, _ARROW_STEPS * record.scenario.time_step_s)
+        at = np.array([np.interp(times, record.time_s, column) for column in record.positions_m.T])
+        axes.plot(at, vehicles, color=GREY, linewidth=0.7, linestyle="--")
+        for i, number in enumerate(vehicles):
+            colour = vehicle_colour(i)
+            axes.plot([at[i].min(), at[i].max()], [number, number], color=colour, linewidth=1.4)
+            axes.plot(at[i], np.full(len(times), number), linestyle="none", marker=">", markersize=6, color=colour)
+        axes.set_yticks(vehicles)
+        axes.set_ylim(0.5, len(vehicles) + 0.5)
+        name_axes(axes, title)
+    return finish(figure, caption)
 
 
-def _draw_road(axes: Axes, record: EpisodeRecord) -> None:
-    """Three parallel lines with arrows."""
-    vehicles = np.arange(1, record.positions_m.shape[1] + 1)
-    every_s = _ARROW_STEPS * record.scenario.time_step_s
-    times = np.arange(0.0, record.time_s[-1] + 1e-9, every_s)
-    at = np.array([np.interp(times, record.time_s, column) for column in record.positions_m.T])
-    axes.plot(at, vehicles, color=GREY, linewidth=0.7, linestyle="--")
-    for i, number in enumerate(vehicles):
-        colour = vehicle_colour(i)
-        axes.plot([at[i].min(), at[i].max()], [number, number], color=colour, linewidth=1.4)
-        axes.plot(at[i], np.full(len(times), number), linestyle="none", marker=">", markersize=6, color=colour)
-    axes.set_yticks(vehicles)
-    axes.set_ylim(0.5, len(vehicles) + 0.5)
+def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, list[Axes]]:
+    """Panels on common scales, two in a row, named at the left and below."""
+    rows = (panels + 1) // 2
+    figure, every = new_panels((10.0, height_in * rows + 1.0), rows, 2, sharex=True, sharey=True)
+    for axes in every[::2]:
+        name_axes(axes, y=y)
+    for axes in every[-2:]:
+        name_axes(axes, x=x)
+    return figure, every
 
 
 def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, caption: str) -> Figure:
     """The command of the driven vehicle over time: one panel per title, one line per label."""
-    figure = new_figure(10.0, 2.3 * ((len(panels) + 1) // 2) + 1.0)
-    every = figure.subplots((len(panels) + 1) // 2, 2, sharex=True, sharey=True, squeeze=False).ravel()
+    figure, every = _in_pairs(len(panels), 2.3, "Time since Vehicle 1 began to brake (s)", "Command (m/s²)")
     for axes, (title, records) in zip(every, panels.items(), strict=False):
-        style_axes(axes)
         axes.axhline(0.0, color=GREY, linewidth=0.8)
         for number, (label, record) in enumerate(records.items()):
             style = {**series_style(number), "marker": ""}
             command = record.command_mps2[:, record.vehicle]
             axes.plot(record.time_s, command, drawstyle="steps-post", label=label, **style)
-        axes.set_title(title, loc="left", fontsize=10)
-    for axes in every[::2]:
-        axes.set_ylabel("Command (m/s²)", fontsize=9)
-    for axes in every[-2:]:
-        axes.set_xlabel("Time since Vehicle 1 began to brake (s)", fontsize=9)
-    _legend(figure, every[0], 4)
-    add_caption(figure, caption)
-    return figure
+        name_axes(axes, title)
+    return finish(figure, caption, every[0], columns=4)
 
 
 def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: str, caption: str) -> Figure:
     """By how much each change moves a number: one row per change, one mark per label, with its interval."""
     rows = list(changes)
     labels = list(dict.fromkeys(label for each in changes.values() for label in each))
-    figure = new_figure(9.4, 0.3 * len(rows) + 1.6)
-    axes = figure.subplots()
-    style_axes(axes)
+    figure, (axes,) = new_panels((9.4, 0.3 * len(rows) + 1.6))
     axes.axvline(0.0, color=GREY, linewidth=0.9)
     for number, label in enumerate(labels):
         at = [(len(rows) - 1 - k + 0.16 * (0.5 * (len(labels) - 1) - number), changes[row].get(label))
@@ -414,12 +376,5 @@ def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: st
         axes.plot(line.y, line.x, linestyle="none", marker=style["marker"], markersize=4.5, color=style["color"],
                   label=label)  # fmt: skip
     axes.set_yticks(range(len(rows)), [textwrap.fill(row, _ROW_CHARACTERS) for row in rows[::-1]], fontsize=8)
-    axes.set_xlabel(x_label, fontsize=9)
-    _legend(figure, axes, 3)
-    add_caption(figure, caption)
-    return figure
-
-
-def _legend(figure: Figure, axes: Axes, columns: int) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=columns, frameon=False, fontsize=9)
+    name_axes(axes, x=x_label)
+    return finish(figure, caption, axes, columns=3)

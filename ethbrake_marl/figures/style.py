@@ -6,6 +6,7 @@ import io
 import textwrap
 from functools import cache
 from pathlib import Path
+from typing import Any, Literal
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -17,6 +18,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from ethbrake_marl.envs.drawing.scene import COLOURS as COLOURS  # one palette for figures and frames
 from ethbrake_marl.errors import plain_text
 from ethbrake_marl.evaluation.results import write_output
+from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures import picture_ending
 
 # Markers and dashes repeat the distinction of the colours.
@@ -50,7 +52,7 @@ class ShownFigure(Figure):
         return picture_bytes(self, "shown.png")
 
 
-def series_style(number: int) -> dict[str, object]:
+def series_style(number: int) -> dict[str, Any]:
     """Colour, marker and dashes of the series with this number (from 0); they repeat after seven."""
     k = number % len(COLOURS)
     return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
@@ -60,8 +62,7 @@ def label_text(text: str, most: int = 40) -> str:
     """Text as a figure may have it, whoever wrote it: no formula, no sign that the font lacks, not too long."""
     signs = font_signs()
     told = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
-    short = told if len(told) <= most else f"{told[: most - 16]}…{told[-15:]}"
-    return short.replace("$", r"\$")
+    return (told if len(told) <= most else f"{told[: most - 16]}…{told[-15:]}").replace("$", r"\$")
 
 
 @cache
@@ -81,6 +82,47 @@ def style_axes(axes: Axes) -> None:
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=9, color=GREY)
+
+
+def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
+    """A figure and its axes, row by row, in the style of all; ``how`` as matplotlib's ``subplots``."""
+    figure = new_figure(*size_in)
+    panels = list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
+    for axes in panels:
+        style_axes(axes)
+    return figure, panels
+
+
+def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
+    """What a panel shows, above it, and what its axes mean."""
+    if title:
+        axes.set_title(title, loc="left", fontsize=10)
+    if x:
+        axes.set_xlabel(x, fontsize=9)
+    if y:
+        axes.set_ylabel(y, fontsize=9)
+
+
+def finish(
+    figure: Figure,
+    caption: str,
+    legend: Axes | None = None,
+    *,
+    columns: int = 6,
+    fontsize: float = 9,
+    loc: Literal["outside upper left", "outside upper right"] = "outside upper left",
+) -> Figure:
+    """The figure with its caption, and one legend for all panels above them: that of the axes given."""
+    if legend is not None:
+        named = legend.get_legend_handles_labels()
+        figure.legend(*named, loc=loc, ncols=columns, frameon=False, fontsize=fontsize)
+    add_caption(figure, caption)
+    return figure
+
+
+def ends_of(estimate: Estimate) -> tuple[float, float]:
+    """The interval of an estimate; the value itself where there is none."""
+    return estimate.interval or (estimate.value, estimate.value)
 
 
 def add_caption(figure: Figure, text: str) -> None:

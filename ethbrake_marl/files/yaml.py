@@ -10,16 +10,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, GetJsonSchemaHandler, ValidationError
+from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
-from pydantic_core import CoreSchema, ErrorDetails
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import NullableSchema, WithDefaultSchema
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.store import read_plain
+from ethbrake_marl.files.store import parse_strict_json, read_plain
 
 _NUMERAL = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
@@ -44,6 +44,8 @@ def flow_text(value: Any, longest: int | None = None) -> str:
 
 
 def _flow(value: Any) -> str:
+    if isinstance(value, BaseModel):
+        value = value.model_dump(exclude_none=True)
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_flow(key)}: {_flow(entry)}" for key, entry in value.items()) + "}"
     if isinstance(value, list | tuple):
@@ -293,16 +295,41 @@ _RIGHT = {
 }
 
 
+class FileModel(BaseModel):
+    """What a file may say: unknown keys, other types and later changes are refused."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+UNSHOWN = object()  # a value that the message does not show
+
+
+def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
+    """Raise the error for ``value`` at ``at`` (inside the field being checked): ``right`` says what would do."""
+    shown = "" if value is UNSHOWN else flow_text(value, 60)
+    raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})
+
+
 class Wording:
-    """What messages know of the keys of one kind of file."""
+    """What messages know of one kind of file: its keys by the fields of its model, and what a missing one needs."""
+
+    def __init__(self, model: type[BaseModel], needed: str = "") -> None:
+        self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
         """The keys that may stand where ``path`` ends."""
-        raise TypeError(f"{type(self).__name__} does not say which keys its files have")
+        models = [self.model]
+        for key in path[:-1]:
+            inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
+            models = [found for annotation in inside for found in _models_in(annotation)] or models
+        return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
 
     def needed(self, path: YamlPath) -> str:
         """What is needed at ``path``, where it is missing."""
-        raise TypeError(f"{type(self).__name__} does not say what its files need")
+        return self._needed
 
     def instead(self, key: str) -> str:
         """What there is in place of a key that such files do not have; empty where nothing is known of it."""
@@ -315,6 +342,36 @@ class Wording:
     def right(self, detail: ErrorDetails) -> str:
         """What would be right, where only this kind of file knows; empty where the error says it itself."""
         return ""
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models_in(inner)
+
+
+def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
+    """What a file, or a document, says; raises ``InvalidInput`` with file, line, key, value and what would be right.
+
+    ``advice`` says what must be there where it holds no mapping of keys to values.
+    """
+    document = source if isinstance(source, Document) else read_yaml(source)
+    if not isinstance(document.content, dict):
+        raise InvalidInput(f"{document.file}: must be a mapping {advice}")
+    try:
+        return model.model_validate(document.content)
+    except ValidationError as error:
+        raise explain(error, document, wording) from None
+
+
+def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
+    """The plain content of a JSON file that a program wrote, and what it says; raises ``ValueError`` in one line."""
+    content = parse_strict_json(data)  # no key twice, no NaN
+    try:
+        return content, model.model_validate_json(data)
+    except ValidationError as error:
+        raise ValueError(str(first_mistake(error))) from None
 
 
 def explain(error: ValidationError, document: Document, wording: Wording) -> InvalidInput:

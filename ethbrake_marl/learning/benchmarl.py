@@ -24,10 +24,9 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MultiAgentMLP
 
 from ethbrake_marl.envs.common import feature_box, make_engine, resolve_scenario
-from ethbrake_marl.learning.algorithms.ppo import PpoRecipe
-from ethbrake_marl.learning.progress import own_random_state
-from ethbrake_marl.learning.team_file import team_content
-from ethbrake_marl.learning.training import create_run, resolve, write_status
+from ethbrake_marl.learning.checkpoint import own_random_state
+from ethbrake_marl.learning.recipe import PpoRecipe
+from ethbrake_marl.learning.training import create_run, resolve, team_content, write_status
 from ethbrake_marl.observations import full_state, observation_for, state_features
 from ethbrake_marl.policies.actor import Float32s, NetworkSpec, installed_versions, observation_schema
 from ethbrake_marl.policies.bundle import Policy, make_policy, save_policy

@@ -10,7 +10,10 @@ import copy
 import hashlib
 import json
 import os
+import random
+from collections import deque
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,20 +21,20 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import safetensors.numpy
 import torch
+from gymnasium.spaces import Space
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field
 from safetensors import SafetensorError
 from typing_extensions import TypedDict
 
 from ethbrake_marl.engine.snapshot import Arrays
-from ethbrake_marl.errors import CorruptBundle, EthBrakeError
+from ethbrake_marl.errors import CorruptBundle, EthBrakeError, InvalidInput
 from ethbrake_marl.files.arrays import ArrayHeader, ArrayRow, check_arrays, map_npy, safetensors_headers
 from ethbrake_marl.files.store import new_folder, open_plain, parse_strict_json, read_plain, remove_folder, write_file
-from ethbrake_marl.files.yaml import first_mistake
-from ethbrake_marl.learning.algorithms.protocol import Algorithm
-from ethbrake_marl.learning.loop import EPISODE_COLUMNS
-from ethbrake_marl.learning.progress import REPLAY, Model, parse_progress
-from ethbrake_marl.policies.actor import Sha256
+from ethbrake_marl.files.yaml import FileModel, read_json_model
+from ethbrake_marl.learning.progress import EPISODE_COLUMNS, Model, parse_progress
+from ethbrake_marl.learning.training import Algorithm
+from ethbrake_marl.policies.actor import Sha256, installed_versions
 from ethbrake_marl.policies.bundle import Policy, Trained, drivers_of, read_trained, save_trained
 
 # The schema of a checkpoint's JSON files: their keys, types and bounds.
@@ -41,16 +44,12 @@ Number = Annotated[int | float, Field(ge=-1e300, le=1e300)]
 Seconds = Annotated[float, Field(strict=False, ge=0.0, allow_inf_nan=False)]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-
-
-class _ListedFile(_Part):
+class _ListedFile(FileModel):
     bytes: Count
     sha256: Sha256
 
 
-class Listing(_Part):
+class Listing(FileModel):
     """``checkpoint.json``: every other file of the checkpoint, and from where and when it is."""
 
     format: Literal["ethbrake-checkpoint"]
@@ -73,25 +72,25 @@ class _Counters(TypedDict):
 _Counters.__pydantic_config__ = ConfigDict(strict=True, extra="forbid")  # type: ignore[attr-defined]
 
 
-class _Words(_Part):
+class _Words(FileModel):
     state: Annotated[int, Field(ge=0, lt=2**128)]
     inc: Annotated[int, Field(ge=0, lt=2**128)]
 
 
-class _ActionGenerator(_Part):
+class _ActionGenerator(FileModel):
     bit_generator: Literal["PCG64"]
     state: _Words
     has_uint32: Literal[0, 1]
     uinteger: Annotated[int, Field(ge=0, lt=2**32)]
 
 
-class _Generators(_Part):
+class _Generators(FileModel):
     numpy: tuple[Annotated[int, Field(ge=0, le=624)], Literal[0, 1], Number]
     python: tuple[Literal[3], Number | None]
     actions: _ActionGenerator
 
 
-class _Replay(_Part):
+class _Replay(FileModel):
     pos: Count | None = None
     full: bool | None = None
 
@@ -103,7 +102,7 @@ def _check_place(evaluation: dict[str, Number]) -> dict[str, Number]:
     return evaluation
 
 
-class _Course(_Part):
+class _Course(FileModel):
     evaluations: list[Annotated[dict[str, Number], AfterValidator(_check_place)]]
     alarms: list[str]
     best_harm: Number | None
@@ -116,14 +115,14 @@ def _every_column(ended: dict[str, list[Number]]) -> dict[str, list[Number]]:
     return ended
 
 
-class _Between(_Part):
+class _Between(FileModel):
     updates: Count
     ended: Annotated[dict[str, list[Number]], AfterValidator(_every_column)]
     course: _Course
 
 
-class Numbers(_Part):
-    """``state.json``: what ``capture_model``, ``BetweenUpdates.state`` and the session keep of a training."""
+class Numbers(FileModel):
+    """``state.json``: what ``capture_model`` and the session keep of a training."""
 
     training: Sha256  # which one, see ``Training.identity``
     counters: _Counters
@@ -133,16 +132,6 @@ class Numbers(_Part):
     between: _Between
     replay: _Replay
     events: dict[str, Count]
-
-
-def check_json(schema: type[Listing | Numbers], data: bytes) -> dict[str, Any]:
-    """The content of a JSON file of a checkpoint; raises ``ValueError``, in one line, unless ``schema`` fits it."""
-    content: dict[str, Any] = parse_strict_json(data)
-    try:
-        schema.model_validate_json(data)
-    except ValidationError as error:
-        raise ValueError(str(first_mistake(error))) from None
-    return content
 
 
 FORMAT_VERSION = 1
@@ -179,7 +168,7 @@ class TrainingState:
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
-    """Write ``folder``, completely or not at all, with every byte on the disk before it has its name."""
+    """Write ``folder``, completely or not at all, with every byte on the disk before it has its name; old ones go."""
     with new_folder(folder) as partial:
         write_file(partial / _NUMBERS, json.dumps(state.numbers, allow_nan=False).encode())
         write_file(partial / _ARRAYS, safetensors.numpy.save(_contiguous(state.arrays)))
@@ -202,14 +191,19 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
             },
         }
         write_file(partial / LISTING, json.dumps(listing, indent=2).encode() + b"\n")
+    for old in checkpoint_folders(folder.parent)[KEPT:]:
+        remove_folder(old)
 
 
 def read_checkpoint(folder: Path) -> TrainingState:
-    """Read and check every file of ``folder``; raises ``CorruptBundle`` naming the file and what is wrong with it."""
+    """Read and check every file of ``folder``; raises ``CorruptBundle`` naming the file that is damaged.
+
+    Raises ``InvalidInput`` where all files are as they were written, and one is not as this version writes it.
+    """
     listing, data = _check_files(folder)
+    place = folder / _NUMBERS
     try:
-        place = folder / _NUMBERS
-        numbers = check_json(Numbers, data[_NUMBERS])
+        numbers, _ = read_json_model(data[_NUMBERS], Numbers)
         place = folder / _ARRAYS
         arrays = _arrays(data[_ARRAYS])
         replay = {}
@@ -219,23 +213,25 @@ def read_checkpoint(folder: Path) -> TrainingState:
         place = folder / _TABLE
         parse_progress(data[_TABLE])
         place = folder / _POLICY
-        return TrainingState(
-            steps=listing["steps"],
-            updates=listing["updates"],
-            numbers=numbers,
-            arrays=arrays,
-            replay=replay,
-            policy=read_trained(folder / _POLICY),
-            best=read_trained(folder / _BEST) if (folder / _BEST).is_dir() else None,
-            table=data[_TABLE],
-            versions=listing["versions"],
-        )
-    except EthBrakeError as error:
-        raise CorruptBundle(f"{folder}: {error}") from None
-    except KeyError as error:
-        raise CorruptBundle(f"{folder / error.args[0]}: is missing") from None
-    except (ValueError, SafetensorError) as error:
-        raise CorruptBundle(f"{place}: {error}") from None
+        policy = read_trained(place)
+        place = folder / _BEST
+        best = read_trained(place) if place.is_dir() else None
+    except KeyError:
+        raise CorruptBundle(f"{place}: is missing") from None
+    except (ValueError, EthBrakeError, SafetensorError) as error:
+        raise _of_another_version(f"{place}: {error}", listing.versions) from None
+    return TrainingState(
+        listing.steps, listing.updates, numbers, arrays, replay, policy, best, data[_TABLE], listing.versions
+    )
+
+
+def _of_another_version(what: str, versions: Mapping[str, Any]) -> InvalidInput:
+    """The error for a checkpoint that is not damaged: nobody deletes it."""
+    wrote, here = versions.get("ethbrake-marl"), installed_versions()["ethbrake-marl"]
+    return InvalidInput(
+        f"{what}; every file of this checkpoint is as version {wrote} of this package wrote it, and version {here}"
+        " would write another one: go on with that version, or delete the checkpoint to go on from the one before"
+    )
 
 
 def _arrays(data: bytes) -> Arrays:
@@ -251,7 +247,10 @@ def checkpoint_folders(folder: Path) -> list[Path]:
 
 
 def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:
-    """The newest checkpoint in ``folder`` that is whole, and why each newer one is not; damaged ones are deleted."""
+    """The newest checkpoint in ``folder`` that is whole, and why each newer one is not; damaged ones are deleted.
+
+    Raises ``InvalidInput`` at one of another version, which stays.
+    """
     reasons: list[str] = []
     for path in checkpoint_folders(folder):
         try:
@@ -262,40 +261,40 @@ def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:
     return None, reasons
 
 
-def prune(folder: Path, keep: int = KEPT) -> None:
-    """Delete all but the newest ``keep`` checkpoints."""
-    for path in checkpoint_folders(folder)[keep:]:
-        remove_folder(path)
-
-
-def _check_files(folder: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
+def _check_files(folder: Path) -> tuple[Listing, dict[str, bytes]]:
     """The listing, and the content of the files beside it; every file is there, and is what the listing says."""
     path = folder / LISTING
     try:
-        listing = check_json(Listing, _read(path, _LISTING_LIMIT_BYTES))
+        data = _read(path, _LISTING_LIMIT_BYTES)
+        content = parse_strict_json(data)
+        version = content.get("format_version") if isinstance(content, dict) else None
+        if type(version) is int and version != FORMAT_VERSION:
+            versions = content.get("versions")
+            what = f"{path}: format_version = {version}: must be {FORMAT_VERSION}"
+            raise _of_another_version(what, versions if isinstance(versions, dict) else {})
+        _, listing = read_json_model(data, Listing)
         found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if not _is_folder(path)}
     except OSError as error:
         raise CorruptBundle(f"{folder}: cannot be read ({error.strerror})") from None
     except ValueError as error:
-        if isinstance(error, CorruptBundle):
+        if isinstance(error, EthBrakeError):
             raise
         raise CorruptBundle(f"{path}: is damaged ({error})") from None
-    files = listing["files"]
+    files = listing.files
     if found.keys() != files.keys() | {LISTING}:
         different = sorted(found.keys() ^ (files.keys() | {LISTING}))[0]
         raise CorruptBundle(f"{folder / different}: is {'extra' if different in found else 'missing'}")
-    data = {}
+    held = {}
     for name, entry in files.items():
-        digest, size = hashlib.sha256(), 0
         if name in _HELD_LIMITS_BYTES:
-            data[name] = _read(found[name], _HELD_LIMITS_BYTES[name])
-            digest, size = hashlib.sha256(data[name]), len(data[name])
+            held[name] = _read(found[name], _HELD_LIMITS_BYTES[name])
+            digest, size = hashlib.sha256(held[name]), len(held[name])
         else:
             with open_plain(found[name], _SIZE_LIMIT_BYTES, refusal=CorruptBundle, follow_links=False) as stream:
                 digest, size = hashlib.file_digest(stream, "sha256"), stream.tell()
-        if (size, digest.hexdigest()) != (entry["bytes"], entry["sha256"]):
+        if (size, digest.hexdigest()) != (entry.bytes, entry.sha256):
             raise CorruptBundle(f"{found[name]}: is not the file that was written (size or SHA-256 differ)")
-    return listing, data
+    return listing, held
 
 
 def _read(path: Path, limit_bytes: int) -> bytes:
@@ -320,6 +319,145 @@ def _write_array(path: Path, array: NDArray[Any]) -> None:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# The random generators that a training uses: kept apart from the caller's, written down, and brought back.
+
+
+@contextmanager
+def own_random_state() -> Iterator[None]:
+    """Stable-Baselines3 seeds and uses the global generators: give them back as they were. One torch thread.
+
+    A second thread makes a network this small 3 to 15 times slower as soon as another process wants a core.
+    """
+    states = random.getstate(), np.random.get_state(), torch.get_rng_state(), torch.get_num_threads()  # noqa: NPY002
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        torch.set_rng_state(states[2])
+        torch.set_num_threads(states[3])
+
+
+def capture_random(actions: Space[Any]) -> tuple[Arrays, dict[str, Any]]:
+    """States of Python's, numpy's and torch's global generators, and of the generator of random actions.
+
+    The arrays are named ``random.*``; the rest is plain JSON.
+    """
+    numpy_state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
+    version, numbers, gauss = random.getstate()
+    arrays: Arrays = {
+        "random.torch": torch.get_rng_state().numpy().copy(),
+        "random.numpy": np.array(numpy_state["state"]["key"], np.uint32),
+        "random.python": np.array(numbers, np.uint64),
+    }
+    plain = {
+        "numpy": [int(numpy_state["state"]["pos"]), int(numpy_state["has_gauss"]), float(numpy_state["gauss"])],
+        "python": [version, gauss],
+        "actions": actions.np_random.bit_generator.state,
+    }
+    return arrays, plain
+
+
+def restore_random(actions: Space[Any], arrays: Mapping[str, NDArray[Any]], plain: Mapping[str, Any]) -> None:
+    """Bring the generators to the state of ``capture_random``."""
+    position, has_gauss, cached = plain["numpy"]
+    np.random.set_state(("MT19937", arrays["random.numpy"], position, has_gauss, cached))  # noqa: NPY002
+    version, gauss = plain["python"]
+    random.setstate((version, tuple(int(number) for number in arrays["random.python"]), gauss))
+    torch.set_rng_state(torch.from_numpy(arrays["random.torch"].copy()))
+    actions.np_random.bit_generator.state = plain["actions"]
+
+
+REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "_total_timesteps")
+
+
+def capture_model(model: Model, algorithm: Algorithm) -> tuple[Arrays, dict[str, Any], Arrays]:
+    """Weights, optimisers, environment, random generators, counters and log between two updates, and replay memory.
+
+    Of the replay memory (nothing without one, as in PPO) the filled part, as views.
+    """
+    arrays: Arrays = {f"policy.{name}": _copy(tensor) for name, tensor in model.policy.state_dict().items()}
+    arrays |= {name: _copy(tensor) for name, tensor in algorithm.learned_beside(model).items()}
+    rates: dict[str, float] = {}
+    for name, optimizer in algorithm.optimizers(model).items():
+        content = optimizer.state_dict()
+        rates[name] = float(content["param_groups"][0]["lr"])
+        for index, entries in content["state"].items():
+            arrays |= {f"optimizer.{name}.{index}.{key}": _copy(value) for key, value in entries.items()}
+    environment: Any = model.env
+    arrays |= {f"environment.{name}": array for name, array in environment.snapshot().items()}
+    generators, random_plain = capture_random(model.action_space)
+    observations: Any = model._last_obs
+    episodes = list(model.ep_info_buffer or ())
+    arrays |= generators | {
+        "last.observations": observations.copy(),
+        "last.episode_starts": np.array(model._last_episode_starts, np.bool_),
+        "episodes.return": np.array([episode["r"] for episode in episodes], np.float64),
+        "episodes.steps": np.array([episode["l"] for episode in episodes], np.int64),
+    }
+    counters = {name: getattr(model, name) for name in _COUNTERS}
+    log = model.logger
+    pending = {}
+    for name, value in log.name_to_value.items():
+        number = value.item() if isinstance(value, np.generic | torch.Tensor) else value
+        pending[name] = [number, log.name_to_count[name], list(log.name_to_excluded[name] or ())]
+    memory: Any = getattr(model, "replay_buffer", None)
+    place = {} if memory is None else {"pos": memory.pos, "full": memory.full}
+    replay = {} if memory is None else {name: getattr(memory, name)[: memory.size()] for name in REPLAY}
+    numbers = {"counters": counters, "learning_rates": rates, "random": random_plain, "log": pending, "replay": place}
+    return arrays, numbers, replay
+
+
+def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> None:
+    """Bring a freshly built model of the same recipe, whose logger is set, to the state of ``capture_model``."""
+    arrays, plain = state.arrays, state.numbers
+    model.policy.load_state_dict({name: torch.from_numpy(array) for name, array in _group(arrays, "policy.").items()})
+    for name, tensor in algorithm.learned_beside(model).items():
+        tensor.data.copy_(torch.from_numpy(arrays[name]))
+    for name, optimizer in algorithm.optimizers(model).items():
+        _restore_optimizer(optimizer, _group(arrays, f"optimizer.{name}."), plain["learning_rates"][name])
+    environment: Any = model.env
+    environment.restore(_group(arrays, "environment."))
+    for name in _COUNTERS:
+        setattr(model, name, plain["counters"][name])
+    model._last_obs = arrays["last.observations"].copy()
+    model._last_episode_starts = arrays["last.episode_starts"].copy()
+    model.ep_info_buffer, model.ep_success_buffer = (deque[Any](maxlen=model._stats_window_size) for _ in range(2))
+    for gained, steps in zip(arrays["episodes.return"].tolist(), arrays["episodes.steps"].tolist(), strict=True):
+        model.ep_info_buffer.append({"r": gained, "l": steps, "t": 0.0})
+    restore_random(model.action_space, arrays, plain["random"])
+    for name, (value, count, excluded) in plain["log"].items():
+        model.logger.name_to_value[name] = value
+        model.logger.name_to_count[name] = count
+        model.logger.name_to_excluded[name] = tuple(excluded)
+    memory: Any = getattr(model, "replay_buffer", None)
+    if memory is not None:
+        for name in REPLAY:
+            getattr(memory, name)[: len(state.replay[name])] = state.replay[name]
+        memory.pos, memory.full = plain["replay"]["pos"], plain["replay"]["full"]
+
+
+def _restore_optimizer(optimizer: torch.optim.Optimizer, arrays: Arrays, rate: float) -> None:
+    content = optimizer.state_dict()
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name, array in arrays.items():
+        index, key = name.split(".")
+        state.setdefault(int(index), {})[key] = torch.from_numpy(array.copy())
+    for group in content["param_groups"]:
+        group["lr"] = rate
+    optimizer.load_state_dict({"state": state, "param_groups": content["param_groups"]})
+
+
+def _group(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
+def _copy(tensor: Any) -> NDArray[Any]:
+    return np.array(torch.as_tensor(tensor).detach().cpu().numpy())
 
 
 # The check that a checkpoint belongs to a model: arrays, counters and policies as this model would write them.

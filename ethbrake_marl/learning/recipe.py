@@ -6,106 +6,36 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import import_module
+from operator import not_
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic.json_schema import models_json_schema
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import (
     Document,
+    FileModel,
     FileSchema,
     Override,
     Wording,
     YamlPath,
     changed_parts,
-    explain,
     flow_text,
     parse_overrides,
     publish,
+    read_model,
     read_yaml,
+    refuse,
     schema_lines,
 )
 from ethbrake_marl.policies.actor import Activation, NetworkSpec, Width
 from ethbrake_marl.rewards import RewardParams, registered_terms, setting_names
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.catalogue import check_file_name, shipped_folder
 from ethbrake_marl.scenario.features import ListedFeatures, listed_features
-
-# The names of the learning algorithms, each with the class of its recipes and the algorithm itself.
-#
-# An entry of the package is a string ``module:attribute``, imported when it is first used.
-
-_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
-_PLACE = "ethbrake_marl.learning.algorithms"
-
-
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    recipe: str | type[Any]
-    algorithm: str | Any
-
-
-_ENTRIES: dict[str, _Entry] = {
-    "ppo": _Entry(f"{_PLACE}.ppo:PpoRecipe", f"{_PLACE}.ppo:Ppo"),
-    "sac": _Entry(f"{_PLACE}.sac:SacRecipe", f"{_PLACE}.sac:Sac"),
-    "counterfactual": _Entry(
-        f"{_PLACE}.counterfactual:CounterfactualRecipe", f"{_PLACE}.counterfactual:Counterfactual"
-    ),
-}
-
-
-def register_algorithm(name: str, recipe: type[BaseModel], algorithm: type[Any]) -> None:
-    """Make ``algorithm: name`` a recipe that can be read, trained, stopped and resumed.
-
-    Args:
-        name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
-        recipe: the class of its recipes, made from ``learning.recipe.TrainingRecipe``; it checks the YAML file.
-        algorithm: the class of the algorithm, made from ``learning.algorithms.protocol.Algorithm``.
-
-    Raises ``InvalidInput`` for a name that is taken or is no such name, or a class that lacks what is needed.
-
-    """
-    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
-        raise InvalidInput(f"algorithm {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
-    if name in _ENTRIES:
-        raise InvalidInput(f"algorithm {name!r}: is registered already; give another name")
-    for what, given, needed in (("recipe", recipe, "network_spec"), ("algorithm", algorithm, "build")):
-        if not (isinstance(given, type) and hasattr(given, needed)):
-            raise InvalidInput(f"algorithm {name!r}: {what} = {given!r:.80}: must be a class with {needed}")
-    _ENTRIES[name] = _Entry(recipe, algorithm)
-
-
-def algorithm_names() -> tuple[str, ...]:
-    """Every registered name, the package's own first."""
-    return tuple(_ENTRIES)
-
-
-def recipe_class(name: str) -> Any:
-    """The class of the recipes of an algorithm; raises ``UnknownName``."""
-    return _import(_entry(name).recipe)
-
-
-def algorithm_named(name: str) -> Any:
-    """The algorithm of this name, new; raises ``UnknownName``."""
-    return _import(_entry(name).algorithm)()
-
-
-def _entry(name: str) -> _Entry:
-    if name not in _ENTRIES:
-        raise unknown_name("algorithm", name, _ENTRIES)
-    return _ENTRIES[name]
-
-
-def _import(entry: str | Any) -> Any:
-    if not isinstance(entry, str):
-        return entry
-    module, _, attribute = entry.partition(":")
-    return getattr(import_module(module), attribute)
-
+from ethbrake_marl.scenario.schema import check_file_name, shipped_folder
 
 WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
 
@@ -117,15 +47,7 @@ Rate = Annotated[float, Field(gt=0.0, le=1.0)]
 Layers = Annotated[tuple[Width, ...], Field(strict=False, min_length=1, max_length=8)]
 
 
-def _none(value: Any) -> bool:
-    return value is None
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
-
-class LearningRate(_Part):
+class LearningRate(FileModel):
     """A learning rate that falls from ``start`` to ``end`` over the training."""
 
     start: Rate
@@ -138,7 +60,15 @@ class LearningRate(_Part):
         return self.end + (self.start - self.end) * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
-class NetworkShape(_Part):
+class _Shape(FileModel):
+    def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
+        """What a bundle holds for one action in [-1, 1]: the actor, and what ``more`` says."""
+        shape: Any = self  # its fields stand in an order of their own
+        fields = {"policy_hidden": shape.policy, "value_hidden": (), "activation": shape.activation, "output": "clip"}
+        return NetworkSpec(observation_size=observation_size, action_size=1, **(fields | more))
+
+
+class NetworkShape(_Shape):
     """Hidden layers of actor and critic, and the exploration noise they start with."""
 
     policy: Layers
@@ -146,57 +76,34 @@ class NetworkShape(_Part):
     activation: Activation = "relu"
     initial_log_std: Annotated[float, Field(ge=-10.0, le=2.0)] = 0.0
 
-    def spec(self, observation_size: int) -> NetworkSpec:
-        """The whole network for one action in [-1, 1]."""
-        return NetworkSpec(
-            observation_size=observation_size,
-            action_size=1,
-            policy_hidden=self.policy,
-            value_hidden=self.value,
-            activation=self.activation,
-            output="clip",
-        )
+    def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
+        """Actor and critic."""
+        return super().spec(observation_size, value_hidden=self.value, **more)
 
 
-class SquashedShape(_Part):
+class SquashedShape(_Shape):
     """Hidden layers of the actor and of each of the two critics; the actor's noise depends on what it sees."""
 
     policy: Layers
     value: Layers
     activation: Activation = "relu"
 
-    def spec(self, observation_size: int) -> NetworkSpec:
-        """What a bundle holds: the actor, whose squashed mean is the action. Critics stay in the checkpoints."""
-        return NetworkSpec(
-            observation_size=observation_size,
-            action_size=1,
-            policy_hidden=self.policy,
-            value_hidden=(),
-            activation=self.activation,
-            output="tanh",
-        )
+    def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
+        """The actor, whose squashed mean is the action. Critics stay in the checkpoints."""
+        return super().spec(observation_size, output="tanh", **more)
 
 
-class ActorShape(_Part):
+class ActorShape(_Shape):
     """Hidden layers of the actor, where there is no critic."""
 
     policy: Layers
     activation: Activation = "relu"
-    initial_action: Annotated[float | None, Field(ge=-1.0, le=1.0, exclude_if=_none)] = None  # at first; None: 0
-
-    def spec(self, observation_size: int) -> NetworkSpec:
-        """What a bundle holds."""
-        return NetworkSpec(
-            observation_size=observation_size,
-            action_size=1,
-            policy_hidden=self.policy,
-            value_hidden=(),
-            activation=self.activation,
-            output="clip",
-        )
+    initial_action: Annotated[float | None, Field(ge=-1.0, le=1.0, exclude_if=lambda v: v is None)] = (
+        None  # at first; None: 0
+    )
 
 
-class OffsetRange(_Part):
+class OffsetRange(FileModel):
     """How far an action is moved to see what comes of it; the logarithm of what is drawn is uniform."""
 
     smallest: Rate
@@ -210,7 +117,7 @@ class OffsetRange(_Part):
         return value
 
 
-class EvaluationPlan(_Part):
+class EvaluationPlan(FileModel):
     """The fixed list on which the policy is measured while it learns."""
 
     every_updates: Annotated[int, Field(ge=1)]
@@ -218,7 +125,7 @@ class EvaluationPlan(_Part):
     seed: Annotated[int, Field(ge=0)]
 
 
-class TrainingRecipe(_Part):
+class TrainingRecipe(FileModel):
     """How to train, whatever the algorithm: its name, reward, seed, and what is saved and measured on the way.
 
     An update is one round of collecting and learning. The recipes of an algorithm are a class made from this one.
@@ -243,7 +150,7 @@ class TrainingRecipe(_Part):
     learning_rate: LearningRate  # from its start to its end
     gamma: Fraction  # discount of one time step
     reward: RewardParams  # what is learned for
-    observation: Annotated[ListedFeatures | None, Field(exclude_if=_none)] = None  # of learners; None: the scenario's
+    observation: Annotated[ListedFeatures | None, Field(exclude_if=not_)] = None  # of learners; None: the scenario's
     horizon_is_end: bool = False  # nothing is expected beyond the horizon
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of worlds, networks and exploration
     evaluation: EvaluationPlan  # the fixed list, and how often
@@ -296,12 +203,273 @@ class TrainingRecipe(_Part):
         return changed  # type: ignore[return-value]  # of another class only if another algorithm was asked for
 
 
+# Modes: what a recipe says of learning several networks and a gate.
+
+
+class Shares(FileModel):
+    """Of all updates, the share of each stage; together they are 1."""
+
+    alone: Fraction  # the first network, in all worlds
+    further: Fraction  # each of the others in the worlds of its own mode, one after the other
+    gate: Fraction  # the gate between them
+    together: Fraction  # all networks and the gate, each network where the gate chooses it
+
+    @model_validator(mode="after")
+    def _everything(self) -> Shares:
+        total = self.alone + self.further + self.gate + self.together
+        if not abs(total - 1.0) <= 1e-9:
+            raise ValueError(f"alone, further, gate and together are {total:g} in all; must be 1")
+        return self
+
+
+class ModesPlan(FileModel):
+    """How many networks, how the worlds of each further one are found, and how the gate between them learns."""
+
+    networks: Annotated[int, Field(ge=2, le=16)]
+    gate: Layers  # hidden layers
+    worlds: Annotated[int, Field(ge=1, le=1_000_000)]  # in which a mode is looked for
+    templates: Annotated[int, Field(ge=1, le=100_000)]  # drawn in each of them
+    gain: NonNegative  # return by which a template must be better than all networks before to be imitated
+    margin: Positive  # return by which a network may be worse than those before in a world of its own
+    imitation_epochs: Annotated[int, Field(ge=1, le=1000)]
+    gate_states: Annotated[int, Field(ge=1, le=1_000_000)]  # in each update, at which networks are compared
+    gate_memory: Annotated[int, Field(ge=1, le=1_000_000)]  # of them that are remembered
+    gate_steps: Annotated[int, Field(ge=1, le=100_000)]  # of its optimiser in each update
+    tie_break: NonNegative  # of the harm by the other count, added to minus the return when networks are compared
+    together_rate: Rate  # share of the learning rate in the last stage
+    shares: Shares
+
+
+ROLLOUT_LIMIT = 2**24  # decisions held in memory between two updates
+
+
+class PpoRecipe(TrainingRecipe):
+    """PPO: collect ``n_steps`` decisions of every learner, then go through them ``n_epochs`` times."""
+
+    schemes = get_args(Scheme)
+
+    algorithm: Literal["ppo"]
+    batch_size: Annotated[int, Field(ge=2)]
+    n_steps: Annotated[int, Field(ge=2)]
+    n_epochs: Annotated[int, Field(ge=1, le=1000)]
+    gae_lambda: Fraction
+    clip_range: Rate
+    ent_coef: NonNegative
+    vf_coef: NonNegative
+    max_grad_norm: Positive
+    target_kl: Positive | None = None
+    turns: Annotated[int, Field(ge=1, le=1000)] | None = None  # of independent learners; None: all learn at once
+    network: NetworkShape
+
+    @model_validator(mode="after")
+    def _turns_are_for_independent_learners(self) -> PpoRecipe:
+        if self.turns is not None and self.scheme != "independent":
+            refuse(("turns",), self.turns, "is for scheme: independent only; leave it out")
+        return self
+
+    @model_validator(mode="after")
+    def _whole_batches(self) -> PpoRecipe:
+        rollout = self.n_envs * self.n_steps
+        if not rollout <= ROLLOUT_LIMIT:
+            right = f"n_envs x n_steps = {rollout} decisions per update; at most {ROLLOUT_LIMIT}"
+            refuse(("n_envs",), self.n_envs, right)
+        if rollout % self.batch_size:
+            refuse(("batch_size",), self.batch_size, f"must divide n_envs x n_steps = {rollout}")
+        return self
+
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """Actor and critic."""
+        return self.network.spec(observation_size)
+
+    @property
+    def rounds(self) -> int:
+        """Decisions of each learner between two updates."""
+        return self.n_steps
+
+    def check_learners(self, learners: int) -> None:
+        """Every turn needs an update of its own."""
+        updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
+        if self.turns is not None and self.turns * learners > updates:
+            raise InvalidInput(
+                f"recipe {self.name!r}: turns = {self.turns}: {learners} learners need {self.turns * learners}"
+                f" updates, total_steps = {self.total_steps} are {updates}"
+            )
+
+
+class SacRecipe(TrainingRecipe):
+    """SAC: collect ``steps_per_update`` decisions of every learner, then ``gradient_steps`` steps from the memory."""
+
+    algorithm: Literal["sac"]
+    batch_size: Annotated[int, Field(ge=2)]
+    steps_per_update: Annotated[int, Field(ge=1, le=10_000)] = 1
+    gradient_steps: Annotated[int, Field(ge=1, le=100_000)] = 1
+    buffer_size: Annotated[int, Field(ge=1, le=10_000_000)]
+    learning_starts: Annotated[int, Field(ge=0)]
+    tau: Rate
+    ent_coef: float | str = "auto"
+    initial_ent_coef: Positive = 1.0  # where an automatic one starts
+    target_entropy: Annotated[float, Field(allow_inf_nan=False)] | None = None  # None: -1 per action
+    target_update_interval: Annotated[int, Field(ge=1)] = 1
+    network: SquashedShape
+    log_every_updates: Annotated[int, Field(ge=1)]
+
+    @field_validator("ent_coef", mode="plain")
+    @classmethod
+    def _automatic_or_fixed(cls, value: Any) -> float | str:
+        if value == "auto":
+            return "auto"
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
+            raise ValueError("must be auto or a number of at least 0")
+        return float(value)
+
+    @model_validator(mode="after")
+    def _room_for_everybody(self) -> SacRecipe:
+        if not self.buffer_size >= self.n_envs:
+            refuse(("buffer_size",), self.buffer_size, f"must be at least n_envs = {self.n_envs}")
+        return self
+
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """The actor alone."""
+        return self.network.spec(observation_size)
+
+    @property
+    def rounds(self) -> int:
+        """Decisions of each learner between two updates."""
+        return self.steps_per_update
+
+    @property
+    def logged_updates(self) -> int:
+        """Updates between two rows of the progress table."""
+        return self.log_every_updates
+
+    @property
+    def update_ratio(self) -> float:
+        """Gradient steps per decision of one learner in each world."""
+        return self.gradient_steps / (self.n_envs * self.steps_per_update)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The update ratio."""
+        return {"update_ratio": self.update_ratio}
+
+
+MOMENTS_LIMIT = 2**22  # decisions held in memory between two updates
+
+
+Steps = Annotated[int, Field(ge=1, le=1000)]
+
+
+class CounterfactualRecipe(TrainingRecipe):
+    """Try ``counterfactuals`` of the ``n_envs x n_steps`` decisions of a round otherwise, then learn from all of them.
+
+    ``start`` names a policy to go on from; without one it begins with random weights.
+    """
+
+    algorithm: Literal["counterfactual"]
+    start: Annotated[str, Field(pattern=r"^(ppo|counterfactual|universal)@.+$", max_length=4096)] | None = None
+    n_steps: Annotated[int, Field(ge=1)]
+    counterfactuals: Annotated[int, Field(ge=1)]
+    offset: OffsetRange
+    holds: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=16)]
+    gradient_limit: Positive
+    trust_radius: Rate
+    anchor: Positive
+    n_epochs: Annotated[int, Field(ge=1, le=1000)]
+    batch_size: Annotated[int, Field(ge=2)]
+    averaging: Fraction
+    focus: Annotated[float, Field(ge=0.0, le=0.99, exclude_if=not_)] = (
+        0.0  # share of what is tried that a scout chooses
+    )
+    network: ActorShape
+    modes: Annotated[ModesPlan | None, Field(exclude_if=not_)] = None  # several networks and a gate
+
+    @model_validator(mode="after")
+    def _counts_to_the_end(self) -> CounterfactualRecipe:
+        if self.reward.shaping > 0.0:
+            right = "must be 0: a counterfactual is played to the end, where shaping tells nothing more"
+            refuse(("reward", "shaping"), self.reward.shaping, right)
+        return self
+
+    @model_validator(mode="after")
+    def _enough_decisions(self) -> CounterfactualRecipe:
+        visited = self.n_envs * self.n_steps
+        if not visited <= MOMENTS_LIMIT:
+            right = f"n_envs x n_steps = {visited} decisions per update; at most {MOMENTS_LIMIT}"
+            refuse(("n_envs",), self.n_envs, right)
+        if not self.counterfactuals <= visited:
+            refuse(("counterfactuals",), self.counterfactuals, f"must be at most n_envs x n_steps = {visited}")
+        return self
+
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """The actor alone, or several and a gate."""
+        modes = self.modes
+        several = {} if modes is None else {"networks": modes.networks, "gate_hidden": modes.gate}
+        return self.network.spec(observation_size, **several)
+
+    def check_learners(self, learners: int) -> None:
+        """Several networks are for one learner: a mode of several would have to be chosen by all of them at once."""
+        if self.modes is not None and learners != 1:
+            raise InvalidInput(f"recipe {self.name!r}: modes: are for one learner, not for {learners}; leave modes out")
+
+    @property
+    def rounds(self) -> int:
+        """Decisions of each learner between two updates."""
+        return self.n_steps
+
+
+# The names of the learning algorithms, each with the class of its recipes and the algorithm itself.
+#
+# An algorithm of the package is a string ``module:attribute``, imported when it is first used: torch takes seconds.
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
+_ALGORITHMS: dict[str, tuple[type[TrainingRecipe], str | type[Any]]] = {
+    "ppo": (PpoRecipe, "ethbrake_marl.learning.algorithms:Ppo"),
+    "sac": (SacRecipe, "ethbrake_marl.learning.algorithms:Sac"),
+    "counterfactual": (CounterfactualRecipe, "ethbrake_marl.learning.counterfactual:Counterfactual"),
+}
+
+
+def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any]) -> None:
+    """Make ``algorithm: name`` a recipe that can be read, trained, stopped and resumed.
+
+    Args:
+        name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
+        recipe: the class of its recipes, made from ``learning.recipe.TrainingRecipe``; it checks the YAML file.
+        algorithm: the class of the algorithm, made from ``learning.training.Algorithm``.
+
+    Raises ``InvalidInput`` for a name that is taken or is no such name, or a class that lacks what is needed.
+
+    """
+    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
+        raise InvalidInput(f"algorithm {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
+    if name in _ALGORITHMS:
+        raise InvalidInput(f"algorithm {name!r}: is registered already; give another name")
+    for what, given, needed in (("recipe", recipe, "network_spec"), ("algorithm", algorithm, "build")):
+        if not (isinstance(given, type) and hasattr(given, needed)):
+            raise InvalidInput(f"algorithm {name!r}: {what} = {given!r:.80}: must be a class with {needed}")
+    _ALGORITHMS[name] = recipe, algorithm
+
+
+def algorithm_names() -> tuple[str, ...]:
+    """Every registered name, the package's own first."""
+    return tuple(_ALGORITHMS)
+
+
+def algorithm_named(name: str) -> Any:
+    """The algorithm of this name, new."""
+    algorithm = _ALGORITHMS[name][1]
+    if isinstance(algorithm, str):
+        module, _, attribute = algorithm.partition(":")
+        algorithm = getattr(import_module(module), attribute)
+    return algorithm()
+
+
 def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
     """Read a shipped recipe by name (``ppo``) or a file by path (anything with a separator or ``.yaml``).
 
     Raises ``UnknownName`` with a suggestion, or ``InvalidInput`` with file, line, key, value and what would be right.
     """
-    return _checked(read_yaml(recipe_path(name_or_path)))
+    return _checked(recipe_path(name_or_path))
 
 
 def recipe_path(name_or_path: str | Path) -> Path:
@@ -325,41 +493,22 @@ def recipe_of(content: str) -> TrainingRecipe:
     return _checked(Document("recipe", json.loads(content), {}))
 
 
-def _checked(document: Document) -> TrainingRecipe:
-    content = document.content
-    if not isinstance(content, dict):
-        raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance algorithm: ppo")
-    name = content.get("algorithm", "ppo")
-    if not isinstance(name, str) or name not in algorithm_names():
-        where, right = document.where(("algorithm",)), " or ".join(algorithm_names())
+def _checked(source: Path | Document) -> TrainingRecipe:
+    document = source if isinstance(source, Document) else read_yaml(source)
+    name = document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
+    if not isinstance(name, str) or name not in _ALGORITHMS:
+        where, right = document.where(("algorithm",)), " or ".join(_ALGORITHMS)
         raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}")
-    model: type[TrainingRecipe] = recipe_class(name)
-    try:
-        return model.model_validate(content)
-    except ValidationError as error:
-        raise explain(error, document, RecipeWording(name, model)) from None
+    shipped = f"; every key is in the shipped recipe {name}" if name in shipped_recipes() else ""
+    model = _ALGORITHMS[name][0]
+    wording = _RecipeWording(model, f"it is needed{shipped}")
+    return read_model(document, model, wording, "of keys to values, for instance algorithm: ppo")
 
 
-class RecipeWording(Wording):
-    """The ``Wording`` of messages about a recipe of one algorithm."""
-
-    def __init__(self, algorithm: str, model: type[TrainingRecipe]) -> None:
-        self._algorithm, self._model = algorithm, model
-
+class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """The keys of the part in which ``path`` ends."""
-        model: type[BaseModel] = self._model
-        for part in path[:-1]:
-            annotation = model.model_fields[str(part)].annotation
-            for inner in (annotation, *get_args(annotation)):  # a part that may be left out is "that part, or None"
-                if isinstance(inner, type) and issubclass(inner, BaseModel):
-                    model = inner
-        return setting_names() if model is RewardParams else list(model.model_fields)
-
-    def needed(self, path: YamlPath) -> str:
-        """Where an example stands."""
-        shipped = self._algorithm in shipped_recipes()
-        return f"it is needed; every key is in the shipped recipe {self._algorithm}" if shipped else "it is needed"
+        """Registered terms have their weights beside the others."""
+        return setting_names() if path[:-1] == ("reward",) else super().known(path)
 
 
 # Meanings of the keys of a recipe, and the text of a new one: every key with its value and a comment.
@@ -462,7 +611,7 @@ def recipe_json_schema() -> dict[str, Any]:
 
     Which keys there are depends on ``algorithm``. Algorithms and reward terms that are registered now are known too.
     """
-    classes = {name: recipe_class(name) for name in algorithm_names()}
+    classes = {name: recipe for name, (recipe, _) in _ALGORITHMS.items()}
     places, whole = models_json_schema([(each, "validation") for each in classes.values()], schema_generator=FileSchema)
     parts = whole["$defs"]
     for name, recipe in classes.items():
@@ -503,7 +652,6 @@ def _described(key: str, value: dict[str, Any]) -> dict[str, Any]:
 # Schemes of training several learners together, and the network that therefore drives each vehicle.
 
 SCHEMES: tuple[Scheme, ...] = get_args(Scheme)
-POLICY = "policy"  # folder of a run in which the policies stand
 
 
 def scheme_of(recipe: TrainingRecipe, scenario: Scenario) -> Scheme:
@@ -544,7 +692,7 @@ def drivers(scheme: Scheme, scenario: Scenario) -> dict[str, str]:
 
 def driver(scheme: Scheme, vehicle: str) -> str:
     """Where in the run's folder the bundle stands that drives a learner."""
-    return f"{POLICY}/{vehicle}" if scheme == "independent" else POLICY
+    return f"policy/{vehicle}" if scheme == "independent" else "policy"
 
 
 def who_drives_what(given: Mapping[str, str]) -> str:

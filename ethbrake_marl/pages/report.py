@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,36 +15,31 @@ from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.episodes import follow_episodes
 from ethbrake_marl.evaluation.inputs import policy_sha256
+from ethbrake_marl.evaluation.measures import BASELINE, Regrets, assess
 from ethbrake_marl.evaluation.outcome import (
-    PAPER_NOTE,
-    PAPER_PARAMETERS,
     Evaluation,
     Outcome,
     parameter_line,
     parameters,
 )
 from ethbrake_marl.evaluation.passport import issue_passport
-from ethbrake_marl.evaluation.regret import Regrets, assess
 from ethbrake_marl.evaluation.results import write_output
 from ethbrake_marl.evaluation.shield_modes import ModeRow, are_teams, compare_behind_shields
 from ethbrake_marl.evaluation.statistics import Estimate, mean, rate
 from ethbrake_marl.evaluation.summary import (
-    BASELINE,
-    Line,
     SummaryRow,
-    filled_columns,
     identity_lines,
     knowledge_lines,
     left_out_lines,
     limit_lines,
-    our_lines,
-    paper_blocks,
-    table_columns,
+    paper_lines,
+    summary_sheet,
     table_meanings,
     warning_lines,
 )
 from ethbrake_marl.figures.evaluation import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.figures.style import Figure
+from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.pages.frame import Block, Cell, Part, Row, Section, facts, page, paragraph, table
 from ethbrake_marl.pages.player import Played, player
@@ -111,40 +106,6 @@ def _largest(value: Floats, among: Bools) -> Ints:
     return order[among[order]]
 
 
-def play_chosen(
-    evaluation: Evaluation,
-    chosen: Sequence[Chosen],
-    agents: Mapping[str, Driver],
-    *,
-    spellings: Mapping[str, str] | None = None,
-    harm_count: HarmCount = "first",
-    on_agent: Callable[[str], None] | None = None,
-) -> list[Played]:
-    """Let every agent drive these worlds once more, and keep the motion and a passport of each episode.
-
-    Args:
-        evaluation: whose worlds they are.
-        chosen: at least one.
-        agents: that were evaluated, by name; they are left as they are.
-        spellings: how an agent is written on a command line, where that is not its name.
-        harm_count: that agents minimised.
-        on_agent: is told each agent that is done.
-
-    """
-    rows = np.array([each.row for each in chosen], np.int64)
-    worlds, numbers = evaluation.worlds.take(rows), evaluation.index[rows]
-    scenario = evaluation.scenario
-    if evaluation.vehicles != scenario.learners:
-        scenario = scenario.with_learners(evaluation.vehicles)
-    played = [Played(int(n), each.kind, each.why, {}, {}) for n, each in zip(numbers, chosen, strict=True)]
-    for name, agent in agents.items():
-        spelling = (spellings or {}).get(name, name)
-        drive_played(played, worlds, name, agent, scenario, spelling, seed=evaluation.seed, harm_count=harm_count)
-        if on_agent is not None:
-            on_agent(name)
-    return played
-
-
 def drive_played(
     played: Sequence[Played],
     worlds: Worlds,
@@ -192,28 +153,20 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Collection[int]) 
     known = [] if regrets is None else ["Best known, first", "Best known, total"]
     known += [] if avoidable is None else ["Contact"]
     head = ["World", "First-impact harm", "Total harm", *known, "Impacts"]
+    columns = [outcome.first_impact_harm, outcome.total_harm]
+    columns += [] if regrets is None else [regrets.best(count) for count in HARM_COUNTS]
     rows: list[Row] = []
     for k in worst_rows(evaluation, focus).tolist():
         number = int(evaluation.index[k])
-        best: list[str] = []
-        if regrets is not None:
-            best += [f"{regrets.best(count)[k]:.2f}" for count in HARM_COUNTS]
-        if avoidable is not None:
-            best.append("avoidable" if avoidable[k] else "unavoidable")
         button = Markup('{} <button type="button" data-watch="{}">Watch</button>').format(number, number)
-        harms = (f"{outcome.first_impact_harm[k]:.2f}", f"{outcome.total_harm[k]:.2f}")
-        world = button if number in watched else number
-        rows.append([world, *harms, *best, int(outcome.impacts[k])])
-    why = (
-        "by total harm, as nothing is proven of these worlds"
-        if regrets is None
-        else "by total harm above the best known"
-    )
+        contact = [] if avoidable is None else ["avoidable" if avoidable[k] else "unavoidable"]
+        harms = (f"{column[k]:.2f}" for column in columns)
+        rows.append([button if number in watched else number, *harms, *contact, int(outcome.impacts[k])])
+    why = "as nothing is proven of these worlds" if regrets is None else "above the best known"
+    told = f"Of {focus}, by total harm{',' * (regrets is None)} {why}. Harm in m²/s²."
     if not rows:
         return Section("Worst ten worlds", [f"{focus} did no harm above the best known in any of these worlds."])
-    return Section(
-        "Worst ten worlds", [f"Of {focus}, {why}. Harm in m²/s².", table(head, rows, caption=f"Worlds of {focus}")]
-    )
+    return Section("Worst ten worlds", [told, table(head, rows, caption=f"Worlds of {focus}")])
 
 
 def avoidable_section(evaluation: Evaluation) -> Section:
@@ -233,7 +186,8 @@ def avoidable_section(evaluation: Evaluation) -> Section:
         )
         for where, among in (("Contact avoidable", avoidable), ("Contact unavoidable", ~avoidable)):
             if among.any():
-                body.append(_split_table(evaluation, regrets, where, among))
+                rows = [[agent, *_split_cells(each, regrets, among)] for agent, each in evaluation.outcomes.items()]
+                body.append(table(_SPLIT, rows, caption=f"{where}: {count_of(int(among.sum()), 'world')}"))
         body.append(
             drawing(
                 harm_in_parts(evaluation),
@@ -249,10 +203,7 @@ def avoidable_section(evaluation: Evaluation) -> Section:
     return Section("What was avoidable", body)
 
 
-def _split_table(evaluation: Evaluation, regrets: Regrets, where: str, among: Bools) -> Part:
-    head = ["Agent", "Collided", "First-impact harm", "Total harm", "Regret, first-impact", "Regret, total"]
-    rows = [[agent, *_split_cells(outcome, regrets, among)] for agent, outcome in evaluation.outcomes.items()]
-    return table(head, rows, caption=f"{where}: {count_of(int(among.sum()), 'world')}")
+_SPLIT = ("Agent", "Collided", "First-impact harm", "Total harm", "Regret, first-impact", "Regret, total")
 
 
 def _split_cells(outcome: Outcome, regrets: Regrets, among: Bools) -> list[Cell]:
@@ -297,52 +248,42 @@ def shield_section(evidence: ShieldEvidence) -> Section:
     head += [*VERDICTS, "Worlds above the bound"]
     lines: list[Row] = []
     for row in rows:
-        shares = (None,) * len(VERDICTS) if row.verdicts is None else row.verdicts
-        replaced = [_NONE if share is None else f"{100.0 * share:.1f} %" for share in (row.replaced, *shares)]
+        shares = map(_share, (row.replaced, *(row.verdicts or [None] * len(VERDICTS))))
         above = _NONE if row.above_bound is None else row.above_bound
         against = row.against_none if teams else row.against_episode
         told_against = _NONE if against is None else _cell(against)
-        lines.append([f"{row.agent}, {row.mode}", _cell(row.harm), told_against, *replaced, above])
+        lines.append([f"{row.agent}, {row.mode}", _cell(row.harm), told_against, *shares, above])
     told = (
         "Each agent alone and behind every mode of the shield. Each decision that step mode replaced was simulated"
         " again without it: needed (harm would have been higher), harmless (the same), costly (lower)."
     )
-    left_out = rows[0].left_out
-    notes = [paragraph(evidence.conditions, "quiet")]
-    if left_out:
+    body: list[str | Part] = [told, table(head, lines, caption="Modes of the shield")]
+    if teams:
+        head = ["Agent, mode, vehicle", "Decisions replaced", "Bears", "Under the baseline plan", "Worlds with more"]
+        lines = [
+            [f"{row.agent}, {row.mode}, {each.vehicle}", _share(each.replaced), f"{each.harm:.2f}",
+             f"{each.baseline:.2f}", _share(each.above_baseline)]
+            for row in rows
+            for each in row.vehicles
+        ]  # fmt: skip
+        body.append(table(head, lines, caption="What each vehicle bears"))
+    body.append(paragraph(evidence.conditions, "quiet"))
+    if left_out := rows[0].left_out:
         told_of = count_of(len(left_out), "world")
-        notes.append(paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
-    borne = [_shares(rows)] if teams else []
-    return Section("Shield", [told, table(head, lines, caption="Modes of the shield"), *borne, *notes])
+        body.append(paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
+    return Section("Shield", body)
 
 
-def _shares(rows: Sequence[ModeRow]) -> Part:
-    """What each vehicle bears behind the shield of a team."""
-    head = ["Agent, mode, vehicle", "Decisions replaced", "Bears", "Under the baseline plan", "Worlds with more"]
-    lines: list[Row] = [
-        [
-            f"{row.agent}, {row.mode}, {each.vehicle}",
-            _NONE if each.replaced is None else f"{100.0 * each.replaced:.1f} %",
-            f"{each.harm:.2f}",
-            f"{each.baseline:.2f}",
-            f"{100.0 * each.above_baseline:.1f} %",
-        ]
-        for row in rows
-        for each in row.vehicles
-    ]
-    return table(head, lines, caption="What each vehicle bears")
+def _share(share: float | None) -> str:
+    return _NONE if share is None else f"{100.0 * share:.1f} %"
 
 
 def _cell(estimate: Estimate, scale: float = 1.0, digits: int = 2, unit: str = "") -> Cell:
-    value = f"{scale * estimate.value:.{digits}f}{unit}".replace("-", "−")
-    if estimate.interval is None:
-        return Cell(value)
-    low, high = (f"{scale * end:.{digits}f}".replace("-", "−") for end in estimate.interval)
-    return Cell(value, f"{low}, {high}")
+    value, *ends = (f"{scale * each:.{digits}f}" for each in (estimate.value, *(estimate.interval or ())))
+    return Cell(f"{value}{unit}".replace("-", "−"), ", ".join(ends).replace("-", "−"))
 
 
-_HEADLINE = (0, 1, 2, 6, 7, 9, 10)  # of the table's columns; those of registered harm metrics follow
-_OTHERS = (3, 4, 5, 8)
+_OTHERS = ("sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_rate", "predicted_harm")
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,9 +336,30 @@ def play_for_report(
     harm_count: HarmCount = "first",
     on_agent: Callable[[str], None] | None = None,
 ) -> list[Played]:
-    """The episodes of a report: see ``choose_shown`` and ``play_chosen``, whose arguments these are."""
+    """Let every agent drive the worlds of a report once more: the motion and a passport of each episode.
+
+    Args:
+        evaluation: whose worlds they are.
+        agents: that were evaluated, by name; they are left as they are.
+        focus: the agent whose worst worlds are shown: see ``choose_shown``.
+        spellings: how an agent is written on a command line, where that is not its name.
+        harm_count: that agents minimised.
+        on_agent: is told each agent that is done.
+
+    """
     chosen = choose_shown(evaluation, focus)
-    return play_chosen(evaluation, chosen, agents, spellings=spellings, harm_count=harm_count, on_agent=on_agent)
+    rows = np.array([each.row for each in chosen], np.int64)
+    worlds, numbers = evaluation.worlds.take(rows), evaluation.index[rows]
+    scenario = evaluation.scenario
+    if evaluation.vehicles != scenario.learners:
+        scenario = scenario.with_learners(evaluation.vehicles)
+    played = [Played(int(n), each.kind, each.why, {}, {}) for n, each in zip(numbers, chosen, strict=True)]
+    for name, agent in agents.items():
+        spelling = (spellings or {}).get(name, name)
+        drive_played(played, worlds, name, agent, scenario, spelling, seed=evaluation.seed, harm_count=harm_count)
+        if on_agent is not None:
+            on_agent(name)
+    return played
 
 
 def render_report(report: Report) -> str:
@@ -433,27 +395,24 @@ def _results(report: Report) -> Section:
                 "Mean per world of the squared closing speed of impacts: each pair's first one, and every one.",
             )
         )
-    columns = table_columns(rows)
-    blocks = paper_blocks(rows)
-    shown = filled_columns(_all_lines(rows), (*_HEADLINE, *range(len(table_columns(())), len(columns))))
-    lines: list[Row] = [_row(line, shown) for line in our_lines(rows)]
-    for name, paper in blocks:
-        lines += [Block(f"The paper's {name}, as printed"), *(_row(line, shown) for line in paper)]
-    body.append(table(["Agent", *(columns[k] for k in shown)], lines, caption="Means with 95 % intervals"))
+    sheet = summary_sheet(rows)
+    names = [name for name in sheet.names if name not in ("Knows", *_OTHERS)]
+    body.append(_table(sheet, names, "Means with 95 % intervals"))
     if rows:
         body.append(paragraph(f"{parameter_line(rows[0].parameters)}. Harm in m²/s².", "quiet"))
     body += [paragraph(text, "quiet") for text in _empty_lines(report)]
     body += [paragraph(text, "note") for text in (*left_out_lines(rows), *warning_lines(rows))]
     body += [paragraph(f"The limit: {text}", "quiet") for text in limit_lines(rows)]
     body += [paragraph(f"Who knows what: {text}", "note") for text in knowledge_lines(rows)]
-    body += [paragraph(f"The paper's {name}: {PAPER_PARAMETERS[name]}.", "quiet") for name, _ in blocks]
-    body += [paragraph(PAPER_NOTE, "note")] if blocks else []
+    *paper, note = paper_lines(rows) or [""]
+    body += [paragraph(f"The paper's {line}", "quiet") for line in paper]
+    body += [paragraph(note, "note")] if note else []
     return Section("Results", body)
 
 
 def _empty_lines(report: Report) -> list[str]:
     """Which columns of the tables hold nothing, and why where that is known, as a sentence; none where all do."""
-    names = _empty(report.rows, _all_lines(report.rows))
+    names = _empty(report.rows)
     if not names:
         return []
     limits = report.evaluation.limits if report.evaluation is not None else None
@@ -461,20 +420,27 @@ def _empty_lines(report: Report) -> list[str]:
     return [f"Columns without a value in any row are left out: {'; '.join(names)}.{because}"]
 
 
-def _all_lines(rows: Sequence[SummaryRow]) -> list[Line]:
-    """Our lines and the paper's."""
-    return [*our_lines(rows), *(line for _, paper in paper_blocks(rows) for line in paper)]
+def _empty(rows: Sequence[SummaryRow]) -> list[str]:
+    """Columns of the table of these rows in which no line has a value."""
+    sheet = summary_sheet(rows)
+    filled = sheet.filled()
+    return [name for k, name in enumerate(sheet.headings) if k not in filled]
 
 
-def _empty(rows: Sequence[SummaryRow], lines: Sequence[Line]) -> list[str]:
-    """Columns of the table of these rows in which none of the lines has a value."""
-    columns = table_columns(rows)
-    filled = filled_columns(lines, range(len(columns)))
-    return [name for k, name in enumerate(columns) if k not in filled]
-
-
-def _row(line: Line, columns: Sequence[int]) -> Row:
-    return [line.agent, *(Cell(line.cells[k].value, line.cells[k].interval) for k in columns)]
+def _table(sheet: Sheet, names: Sequence[str], caption: str) -> Part:
+    """Columns of a table by name, below those of the agent; what is empty is left out."""
+    filled = set(sheet.filled())
+    kept = [k for k, name in enumerate(sheet.names) if k == 0 or (name in names and k in filled)]
+    some = sheet.only(kept)
+    words = [name == "Knows" for name in some.names[1:]]
+    lines: list[Row] = []
+    for row in some.shown():
+        if isinstance(row, str):
+            lines.append(Block(f"The paper's {row.removeprefix('paper, ')}, as printed"))
+        else:
+            cells = (Cell(value, below, text) for (value, below), text in zip(row[1:], words, strict=True))
+            lines.append([row[0].value, *cells])
+    return table(some.headings, lines, caption=caption)
 
 
 def _episodes(report: Report) -> list[Section]:
@@ -516,12 +482,10 @@ def _unrepeated(played: Sequence[Played], evaluation: Evaluation) -> list[str]:
 
 
 def _other_test(test: ReportTest) -> Section:
-    columns = table_columns(test.rows)
-    filled = filled_columns(our_lines(test.rows), range(len(columns)))
-    lines = [_row(line, filled) for line in our_lines(test.rows)]
-    head = ["Agent", *(columns[k] for k in filled)]
-    body: list[str | Part] = [test.description, table(head, lines, caption=test.title)]
-    if empty := _empty(test.rows, our_lines(test.rows)):
+    sheet = summary_sheet(test.rows)
+    names = [name for name in sheet.names if name != "Knows"]
+    body: list[str | Part] = [test.description, _table(sheet, names, test.title)]
+    if empty := _empty(test.rows):
         body.append(paragraph(f"Columns without a value in any row are left out: {'; '.join(empty)}.", "quiet"))
     if test.rows:
         told = [f"{parameter_line(test.rows[0].parameters)}.", *limit_lines(test.rows), *identity_lines(test.rows)]
@@ -531,16 +495,15 @@ def _other_test(test: ReportTest) -> Section:
 
 
 def _measures(report: Report) -> Section:
-    filled = filled_columns(our_lines(report.rows), _OTHERS)
-    lines = [[line.agent, Cell(line.knows, words=True), *_row(line, filled)[1:]] for line in our_lines(report.rows)]
-    head = ["Agent", "Knows", *(table_columns(())[k] for k in filled)]
-    return Section("Other measures", [table(head, lines, caption="In the same worlds")])
+    sheet = summary_sheet(report.rows)
+    ours = replace(sheet, rows=sheet.rows[: len(report.rows)])
+    return Section("Other measures", [_table(ours, ("Knows", *_OTHERS), "In the same worlds")])
 
 
 def _reading(report: Report) -> Section:
-    empty = set(_empty(report.rows, _all_lines(report.rows)))
-    empty = empty.intersection(*(_empty(test.rows, our_lines(test.rows)) for test in report.tests))
-    columns = table_columns(report.rows)
+    empty = set(_empty(report.rows))
+    empty = empty.intersection(*(_empty(test.rows) for test in report.tests))
+    columns = summary_sheet(report.rows).headings[2:]
     told = {}
     for name, meaning in table_meanings(report.rows).items():
         about = {column for column in columns if column.startswith(name)}

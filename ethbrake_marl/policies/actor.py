@@ -13,13 +13,15 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
+from operator import not_
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+from pydantic import ConfigDict, Field, JsonValue, model_validator
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.yaml import FileModel
 from ethbrake_marl.observations import ObservationSpec, choose_observation
 from ethbrake_marl.physics.compiled import LN2_HIGH, LN2_LOW, PER_LN2, compiled, exp_of_small
 from ethbrake_marl.scenario.features import Of, registered_in
@@ -41,15 +43,7 @@ Hidden = Annotated[tuple[Width, ...], Field(min_length=1, max_length=8)]
 PerhapsHidden = Annotated[tuple[Width, ...], Field(max_length=8)]
 
 
-def _one(value: int) -> bool:
-    return value == 1
-
-
-def _nothing(value: tuple[Any, ...]) -> bool:
-    return not value
-
-
-class NetworkSpec(BaseModel):
+class NetworkSpec(FileModel):
     """An actor, and perhaps a critic, both multilayer perceptrons on the same observation.
 
     The action is ``output(actor(observation))`` in [-1, 1]: ``clip`` cuts the actor's mean at the bounds (PPO's
@@ -61,16 +55,14 @@ class NetworkSpec(BaseModel):
     remembers nothing. There is neither noise nor critic then.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
     observation_size: Annotated[int, Field(ge=1, le=4096)]
     action_size: Annotated[int, Field(ge=1, le=64)]
     policy_hidden: Hidden
     value_hidden: PerhapsHidden
     activation: Activation
     output: Output
-    networks: Annotated[int, Field(ge=1, le=16, exclude_if=_one)] = 1
-    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=_nothing)] = ()
+    networks: Annotated[int, Field(ge=1, le=16, exclude_if=lambda networks: networks == 1)] = 1
+    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()
 
     @model_validator(mode="after")
     def _a_gate_between_several(self) -> NetworkSpec:
@@ -153,8 +145,8 @@ Neighbours = Annotated[int, Field(ge=0, le=64)]
 _VEHICLE = re.compile(r"vehicle_[1-9][0-9]?")
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+class _Strict(FileModel):
+    model_config = ConfigDict(allow_inf_nan=False)
 
 
 class FeatureDefinition(_Strict):
@@ -177,7 +169,7 @@ class ObservationSchema(_Strict):
     rear: Neighbours
     features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]
     scaling_sha256: Sha256
-    registered: Annotated[tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=_nothing)] = ()
+    registered: Annotated[tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=not_)] = ()
 
     @property
     def spec(self) -> ObservationSpec:

@@ -1,25 +1,35 @@
 """Scenarios: strict YAML files that describe families of worlds, and the reproducible lists drawn from them."""
 
 from ethbrake_marl.files.yaml import Document, parse_yaml, read_yaml
-from ethbrake_marl.scenario.catalogue import (
-    CatalogueEntry,
-    list_scenarios,
-    load_scenario,
-    new_scenario_text,
-    read_scenario,
-    scenario_folder,
-    scenario_path,
+from ethbrake_marl.scenario.fields import (
+    Choice,
+    LogUniform,
+    Normal,
+    Sample,
+    Uniform,
+    constant_command,
+    is_state_free,
+    parse_agent_spec,
 )
-from ethbrake_marl.scenario.initial_states import (
+from ethbrake_marl.scenario.sampling import (
+    Channel,
     initial_state_worlds,
     read_initial_states,
     table_columns,
     worlds_from_table,
 )
-from ethbrake_marl.scenario.lines import constant_command, is_state_free, parse_agent_spec
-from ethbrake_marl.scenario.quantities import Choice, LogUniform, Normal, Sample, Uniform
-from ethbrake_marl.scenario.sampling import Channel
-from ethbrake_marl.scenario.schema import Scenario, Task, scenario_json_schema
+from ethbrake_marl.scenario.schema import (
+    CatalogueEntry,
+    Scenario,
+    Task,
+    list_scenarios,
+    load_scenario,
+    new_scenario_text,
+    read_scenario,
+    scenario_folder,
+    scenario_json_schema,
+    scenario_path,
+)
 
 __all__ = [
     "CatalogueEntry",

@@ -24,14 +24,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from operator import not_
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic import AfterValidator, Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, PydanticCustomError
+from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.yaml import FileModel, refuse
 from ethbrake_marl.physics.messages import CHANNEL, LINK, link_at, message_columns, ring_at, ring_length
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds
 
@@ -90,7 +92,7 @@ _OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "proc
 def _known_preset(name: str) -> str:
     if name not in CHANNELS:
         *names, last = CHANNELS
-        raise PydanticCustomError("scenario", "{right}", {"right": f"must be {', '.join(names)} or {last}"})
+        refuse((), name, f"must be {', '.join(names)} or {last}")
     return name
 
 
@@ -103,14 +105,8 @@ class _PresetSchema:
 Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
-def _not_given(value: Any) -> bool:
-    return value is None
-
-
-class V2X(BaseModel):
+class V2X(FileModel):
     """A preset, and what differs from it; see ``docs/cooperation.md``. Written as its name alone, or as a mapping."""
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
     preset: Preset = "paper"
     hears: Hears | None = None
@@ -124,14 +120,14 @@ class V2X(BaseModel):
     processing_s: Seconds | None = None
     actuation_s: Seconds | None = None
     sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = None
-    persistence: Persistence | None = Field(default=None, exclude_if=_not_given)
+    persistence: Persistence | None = Field(default=None, exclude_if=not_)
 
     @model_validator(mode="before")
     @classmethod
     def _by_name(cls, value: Any) -> Any:
         if not isinstance(value, str | dict | V2X):
             right = f"must be a preset ({', '.join(CHANNELS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
-            raise PydanticCustomError("scenario", "{right}", {"right": right})
+            refuse((), value, right)
         return {"preset": value} if isinstance(value, str) else value
 
     @model_validator(mode="after")
@@ -211,8 +207,7 @@ def _require(holds: bool, name: str, v2x: V2X, right: str) -> None:
     """Refuse the value of ``name`` unless ``holds``; ``right`` says what would do."""
     if not holds:
         value = getattr(v2x, name)
-        shown = v2x.channel._asdict()[name] if value is None else list(value) if isinstance(value, tuple) else value
-        raise PydanticCustomError("scenario", "{right}", {"right": right, "value": str(shown), "at": (name,)})
+        refuse((name,), v2x.channel._asdict()[name] if value is None else value, right)
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:

@@ -25,7 +25,7 @@ from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.physics import Floats, Worlds, concatenate
 from ethbrake_marl.physics.worlds import is_known_at_once, known_at_once
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.quantities import DECLARED
+from ethbrake_marl.scenario.fields import DECLARED
 
 # Checks of what a shield is built with: amounts, scenario, policy, environment.
 

@@ -252,12 +252,12 @@ def shield(env: Any, policy: Proposing | None = None, mode: str = "step", **opti
     if isinstance(env, gymnasium.vector.VectorEnv):
         return ShieldedVectorEnv(env, policy, **settings)  # type: ignore[arg-type]
     if isinstance(env, gymnasium.Env):
-        return ShieldedEnv(env, policy, **settings)
+        return ShieldedEnv(env, policy, **settings)  # type: ignore[arg-type]
     vec_env = getattr(sys.modules.get("stable_baselines3.common.vec_env"), "VecEnv", None)
     if vec_env is not None and isinstance(env, vec_env):
         from ethbrake_marl.shield.sb3 import ShieldedVecEnv  # torch: only where there is such an environment
 
-        return ShieldedVecEnv(env, policy, **settings)  # type: ignore[arg-type]
+        return ShieldedVecEnv(env, policy, **settings)
     if isinstance(env, ParallelEnv):
         return HybridShield(env, policy, **settings)
     raise InvalidInput(

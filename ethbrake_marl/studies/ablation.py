@@ -32,8 +32,7 @@ from ethbrake_marl.evaluation.seed_statistics import (
 from ethbrake_marl.files.store import check_writable, write_file
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe
-from ethbrake_marl.learning.team_file import load_team
-from ethbrake_marl.learning.training import RunDirectory, check_same, read_object, resolve
+from ethbrake_marl.learning.training import RunDirectory, check_same, load_team, read_object, resolve
 from ethbrake_marl.limits.best_harm import (
     CHUNK,
     BestHarmTable,

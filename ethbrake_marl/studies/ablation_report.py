@@ -24,8 +24,7 @@ from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json
 from ethbrake_marl.figures.studies import change_figure, harm_curve, who_pays
 from ethbrake_marl.figures.style import Figure, write_picture
 from ethbrake_marl.learning.recipe import WORDS
-from ethbrake_marl.learning.team_file import is_team, load_team
-from ethbrake_marl.learning.training import RunDirectory
+from ethbrake_marl.learning.training import RunDirectory, is_team, load_team
 from ethbrake_marl.limits.best_harm import best_harm
 from ethbrake_marl.pages.frame import Section, facts, page, table
 from ethbrake_marl.pages.player import Played, player
@@ -34,8 +33,7 @@ from ethbrake_marl.pages.vector import drawing
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.policies.bundle import Policy, load_policy
 from ethbrake_marl.scenario import Sample, Scenario
-from ethbrake_marl.scenario.lines import LEARNER
-from ethbrake_marl.scenario.quantities import DECLARED
+from ethbrake_marl.scenario.fields import DECLARED, LEARNER
 from ethbrake_marl.studies.ablation import (
     TOLERANCE,
     Harms,

@@ -31,10 +31,10 @@ from ethbrake_marl.evaluation import (
     write_per_world_csv,
 )
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, make_agents
+from ethbrake_marl.evaluation.measures import BASELINE
 from ethbrake_marl.evaluation.outcome import MAIN_TEST, TESTS, other_tests
 from ethbrake_marl.evaluation.results import PER_WORLD, results_to_json, write_output
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
-from ethbrake_marl.evaluation.summary import BASELINE
 from ethbrake_marl.figures.evaluation import harm_against_total_gap, learning_curve, trajectories
 from ethbrake_marl.figures.style import picture_bytes
 from ethbrake_marl.learning.recipe import TrainingRecipe, algorithm_names

@@ -16,7 +16,7 @@ from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.physics import Floats, Ints
 from ethbrake_marl.scenario import Sample, Scenario
-from ethbrake_marl.scenario.initial_states import ranges_of
+from ethbrake_marl.scenario.sampling import ranges_of
 
 # Measures of an agent's weakness, world by world.
 

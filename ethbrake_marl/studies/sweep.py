@@ -27,8 +27,8 @@ from ethbrake_marl.files.store import (
     remove_unfinished,
     write_file,
 )
-from ethbrake_marl.learning.loop import StopAt
 from ethbrake_marl.learning.progress import OBJECTIVE, chosen_by
+from ethbrake_marl.learning.train import StopAt
 from ethbrake_marl.learning.training import (
     RunDirectory,
     Training,

@@ -11,13 +11,11 @@ from typing import Annotated, Any
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     ConfigDict,
     Discriminator,
     Field,
     PrivateAttr,
     Tag,
-    ValidationError,
     field_validator,
     model_validator,
 )
@@ -25,13 +23,14 @@ from pydantic import (
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.files.yaml import (
     Document,
+    FileModel,
     FileSchema,
     OneOrMore,
     Wording,
     YamlPath,
-    explain,
     flow_text,
     publish,
+    read_model,
     read_yaml,
 )
 from ethbrake_marl.learning.recipe import TrainingRecipe
@@ -87,11 +86,7 @@ def _place(path: YamlPath) -> str:
     return "grid" if path == _GRID else f"jobs[{path[1]}]"
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
-
-class SeedRange(_Part):
+class SeedRange(FileModel):
     """``count`` seeds from ``first`` on."""
 
     first: _Seed = Field(default=0, description="the smallest seed")
@@ -109,7 +104,7 @@ _Seeds = Annotated[
 ]
 
 
-class _Lines(_Part):
+class _Lines(FileModel):
     """What a grid and a job have in common: a scenario, or the level of cooperation in its place."""
 
     model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["scenario"]}, {"required": ["level"]}]})
@@ -158,7 +153,7 @@ class ListedJob(_Lines):
     seed: _Seed = Field(default=0, description="of the training")
 
 
-class SweepFile(_Part):
+class SweepFile(FileModel):
     """The whole file; ``settings`` hold for every job."""
 
     title: str = Field(default="", description="one line, for you")
@@ -210,12 +205,8 @@ class SweepFile(_Part):
 def read_sweep(path: str | Path) -> SweepFile:
     """Read the file of a sweep; raises ``InvalidInput`` with file, line, key, value and what would be right."""
     document = read_yaml(path)
-    if not isinstance(document.content, dict):
-        raise InvalidInput(f"{document.file}: must be a mapping with a grid or a list of jobs")
-    try:
-        found = SweepFile.model_validate(document.content)
-    except ValidationError as error:
-        raise explain(error, document, _SweepWording()) from None
+    wording = Wording(SweepFile, "it is needed; docs/scaling.md shows an example")
+    found = read_model(document, SweepFile, wording, "with a grid or a list of jobs")
     found._document = document
     _check_size(found, document)
     return found
@@ -231,18 +222,6 @@ def _check_size(found: SweepFile, document: Document) -> None:
     size = (0 if found.grid is None else found.grid.size()) + len(found.jobs)
     if not 1 <= size <= MOST_JOBS:
         raise InvalidInput(f"{document.file}: asks for {count_of(size, 'job')}; must be from 1 to {MOST_JOBS:,}")
-
-
-class _SweepWording(Wording):
-    def known(self, path: YamlPath) -> list[str]:
-        """The keys of the part in which ``path`` ends."""
-        parts: dict[Any, type[BaseModel]] = {"grid": Grid, "jobs": ListedJob}
-        model = SeedRange if "seed" in path[:-1] else parts.get(path[0], SweepFile) if len(path) > 1 else SweepFile
-        return [field.alias or name for name, field in model.model_fields.items()]
-
-    def needed(self, path: YamlPath) -> str:
-        """Where an example stands."""
-        return "it is needed; docs/scaling.md shows an example"
 
 
 # The jobs of a sweep, each known by the hash of its configuration, all checked before the first begins.

@@ -13,11 +13,9 @@ import numpy as np
 
 from ethbrake_marl.errors import OnProgress, Progress
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.learning.loop import StopAt
 from ethbrake_marl.learning.recipe import TrainingRecipe
-from ethbrake_marl.learning.team_file import load_team
-from ethbrake_marl.learning.train import resume, train
-from ethbrake_marl.learning.training import RunDirectory, Training, is_finished
+from ethbrake_marl.learning.train import StopAt, resume, train
+from ethbrake_marl.learning.training import RunDirectory, Training, is_finished, load_team
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.studies.jobs import pack, run_all
 

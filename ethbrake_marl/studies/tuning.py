@@ -21,7 +21,7 @@ from ethbrake_marl.learning.progress import HARM_METRIC, OBJECTIVE
 from ethbrake_marl.learning.recipe import recipe_text
 from ethbrake_marl.learning.training import RunDirectory, read_object
 from ethbrake_marl.policies.actor import installed_versions
-from ethbrake_marl.scenario.catalogue import check_file_name
+from ethbrake_marl.scenario.schema import check_file_name
 from ethbrake_marl.studies.jobs import RETRIES, Attempt, Workers, pack, run_jobs
 from ethbrake_marl.studies.sweep import RESULTS, do_job, read_results, reason_of
 from ethbrake_marl.studies.trainings import TrainingJob, time_training, training_seconds

@@ -15,21 +15,18 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import (
     AfterValidator,
-    BaseModel,
-    ConfigDict,
     Discriminator,
     Field,
     PlainValidator,
     PrivateAttr,
     Tag,
-    ValidationError,
     WithJsonSchema,
     model_validator,
 )
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.plugins import noted_plugins
-from ethbrake_marl.files.yaml import Document, Wording, YamlPath, explain, flow_text, publish, read_yaml
+from ethbrake_marl.files.yaml import Document, FileModel, Wording, flow_text, publish, read_model, read_yaml
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.learning.training import Training, resolve, training_content
 from ethbrake_marl.policies.actor import installed_versions
@@ -52,11 +49,7 @@ def _check_number(value: Any) -> int | float:
 _Number = Annotated[int | float, PlainValidator(_check_number), WithJsonSchema({"type": "number"})]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
-
-class Range(_Part):
+class Range(FileModel):
     """From ``low`` to ``high``, both included; whole numbers where both are written without a point."""
 
     low: _Number = Field(description="the least value, included")
@@ -82,7 +75,7 @@ class Range(_Part):
         return self
 
 
-class Choices(_Part):
+class Choices(FileModel):
     """One of a list of values, of any kind."""
 
     choices: tuple[Any, ...] = Field(strict=False, min_length=2, description="values of any kind that the recipe takes")
@@ -117,7 +110,7 @@ def _check_keys(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
-class Measuring(_Part):
+class Measuring(FileModel):
     """The list by which trials are judged and pruned, and how often in a training."""
 
     worlds: int = Field(default=1000, ge=1, le=1_000_000, description="of the list")
@@ -125,7 +118,7 @@ class Measuring(_Part):
     times: int = Field(default=10, ge=1, le=1000, description="how often a training is measured")
 
 
-class Pruning(_Part):
+class Pruning(FileModel):
     """A trial stops whose least harm so far is beyond what the share ``keep`` of the finished ones had by then."""
 
     keep: float = Field(default=0.5, gt=0.0, lt=1.0, description="the share of finished trials to be as good as")
@@ -133,7 +126,7 @@ class Pruning(_Part):
     after_times: _Count = Field(default=3, description="nobody is stopped before it was measured so often")
 
 
-class Sampling(_Part):
+class Sampling(FileModel):
     """Who proposes: Optuna's TPE, or chance."""
 
     name: Literal["tpe", "random"] = Field(default="tpe", description="Optuna's TPE, or chance")
@@ -141,7 +134,7 @@ class Sampling(_Part):
     random_trials: _Count = Field(default=10, description="trials by chance before TPE begins")
 
 
-class TuningFile(_Part):
+class TuningFile(FileModel):
     """The whole file."""
 
     title: str = Field(default="", description="one line, for you")
@@ -167,12 +160,8 @@ class TuningFile(_Part):
 def read_tuning(path: str | Path) -> TuningFile:
     """Read the file of a tuning; raises ``InvalidInput`` with file, line, key, value and what would be right."""
     document = read_yaml(path)
-    if not isinstance(document.content, dict):
-        raise InvalidInput(f"{document.file}: must be a mapping with scenario, recipe and search")
-    try:
-        found = TuningFile.model_validate(document.content)
-    except ValidationError as error:
-        raise explain(error, document, _TuningWording()) from None
+    wording = Wording(TuningFile, "it is needed; docs/tuning.md shows an example")
+    found = read_model(document, TuningFile, wording, "with scenario, recipe and search")
     found._document = document
     return found
 
@@ -180,20 +169,6 @@ def read_tuning(path: str | Path) -> TuningFile:
 def tuning_json_schema() -> dict[str, Any]:
     """JSON Schema of the file of a tuning, for editors that complete and check YAML."""
     return publish({**TuningFile.model_json_schema(), "title": "Tuning"})
-
-
-class _TuningWording(Wording):
-    def known(self, path: YamlPath) -> list[str]:
-        """The keys of the part in which ``path`` ends."""
-        parts: dict[Any, type[BaseModel]] = {"measure": Measuring, "prune": Pruning, "sampler": Sampling}
-        if len(path) > 2 and path[0] == "search":
-            return [*Range.model_fields, *Choices.model_fields]
-        model = parts.get(path[0], TuningFile) if len(path) > 1 else TuningFile
-        return [field.alias or name for name, field in model.model_fields.items()]
-
-    def needed(self, path: YamlPath) -> str:
-        """Where an example stands."""
-        return "it is needed; docs/tuning.md shows an example"
 
 
 # A tuning, resolved: the training that every trial changes, and a search space all of which can be trained.

@@ -13,7 +13,7 @@ from ethbrake_marl.agents.registry import Entry, make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.scenario.catalogue import shipped_folder
+from ethbrake_marl.scenario.schema import shipped_folder
 from tests.failing_worlds import plant
 
 

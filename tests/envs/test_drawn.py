@@ -14,7 +14,7 @@ from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
 from ethbrake_marl.envs.common import describe_worlds
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import load_scenario, read_scenario
-from ethbrake_marl.scenario.quantities import quantity_columns
+from ethbrake_marl.scenario.fields import quantity_columns
 
 MIXED = load_scenario("realistic-mixed")
 BOTH = read_scenario(

@@ -17,8 +17,8 @@ from ethbrake_marl.evaluation import (
     summarise,
     write_per_world_csv,
 )
+from ethbrake_marl.evaluation.measures import FAR_M
 from ethbrake_marl.evaluation.rollout import ShovedFront
-from ethbrake_marl.evaluation.summary import FAR_M
 from ethbrake_marl.physics import advance_sampled
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.evaluation import regret
-from ethbrake_marl.evaluation.regret import between, bounds_of, proven_of_table, shipped_bounds, shipped_lines
+from ethbrake_marl.evaluation import measures
+from ethbrake_marl.evaluation.measures import between, bounds_of, proven_of_table, shipped_bounds, shipped_lines
 from ethbrake_marl.limits.best_harm import BestHarmTable, shipped_tables
 from ethbrake_marl.scenario import Task, load_scenario
 
@@ -54,7 +54,7 @@ def test_shipped__in_the_papers_lists_leaning_explains_what_is_between() -> None
 
 def test_shipped__every_table_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     few = [replace_header(table, episodes=20) for table in shipped_tables()]
-    monkeypatch.setattr(regret, "shipped_tables", lambda: few)
+    monkeypatch.setattr(measures, "shipped_tables", lambda: few)
     found = list(shipped_bounds())
     assert [one.scenario for one in found] == [table.header["scenario"] for table in shipped_tables()]
     assert len(shipped_lines(found)) == 2 + len(found)
@@ -66,7 +66,7 @@ def replace_header(table: BestHarmTable, **changes: object) -> BestHarmTable:
 
 def test_shipped__where_nothing_is_proven_the_reason_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
     table = replace_header(shipped("paper-delay-low"), episodes=5)
-    monkeypatch.setattr(regret, "unproven_because", lambda *_: "an obstacle stands ahead of vehicle_1")
+    monkeypatch.setattr(measures, "unproven_because", lambda *_: "an obstacle stands ahead of vehicle_1")
     found = bounds_of(table)
     assert found.proven is None and found.gap(found.best_known_first) is None
     assert "an obstacle stands ahead" in shipped_lines([found])[2]

@@ -20,7 +20,7 @@ from ethbrake_marl.evaluation import (
     summarise,
     write_per_world_csv,
 )
-from ethbrake_marl.evaluation.regret import assess, distance
+from ethbrake_marl.evaluation.measures import assess
 from ethbrake_marl.evaluation.summary import SummaryTable
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.limits import limits as limits_module
@@ -104,19 +104,16 @@ def test_best_known__rounding_below_the_table_is_not_below_it(four: Evaluation) 
 
 def test_distance__by_hand(four: Evaluation, evaluation: Evaluation) -> None:
     three = first_worlds(evaluation, 3)
-    found = distance(assess(three), three.outcome("a"), three.outcome("full_brake"))
-    assert found.realised_first is not None and found.realised_total is not None
-    assert found.realised_first.value == pytest.approx((30.0 - 8.0) / (30.0 - 5.0), rel=1e-12)
-    assert found.realised_total.value == pytest.approx((36.0 - 10.0) / (36.0 - 8.0), rel=1e-12)
-    assert found.regret_first is not None and found.regret_first.value == 1.0
-    assert found.regret_total is not None and found.regret_total.value == pytest.approx(2.0 / 3.0, rel=1e-12)
-    assert found.unavoidable_rate is not None and found.unavoidable_rate.value == pytest.approx(2.0 / 3.0)
-    assert found.avoidable_collision_rate is not None
-    assert found.avoidable_collision_rate.value == pytest.approx(1.0 / 3.0)
-    assert found.impact_proven_rate is not None and found.impact_proven_rate.value == pytest.approx(1.0 / 3.0)
-    assert found.proven_harm is not None and found.proven_harm.value == pytest.approx(0.5)
-    assert found.gap_first is not None and found.gap_first.value == pytest.approx((0.0 + 0.5 + 3.0) / 3.0)
-    assert found.gap_total is not None and found.gap_total.value == pytest.approx((0.0 + 1.5 + 5.0) / 3.0)
+    (_, found) = summarise(three)
+    told = {name: each.value for name, each in found.estimates.items() if each is not None}
+    assert told["realised_share_first"] == pytest.approx((30.0 - 8.0) / (30.0 - 5.0), rel=1e-12)
+    assert told["realised_share_total"] == pytest.approx((36.0 - 10.0) / (36.0 - 8.0), rel=1e-12)
+    assert told["mean_regret_first"] == 1.0 and told["mean_regret_total"] == pytest.approx(2.0 / 3.0, rel=1e-12)
+    assert told["unavoidable_rate"] == pytest.approx(2.0 / 3.0)
+    assert told["avoidable_collision_rate"] == pytest.approx(1.0 / 3.0)
+    assert told["impact_proven_rate"] == pytest.approx(1.0 / 3.0) and told["proven_harm"] == pytest.approx(0.5)
+    assert told["best_known_minus_proven_first"] == pytest.approx((0.0 + 0.5 + 3.0) / 3.0)
+    assert told["best_known_minus_proven_total"] == pytest.approx((0.0 + 1.5 + 5.0) / 3.0)
     assert (found.known_best_share, found.below_best_known) == (1.0, 1)
 
 
@@ -146,10 +143,10 @@ def test_limits__of_a_list_longer_than_its_table_are_told_in_a_warning_and_of_no
         found = evaluate(worlds, agents, scenario=paper_random, aftermath=False)
         with nullcontext() if holds is not None else pytest.warns(IncompleteTable):
             (row,) = summarise(found)
-        known = row.distance.known_best_share
+        known = row.known_best_share
         assert known is not None and (known == 1.0) == bool(holds)
         assert (row.to_json()["best_known_warning"] is None) == ("WARNING" not in markdown_table([row]))
-        assert (row.distance.warning == "") == (holds is not None)
+        assert (row.warning == "") == (holds is not None)
         assert ("WARNING" in SummaryTable([row])._repr_html_()) == (holds is None)
 
 

@@ -10,20 +10,20 @@ import pytest
 from ethbrake_marl import harm
 from ethbrake_marl import rewards as terms
 from ethbrake_marl.agents import registry as agents
-from ethbrake_marl.evaluation import harm_metrics
+from ethbrake_marl.evaluation import measures
 from ethbrake_marl.files import plugins
 from ethbrake_marl.learning import recipe as algorithms
-from ethbrake_marl.scenario import catalogue, features, v2x
+from ethbrake_marl.scenario import features, schema, v2x
 
 TABLES = (
-    (catalogue, "FOLDERS"),
+    (schema, "FOLDERS"),
     (features, "FEATURES"),
     (v2x, "CHANNELS"),
     (harm, "KINDS"),
     (agents, "_ENTRIES"),
-    (algorithms, "_ENTRIES"),
+    (algorithms, "_ALGORITHMS"),
     (terms, "TERMS"),
-    (harm_metrics, "METRICS"),
+    (measures, "REGISTERED"),
     (plugins, "_RUN"),
     (plugins, "_LOADED"),
 )

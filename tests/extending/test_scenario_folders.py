@@ -11,7 +11,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.scenario import new_scenario_text
-from ethbrake_marl.scenario.catalogue import FOLDERS
+from ethbrake_marl.scenario.schema import FOLDERS
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, evaluate, record_episode, summarise
-from ethbrake_marl.evaluation.regret import assess
+from ethbrake_marl.evaluation.measures import assess
 from ethbrake_marl.figures.evaluation import (
     harm_against_total_gap,
     harm_by_agent,

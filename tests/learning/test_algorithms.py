@@ -18,10 +18,10 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import InvalidInput, Progress
 from ethbrake_marl.learning import recipe as registry
-from ethbrake_marl.learning.algorithms.ppo import Ppo, PpoRecipe
-from ethbrake_marl.learning.recipe import TrainingRecipe, algorithm_names, load_recipe, register_algorithm
-from ethbrake_marl.learning.team_file import load_team
+from ethbrake_marl.learning.algorithms import Ppo
+from ethbrake_marl.learning.recipe import PpoRecipe, TrainingRecipe, algorithm_names, load_recipe, register_algorithm
 from ethbrake_marl.learning.train import resume, train
+from ethbrake_marl.learning.training import load_team
 from ethbrake_marl.policies.bundle import load_policy
 from tests.learning.tiny import TINY_PPO
 
@@ -42,7 +42,7 @@ RECIPE: dict[str, Any] = {
 @pytest.fixture(autouse=True)
 def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The page's file, imported; what it registers is forgotten afterwards."""
-    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
+    monkeypatch.setattr(registry, "_ALGORITHMS", dict(registry._ALGORITHMS))
     (source,) = (block for block in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "register_algorithm" in block)
     (tmp_path / "my_algorithm.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)

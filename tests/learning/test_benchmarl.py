@@ -9,7 +9,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.team_file import load_team
+from ethbrake_marl.learning.training import load_team
 
 pytest.importorskip("benchmarl", reason="needs the extra marl")
 

@@ -13,9 +13,7 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, Progress
-from ethbrake_marl.learning.algorithms.counterfactual import widened
-from ethbrake_marl.learning.algorithms.counterfactual_model import CounterfactualModel, Tried, trusted_targets
-from ethbrake_marl.learning.algorithms.networks import Adam
+from ethbrake_marl.learning.counterfactual import Adam, CounterfactualModel, Tried, trusted_targets, widened
 from ethbrake_marl.learning.progress import TrainingDiverged
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import resume, train

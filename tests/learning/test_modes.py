@@ -13,16 +13,17 @@ from stable_baselines3.common.logger import Logger
 import ethbrake_marl as eb
 from ethbrake_marl.engine.snapshot import Moment, branch, first_moments, visit
 from ethbrake_marl.errors import InvalidInput, Progress
-from ethbrake_marl.learning.algorithms.modes_model import (
+from ethbrake_marl.learning.counterfactual import (
     ModesModel,
     NoOtherMode,
+    Stage,
     drive_from,
     explore,
     own_worlds,
     show_templates,
+    stages_of,
 )
-from ethbrake_marl.learning.algorithms.protocol import ModesPlan, Stage, stages_of
-from ethbrake_marl.learning.recipe import algorithm_named, load_recipe
+from ethbrake_marl.learning.recipe import ModesPlan, algorithm_named, load_recipe
 from ethbrake_marl.learning.train import TrainResult, _environment, make_model, resume, train
 from ethbrake_marl.learning.training import resolve
 from ethbrake_marl.policies.bundle import load_policy

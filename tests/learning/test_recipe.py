@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.learning.algorithms.sac import SacRecipe
-from ethbrake_marl.learning.recipe import LearningRate, load_recipe, recipe_of, shipped_recipes
+from ethbrake_marl.learning.recipe import LearningRate, SacRecipe, load_recipe, recipe_of, shipped_recipes
 from ethbrake_marl.policies.actor import NetworkSpec
 
 GOOD = """\
@@ -48,7 +47,7 @@ def test_load_recipe__reads_a_file(tmp_path: Path) -> None:
 def test_load_recipe__the_papers_network() -> None:
     recipe = load_recipe("ppo-paper")
     assert recipe.name == "ppo-paper"
-    assert recipe.network.spec(27) == NetworkSpec(
+    assert recipe.network_spec(27) == NetworkSpec(
         observation_size=27,
         action_size=1,
         policy_hidden=(256, 256),

@@ -13,7 +13,6 @@ from ethbrake_marl.learning.recipe import (
     algorithm_names,
     load_recipe,
     new_recipe_text,
-    recipe_class,
     recipe_json_schema,
     shipped_recipes,
 )
@@ -31,7 +30,7 @@ def test_schema__is_one() -> None:
 
 @pytest.mark.parametrize("algorithm", algorithm_names())
 def test_schema__says_what_every_key_of_an_algorithm_means(algorithm: str) -> None:
-    recipe = recipe_class(algorithm)
+    recipe = type(load_recipe(algorithm))
     properties = recipe_json_schema()["$defs"][recipe.__name__]["properties"]
     assert set(properties) == set(recipe.model_fields)
     assert [key for key, value in properties.items() if not value.get("description")] == []

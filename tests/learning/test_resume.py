@@ -242,6 +242,26 @@ def test_resume__a_damaged_checkpoint_is_found_and_the_one_before_is_used(
     assert _rows(tmp_path / "run") == _rows(reference)
 
 
+@pytest.mark.parametrize("key", ["training", "format_version"])
+def test_resume__a_checkpoint_of_another_version_is_refused_and_stays(
+    key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    newest, before = _stopped(tmp_path / "run", monkeypatch)
+    path, listing = newest / "state.json", json.loads((newest / "checkpoint.json").read_text())
+    if key == "training":  # of a time when no checkpoint said so
+        path.write_text(json.dumps({name: each for name, each in json.loads(path.read_text()).items() if name != key}))
+        data = path.read_bytes()
+        listing["files"]["state.json"] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    else:
+        listing[key] = 2
+    (newest / "checkpoint.json").write_text(json.dumps(listing))
+    files = {path: path.read_bytes() for path in newest.rglob("*") if path.is_file()}
+    told = {"training": "state.json: training: is missing", "format_version": "format_version = 2: must be 1"}[key]
+    with pytest.raises(InvalidInput, match=rf"{told}; .* is as version .* wrote it, .*: go on with that version, or"):
+        resume(tmp_path / "run", measure=_measure)
+    assert {path: path.read_bytes() for path in newest.rglob("*") if path.is_file()} == files and before.is_dir()
+
+
 def test_resume__without_any_checkpoint_it_starts_again(
     whole: Callable[[str], tuple[Path, TrainResult]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

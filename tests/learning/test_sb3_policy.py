@@ -7,9 +7,7 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import SACPolicy
 
-from ethbrake_marl.learning.algorithms.networks import tensors_of
-from ethbrake_marl.learning.algorithms.ppo import ppo_arguments
-from ethbrake_marl.learning.algorithms.sac import sac_arguments
+from ethbrake_marl.learning.algorithms import ppo_arguments, sac_arguments, tensors_of
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.policies.actor import Actor, NetworkSpec
 
@@ -17,7 +15,7 @@ SHAPE = load_recipe("ppo-paper").network
 
 
 def _papers_network(observation_size: int) -> NetworkSpec:
-    return load_recipe("ppo-paper").network.spec(observation_size)
+    return load_recipe("ppo-paper").network_spec(observation_size)
 
 
 def _policy(spec: NetworkSpec, seed: int) -> ActorCriticPolicy:
@@ -63,8 +61,8 @@ def test_tensors_of__is_a_copy() -> None:
 
 
 def test_tensors_of__of_sac_gives_its_deterministic_action() -> None:
-    shape = load_recipe("sac-paper").network
-    spec = shape.spec(27)
+    recipe = load_recipe("sac-paper")
+    shape, spec = recipe.network, recipe.network_spec(27)
     torch.manual_seed(3)
     seen = Box(-10.0, 10.0, (27,), np.float32)
     policy = SACPolicy(seen, Box(-1.0, 1.0, (1,), np.float32), lambda _: 1e-3, **sac_arguments(shape))

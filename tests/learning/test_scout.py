@@ -11,7 +11,7 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, Progress
-from ethbrake_marl.learning.algorithms.networks import Scout, choose_rows, draw_rows
+from ethbrake_marl.learning.counterfactual import Scout, choose_rows, draw_rows
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import resume, train
 

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, outcome, parameters, rollout, summarise, write_per_world_csv
-from ethbrake_marl.evaluation.regret import assess
+from ethbrake_marl.evaluation.measures import assess
 from ethbrake_marl.evaluation.summary import limit_lines
 from ethbrake_marl.figures.evaluation import harm_in_parts
 from ethbrake_marl.limits import limits, lower_bound
@@ -134,10 +134,12 @@ def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decide
     agents = {name: make_agent(name) for name in ("full_brake", "coast")}
     found = evaluate(scenario.sample(20, 7), agents, scenario=scenario)
     rows = summarise(found)
-    told = rows[0].distance
-    assert told.unavoidable_rate is None and told.between is None and told.avoidable_collision_rate is None
-    assert told.proven_harm is not None and 0 < told.proven_harm.value < told.best_known_first.value
-    assert told.impact_proven_rate is not None and told.known_best_share == 0.0
+    told = rows[0]
+    assert told["unavoidable_rate"] is None and told.between is None and told["avoidable_collision_rate"] is None
+    assert (
+        told["proven_harm"] is not None and 0 < told["proven_harm"].value < told["best_known_first_impact_harm"].value
+    )
+    assert told["impact_proven_rate"] is not None and told.known_best_share == 0.0
     [text] = limit_lines(rows)
     assert "no joint command avoids an impact (proven)" in text and "avoids contact" not in text
     write_per_world_csv(tmp_path / "out.csv", found)

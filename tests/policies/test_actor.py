@@ -15,7 +15,7 @@ Tensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 
 
 def _papers_network(observation_size: int) -> NetworkSpec:
-    return load_recipe("ppo-paper").network.spec(observation_size)
+    return load_recipe("ppo-paper").network_spec(observation_size)
 
 
 def _observations(n: int, size: int) -> np.ndarray:

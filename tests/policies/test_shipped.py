@@ -187,6 +187,6 @@ def test_shipped__refined_is_nowhere_below_the_shipped_table(test: str, harm_cou
     sample = replace(every, worlds=every.worlds.take(rows), index=every.index[rows])
     lineup = make_lineup([f"{kind}@shipped+refined+episode" for kind in kinds], scenario, harm_count=harm_count)
     found = summarise(evaluate(sample, lineup, scenario=scenario, seed=7))
-    assert [(row.agent, row.distance.known_best_share, row.distance.below_best_known) for row in found] == [
+    assert [(row.agent, row.known_best_share, row.below_best_known) for row in found] == [
         (name, 1.0, 0) for name in lineup
     ]

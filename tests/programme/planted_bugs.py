@@ -39,16 +39,16 @@ EXACT, SEEDS, TABLE, REGRET, ROLLOUT = (
     "ethbrake_marl/evaluation/statistics.py",
     "ethbrake_marl/evaluation/seed_statistics.py",
     "ethbrake_marl/evaluation/summary.py",
-    "ethbrake_marl/evaluation/regret.py",
+    "ethbrake_marl/evaluation/measures.py",
     "ethbrake_marl/evaluation/rollout.py",
 )
 SHARDS = "ethbrake_marl/studies/shards.py"
 COURSE, LOOP, EVENTS, KEPT, INDEPENDENT, RECIPE = (
     "ethbrake_marl/learning/progress.py",
-    "ethbrake_marl/learning/loop.py",
+    "ethbrake_marl/learning/train.py",
     "ethbrake_marl/learning/progress.py",
     "ethbrake_marl/learning/training.py",
-    "ethbrake_marl/learning/algorithms/networks.py",
+    "ethbrake_marl/learning/algorithms.py",
     "ethbrake_marl/learning/recipe.py",
 )
 
@@ -214,7 +214,10 @@ BUGS: dict[str, Bug] = {
         SEEDS, "drawn = rng.integers(worlds, size=(size, worlds)) +", "drawn = np.arange(worlds) + 0 *", OF_STATISTICS
     ),
     "impacts counted as collisions": Bug(
-        TABLE, "int(outcome.collided.sum())", "min(int(outcome.impacts.sum()), len(first))", OF_TABLES
+        REGRET,
+        '"collision_rate", lambda o, _: o.collided,',
+        '"collision_rate", lambda o, _: o.impacts,',
+        OF_TABLES,
     ),
     "regret of total harm against the best first-impact harm": Bug(
         REGRET,
@@ -223,7 +226,7 @@ BUGS: dict[str, Bug] = {
         OF_TABLES,
     ),
     "a share realised though some world's best is unknown": Bug(
-        REGRET, "full_brake if bool(known.all()) else None", "full_brake if bool(known.any()) else None", OF_TABLES
+        REGRET, "own.count(KNOWN) != worlds", "own.count(KNOWN) == 0", OF_TABLES
     ),
     "an agent's prediction of the first chunk told for all": Bug(
         ROLLOUT,
@@ -261,7 +264,7 @@ BUGS: dict[str, Bug] = {
         COURSE, "max(TIMES_LEAST * least[harm],", "max(4.0 * least[harm],", OF_LEARNING
     ),
     "a lost training is not stopped": Bug(
-        LOOP, "self.course.lost if self._stop_when_lost else None", "None", OF_LEARNING
+        LOOP, "self.course.lost if self._wishes.stop_when_lost else None", "None", OF_LEARNING
     ),
     "the learning rate falls at once": Bug(
         RECIPE, "done = min(max(1.0 - remaining, 0.0), 1.0)", "done = 1.0", OF_LEARNING

@@ -163,8 +163,11 @@ REPRODUCTION = Suite(
     quick={
         "studies/reproduction/item.py": (
             "tests/studies/reproduction/test_verdicts.py",
-            "tests/studies/reproduction/test_printed.py",
             "tests/studies/reproduction/test_folder.py",
+            "tests/studies/reproduction/test_items.py",
+        ),
+        "studies/reproduction/lists.py": (
+            "tests/studies/reproduction/test_printed.py",
             "tests/studies/reproduction/test_items.py",
         ),
         "studies/reproduction/folder.py": (
@@ -178,7 +181,7 @@ REPRODUCTION = Suite(
     },
     otherwise=OF_ITEMS,
     whole=("tests/studies/reproduction", "tests/test_reproduction_page.py", "tests/cli/test_reproduce.py"),
-    left_out=frozenset({"__init__.py", "page.py", "markdown.py", "register.py"}),  # pages, and what the paper says
+    left_out=frozenset({"__init__.py"}),
     preloaded=SCIENCE,
 )
 
@@ -193,11 +196,8 @@ EVALUATION = Suite(
         "figures/studies.py": ("tests/figures/test_learning_curves.py",),
         "evaluation/rollout.py": ("tests/evaluation/test_rollout.py", "tests/agents/test_team.py"),
         "evaluation/outcome.py": ("tests/evaluation/test_rollout.py", "tests/evaluation/test_left_out.py"),
-        "evaluation/regret.py": ("tests/evaluation/test_regret.py",),
-        'evaluation/episodes.py': (
-            'tests/evaluation/test_record.py',
-            'tests/evaluation/test_film.py',
-        ),
+        "evaluation/measures.py": ("tests/evaluation/shards/test_shards.py", "tests/evaluation/test_regret.py",),
+        'evaluation/episodes.py': ('tests/evaluation/test_record.py', 'tests/evaluation/test_film.py',),
         "evaluation/summary.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
         'evaluation/curves.py': (
             'tests/figures/test_criticality.py',
@@ -256,8 +256,7 @@ LEARNING = Suite(
             "tests/learning/test_train.py",
             "tests/learning/test_resume.py",
         ),
-        "learning/algorithms/networks.py": ("tests/learning/test_teams.py",),
-        "learning/team_file.py": ("tests/learning/test_teams.py",),
+        "learning/algorithms.py": ("tests/learning/test_teams.py",),
         "learning/train.py": (
             "tests/learning/test_sb3_policy.py",
             "tests/learning/test_train.py",

@@ -21,8 +21,8 @@ from ethbrake_marl.scenario import (
     scenario_json_schema,
     scenario_path,
 )
-from ethbrake_marl.scenario import catalogue as shipped_files
-from ethbrake_marl.scenario.lines import OF_EVERY_VEHICLE
+from ethbrake_marl.scenario import schema as shipped_files
+from ethbrake_marl.scenario.fields import OF_EVERY_VEHICLE
 
 SHIPPED = [entry.path for entry in list_scenarios()]
 ROOT = Path(__file__).resolve().parents[2]

@@ -14,7 +14,7 @@ from ethbrake_marl.scenario import (
     parse_yaml,
     read_initial_states,
 )
-from ethbrake_marl.scenario.quantities import values
+from ethbrake_marl.scenario.fields import values
 from ethbrake_marl.scenario.sampling import uniform_numbers
 
 REST = {

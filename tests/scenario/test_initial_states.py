@@ -91,7 +91,7 @@ def test_csv__blank_lines_at_the_end_are_nothing(tmp_path: Path, end: str):
 
 def test_csv__beyond_the_limit_is_not_read_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = write(tmp_path, f"{HEADER}\n10,8,20,18,20\n")
-    monkeypatch.setattr("ethbrake_marl.scenario.initial_states.SIZE_LIMIT", path.stat().st_size)
+    monkeypatch.setattr("ethbrake_marl.scenario.sampling.SIZE_LIMIT", path.stat().st_size)
     assert read_initial_states(path, PAPER).n == 1
     larger = write(tmp_path, f"{HEADER}\n10,8,20,18,20\n\n")
     for file, reason in ((larger, "larger than 0 KiB, the limit for such a file"), (Path("/dev/zero"), "a device")):

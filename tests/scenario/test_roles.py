@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario.lines import constant_command, is_state_free, parse_agent_spec
+from ethbrake_marl.scenario.fields import constant_command, is_state_free, parse_agent_spec
 
 
 @pytest.mark.parametrize(

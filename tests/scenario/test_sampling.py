@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Vehicles, Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario, sampling
-from ethbrake_marl.scenario.quantities import BLOCK, OTHERWISE, QUANTITIES
+from ethbrake_marl.scenario.fields import BLOCK, OTHERWISE, QUANTITIES
 from ethbrake_marl.scenario.sampling import uniform_numbers
 
 # As printed by: python -c "import ethbrake_marl as eb; print(eb.load_scenario('paper-random').sample(3, 7).worlds)"

@@ -405,7 +405,7 @@ def test_initial_state__needs_a_channel_without_chance():
         ({"preset": "sensors-only", "lost": 0.5}, r"v2x.lost = 0.5: hears none has no messages; leave it out"),
         ({"preset": "sensors-only", "link_latency_s": 0.2}, r"v2x.link_latency_s = 0.2: hears none has no messages"),
         ({"link_latency_s": 0.1, "hears": "none"}, r"v2x.link_latency_s = 0.1: hears none has no messages"),
-        ({"sensing_s": [0.8, 1]}, r"v2x.sensing_s = \[0.8, 1.0\]: senses none has nobody in sight; leave it out"),
+        ({"sensing_s": [0.8, 1]}, r"v2x.sensing_s = \[0.8, 1\]: senses none has nobody in sight; leave it out"),
         ({"link_latency_s": 0.1, "lost": 0.1}, r"v2x.lost = 0.1: without sight .* use senses: both or front"),
         (5, r"v2x = 5: must be a preset \(paper, .*\), or a mapping such as"),
     ],

@@ -14,7 +14,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import scenario_sha256, worlds_sha256
 from ethbrake_marl.scenario import Scenario, load_scenario, parse_yaml, scenario_folder
-from ethbrake_marl.scenario.quantities import quantity
+from ethbrake_marl.scenario.fields import quantity
 from ethbrake_marl.scenario.sampling import uniform_numbers
 
 MIXED = load_scenario("realistic-mixed")

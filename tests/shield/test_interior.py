@@ -13,14 +13,7 @@ from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics.kernel import number_of_decisions
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield import (
-    HybridShield,
-    ShieldedDriver,
-    ShieldOptions,
-    StepShield,
-    enclosure,
-    parse_uncertainty,
-)
+from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldOptions, StepShield, enclosure, parse_uncertainty
 from ethbrake_marl.shield.certify import begin_running, plan_harm
 from ethbrake_marl.shield.enclosure import Known, bound_plans, boxes_of, cell_of, wait
 from tests.shield.enclosed import outside

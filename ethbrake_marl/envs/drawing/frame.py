@@ -1,10 +1,14 @@
-"""A moment as pixels: the road to scale, and below it a panel for each vehicle. Importing this file imports Pillow."""
+"""A moment as pixels: the road to scale, below it a panel for each vehicle; and the window that shows such frames.
+
+Importing this file imports Pillow; pygame is imported by the first window.
+"""
 
 from __future__ import annotations
 
 import math
+import os
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +22,10 @@ from ethbrake_marl.envs.drawing.scene import (
     pair_words,
     shield_words,
     speed_words,
+    star,
     vehicle_colour,
 )
-from ethbrake_marl.errors import plain_text
+from ethbrake_marl.errors import InvalidInput, need, plain_text
 
 Frame = NDArray[np.uint8]  # [HEIGHT, WIDTH, 3]
 
@@ -36,13 +41,6 @@ _FINE = 2  # shapes are drawn so many times larger, for smooth edges
 _PAPER, _INK, _GREY = "#ffffff", "#1a1a1a", "#6b6b6b"
 _ASPHALT, _DASH = "#4a4d52", "#e8e8e8"
 _BRAKE, _DRIVE, _FLASH, _SHIELD = "#c1121f", "#2a7f3f", "#ffd60a", "#6a3d9a"
-
-
-class _Panel(NamedTuple):
-    """Where a vehicle's numbers stand (pixels)."""
-
-    left: float
-    width: float
 
 
 class _Space(NamedTuple):
@@ -108,7 +106,7 @@ def _draw_road(pen: _Pen, scene: Scene) -> None:
             pen.line(x, _ROAD_TOP - 10, x, _ROAD_TOP - 2, _GREY)
         pen.line(space.left, _ROAD_TOP - 6, space.right, _ROAD_TOP - 6, _GREY)
     for struck in scene.struck:
-        pen.shape(_star(_contact(scene, struck), _LANE, 17, 8), _FLASH, _BRAKE)
+        pen.shape(star(_contact(scene, struck), _LANE, 17, 8), _FLASH, _BRAKE)
 
 
 def _draw_vehicle(pen: _Pen, scene: Scene, i: int) -> None:
@@ -139,7 +137,9 @@ def _draw_panel(pen: _Pen, scene: Scene, i: int) -> None:
 
 
 def _write_head(text: ImageDraw.ImageDraw, scene: Scene) -> None:
-    text.text((_MARGIN, 10), _shortened(plain_text(scene.title)[:200], _TITLE, 15), _GREY, _font(15))
+    title = plain_text(scene.title)[:200]
+    cut = [title, *(f"{title[:k]}..." for k in range(len(title), -1, -1))]
+    text.text((_MARGIN, 10), _fitting(cut, _TITLE, 15), _GREY, _font(15))
     clock = f"{scene.time_s:.2f} s after the alert{', ended' if scene.ended else ''}"
     text.text((WIDTH - _MARGIN, 8), clock, _INK, _font(18), anchor="ra")
     harm = f"harm {scene.first_harm:.2f} by first impacts, {scene.total_harm:.2f} in total (m2/s2)"
@@ -205,14 +205,6 @@ def _fitting(words: list[str], width: float, size: int) -> str:
     return next((each for each in words if _font(size).getlength(each) <= width), words[-1])
 
 
-def _shortened(words: str, width: float, size: int) -> str:
-    """The words, cut off at their end where they would be wider than ``width``."""
-    if _font(size).getlength(words) <= width:
-        return words
-    kept = next(k for k in range(len(words), -1, -1) if _font(size).getlength(words[:k] + "...") <= width)
-    return words[:kept] + "..."
-
-
 def _share(scene: Scene, i: int) -> float:
     """The command in force as a share of the vehicle's capacity; below 0 it brakes."""
     command = float(scene.command_mps2[i])
@@ -220,12 +212,12 @@ def _share(scene: Scene, i: int) -> float:
     return command / capacity if command != 0.0 else 0.0
 
 
-def _panel(scene: Scene, i: int) -> _Panel:
-    """Panels stand in the order of the line, Vehicle 1 on the right."""
+def _panel(scene: Scene, i: int) -> tuple[float, float]:
+    """Left edge and width (pixels) of a vehicle's numbers, in the order of the line, Vehicle 1 on the right."""
     count = len(scene.front_m)
     gap = 24.0 if count <= 5 else 10.0
     width = min((WIDTH - 2 * _MARGIN - gap * (count - 1)) / count, 240.0)
-    return _Panel(WIDTH - _MARGIN - width - i * (WIDTH - 2 * _MARGIN - width) / max(count - 1, 1), width)
+    return WIDTH - _MARGIN - width - i * (WIDTH - 2 * _MARGIN - width) / max(count - 1, 1), width
 
 
 def _x(scene: Scene, place_m: float) -> float:
@@ -262,15 +254,57 @@ def _contact(scene: Scene, struck: Struck) -> float:
     return (_x(scene, scene.front_m[struck.pair + 1]) + _x(scene, scene.front_m[struck.pair] - BODY_M)) / 2
 
 
-def _star(x: float, y: float, far: float, near: float) -> list[tuple[float, float]]:
-    """A star of eight points."""
-    radii = [(far if k % 2 == 0 else near) for k in range(16)]
-    return [(x + r * math.cos(k * math.pi / 8), y + r * math.sin(k * math.pi / 8)) for k, r in enumerate(radii)]
-
-
 @cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
     """Pillow's own font: the same on every machine that has this Pillow."""
     font = ImageFont.load_default(size)
     assert isinstance(font, ImageFont.FreeTypeFont)
     return font
+
+
+class Window:
+    """The window of ``render_mode="human"``; it opens with its first frame, and stays closed once its user closes it.
+
+    A copy is a window of its own. Raises ``MissingExtra`` where its library is missing.
+    """
+
+    def __init__(self) -> None:
+        need("pygame")
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # importing a library says nothing
+        import pygame
+
+        self._pygame: Any = pygame
+        self._screen: Any = None
+        self._clock: Any = None
+        self.closed_by_user = False  # until an episode begins
+
+    def __reduce__(self) -> tuple[type[Window], tuple[()]]:
+        return Window, ()
+
+    def show(self, frame: Frame, fps: float) -> None:
+        """Show a frame [H, W, 3] for 1/fps seconds. Raises ``InvalidInput`` where there is no display."""
+        if self.closed_by_user:
+            return
+        pygame = self._pygame
+        if self._screen is None:
+            try:
+                pygame.display.init()
+                self._screen = pygame.display.set_mode((WIDTH, HEIGHT))
+            except pygame.error as error:
+                raise InvalidInput(
+                    f"render_mode = 'human': no window can be opened here ({error}); 'rgb_array' needs no display"
+                ) from None
+            pygame.display.set_caption("EthBrake")
+            self._clock = pygame.time.Clock()
+        self._screen.blit(pygame.image.frombuffer(frame.tobytes(), (WIDTH, HEIGHT), "RGB"), (0, 0))
+        pygame.display.flip()
+        self._clock.tick(fps)
+        if any(event.type == pygame.QUIT for event in pygame.event.get()):
+            self.close()
+            self.closed_by_user = True
+
+    def close(self) -> None:
+        """Close the window, if it is open."""
+        if self._screen is not None:
+            self._pygame.display.quit()
+            self._screen = self._clock = None

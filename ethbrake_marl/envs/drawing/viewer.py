@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.envs.drawing.scene import Scene, Trace, kept_motions, moments, scenes
-from ethbrake_marl.errors import InvalidInput, check_whole_number, need
+from ethbrake_marl.envs.drawing.scene import Scene, Trace, kept_motions, moments, scene_text, scenes
+from ethbrake_marl.errors import InvalidInput, check_whole_number
 
 if TYPE_CHECKING:
     from ethbrake_marl.envs.drawing.frame import Frame
-    from ethbrake_marl.envs.drawing.window import Window
 
 MODES = ["human", "rgb_array", "rgb_array_list", "ansi"]
 BATCH_MODES = ["rgb_array", "ansi"]  # of many worlds at once
@@ -36,7 +35,11 @@ class Viewer:
             raise InvalidInput(f"render_mode = {mode!r}: must be {', '.join(repr(known) for known in modes)}, or None")
         self.mode = mode
         self._engine = engine
-        self._window: Window | None = None if mode != "human" else import_window()()
+        self._window = None
+        if mode == "human":
+            from ethbrake_marl.envs.drawing.frame import Window
+
+            self._window = Window()
         self._trace = None if mode is None else Trace(engine, whole=mode == "rgb_array_list")
         self._shown = 0  # motions of the running episode that a list of frames has shown
 
@@ -44,7 +47,7 @@ class Viewer:
         """An episode has begun: the list of frames starts anew, and the window shows the way to the first decision."""
         self._shown = 0
         if self._window is not None:
-            self._window.open_again()
+            self._window.closed_by_user = False
             self.play()
 
     def play(self) -> None:
@@ -62,7 +65,7 @@ class Viewer:
             return None
         if self.mode == "rgb_array_list":
             return self._new_frames()
-        return self._drawn()(self._last(0)[-1])
+        return self._shown_as(self._last(0)[-1])
 
     def render_each(self) -> tuple[Any, ...]:
         """What the mode says of every world, in order."""
@@ -70,8 +73,7 @@ class Viewer:
             raise InvalidInput(
                 f"render: made with render_mode=None; give one of {', '.join(BATCH_MODES)} when it is made"
             )
-        draw_one = self._drawn()
-        return tuple(draw_one(self._last(k)[-1]) for k in range(self._engine.n))
+        return tuple(self._shown_as(self._last(k)[-1]) for k in range(self._engine.n))
 
     def step_frames(self, fps: float = SMOOTH_FPS) -> list[Frame]:
         """The frames [H, W, 3] between the last decision, or the alert, and now: ``fps`` in a second of the world.
@@ -100,12 +102,8 @@ class Viewer:
         new, self._shown = motions[self._shown :], len(motions)
         return [draw(scenes(self._engine, motion, 0)[-1]) for motion in new]
 
-    def _drawn(self) -> Callable[[Scene], Any]:
-        if self.mode == "ansi":
-            from ethbrake_marl.envs.drawing.scene import scene_text
-
-            return scene_text
-        return draw
+    def _shown_as(self, scene: Scene) -> Any:
+        return scene_text(scene) if self.mode == "ansi" else draw(scene)
 
 
 def draw(scene: Scene) -> Frame:
@@ -113,14 +111,6 @@ def draw(scene: Scene) -> Frame:
     from ethbrake_marl.envs.drawing.frame import draw_frame
 
     return draw_frame(scene)
-
-
-def import_window() -> type[Window]:
-    """The class of the window. Raises ``MissingExtra`` where its library is missing."""
-    need("pygame")
-    from ethbrake_marl.envs.drawing.window import Window
-
-    return Window
 
 
 def render_metadata(engine: Engine, modes: Sequence[str] = MODES) -> dict[str, Any]:

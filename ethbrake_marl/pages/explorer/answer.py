@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,10 +24,9 @@ from ethbrake_marl.pages.player import played_episode, played_world
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.kernel import decision_at, first_decision_s, number_of_decisions
 from ethbrake_marl.scenario import Scenario, Task
-from ethbrake_marl.scenario.initial_states import initial_state_worlds
-from ethbrake_marl.scenario.quantities import OPTIONAL, QUANTITIES, SYMBOLS, QuantityRule
+from ethbrake_marl.scenario.fields import OPTIONAL, QUANTITIES, SYMBOLS, QuantityRule
+from ethbrake_marl.scenario.sampling import initial_state_worlds
 from ethbrake_marl.search import (
-    ProfileProblem,
     Profiles,
     constant_profiles,
     even_grid,
@@ -40,20 +39,7 @@ from ethbrake_marl.search import (
 # A state is plain data: a quantity of every vehicle or pair is a list, one of the whole world a number.
 
 State = dict[str, Any]
-
-
-class Group(NamedTuple):
-    """The sliders of one quantity."""
-
-    field: str  # key in a state
-    title: str
-    unit: str  # "" for a plain number
-    low: float
-    high: float  # sliders end here, the numbers beside them at ``most``
-    step: float
-    most: float
-    names: tuple[str, ...]  # of each slider: vehicle, pair or world
-    usual: bool  # shown at once; the others open
+_RULES: dict[str, QuantityRule] = {**QUANTITIES, **OPTIONAL}
 
 
 # title, least, greatest and step of a slider, and whether it is shown at once
@@ -70,20 +56,32 @@ _SLIDERS: dict[str, tuple[str, float, float, float, bool]] = {
 }
 
 
-def slider_groups(scenario: Scenario, state: State) -> list[Group]:
-    """The sliders of a scenario's worlds; they reach as far as the scenario draws, and as the state is."""
+def slider_groups(scenario: Scenario, state: State) -> list[dict[str, Any]]:
+    """The sliders of each quantity of a scenario's worlds, as the page takes them.
+
+    They reach as far as the scenario draws, and as the state is (``low``, ``high``); the numbers beside them reach to
+    ``most``. What is not ``usual`` opens when it is asked for.
+    """
     found = []
     for field, (title, low, high, step, usual) in _SLIDERS.items():
         if field not in state:
             continue
-        rule = _rules()[field]
+        rule = _RULES[field]
         values = state[field] if isinstance(state[field], list) else [state[field]]
         bounds = [] if field in OPTIONAL else scenario.bounds(field)
-        reach = max(high, *values, *(most for _, most in bounds))
-        unit = SYMBOLS.get(rule.unit, rule.unit).replace("2", "²")
-        names = tuple(_owner(rule, i) for i in range(rule.count(scenario.vehicles)))
-        least = min(low, *values, *(least for least, _ in bounds))
-        found.append(Group(field, title, unit, least, min(reach, rule.high), step, rule.high, names, usual))
+        number = range(1, rule.count(scenario.vehicles) + 1)
+        names = {"vehicle": [f"Vehicle {i}" for i in number], "pair": [f"{i} to {i + 1}" for i in number]}
+        found.append({
+            "field": field,
+            "title": title,
+            "unit": SYMBOLS.get(rule.unit, rule.unit).replace("2", "²"),
+            "low": min(low, *values, *(least for least, _ in bounds)),
+            "high": min(max(high, *values, *(most for _, most in bounds)), rule.high),
+            "step": step,
+            "most": rule.high,
+            "names": names.get(rule.per, [""]),
+            "usual": usual,
+        })  # fmt: skip
     return found
 
 
@@ -99,7 +97,7 @@ def read_state(given: object, scenario: Scenario) -> Worlds:
     """
     if not isinstance(given, Mapping):
         raise InvalidInput("world: must be an object such as {'gaps_m': [7, 7], ...}")
-    known = {**QUANTITIES, **OPTIONAL} if scenario.has_obstacle else QUANTITIES
+    known = _RULES if scenario.has_obstacle else QUANTITIES
     for key in given:
         if key not in known:
             hint = suggestion(str(key), known) or f"known: {', '.join(known)}"
@@ -124,37 +122,23 @@ def read_number(value: object, what: str) -> float:
     return float(value)
 
 
-def _rules() -> dict[str, QuantityRule]:
-    return {**QUANTITIES, **OPTIONAL}
-
-
-def _owner(rule: QuantityRule, index: int) -> str:
-    names = {"vehicle": f"Vehicle {index + 1}", "pair": f"{index + 1} to {index + 2}", "world": ""}
-    return names[rule.per]
-
-
 # A profile that somebody draws: commands of one vehicle on the grid of decisions, and the agent that drives it.
 
 MOST_COMMANDS = 2_000
 
 
-class Grid(NamedTuple):
-    """Where the commands of a profile fall, and which are possible."""
-
-    first_s: float
-    step_s: float
-    steps: int
-    low_mps2: float
-    high_mps2: float
-
-
-def decision_grid(world: Worlds, scenario: Scenario, vehicle: int) -> Grid:
-    """The decisions of a vehicle in one world (n = 1)."""
+def decision_grid(world: Worlds, scenario: Scenario, vehicle: int) -> dict[str, Any]:
+    """Where the commands of a profile of a vehicle fall in one world (n = 1), and which are possible."""
     first = first_decision_s(world, [vehicle])
-    steps = int(number_of_decisions(first, scenario.time_step_s, scenario.horizon_s)[0])
+    steps = number_of_decisions(first, scenario.time_step_s, scenario.horizon_s)
     v = world.vehicles
-    low, high = -float(v.braking_capacity_mps2[0, vehicle]), float(v.driving_capacity_mps2[0, vehicle])
-    return Grid(float(first[0]), scenario.time_step_s, steps, low, high)
+    return {
+        "first_s": float(first[0]),
+        "step_s": scenario.time_step_s,
+        "steps": int(steps[0]),
+        "low_mps2": -float(v.braking_capacity_mps2[0, vehicle]),
+        "high_mps2": float(v.driving_capacity_mps2[0, vehicle]),
+    }
 
 
 def read_profile(given: object) -> Floats:
@@ -238,7 +222,7 @@ class Explored:
             "outcomes": [outcome(name, motion) for name, motion in motions.items()],
             "verdict": self.verdict(world),
             "constant": self.best_constant(world),
-            "grid": decision_grid(world, self.scenario, self.vehicle)._asdict(),
+            "grid": decision_grid(world, self.scenario, self.vehicle),
         }
 
     def by_hand(self, profile: Floats) -> HandDriven:
@@ -277,7 +261,7 @@ class Explored:
 
     def commands_of(self, world: Worlds, agent: str) -> list[float]:
         """What an agent of the line-up commands in each decision (m/s2), to begin a profile from."""
-        steps = decision_grid(world, self.scenario, self.vehicle).steps
+        steps = decision_grid(world, self.scenario, self.vehicle)["steps"]
         driver = self.lineup[agent]
         assert not isinstance(driver, Team)  # refused at the beginning
         return _step_by_step(driven_profiles(driver, world, self.task, np.array([steps])))
@@ -297,7 +281,8 @@ class Explored:
             time_step_s=self.scenario.time_step_s,
             others_mps2=scripted_commands(world, self.task),
         )
-        given = self._starts(world, problem)
+        constant = np.full((1, 1, 1), -self.best_constant(world)["deceleration_mps2"])
+        given = constant_profiles(problem, np.concatenate([constant, even_grid(problem, CONSTANTS)], axis=1))
         used = 0
         while True:
             given = search_profiles(problem, given, budget=SLICE, seed=used // SLICE).profiles
@@ -314,11 +299,6 @@ class Explored:
             "by_hand": which == 1,
             "episode": played_episode(motions[which], (self.vehicle,)),
         }
-
-    def _starts(self, world: Worlds, problem: ProfileProblem) -> Profiles:
-        grid = even_grid(problem, CONSTANTS)
-        constant = self.best_constant(world)["deceleration_mps2"]
-        return constant_profiles(problem, np.concatenate([np.full((1, 1, 1), -constant), grid], axis=1))
 
 
 def outcome(name: str, motion: EpisodeMotion) -> dict[str, Any]:

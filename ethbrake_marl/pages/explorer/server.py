@@ -10,7 +10,7 @@ import os
 import re
 import secrets
 import socket
-from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from collections.abc import Awaitable, Callable, MutableMapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -42,11 +42,11 @@ from ethbrake_marl.pages.explorer.answer import (
 )
 from ethbrake_marl.pages.frame import Part, Section, data, page, page_policy, render, shown
 from ethbrake_marl.pages.player import live_player
-from ethbrake_marl.physics import Worlds
+from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.policies.bundle import Policy
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.initial_states import table_columns
-from ethbrake_marl.scenario.quantities import OTHERWISE
+from ethbrake_marl.scenario.fields import OTHERWISE
+from ethbrake_marl.scenario.sampling import table_columns
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 
 if TYPE_CHECKING:
@@ -137,14 +137,20 @@ class Guard:
             await send(message)
 
         status, why = self._refusal(scope)
-        if status:
-            await _tell(send_guarded, status, why)
-        else:
+        if not status:
             await self._app(scope, receive, send_guarded)
+            return
+        body = json.dumps({"error": why}).encode()
+        told = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+        await send_guarded({"type": "http.response.start", "status": status, "headers": told})
+        await send_guarded({"type": "http.response.body", "body": body})
 
     def _refusal(self, scope: Scope) -> tuple[int, str]:
         """Status and reason for a request that is not answered; 0 for one that is."""
-        hosts, origins, sites = (_values(scope, name) for name in (b"host", b"origin", b"sec-fetch-site"))
+        hosts, origins, sites = (
+            [value for key, value in scope["headers"] if key.lower() == name]
+            for name in (b"host", b"origin", b"sec-fetch-site")
+        )
         if len(hosts) != 1 or hosts[0] not in self._hosts:
             return 403, "another host; open the address that ethbrake printed"
         if len(origins) > 1 or any(origin != b"http://" + hosts[0] for origin in origins):
@@ -155,17 +161,6 @@ class Guard:
         if len(given) != 3 or given[0] or not secrets.compare_digest(given[1], self._token):
             return 403, "no token, or another one; open the address that ethbrake printed"
         return 0, ""
-
-
-def _values(scope: Scope, name: bytes) -> list[bytes]:
-    return [value for key, value in scope["headers"] if key.lower() == name]
-
-
-async def _tell(send: Send, status: int, why: str) -> None:
-    body = json.dumps({"error": why}).encode()
-    headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": body})
 
 
 # A thread that does one piece of work after another, of which only the newest is worth doing.
@@ -356,28 +351,22 @@ def _part(name: str, **values: object) -> Part:
 
 
 def _content(explored: Explored, state: State, world: int) -> dict[str, Any]:
-    groups = [group._asdict() for group in slider_groups(explored.scenario, state)]
     agents = list(explored.lineup)
+    learned = [
+        k for k, each in enumerate(explored.lineup.values()) if isinstance(getattr(each, "policy", None), Policy)
+    ]
     return {
-        "groups": groups,
+        "groups": slider_groups(explored.scenario, state),
         "state": state,
         "world": world,
         "agents": [shown(agent) for agent in agents],
         "named": agents,  # as the server knows them
-        "rival": _rival(explored),
+        "rival": [*learned, len(agents) - 1][0],  # whom to beat: the first agent that learned, else the last one
         "worst": agents.index("full_brake") if "full_brake" in agents else 0,
         "driven": [explored.vehicle],
         "vehicles": explored.scenario.vehicles,
         "harm_count": explored.harm_count,
     }
-
-
-def _rival(explored: Explored) -> int:
-    """Whom to beat: the first agent that learned, else the last one."""
-    for k, agent in enumerate(explored.lineup.values()):
-        if isinstance(getattr(agent, "policy", None), Policy):
-            return k
-    return len(explored.lineup) - 1
 
 
 MOST_BODY = 64 * 1024  # bytes of a question
@@ -388,7 +377,7 @@ _STOPS = 1  # s that questions get when the server ends
 _LAST_WORLD = 10**9
 
 Asked = dict[str, Any]
-Answer = Callable[[Asked], Awaitable[Any]]
+Answer = Callable[..., Awaitable[Any]]
 
 
 @dataclass(frozen=True)
@@ -412,7 +401,9 @@ def explorer_app(setting: Setting, token: str, port: int, *, warm_up: bool = Fal
     from starlette.responses import HTMLResponse
     from starlette.routing import Route
 
-    page = explorer_page(setting.explored, _first_state(setting), world=setting.world, seed=setting.seed)
+    state = state_of(_worlds(setting, setting.world))
+    read_state(state, setting.explored.scenario)  # refuses scenarios whose channel is drawn
+    page = explorer_page(setting.explored, state, world=setting.world, seed=setting.seed)
     policy = {"content-security-policy": f"{page.policy}; frame-ancestors 'none'"}
 
     async def show_page(request: Request) -> Response:
@@ -426,7 +417,7 @@ def explorer_app(setting: Setting, token: str, port: int, *, warm_up: bool = Fal
     if warm_up:
         answers.warm_up()
     routes = [Route("/{token}/", show_page, methods=["GET"])]
-    routes += [Route(f"/{{token}}/{name}", _asked(each), methods=["POST"]) for name, each in answers.by_name.items()]
+    routes += [Route(f"/{{token}}/{name}", each, methods=["POST"]) for name, each in answers.routes().items()]
     app = Starlette(routes=routes, exception_handlers={HTTPException: refuse})
     app.router.redirect_slashes = False
     return Guard(app, token, port)
@@ -438,13 +429,36 @@ class _Answers:
     def __init__(self, setting: Setting) -> None:
         self._setting, self._explored = setting, setting.explored
         self._drive, self._search, self._repeat = Worker("agents"), Worker("search"), Worker("profile")
-        self.by_name: dict[str, Answer] = {
-            "answer": self.answer, "best": self.best, "profile": self.profile, "world": self.world, "save": self.save,
-        }  # fmt: skip
+        self._questions: dict[str, tuple[Answer, tuple[str, ...]]] = {  # with what must be asked, and nothing else
+            "answer": (self.answer, ("world", "profile")),
+            "best": (self.best, ("world", "profile", "seconds")),
+            "profile": (self.profile, ("world", "agent")),
+            "world": (self.world, ("number",)),
+            "save": (self.save, ("world", "name", "kind")),
+        }
 
-    @property
-    def scenario(self) -> Scenario:
-        return self._explored.scenario
+    def routes(self) -> dict[str, Callable[[Request], Awaitable[Response]]]:
+        """What answers each question: it is read, and whatever is wrong becomes one line of JSON."""
+        return {name: partial(self._reply_to, *question) for name, question in self._questions.items()}
+
+    async def _reply_to(self, answer: Answer, keys: tuple[str, ...], request: Request) -> Response:
+        try:
+            asked = await _read(request)
+            for key in asked:
+                if key not in keys:
+                    raise InvalidInput(f"unknown key {key!r:.60}; known: {', '.join(keys)}")
+            if missing := [key for key in keys if key not in asked]:
+                raise InvalidInput(f"{missing[0]} is missing")
+            if "world" in asked:
+                asked["world"] = read_state(asked["world"], self._explored.scenario)
+            if "profile" in asked:
+                asked["profile"] = read_profile(asked["profile"])
+            return _reply(await answer(**asked))
+        except Superseded:
+            return _reply({"error": "a newer question came first", "superseded": True}, HTTPStatus.CONFLICT)
+        except Exception as error:  # a defect of ours: told, and the server lives on
+            status, told = next((status, told) for kind, status, told in _FAULTS if isinstance(error, kind))
+            return _reply({"error": told(error)}, status)
 
     def warm_up(self) -> None:
         """Begin with the first world, before anybody asks."""
@@ -452,72 +466,47 @@ class _Answers:
         self._drive.start(lambda: self._explored.answer(world, profile))
         self._search.start(lambda: self._explored.search(world, profile, 0.0, lambda: True))
 
-    async def answer(self, asked: Asked) -> Any:
+    async def answer(self, world: Worlds, profile: Floats) -> Any:
         """Every agent in this world."""
-        _check_keys(asked, ("world", "profile"))
-        world, profile = read_state(asked["world"], self.scenario), read_profile(asked["profile"])
         return await self._drive.newest(partial(self._explored.answer, world, profile))
 
-    async def best(self, asked: Asked) -> Any:
+    async def best(self, world: Worlds, profile: Floats, seconds: object) -> Any:
         """The best profile of a short search."""
-        _check_keys(asked, ("world", "profile", "seconds"))
-        seconds = read_number(asked["seconds"], "seconds")
+        seconds = read_number(seconds, "seconds")
         if not 0.0 <= seconds <= MOST_SECONDS:
             raise InvalidInput(f"seconds = {seconds:g}: must be 0 to {MOST_SECONDS:g}")
-        world, profile = read_state(asked["world"], self.scenario), read_profile(asked["profile"])
-        stop = self._search.is_wanted
-        return await self._search.newest(partial(self._explored.search, world, profile, seconds, stop))
+        work = partial(self._explored.search, world, profile, seconds, self._search.is_wanted)
+        return await self._search.newest(work)
 
-    async def profile(self, asked: Asked) -> Any:
+    async def profile(self, world: Worlds, agent: object) -> Any:
         """What an agent commands, decision by decision."""
-        _check_keys(asked, ("world", "agent"))
-        agent = asked["agent"]
         if not isinstance(agent, str) or agent not in self._explored.lineup:
             raise InvalidInput(f"agent {agent!r:.80}: is not one of those that are shown")
-        work = partial(self._explored.commands_of, read_state(asked["world"], self.scenario), agent)
-        return {"commands": await self._repeat.newest(work)}
+        return {"commands": await self._repeat.newest(partial(self._explored.commands_of, world, agent))}
 
-    async def world(self, asked: Asked) -> Any:
+    async def world(self, number: Any) -> Any:
         """A world of the scenario's list."""
-        _check_keys(asked, ("number",))
-        check_whole_number("number", asked["number"], 0, _LAST_WORLD)
-        drawn = await asyncio.to_thread(_worlds, self._setting, asked["number"])
-        return {"world": state_of(drawn)}
+        check_whole_number("number", number, 0, _LAST_WORLD)
+        return {"world": state_of(await asyncio.to_thread(_worlds, self._setting, number))}
 
-    async def save(self, asked: Asked) -> Any:
+    async def save(self, world: Worlds, name: object, kind: object) -> Any:
         """The state as a new file."""
-        _check_keys(asked, ("world", "name", "kind"))
-        world = read_state(asked["world"], self.scenario)
-        name, kind, folder = asked["name"], asked["kind"], self._setting.folder
-        return {"file": await asyncio.to_thread(save_state, folder, name, kind, world, self.scenario)}
-
-
-def _asked(answer: Answer) -> Callable[[Request], Awaitable[Response]]:
-    """What answers a question: it is read, and whatever is wrong becomes one line of JSON."""
-
-    async def reply(request: Request) -> Response:
-        try:
-            return _reply(await answer(await _read(request)))
-        except Superseded:
-            return _reply({"error": "a newer question came first", "superseded": True}, HTTPStatus.CONFLICT)
-        except _TooLarge:
-            return _reply({"error": f"more than {MOST_BODY} bytes"}, HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-        except TimeoutError:
-            return _reply({"error": "the question did not come to its end"}, HTTPStatus.REQUEST_TIMEOUT)
-        except PhysicsError as error:
-            return _reply({"error": f"a defect of the physics: {error}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
-        except EthBrakeError as error:
-            return _reply({"error": str(error)}, HTTPStatus.BAD_REQUEST)
-        except OSError as error:
-            return _reply({"error": f"cannot be written: {error.strerror or error}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
-        except Exception as error:  # a defect of ours: told, and the server lives on
-            return _reply({"error": f"a defect: {one_line(describe_error(error))}"}, HTTPStatus.INTERNAL_SERVER_ERROR)
-
-    return reply
+        scenario, folder = self._explored.scenario, self._setting.folder
+        return {"file": await asyncio.to_thread(save_state, folder, name, kind, world, scenario)}
 
 
 class _TooLarge(Exception):  # becomes an answer
     """More bytes than a question may have."""
+
+
+_FAULTS: tuple[tuple[type[Exception], HTTPStatus, Callable[[Any], str]], ...] = (  # the first that fits
+    (_TooLarge, HTTPStatus.REQUEST_ENTITY_TOO_LARGE, lambda error: f"more than {MOST_BODY} bytes"),
+    (TimeoutError, HTTPStatus.REQUEST_TIMEOUT, lambda error: "the question did not come to its end"),
+    (PhysicsError, HTTPStatus.INTERNAL_SERVER_ERROR, lambda error: f"a defect of the physics: {error}"),
+    (EthBrakeError, HTTPStatus.BAD_REQUEST, str),
+    (OSError, HTTPStatus.INTERNAL_SERVER_ERROR, lambda error: f"cannot be written: {error.strerror or error}"),
+    (Exception, HTTPStatus.INTERNAL_SERVER_ERROR, lambda error: f"a defect: {one_line(describe_error(error))}"),
+)
 
 
 async def _read(request: Request) -> Asked:
@@ -540,14 +529,6 @@ async def _read(request: Request) -> Asked:
     return asked
 
 
-def _check_keys(asked: Mapping[str, Any], keys: tuple[str, ...]) -> None:
-    for key in asked:
-        if key not in keys:
-            raise InvalidInput(f"unknown key {key!r:.60}; known: {', '.join(keys)}")
-    if missing := [key for key in keys if key not in asked]:
-        raise InvalidInput(f"{missing[0]} is missing")
-
-
 def _reply(content: object, status: int = HTTPStatus.OK) -> Response:
     from starlette.responses import JSONResponse
 
@@ -556,13 +537,6 @@ def _reply(content: object, status: int = HTTPStatus.OK) -> Response:
 
 def _worlds(setting: Setting, number: int) -> Any:
     return setting.explored.scenario.sample(1, setting.seed, first=number).worlds
-
-
-def _first_state(setting: Setting) -> dict[str, Any]:
-    """The state that the page begins with; reading it back refuses scenarios whose channel is drawn."""
-    state = state_of(_worlds(setting, setting.world))
-    read_state(state, setting.explored.scenario)
-    return state
 
 
 def serve_explorer(setting: Setting, port: int, ready: Callable[[str], None]) -> None:

@@ -1,18 +1,22 @@
-"""The folder of a reproduction: its settings, and for each item its result, figures and data, each written whole."""
+"""The folder of a reproduction: its settings, and for each item its result, figures and data, each written whole.
+
+``ITEMS`` is the one table of what can be made; ``reproduce`` makes items and writes a folder and its page;
+``write_docs`` shows the folder as Markdown.
+"""
 
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import re
 import textwrap
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -39,40 +43,38 @@ from ethbrake_marl.pages.frame import (
 )
 from ethbrake_marl.pages.player import player_of
 from ethbrake_marl.pages.vector import kept_drawing
-from ethbrake_marl.studies.reproduction.gaps import reproduce_gaps
 from ethbrake_marl.studies.reproduction.item import (
-    FULL,
     MOST_EPISODES,
-    OUTCOMES,
     TOLERANCE,
     WIDE,
     Item,
     Made,
+    Result,
     Settings,
+    Table,
     Verdict,
     summarise_verdicts,
 )
-from ethbrake_marl.studies.reproduction.tables import (
+from ethbrake_marl.studies.reproduction.lists import (
+    reproduce_delays,
+    reproduce_distance,
+    reproduce_gaps,
     reproduce_hybrid_table,
     reproduce_illustration,
     reproduce_random_table,
 )
 from ethbrake_marl.studies.reproduction.trainings import (
     CURVES,
+    HIGH,
+    LOW,
     OPEN,
     STOPPED,
-    reproduce_high,
-    reproduce_low,
+    reproduce_curves,
     seconds_left,
     train_groups,
     trained_names,
 )
-from ethbrake_marl.studies.reproduction.two_scenarios import (
-    reproduce_accelerations,
-    reproduce_delays,
-    reproduce_distance,
-    reproduce_trajectories,
-)
+from ethbrake_marl.studies.reproduction.two_scenarios import reproduce_accelerations, reproduce_trajectories
 
 # The episodes that an item lets one watch: kept beside its result as plain data, and read again with suspicion.
 
@@ -116,19 +118,26 @@ class _Content(_Plain):
     shown: Annotated[list[_Index], Field(min_length=1)]
     worlds: Annotated[list[_World], Field(min_length=1)]
 
-
-def keep_episodes(folder: Path, content: Mapping[str, Any] | None) -> None:
-    """Write what ``player_content`` gave into the folder of an item; None: what was there is deleted."""
-    if content is None:
-        (folder / EPISODES).unlink(missing_ok=True)
-    else:
-        write_output(folder / EPISODES, json.dumps(content, allow_nan=False).encode(), force=True)
+    @property
+    def fits(self) -> bool:
+        """Whether every world has an episode of every agent, whole pieces in each."""
+        width, episodes = 8 * (1 + 3 * self.vehicles), [each for world in self.worlds for each in world.episodes]
+        try:
+            sizes = [len(base64.b64decode(episode.pieces, validate=True)) for episode in episodes]
+        except ValueError:
+            return False
+        return (
+            all(k < len(self.agents) for k in self.shown)
+            and all(len(world.episodes) == len(self.agents) for world in self.worlds)
+            and all(size > 0 and size % width == 0 for size in sizes)
+            and all(i < self.vehicles for episode in episodes for i in episode.driven)
+        )
 
 
 def kept_player(folder: Path) -> Part | None:
-    """The player of the episodes that were kept; None where there are none.
+    """The player of the episodes that are kept in the folder of an item; None where there are none.
 
-    Raises ``InvalidInput`` for a file that does not hold what ``keep_episodes`` writes.
+    Raises ``InvalidInput`` for a file that does not hold what an item gives.
     """
     file = folder / EPISODES
     if not file.is_file():
@@ -137,28 +146,10 @@ def kept_player(folder: Path) -> Part | None:
         content = _Content.model_validate_json(read_plain(file, _EPISODE_LIMIT_BYTES))
     except ValidationError as error:
         where = ".".join(map(str, error.errors()[0]["loc"])) or "no JSON"
-        raise _damaged_episode(file, where) from None
-    if not _fits(content):
-        raise _damaged_episode(file, "worlds")
+        raise _damaged(file, shown(where)) from None
+    if not content.fits:
+        raise _damaged(file, "worlds")
     return player_of(_as_text(content.model_dump()))
-
-
-def _fits(content: _Content) -> bool:
-    """Whether every world has an episode of every agent, whole pieces in each."""
-    agents, width = len(content.agents), 8 * (1 + 3 * content.vehicles)
-    if not all(k < agents for k in content.shown):
-        return False
-    for world in content.worlds:
-        if len(world.episodes) != agents:
-            return False
-        for episode in world.episodes:
-            try:
-                size = len(base64.b64decode(episode.pieces, validate=True))
-            except (binascii.Error, ValueError):
-                return False
-            if not size or size % width or not all(i < content.vehicles for i in episode.driven):
-                return False
-    return True
 
 
 def _as_text(value: Any) -> Any:
@@ -170,8 +161,8 @@ def _as_text(value: Any) -> Any:
     return shown(value) if isinstance(value, str) else value
 
 
-def _damaged_episode(file: Path, where: str) -> InvalidInput:
-    return InvalidInput(f"{file}: {shown(where)}: is not what a reproduction writes; make it again (--force)")
+def _damaged(file: Path | str, where: str) -> InvalidInput:
+    return InvalidInput(f"{file}: {where}: is not what a reproduction writes; make it again (--force)")
 
 
 # The table of everything that ``ethbrake reproduce`` makes: one entry per figure and table of the paper.
@@ -184,7 +175,7 @@ ITEMS = (
         ("fig:ppo_sac_high_latency",),
         "Learning curves at high delay",
         "Returns of PPO and SAC in training under large communication delays.",
-        reproduce_high,
+        partial(reproduce_curves, HIGH),
         10,
         _CURVES,
     ),
@@ -193,7 +184,7 @@ ITEMS = (
         ("fig:ppo_sac_low_latency",),
         "Learning curves at low delay",
         "Returns of PPO and SAC in training under small communication delays.",
-        reproduce_low,
+        partial(reproduce_curves, LOW),
         10,
         _CURVES,
     ),
@@ -281,336 +272,102 @@ def choose_items(names: Sequence[str]) -> list[Item]:
     return [item for item in ITEMS if not names or item.name in names]
 
 
-Json = dict[str, Any]
+# The folder: ``reproduction.json`` says what was asked for, ``index.html`` shows everything, each item has a folder.
 
-SETTINGS, RESULT, PAGE = "reproduction.json", "result.json", "index.html"
-ENDINGS = (".svg", ".png")
+PAGE = "index.html"
+_SETTINGS, _RESULT = "reproduction.json", "result.json"
 _FORMAT = {"format": "ethbrake-reproduction", "format_version": 1}
-_STEM = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _LIMIT_BYTES = 16 << 20  # of a figure that is read again
 
 
-@dataclass(frozen=True, slots=True)
-class ReproductionFolder:
-    """Names inside the folder."""
-
-    path: Path
-
-    @property
-    def settings(self) -> Path:
-        """What was asked for."""
-        return self.path / SETTINGS
-
-    @property
-    def page(self) -> Path:
-        """The page of everything."""
-        return self.path / PAGE
-
-    def result(self, name: str) -> Path:
-        """What became of an item."""
-        return self.path / name / RESULT
-
-    def figure(self, name: str, stem: str, ending: str) -> Path:
-        """A figure of an item; raises ``InvalidInput`` for a stem that is no plain name."""
-        return self.path / name / f"{checked_stem(stem)}{ending}"
-
-
-def checked_stem(stem: str) -> str:
-    """The same name of a figure; raises ``InvalidInput`` for one that is no plain name."""
-    if not _STEM.fullmatch(stem):
-        raise InvalidInput(f"figure {stem!r:.60}: must be small letters, digits and -")
-    return stem
-
-
-def open_folder(settings: Settings, *, force: bool = False) -> ReproductionFolder:
+def open_folder(settings: Settings, *, force: bool = False) -> None:
     """Make the folder, or go on in it.
 
     Raises ``InvalidInput`` for one that cannot be made or written to; ``AlreadyExists`` for one that holds something
     else, or a reproduction with other settings, unless ``force``, which replaces its results and keeps its trainings.
     """
-    folder, wanted = ReproductionFolder(settings.folder), _wanted(settings)
-    if folder.path.is_symlink() or (folder.path.exists() and not folder.path.is_dir()):
-        raise InvalidInput(f"{folder.path}: is no plain folder; give another (--output)")
-    if folder.settings.is_file():
-        kept = read_object(folder.settings)
+    folder, wanted = settings.folder, {"episodes": settings.episodes, "version": __version__}
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise InvalidInput(f"{folder}: is no plain folder; give another (--output)")
+    if (folder / _SETTINGS).is_file():
+        kept = read_object(folder / _SETTINGS)
         if kept.get("format") != _FORMAT["format"]:
-            raise AlreadyExists(f"{folder.settings}: is not of a reproduction; give another folder (--output)")
+            raise AlreadyExists(f"{folder / _SETTINGS}: is not of a reproduction; give another folder (--output)")
         other = [
             f"{name} {kept.get(name)!s:.40}, here {value}" for name, value in wanted.items() if kept.get(name) != value
         ]
         if other and not force:
             raise AlreadyExists(
-                f"{folder.path}: holds a reproduction with other settings ({'; '.join(other)}); give another folder"
+                f"{folder}: holds a reproduction with other settings ({'; '.join(other)}); give another folder"
                 " (--output), or replace it with force (--force)"
             )
-    elif folder.path.is_dir() and any(each.name != "trainings" for each in folder.path.iterdir()):
-        raise AlreadyExists(f"{folder.path}: is there already and holds no reproduction; give another (--output)")
+    elif folder.is_dir() and any(each.name != "trainings" for each in folder.iterdir()):
+        raise AlreadyExists(f"{folder}: is there already and holds no reproduction; give another (--output)")
     try:
-        folder.path.mkdir(parents=True, exist_ok=True)
-        check_writable(folder.path)
+        folder.mkdir(parents=True, exist_ok=True)
+        check_writable(folder)
     except OSError as error:
-        raise InvalidInput(f"{folder.path}: cannot be written to ({error.strerror}); give another (--output)") from None
+        raise InvalidInput(f"{folder}: cannot be written to ({error.strerror}); give another (--output)") from None
     if force:
-        _forget(folder)
-    write_file(folder.settings, _text({**_FORMAT, **wanted}))
-    return folder
-
-
-def _wanted(settings: Settings) -> Json:
-    """What every result in a folder shares; the trainings behind a result stand in it."""
-    return {"episodes": settings.episodes, "version": __version__}
-
-
-def _forget(folder: ReproductionFolder) -> None:
-    """Delete every result; figures and data are replaced as they are made again."""
-    for item in ITEMS:
-        folder.result(item.name).unlink(missing_ok=True)
-
-
-def write_item(folder: ReproductionFolder, item: Item, made: Made, more: Mapping[str, Any]) -> Json:
-    """Write figures and data of an item, then its result, which makes them count; gives the result."""
-    place = folder.path / item.name
-    if place.is_symlink() or (place.exists() and not place.is_dir()):
-        raise InvalidInput(f"{place}: is no plain folder; move it away")
-    place.mkdir(exist_ok=True)
-    for drawn in made.figures:
-        for ending in ENDINGS:
-            file = folder.figure(item.name, drawn.stem, ending)
-            write_output(file, picture_bytes(drawn.figure, file), force=True)
-    for stem, text in (made.data or {}).items():
-        write_output(place / f"{stem}.csv", text.encode(), force=True)
-    keep_episodes(place, made.episodes)
-    result = item_json(item, made, more)
-    write_output(folder.result(item.name), _text(result), force=True)
-    return result
-
-
-def item_json(item: Item, made: Made, more: Mapping[str, Any]) -> Json:
-    """An item and what became of it as plain data."""
-    return {
-        "name": item.name,
-        "labels": list(item.labels),
-        "title": item.title,
-        "what": item.what,
-        **more,
-        "verdict": made.verdict.to_json(),
-        "comparisons": [verdict.to_json() for verdict in made.verdicts],
-        "parameters": [{"name": p.name, "value": p.value, "origin": p.origin} for p in made.parameters],
-        "tables": [table.to_json() for table in made.tables],
-        "figures": [{"stem": each.stem, "title": each.title, "text": each.text} for each in made.figures],
-        "data": sorted(f"{stem}.csv" for stem in made.data or {}),
-        "notes": list(made.notes),
-    }
-
-
-def read_results(folder: ReproductionFolder) -> list[Json]:
-    """The results that are there, in the order of the paper; raises ``InvalidInput`` for one that is damaged."""
-    return [read_result(folder, item) for item in ITEMS if folder.result(item.name).is_file()]
-
-
-def read_result(folder: ReproductionFolder, item: Item) -> Json:
-    """The result of an item that was made; raises ``InvalidInput`` for one that is damaged, or another item's."""
-    file = folder.result(item.name)
-    content = checked_result(read_object(file), str(file))
-    if content["name"] != item.name:
-        raise _damaged(f"{file}: name")
-    if any(Path(name).name != name for name in content["data"]):
-        raise _damaged(f"{file}: data")
-    compared = [Verdict(**each) for each in content["comparisons"]]
-    if any(each.outcome not in OUTCOMES for each in compared):
-        raise _damaged(f"{file}: comparisons")
-    if content["verdict"] != summarise_verdicts(compared).to_json():
-        raise _damaged(f"{file}: verdict")
-    if type(content.get("episodes", 2)) is not int:
-        raise _damaged(f"{file}: episodes")
-    return content
-
-
-_TEXT, _TEXTS, _ROWS = TypeAdapter(str), TypeAdapter(list[str]), TypeAdapter(list[list[str]])
-_VERDICT = {"what": _TEXT, "outcome": _TEXT, "because": _TEXT}
-_PARTS: dict[str, dict[str, TypeAdapter[Any]]] = {  # of a result, each a list of such objects
-    "comparisons": _VERDICT,
-    "parameters": {"name": _TEXT, "value": _TEXT, "origin": _TEXT},
-    "tables": {"title": _TEXT, "head": _TEXTS, "rows": _ROWS, "note": _TEXT},
-    "figures": {"stem": _TEXT, "title": _TEXT, "text": _TEXT},
-}
-_WHOLE: dict[str, TypeAdapter[Any]] = {
-    **dict.fromkeys(("name", "title", "what", "made_utc", "machine"), _TEXT),
-    **dict.fromkeys(("labels", "data", "notes", "trained"), _TEXTS),
-    "processor_s": TypeAdapter(float),
-    "verdict": TypeAdapter(dict[str, str]),
-    **dict.fromkeys(_PARTS, TypeAdapter(list[dict[str, Any]])),
-}
-
-
-def checked_result(content: Json, where: str) -> Json:
-    """The same result; raises ``InvalidInput`` where what pages show is not there or of another kind."""
-    _check_keys(content, _WHOLE, where)
-    _check_keys(content["verdict"], _VERDICT, f"{where}: verdict")
-    for name, keys in _PARTS.items():
-        for each in content[name]:
-            _check_keys(each, keys, f"{where}: {name}")
-    for each in content["tables"]:
-        if {len(row) for row in each["rows"]} - {len(each["head"])} or not each["head"]:
-            raise _damaged(f"{where}: tables: rows")
-    return content
-
-
-def _check_keys(content: Json, keys: Mapping[str, TypeAdapter[Any]], where: str) -> None:
-    for key, kind in keys.items():
-        try:
-            kind.validate_python(content.get(key), strict=True)
-        except ValidationError:
-            raise _damaged(f"{where}: {key}") from None
-
-
-def _damaged(where: str) -> InvalidInput:
-    return InvalidInput(f"{where}: is not what a reproduction writes; make it again (--force)")
-
-
-def read_figure(folder: ReproductionFolder, name: str, stem: str, ending: str) -> bytes:
-    """A figure that was written; raises ``InvalidInput`` where it is not there."""
-    return read_plain(folder.figure(name, stem, ending), _LIMIT_BYTES)
+        for item in ITEMS:  # figures and data are replaced as they are made again
+            (folder / item.name / _RESULT).unlink(missing_ok=True)
+    write_file(folder / _SETTINGS, _text({**_FORMAT, **wanted}))
 
 
 def _text(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
-# The page of a reproduction: one HTML file that holds its figures and loads nothing from anywhere.
+def _write_item(place: Path, made: Made, result: Result) -> None:
+    """Write figures and data of an item, then its result, which makes them count."""
+    if place.is_symlink() or (place.exists() and not place.is_dir()):
+        raise InvalidInput(f"{place}: is no plain folder; move it away")
+    place.mkdir(exist_ok=True)
+    for drawn, figure in made.figures.items():
+        for ending in (".svg", ".png"):
+            file = place / f"{drawn.stem}{ending}"
+            write_output(file, picture_bytes(figure, file), force=True)
+    for stem, text in made.data.items():
+        write_output(place / f"{stem}.csv", text.encode(), force=True)
+    (place / EPISODES).unlink(missing_ok=True)
+    if made.episodes is not None:
+        write_output(place / EPISODES, json.dumps(made.episodes, allow_nan=False).encode(), force=True)
+    write_output(place / _RESULT, _text(asdict(result)), force=True)
 
-TITLE = "The paper, made again"
-_LEAD = (
-    " of How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning, with the"
-    " paper's numbers and statements. Every verdict is computed: a number agrees where it is within the chance between"
-    f" two lists of worlds or {100.0 * TOLERANCE:g} % of what is printed, is undecided where that chance alone makes"
-    f" more than {100.0 * WIDE:g} %, and cannot agree where a bound that holds for every strategy excludes it."
-    " Statements are those of the paper's text; its figures hold no printed numbers."
-)
-_OVERVIEW = "Overview"
-_LOAD = r", load [0-9.]+"  # of the machine, which differs from item to item
-_INTERVAL = re.compile(r"(.*) \[([^][]*)\]")
-_NUMBER = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
+def read_results(folder: Path) -> list[Result]:
+    """The results that are there, in the order of the paper.
 
-def render_page(folder: ReproductionFolder, results: Sequence[Json]) -> str:
-    """The page as HTML; whatever the results say is shown as text.
-
-    Raises ``InvalidInput`` for a figure that is not there or holds more than a figure of ours does.
+    Raises ``InvalidInput`` for one that is damaged, or another item's.
     """
-    _, *names = anchors([_OVERVIEW, *(result["title"] for result in results)])
-    rows = [
-        [Markup('<a href="#{}">{}</a>').format(name, shown(result["title"])), _verdict(result["verdict"])]
-        for name, result in zip(names, results, strict=True)
-    ]
-    told = Markup("<p>Made by <code>{}</code> ({}).</p>\n").format(shown(command_of(results)), shown(made_in(results)))
-    few = [paragraph(text, "note") for text in (few_worlds(results),) if text]
-    body = [Part(told), *few, table(["Item", "Verdict"], rows, caption="Verdict on each item")]
-    sections = [Section(_OVERVIEW, body), *(_section(folder, result) for result in results)]
-    return page(TITLE, sections, lead=lead_of(results))
+    return [result for item in ITEMS if (result := _read_result(folder, item)) is not None]
 
 
-def lead_of(results: Sequence[Json]) -> str:
-    """What a page of these results is about."""
-    if len(results) == len(ITEMS):
-        return f"Every figure and table{_LEAD}"
-    return f"{len(results)} of the {len(ITEMS)} items{_LEAD}"
+def _read_result(folder: Path, item: Item) -> Result | None:
+    file = folder / item.name / _RESULT
+    if not file.is_file():
+        return None
+    result = checked_result(read_object(file), file)
+    if result.name != item.name:
+        raise _damaged(file, "name")
+    return result
 
 
-def command_of(results: Sequence[Json]) -> str:
-    """The command that makes these results."""
-    names = [] if len(results) == len(ITEMS) else [result["name"] for result in results]
-    full = any(result.get("mode") == FULL for result in results)
-    most = _most_worlds(results)
-    few = [] if most is None else ["--episodes", str(most)]
-    return " ".join(["ethbrake reproduce", *names, "--full" if full else "--quick", *few])
-
-
-def made_in(results: Sequence[Json]) -> str:
-    """Dates, machines with versions, and processor time of these results."""
-    machines = (f"{each['made_utc'][:10]}, {re.sub(_LOAD, '', each['machine'])}" for each in results)
-    seconds = sum(each["processor_s"] for each in results)
-    return f"{'; '.join(dict.fromkeys(machines))}; {seconds:.0f} s of one core without the trainings"
-
-
-def few_worlds(results: Sequence[Json]) -> str:
-    """That lists are shorter than the paper's, as a sentence; empty where they are not, or where nobody noted it."""
-    most = _most_worlds(results)
-    return (
-        ""
-        if most is None
-        else f"At most {most:,} worlds of each list are driven here; the paper has {MOST_EPISODES:,}."
-    )
-
-
-def _most_worlds(results: Sequence[Json]) -> int | None:
-    """The most worlds of any list, where that is fewer than the paper's."""
-    most = max((result.get("episodes", MOST_EPISODES) for result in results), default=MOST_EPISODES)
-    return most if most < MOST_EPISODES else None
-
-
-def _section(folder: ReproductionFolder, result: Json) -> Section:
-    body: list[str | Part] = [result["what"], _account(result), *result["notes"]]
-    body += [_figure(folder, result["name"], each) for each in result["figures"]]
-    played = kept_player(folder.path / result["name"])
-    body += [heading("Episodes"), played] if played else []
-    for each in result["tables"]:
-        body.append(table(each["head"], _rows(each["rows"]), caption=each["title"]))
-        body += [paragraph(each["note"], "quiet")] if each["note"] else []
-    compared = [[each["what"], _verdict(each)] for each in result["comparisons"]]
-    comparisons = table(["What", "Verdict"], compared, caption="Comparisons with the paper")
-    body.append(opened(f"Comparisons: {len(compared)}", [comparisons]))
-    rows = [[p["name"], Cell(p["value"], words=True), Cell(p["origin"], words=True)] for p in result["parameters"]]
-    parameters = table(["Parameter", "Value", "Origin"], rows, caption="What shapes the item")
-    body.append(opened(f"Parameters: {len(rows)}", [parameters]))
-    return Section(result["title"], body)
-
-
-def _account(result: Json) -> Part:
-    """Verdict, labels of the paper, and where the data are."""
-    code, link = Markup("<code>{}</code>"), Markup('<a href="./{}/{}">{}</a>')
-    labels = [code.format(shown(label)) for label in result["labels"]]
-    name = result["name"]
-    data = [link.format(quote(name, ""), quote(file, ""), shown(f"{name}/{file}")) for file in result["data"]]
-    found = {
-        "Verdict": _outcome(result["verdict"]["outcome"]),
-        "Because": result["verdict"]["because"],
-        "In the paper's source": Markup(", ").join(labels),
-        "Data": Markup(", ").join(data),
-    }
-    return facts({name: value for name, value in found.items() if value})
-
-
-def _figure(folder: ReproductionFolder, name: str, each: Json) -> Part:
-    svg = read_figure(folder, name, each["stem"], ".svg")
-    return kept_drawing(svg, each["title"], each["text"], str(folder.figure(name, each["stem"], ".svg")))
-
-
-def _verdict(verdict: Json) -> Cell:
-    """The outcome, and the numbers that it follows from below it."""
-    return Cell(_outcome(verdict["outcome"]), verdict["because"], words=True)
-
-
-def _outcome(outcome: str) -> Markup:
-    """The word of a verdict, with a sign and a colour where it is one of ours."""
-    kind = outcome.replace(" ", "-") if outcome in OUTCOMES else ""
-    return Markup('<span class="outcome {}">{}</span>').format(kind, shown(outcome))
-
-
-def _rows(rows: Sequence[Sequence[str]]) -> list[list[str | Cell]]:
-    """Rows of a page's table: intervals below their values, and columns of more than numbers as words."""
-    split = [[_cell(text) for text in row] for row in rows]
-    words = [not all(_NUMBER.fullmatch(str(cell.value)) for cell in column) for column in zip(*split, strict=True)]
-    return [
-        [row[0], *(cell._replace(words=wordy) for cell, wordy in zip(cells[1:], words[1:], strict=True))]
-        for row, cells in zip(rows, split, strict=True)
-    ]
-
-
-def _cell(text: str) -> Cell:
-    """A value, and its interval below it."""
-    match = _INTERVAL.fullmatch(text)
-    return Cell(match[1], match[2]) if match else Cell(text)
+def checked_result(content: Mapping[str, Any], where: Path | str) -> Result:
+    """The result in a file; raises ``InvalidInput`` where what pages show is not there or of another kind."""
+    try:
+        result = TypeAdapter(Result).validate_json(json.dumps(content))
+    except ValidationError as error:
+        raise _damaged(where, ": ".join(map(str, error.errors()[0]["loc"]))) from None
+    if any(Path(name).name != name for name in result.data):
+        raise _damaged(where, "data")
+    if any(
+        not table.head or len(row) != len(table.head) for table in result.tables for row in [table.head, *table.rows]
+    ):
+        raise _damaged(where, "tables: rows")
+    if result.verdict != summarise_verdicts(result.comparisons):
+        raise _damaged(where, "verdict")
+    return result
 
 
 # A reproduction: train what is asked for, make item after item, and keep the page up to date as they are finished.
@@ -618,58 +375,166 @@ def _cell(text: str) -> Cell:
 
 def tell_cost(items: Sequence[Item], settings: Settings) -> str:
     """What is left to do and about how long it takes, in one line."""
-    wanted = _groups(items) if settings.mode == FULL else set()
+    wanted = {group for item in items for group in item.trained} if settings.mode == "full" else set()
     training_s = seconds_left(settings.folder, wanted)
     told = f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
     return f"{told}; trainings before them about {training_s / 60.0:.0f} min of one core" if wanted else told
 
 
-def reproduce(items: Sequence[Item], settings: Settings, *, force: bool = False) -> tuple[list[Json], bool]:
+def reproduce(items: Sequence[Item], settings: Settings, *, force: bool = False) -> tuple[list[Result], bool]:
     """Make the items; gives every result that the folder then holds, and whether nothing stopped the trainings.
 
     Items that need no training come first. One whose result is there, with the same trainings behind it, is kept. After
     each item the page is written anew. Ctrl-C during a training ends all trainings, and the items are made of those
     that are finished; a second one stops at once. Raises what ``open_folder`` raises.
     """
-    folder, finished = open_folder(settings, force=force), True
-    for item in sorted(items, key=lambda each: len(each.trained) if settings.mode == FULL else 0):
-        if settings.mode == FULL and finished:
+    open_folder(settings, force=force)
+    full, finished = settings.mode == "full", True
+    for item in sorted(items, key=lambda each: len(each.trained) if full else 0):
+        if full and finished:
             finished = train_groups(settings.folder, item.trained, settings.tell)
-        make_item(folder, item, settings)
-    return read_results(folder), finished
+        trained = trained_names(settings.folder, item.trained) if full else []
+        kept = _read_result(settings.folder, item)
+        if kept is None or list(kept.trained) != trained:
+            _make_item(item, settings, trained)
+            write_file(settings.folder / PAGE, render_page(settings.folder, read_results(settings.folder)).encode())
+    return read_results(settings.folder), finished
 
 
-def make_item(folder: ReproductionFolder, item: Item, settings: Settings) -> Json:
-    """Make one item, or keep it, and bring the page up to date."""
-    trained = trained_names(settings.folder, item.trained) if settings.mode == FULL else []
-    kept = _kept(folder, item, trained)
-    if kept is not None:
-        return kept
+def _make_item(item: Item, settings: Settings, trained: Sequence[str]) -> None:
     started = time.process_time()
     made = item.make(settings)
-    more = {
-        "mode": settings.mode,
-        "episodes": settings.episodes,
-        "trained": trained,
-        "processor_s": round(time.process_time() - started, 1),
-        "made_utc": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": settings.machine,
+    result = Result(
+        name=item.name,
+        labels=item.labels,
+        title=item.title,
+        what=item.what,
+        mode=settings.mode,
+        episodes=settings.episodes,
+        trained=trained,
+        processor_s=round(time.process_time() - started, 1),
+        made_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        machine=settings.machine,
+        verdict=summarise_verdicts(made.verdicts),
+        comparisons=made.verdicts,
+        parameters=made.parameters,
+        tables=made.tables,
+        figures=list(made.figures),
+        data=sorted(f"{stem}.csv" for stem in made.data),
+        notes=made.notes,
+    )
+    _write_item(settings.folder / item.name, made, result)
+
+
+# What every page of results tells.
+
+_TITLE = "The paper, made again"
+_LEAD = (
+    " of How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning, with the"
+    " paper's numbers and statements. Every verdict is computed: a number agrees where it is within the chance between"
+    f" two lists of worlds or {100.0 * TOLERANCE:g} % of what is printed, is undecided where that chance alone makes"
+    f" more than {100.0 * WIDE:g} %, and cannot agree where a bound that holds for every strategy excludes it."
+    " Statements are those of the paper's text; its figures hold no printed numbers."
+)
+_LOAD = r", load [0-9.]+"  # of the machine, which differs from item to item
+_NUMBER = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
+
+
+class _Account(NamedTuple):
+    """All results in a few sentences."""
+
+    lead: str  # what a page of them is about
+    command: str  # that makes them
+    made: str  # dates, machines with versions, and processor time
+    few: str  # that lists are shorter than the paper's; empty where they are not
+
+    @classmethod
+    def of(cls, results: Sequence[Result]) -> _Account:
+        """Of these results."""
+        every = len(results) == len(ITEMS)
+        most = max((result.episodes for result in results), default=MOST_EPISODES)
+        names = [] if every else [result.name for result in results]
+        mode = "--full" if any(result.mode == "full" for result in results) else "--quick"
+        fewer = ["--episodes", str(most)] if most < MOST_EPISODES else []
+        machines = (f"{each.made_utc[:10]}, {re.sub(_LOAD, '', each.machine)}" for each in results)
+        seconds = sum(each.processor_s for each in results)
+        few = f"At most {most:,} worlds of each list are driven here; the paper has {MOST_EPISODES:,}."
+        return cls(
+            f"Every figure and table{_LEAD}" if every else f"{len(results)} of the {len(ITEMS)} items{_LEAD}",
+            " ".join(["ethbrake reproduce", *names, mode, *fewer]),
+            f"{'; '.join(dict.fromkeys(machines))}; {seconds:.0f} s of one core without the trainings",
+            few if fewer else "",
+        )
+
+
+# The page of a reproduction: one HTML file that holds its figures and loads nothing from anywhere.
+
+
+def render_page(folder: Path, results: Sequence[Result]) -> str:
+    """The page as HTML; whatever the results say is shown as text.
+
+    Raises ``InvalidInput`` for a figure that is not there or holds more than a figure of ours does.
+    """
+    account, (_, *names) = _Account.of(results), anchors(["Overview", *(result.title for result in results)])
+    rows = [
+        [Markup('<a href="#{}">{}</a>').format(name, shown(result.title)), _told(result.verdict)]
+        for name, result in zip(names, results, strict=True)
+    ]
+    told = Markup("<p>Made by <code>{}</code> ({}).</p>\n").format(shown(account.command), shown(account.made))
+    few = [paragraph(account.few, "note")] if account.few else []
+    overview = Section("Overview", [Part(told), *few, table(["Item", "Verdict"], rows, caption="Verdict on each item")])
+    return page(_TITLE, [overview, *(_section(folder / each.name, each) for each in results)], lead=account.lead)
+
+
+def _section(place: Path, result: Result) -> Section:
+    code, link = Markup("<code>{}</code>"), Markup('<a href="./{}/{}">{}</a>')
+    data = [
+        link.format(quote(result.name, ""), quote(file, ""), shown(f"{result.name}/{file}")) for file in result.data
+    ]
+    account = {
+        "Verdict": _outcome(result.verdict),
+        "Because": result.verdict.because,
+        "In the paper's source": Markup(", ").join(code.format(shown(label)) for label in result.labels),
+        "Data": Markup(", ").join(data),
     }
-    result = write_item(folder, item, made, more)
-    write_file(folder.page, render_page(folder, read_results(folder)).encode())
-    return result
+    body: list[str | Part] = [result.what, facts({name: value for name, value in account.items() if value})]
+    body += result.notes
+    for drawn in result.figures:
+        file = place / f"{drawn.stem}.svg"
+        body.append(kept_drawing(read_plain(file, _LIMIT_BYTES), drawn.title, drawn.text, str(file)))
+    played = kept_player(place)
+    body += [heading("Episodes"), played] if played else []
+    for each in result.tables:
+        body.append(table(each.head, _rows(each.rows), caption=each.title))
+        body += [paragraph(each.note, "quiet")] if each.note else []
+    compared = [[each.what, _told(each)] for each in result.comparisons]
+    comparisons = table(["What", "Verdict"], compared, caption="Comparisons with the paper")
+    rows = [[each.name, Cell(each.value, words=True), Cell(each.origin, words=True)] for each in result.parameters]
+    parameters = table(["Parameter", "Value", "Origin"], rows, caption="What shapes the item")
+    body += [opened(f"Comparisons: {len(compared)}", [comparisons]), opened(f"Parameters: {len(rows)}", [parameters])]
+    return Section(result.title, body)
 
 
-def _kept(folder: ReproductionFolder, item: Item, trained: list[str]) -> Json | None:
-    """The result that is there already, if the same trainings stand behind it."""
-    if not folder.result(item.name).is_file():
-        return None
-    content = read_result(folder, item)
-    return content if content.get("trained") == trained else None
+def _told(verdict: Verdict) -> Cell:
+    """The outcome, and the numbers that it follows from below it."""
+    return Cell(_outcome(verdict), verdict.because, words=True)
 
 
-def _groups(items: Sequence[Item]) -> set[str]:
-    return {group for item in items for group in item.trained}
+def _outcome(verdict: Verdict) -> Markup:
+    """The word of a verdict, with a sign and a colour."""
+    kind = verdict.outcome.replace(" ", "-")
+    return Markup('<span class="outcome {}">{}</span>').format(kind, verdict.outcome)
+
+
+def _rows(rows: Sequence[Sequence[str]]) -> list[list[str | Cell]]:
+    """Rows of a page's table: intervals below their values, and columns of more than numbers as words."""
+    split = [[re.fullmatch(r"(.*?)(?: \[([^][]*)\])?", text, re.DOTALL) for text in row] for row in rows]
+    values = [[(found[1], found[2] or "") for found in row if found] for row in split]
+    words = [not all(_NUMBER.fullmatch(value) for value, _ in column) for column in zip(*values, strict=True)]
+    return [
+        [row[0], *(Cell(*cell, words=wordy) for cell, wordy in zip(cells[1:], words[1:], strict=True))]
+        for row, cells in zip(rows, values, strict=True)
+    ]
 
 
 # docs/reproduction.md: the results of a reproduction as Markdown, with its figures and its data beside it.
@@ -687,7 +552,7 @@ def check_docs(file: Path) -> None:
     check_target(file, force=True)
 
 
-def write_docs(file: Path, folder: ReproductionFolder, results: Sequence[Json]) -> None:
+def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
     """Write the page, the results as ``.json`` beside it, and the figures into ``figures/``; all are replaced.
 
     Raises as ``check_docs``.
@@ -696,64 +561,61 @@ def write_docs(file: Path, folder: ReproductionFolder, results: Sequence[Json]) 
     figures = file.parent / FIGURES
     figures.mkdir(exist_ok=True)
     for result in results:
-        for each in result["figures"]:
-            data = read_figure(folder, result["name"], each["stem"], ".svg")
-            write_output(figures / f"{PREFIX}{each['stem']}.svg", data, force=True)
-    content = json.dumps(list(results), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        for drawn in result.figures:
+            data = read_plain(folder / result.name / f"{drawn.stem}.svg", _LIMIT_BYTES)
+            write_output(figures / f"{PREFIX}{drawn.stem}.svg", data, force=True)
+    content = json.dumps([asdict(each) for each in results], indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     write_output(file.with_suffix(".json"), content.encode(), force=True)
     write_output(file, docs_page(results).encode(), force=True)
 
 
-def docs_page(results: Sequence[Json]) -> str:
+def docs_page(results: Sequence[Result]) -> str:
     """The page of these results."""
-    few = few_worlds(results)
+    account = _Account.of(results)
+    verdicts = [
+        (f"[{_escaped(each.title)}](#{_escaped(each.name)})", each.verdict.outcome, _escaped(each.verdict.because))
+        for each in results
+    ]
     blocks = [
-        "# The paper, made again",
+        f"# {_TITLE}",
         "What comes out where the paper's experiments are made again, and where it cannot?",
-        _wrapped(lead_of(results)),
-        _wrapped(f"Made by `{command_of(results)} {_PLACES}` ({_escaped(made_in(results))})."),
+        _wrapped(account.lead),
+        _wrapped(f"Made by `{account.command} {_PLACES}` ({_escaped(account.made)})."),
         _wrapped(
             "The page, its figures and `reproduction.json`, which holds the same as data, are written by that command"
             " and not by hand; `ethbrake reproduce` makes them again without training. [The paper, line by line]"
             "(paper.md) has the account of every equation."
         ),
-        *([_wrapped(few)] if few else []),
+        *([_wrapped(account.few)] if account.few else []),
         "## Overview",
-        _table(
-            ("Item", "Verdict", "Because"),
-            [(f"[{_escaped(each['title'])}](#{_escaped(each['name'])})", each["verdict"]["outcome"],
-              _escaped(each["verdict"]["because"])) for each in results],
-        ),
+        _table(("Item", "Verdict", "Because"), verdicts),
         *(block for each in results for block in _item(each)),
-    ]  # fmt: skip
+    ]
     return "\n\n".join(blocks) + "\n"
 
 
-def _item(result: Json) -> list[str]:
+def _item(result: Result) -> list[str]:
     """The section of one item."""
-    labels = ", ".join(_escaped(label) for label in result["labels"])
-    what = f"**{_escaped(result['title'])}**. {_escaped(result['what'])}"
-    blocks = [f"## {_escaped(result['name'])}", _wrapped(f"{what} ({labels})" if labels else what)]
-    blocks.append(_wrapped(f"**{_escaped(result['verdict']['outcome'])}**: {_escaped(result['verdict']['because'])}"))
-    blocks += [_wrapped(_escaped(note)) for note in result["notes"]]
-    for each in result["figures"]:
-        file = f"{FIGURES}/{PREFIX}{checked_stem(each['stem'])}.svg"
-        blocks.append(f"![{_escaped(each['title'])}. {_escaped(each['text'])}]({file})")
-    for part in result["tables"]:
-        blocks += [f"### {_escaped(part['title'])}", _texts(part["head"], part["rows"])]
-        blocks += [_wrapped(_escaped(part["note"]))] if part["note"] else []
-    rows = [(each["what"], each["outcome"], each["because"]) for each in result["comparisons"]]
-    blocks += ["### Comparisons with the paper", _texts(("What", "Verdict", "Because"), rows)]
-    rows = [(each["name"], each["value"], each["origin"]) for each in result["parameters"]]
-    return [*blocks, "### Parameters", _texts(("Parameter", "Value", "Origin"), rows)]
-
-
-def _texts(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of texts, folded where it is long."""
-    table = _table([_escaped(cell) for cell in head], [[_escaped(cell) for cell in row] for row in rows])
-    if len(rows) <= _LONG_TABLE:
-        return table
-    return f"<details>\n<summary>{len(rows)} rows</summary>\n\n{table}\n\n</details>"
+    labels = ", ".join(_escaped(label) for label in result.labels)
+    what = f"**{_escaped(result.title)}**. {_escaped(result.what)}"
+    blocks = [f"## {_escaped(result.name)}", _wrapped(f"{what} ({labels})" if labels else what)]
+    blocks.append(_wrapped(f"**{result.verdict.outcome}**: {_escaped(result.verdict.because)}"))
+    blocks += [_wrapped(_escaped(note)) for note in result.notes]
+    for drawn in result.figures:
+        blocks.append(f"![{_escaped(drawn.title)}. {_escaped(drawn.text)}]({FIGURES}/{PREFIX}{drawn.stem}.svg)")
+    compared = [(each.what, each.outcome, each.because) for each in result.comparisons]
+    found = [(each.name, each.value, each.origin) for each in result.parameters]
+    for part in (
+        *result.tables,
+        Table("Comparisons with the paper", ("What", "Verdict", "Because"), compared),
+        Table("Parameters", ("Parameter", "Value", "Origin"), found),
+    ):
+        head, *rows = [[_escaped(cell) for cell in row] for row in (part.head, *part.rows)]
+        lines = _table(head, rows)
+        if len(rows) > _LONG_TABLE:
+            lines = f"<details>\n<summary>{len(rows)} rows</summary>\n\n{lines}\n\n</details>"
+        blocks += [f"### {_escaped(part.title)}", lines, *([_wrapped(_escaped(part.note))] if part.note else [])]
+    return blocks
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -36,8 +36,23 @@ FIRST_250 = {
 }
 
 
+# Measures by the names that sums had then.
+NAMES = {
+    "collision_rate": "collisions", "vehicle_1_shoved_far_rate": "shoved_far", "unavoidable_rate": "unavoidable",
+    "avoidable_collision_rate": "avoidable_collisions", "impact_proven_rate": "impact_proven",
+    "vehicle_1_shoved_m": "shoved_m", "mean_regret_first": "regret_first", "mean_regret_total": "regret_total",
+    "best_known_first_impact_harm": "best_known_first", "best_known_total_harm": "best_known_total",
+    "best_known_minus_proven_first": "gap_first", "best_known_minus_proven_total": "gap_total",
+}  # fmt: skip
+
+
 def digest_of(tally):
-    return hashlib.sha256(json.dumps(tally.to_json(), sort_keys=True).encode()).hexdigest()[:16]
+    told = tally.to_json()
+    for agent in told["agents"].values():
+        assert all(of == tally.worlds for _, of in agent["counts"].values())
+        agent["counts"] = {name: count for name, (count, _) in agent["counts"].items()}
+        agent |= {part: {NAMES.get(name, name): each for name, each in agent[part].items()} for part in agent}
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 
 
 @pytest.mark.slow

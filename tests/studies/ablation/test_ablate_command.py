@@ -119,15 +119,13 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(ablation, tmp_p
         trained.append(path.name)
         if len(trained) == 2:
             calls = []
-            monkeypatch.setattr(
-                learning_train.BetweenUpdates, "_after_update", _stopping(calls, learning_train.BetweenUpdates)
-            )
+            monkeypatch.setattr(learning_train.Session, "_after_update", _stopping(calls, learning_train.Session))
         return keep(recipe, scenario, path, **options)
 
     keep = trainings.train
     with monkeypatch.context() as patch:
         patch.setattr(trainings, "train", stop_in_the_second)
-        patch.setattr(learning_train.BetweenUpdates, "_after_update", learning_train.BetweenUpdates._after_update)
+        patch.setattr(learning_train.Session, "_after_update", learning_train.Session._after_update)
         assert run_command(["ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL]) == 130
     monkeypatch.undo()
     half = folder / "trainings" / trained[1]

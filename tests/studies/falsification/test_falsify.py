@@ -9,7 +9,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.defaults import HARM_COUNTS, MeasureName
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.scenario.initial_states import ranges_of
+from ethbrake_marl.scenario.sampling import ranges_of
 from ethbrake_marl.studies.falsification import Measure, falsify, make_measure
 from tests.studies.falsification.holed import Holed, in_hole
 

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
-from ethbrake_marl.studies.reproduction.item import Drawn, Item, Made, Parameter, Settings, Table, Verdict
+from ethbrake_marl.studies.reproduction.item import Drawn, Item, Made, Settings, Table, Verdict, stated
 
 HOSTILE = "<script>alert('x')</script>\"|*_\u202e"
 
@@ -15,13 +17,13 @@ def settings(tmp_path: Path) -> Settings:
     return Settings("quick", tmp_path / "out", 24, machine="a machine")
 
 
-def made(text: str = "told", figures: tuple[Drawn, ...] = ()) -> Made:
+def made(text: str = "told", figures: Mapping[Drawn, Figure] | None = None) -> Made:
     """What an item may give, with one text everywhere."""
     return Made(
         (Verdict(text, "agrees", text),),
-        (Parameter(text, text, text),),
+        (stated(text, text, text),),
         (Table(text, (text, text), ((text, text),), text),),
-        figures,
+        figures or {},
         {"data": "a,b\n"},
         (text,),
     )

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
+from pydantic import ValidationError
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.studies import Line, lines_figure
 from ethbrake_marl.studies.reproduction.folder import (
-    ReproductionFolder,
+    checked_result,
     docs_page,
     open_folder,
     read_results,
@@ -27,10 +29,10 @@ from tests.pages.hostile import Page
 from .conftest import HOSTILE, made, planted
 
 
-def drawn(stem: str = "a-figure") -> Drawn:
+def drawn(stem: str = "a-figure") -> dict[Drawn, Figure]:
     line = Line.of([0.0, 1.0], [Estimate(1.0, None), Estimate(2.0, (1.0, 3.0))])
     figure = lines_figure({"panel": {"line": line}}, x_label="x", y_label="y", caption="c")
-    return Drawn(stem, "A figure", "What it shows.", figure)
+    return {Drawn(stem, "A figure", "What it shows."): figure}
 
 
 def hidden(folder: Path) -> list[Path]:
@@ -38,9 +40,9 @@ def hidden(folder: Path) -> list[Path]:
 
 
 def test_reproduce__writes_figures_data_results_and_one_page(settings: Settings) -> None:
-    items = [planted("gaps", lambda s: made(figures=(drawn(),)))]
+    items = [planted("gaps", lambda s: made(figures=drawn()))]
     results, finished = reproduce(items, settings)
-    assert finished and [each["name"] for each in results] == ["gaps"]
+    assert finished and [each.name for each in results] == ["gaps"]
     names = sorted(path.name for path in (settings.folder / "gaps").iterdir())
     assert names == ["a-figure.png", "a-figure.svg", "data.csv", "result.json"]
     page = (settings.folder / "index.html").read_text("utf-8")
@@ -58,7 +60,7 @@ def test_page__tells_everything_that_a_result_holds(settings: Settings) -> None:
     assert page.open == []
     for text in ("A table", "PPO 1.50 1.25, 1.75", "Of 24 worlds.", "What it is.", "label", "Comparisons: 1"):
         assert text in page.text
-    assert result["verdict"]["because"] in page.text and "stated in the paper (told)" in page.text
+    assert result.verdict.because in page.text and "stated in the paper (told)" in page.text
     links = [attributes["href"] for tag, attributes in page.tags if tag == "a"]
     assert "./gaps/data.csv" in links and links.count("#a-title") == 1
     around = [attributes.get("class") for tag, attributes in page.tags if tag == "div"]
@@ -67,9 +69,9 @@ def test_page__tells_everything_that_a_result_holds(settings: Settings) -> None:
 
 def test_page__no_name_of_a_result_leads_elsewhere(settings: Settings) -> None:
     reproduce([planted("gaps", lambda s: made())], settings)
-    file = settings.folder / "gaps" / "result.json"
-    content = json.loads(file.read_text()) | {"name": "javascript:alert(1)", "data": ["//x", '" onclick="']}
-    page = Page(render_page(ReproductionFolder(settings.folder), [content]))
+    (result,) = read_results(settings.folder)
+    hostile = replace(result, name="javascript:alert(1)", data=["//x", '" onclick="'])
+    page = Page(render_page(settings.folder, [hostile]))
     links = [attributes["href"] for tag, attributes in page.tags if tag == "a"]
     assert links[-2:] == ["./javascript%3Aalert%281%29/%2F%2Fx", "./javascript%3Aalert%281%29/%22%20onclick%3D%22"]
     assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
@@ -91,11 +93,11 @@ def test_reproduce__an_interruption_leaves_whole_files_and_goes_on(settings: Set
 
     with pytest.raises(KeyboardInterrupt):
         reproduce([planted("harm-delays", lambda s: made()), planted("gaps", stop)], settings)
-    assert [each["name"] for each in read_results(ReproductionFolder(settings.folder))] == ["harm-delays"]
+    assert [each.name for each in read_results(settings.folder)] == ["harm-delays"]
     assert "A title" in (settings.folder / "index.html").read_text("utf-8")
     assert hidden(settings.folder) == []
     results, _ = reproduce([planted("harm-delays", stop), planted("gaps", lambda s: made())], settings)
-    assert [each["name"] for each in results] == ["harm-delays", "gaps"]
+    assert [each.name for each in results] == ["harm-delays", "gaps"]
 
 
 def test_open_folder__refuses_what_holds_something_else(settings: Settings, tmp_path: Path) -> None:
@@ -116,7 +118,7 @@ def test_open_folder__other_settings_need_force(settings: Settings) -> None:
     with pytest.raises(AlreadyExists, match="episodes 24, here 30"):
         open_folder(replace(settings, episodes=30))
     open_folder(replace(settings, episodes=30), force=True)
-    assert read_results(ReproductionFolder(settings.folder)) == []
+    assert read_results(settings.folder) == []
 
 
 @pytest.mark.parametrize("name", ["<b>out</b>", "a'b\"c", "x\u202ey", "; rm -rf", "{{ 7 * 7 }}"])
@@ -138,14 +140,14 @@ def test_page__whatever_a_result_says_is_text(settings: Settings) -> None:
 
 @pytest.mark.parametrize("stem", ["../../etc/passwd", "a b", "A", "", "x" * 65, "<svg>", "/tmp/x"])
 def test_figures__a_stem_that_is_no_plain_name_is_refused(settings: Settings, stem: str) -> None:
-    with pytest.raises(InvalidInput, match="must be small letters"):
-        reproduce([planted("gaps", lambda s: made(figures=(drawn(stem),)))], settings)
+    with pytest.raises(ValidationError, match="for Drawn"):
+        drawn(stem)
     reproduce([planted("gaps", lambda s: made())], settings)
     file = settings.folder / "gaps" / "result.json"
     content = json.loads(file.read_text())
     content["figures"] = [{"stem": stem, "title": "t", "text": "t"}]
     file.write_text(json.dumps(content))
-    with pytest.raises(InvalidInput, match="must be small letters"):
+    with pytest.raises(InvalidInput, match="figures: 0: stem: is not what a reproduction writes"):
         reproduce([planted("harm-delays", lambda s: made())], settings)
 
 
@@ -165,12 +167,12 @@ NONE_OF_OURS = (
 
 
 def test_page__a_figure_that_is_none_of_ours_is_refused(settings: Settings) -> None:
-    results, _ = reproduce([planted("gaps", lambda s: made(figures=(drawn(),)))], settings)
+    results, _ = reproduce([planted("gaps", lambda s: made(figures=drawn()))], settings)
     file = settings.folder / "gaps" / "a-figure.svg"
     for inside in NONE_OF_OURS:
         file.write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{inside}</svg>')
         with pytest.raises(InvalidInput, match=r"a-figure\.svg: is not a figure as it was drawn"):
-            render_page(ReproductionFolder(settings.folder), results)
+            render_page(settings.folder, results)
 
 
 @pytest.mark.parametrize(
@@ -199,17 +201,18 @@ def test_results__a_damaged_one_is_named(settings: Settings, change) -> None:
     file = settings.folder / "gaps" / "result.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
     with pytest.raises(InvalidInput, match=r"result\.json: [\w: ]+: is not what a reproduction writes"):
-        read_results(ReproductionFolder(settings.folder))
+        read_results(settings.folder)
 
 
 def test_write_docs__page_data_and_figures(settings: Settings, tmp_path: Path) -> None:
-    results, _ = reproduce([planted("gaps", lambda s: made(figures=(drawn(),)))], settings)
+    results, _ = reproduce([planted("gaps", lambda s: made(figures=drawn()))], settings)
     file = tmp_path / "page.md"
-    write_docs(file, ReproductionFolder(settings.folder), results)
-    assert file.read_text("utf-8") == docs_page(json.loads((tmp_path / "page.json").read_text("utf-8")))
+    write_docs(file, settings.folder, results)
+    written = json.loads((tmp_path / "page.json").read_text("utf-8"))
+    assert file.read_text("utf-8") == docs_page([checked_result(each, "page.json") for each in written])
     assert (tmp_path / "figures" / "reproduction-a-figure.svg").is_file()
     with pytest.raises(InvalidInput, match=r"must end in \.md"):
-        write_docs(tmp_path / "page.html", ReproductionFolder(settings.folder), results)
+        write_docs(tmp_path / "page.html", settings.folder, results)
 
 
 def test_pages__say_command_machine_and_how_little_was_made(settings: Settings) -> None:
@@ -219,12 +222,13 @@ def test_pages__say_command_machine_and_how_little_was_made(settings: Settings) 
     page = Page((settings.folder / "index.html").read_text("utf-8"))
     for text in (page.text, docs_page(results)):
         assert "1 of the 10 items" in text and "ethbrake reproduce gaps --quick --episodes 24" in text
-        assert f"({results[0]['made_utc'][:10]}, a CPU, numpy 2.4.6; " in text
+        assert f"({results[0].made_utc[:10]}, a CPU, numpy 2.4.6; " in text
         assert "At most 24 worlds of each list are driven here; the paper has 10,000." in text
 
 
 def test_pages__of_results_that_do_not_say_how_many_worlds_say_nothing_of_it(settings: Settings) -> None:
-    (result,), _ = reproduce([planted("gaps", lambda s: made())], settings)
-    result.pop("episodes")
-    page = Page(render_page(ReproductionFolder(settings.folder), [result]))
+    (found,), _ = reproduce([planted("gaps", lambda s: made())], settings)
+    content = {name: value for name, value in asdict(found).items() if name != "episodes"}
+    result = checked_result(content, "result.json")
+    page = Page(render_page(settings.folder, [result]))
     assert "worlds of each list" not in page.text and "reproduce gaps --quick (" in page.text

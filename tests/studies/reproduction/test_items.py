@@ -8,7 +8,8 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.studies.reproduction.folder import ITEMS, choose_items
-from ethbrake_marl.studies.reproduction.item import GAPS, Item, Made, Settings
+from ethbrake_marl.studies.reproduction.item import Item, Made, Settings, summarise_verdicts
+from ethbrake_marl.studies.reproduction.lists import GAPS
 
 PAPER = Path(__file__).resolve().parents[3] / "docs" / "paper.md"
 
@@ -28,8 +29,8 @@ def test_item__has_verdicts_parameters_tables_and_data(made_of: dict[str, Made],
     made = made_of[name]
     assert made.verdicts and {verdict.outcome for verdict in made.verdicts} <= OUTCOMES
     assert all(verdict.because for verdict in made.verdicts)
-    assert "\n" not in made.verdict.because
-    stated = {parameter.name: bool(parameter.stated) for parameter in made.parameters}
+    assert "\n" not in summarise_verdicts(made.verdicts).because
+    stated = {parameter.name: parameter.origin.startswith("stated") for parameter in made.parameters}
     assert stated["masses"] and stated["braking capacities"]
     assert not stated["restitution e"] and not stated["time step"] and not stated["horizon"]
     assert made.tables and all(len(row) == len(table.head) for table in made.tables for row in table.rows)

@@ -8,21 +8,18 @@ import pytest
 
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.outcome import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST, PaperRow
-from ethbrake_marl.studies.reproduction.item import (
-    AS_STATED,
-    AT_200_MS,
-    FULL_BRAKE,
-    NAMES,
+from ethbrake_marl.studies.reproduction.item import FULL_BRAKE, NAMES, READINGS, lineup
+from ethbrake_marl.studies.reproduction.lists import (
     NOBODY,
-    RATE,
     Beside,
     compare_rows,
     decrease_verdict,
-    lineup,
-    read_scenario,
     rows_table,
     selection_verdict,
 )
+
+AS_STATED, AT_200_MS = READINGS
+RATE = "collision rate"
 
 
 def printed(table: str, agent: str) -> PaperRow:
@@ -30,7 +27,7 @@ def printed(table: str, agent: str) -> PaperRow:
 
 
 def beside(reading, worlds: int = 400) -> Beside:
-    scenario = read_scenario("paper-random", reading)
+    scenario = reading.scenario("paper-random")
     agents = lineup((FULL_BRAKE,), scenario)
     evaluation = evaluate(scenario.sample(worlds, 7), agents, scenario=scenario, aftermath=False)
     return Beside(reading.name, evaluation, {"Non-E": (NAMES[FULL_BRAKE],), "Hybrid PPO": (NAMES[FULL_BRAKE],)})

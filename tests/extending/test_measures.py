@@ -1,4 +1,4 @@
-"""Harm metrics from the user's own file: beside the two counts of harm wherever an evaluation is told."""
+"""Measures of the user's own: one registered function, and it stands wherever an evaluation is told."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet
 import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import markdown_table
-from ethbrake_marl.evaluation.harm_metrics import METRICS
-from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.evaluation.measures import REGISTERED
+from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.pages.report import Report, render_report
 
 SCENARIO = eb.load_scenario("paper-random")
@@ -34,7 +35,7 @@ def injury(episodes: Any) -> Any:
 
 
 def register(function: Any = squared, name: str = "squared", unit: str = "m2/s2") -> None:
-    eb.register_harm_metric(name, function, unit=unit)
+    eb.register_measure(name, function, unit=unit)
 
 
 def evaluated(**options: Any) -> Any:
@@ -42,7 +43,7 @@ def evaluated(**options: Any) -> Any:
     return eb.evaluate(SAMPLE, agents, scenario=SCENARIO, **options)
 
 
-def test_metric__sees_every_impact_whatever_the_chunk() -> None:
+def test_measure__sees_every_impact_whatever_the_chunk() -> None:
     register()
     whole, parts = evaluated(), evaluated(chunk=7)
     for name, outcome in whole.outcomes.items():
@@ -53,7 +54,7 @@ def test_metric__sees_every_impact_whatever_the_chunk() -> None:
     assert evaluated(aftermath=False).outcome("full_brake").metrics == {}
 
 
-def test_metric__changes_nothing_else() -> None:
+def test_measure__changes_nothing_else() -> None:
     before = evaluated()
     register()
     after = evaluated()
@@ -62,7 +63,7 @@ def test_metric__changes_nothing_else() -> None:
         assert outcome.total_harm.tobytes() == after.outcome(name).total_harm.tobytes()
 
 
-def test_metric_of_each_vehicle__stands_in_rows_frame_markdown_and_report() -> None:
+def test_measure_of_each_vehicle__stands_in_rows_frame_markdown_and_report() -> None:
     register()
     register(injury, "injury", "1")
     found = evaluated()
@@ -91,11 +92,55 @@ def lambda_free(episodes: Any) -> Any:
     return episodes.largest_speed_change_mps
 
 
+def change_of_vehicle_3(episodes: Any) -> Any:
+    """Largest change of speed of Vehicle 3 in one impact."""
+    return episodes.largest_speed_change_mps[:, 2]
+
+
+def hit_hard(episodes: Any) -> Any:
+    """Whether Vehicle 3 was hit hard."""
+    return episodes.largest_speed_change_mps[:, 2] > 2.0
+
+
+def test_measure__one_function_and_it_stands_in_every_output(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    register(change_of_vehicle_3, "change_of_rear", "m/s")
+    register(hit_hard, "hit_hard", "1")
+    names, agents = ("metric_change_of_rear", "metric_hit_hard"), ["--agents", "full_brake,e_v2x_bm", "--seed", "7"]
+
+    def told(*words: str) -> str:
+        assert run_command(["evaluate", *agents, *words]) == 0
+        return capsys.readouterr().out
+
+    text = " ".join(told("--episodes", "40", "--per-world", "out.csv", "--report", "out.html").split())
+    rows = list(csv.DictReader(Path("out.csv").read_text().splitlines()))[:40]
+    change, hit = (np.array([float(row[name]) for row in rows]) for name in names)
+    assert np.ptp(change) > 1.0 and set(hit) == {0.0, 1.0} and ((change > 2.0) == hit).all()
+    for page in (text, Path("out.html").read_text()):
+        assert "change_of_rear (m/s)" in page and f"{change.mean():.2f}" in page and "hit_hard (1)" in page
+    results = json.loads(Path("out.csv.json").read_text())[0]
+    expected = [mean(change), rate(int(hit.sum()), 40)]
+    assert [(results[n], tuple(results[f"{n}_interval"])) for n in names] == [(e.value, e.interval) for e in expected]
+    told("--episodes", "40", "--per-world", "out.parquet")
+    table = pyarrow.parquet.read_table("out.parquet")
+    assert [table[name].to_pylist()[:40] for name in names] == [change.tolist(), hit.tolist()]
+    sharded = json.loads(told("--episodes", "1040", "--shards", "2", "--json", "--output", "kept", "--rows"))
+    (whole,) = (row for row in json.loads(told("--episodes", "1040", "--json")) if row["agent"] == "full_brake")
+    assert [sharded[0][name] for name in names] == [whole[name] for name in names]
+    parts = [pyarrow.parquet.read_table(path) for path in sorted(Path("kept").rglob("*.parquet"))]
+    first = [row for part in parts for row in part.to_pylist() if row["agent"] == "full_brake"][:40]
+    assert [row[names[0]] for row in first] == change.tolist()
+    lines = markdown_table(eb.summarise(evaluated())).splitlines()
+    assert "| change_of_rear (m/s) | hit_hard (1) |" in lines[0]
+
+
 def test_plugin__with_a_metric_is_seen_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.py").write_text(
         "import ethbrake_marl as eb\n\n\ndef worst(episodes):\n    'Largest change of speed in the line.'\n"
         "    return episodes.largest_speed_change_mps.max(axis=1)\n\n\n"
-        "eb.register_harm_metric('worst', worst, unit='m/s')\n"
+        "eb.register_measure('worst', worst, unit='m/s')\n"
     )
     words = ["evaluate", "--plugin", str(tmp_path / "mine.py"), "--episodes", "5", "--agents", "full_brake"]
     assert run_command([*words, "--per-world", str(tmp_path / "out.csv")]) == 0
@@ -103,10 +148,10 @@ def test_plugin__with_a_metric_is_seen_on_the_command_line(tmp_path: Path, capsy
     rows = list(csv.DictReader((tmp_path / "out.csv").read_text().splitlines()))
     (told,) = json.loads((tmp_path / "out.csv.json").read_text())
     assert told["metric_worst"] == pytest.approx(np.mean([float(row["metric_worst"]) for row in rows]))
-    assert run_command(["evaluate", "--help"]) == 0 and "Harm metrics" in capsys.readouterr().out
+    assert run_command(["evaluate", "--help"]) == 0 and "Measures" in capsys.readouterr().out
 
 
-def test_register_harm_metric__refuses_what_cannot_be_used() -> None:
+def test_register_measure__refuses_what_cannot_be_used() -> None:
     def flat(episodes: Any) -> Any:
         """One number for all."""
         return 1.0
@@ -130,8 +175,8 @@ def test_register_harm_metric__refuses_what_cannot_be_used() -> None:
     ):
         with pytest.raises(InvalidInput, match=message):
             register(function, name)
-    assert not METRICS
+    assert not REGISTERED
     register()
     register()
-    with pytest.raises(AlreadyExists, match="harm metric 'squared' is registered already"):
+    with pytest.raises(AlreadyExists, match="measure 'squared' is registered already"):
         register(injury)

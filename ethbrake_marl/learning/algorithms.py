@@ -1,4 +1,4 @@
-"""Networks for Stable-Baselines3: a central critic, and how its weights become a policy's.
+"""PPO and SAC of Stable-Baselines3: the model of each scheme, and how its weights become a policy's.
 
 Central training, decentral driving (MAPPO): all learners share an actor, and the critic sees the whole line. A row of
 the environment is a vehicle's own observation and behind it the full state (``make_sb3_vec_env(...,
@@ -8,14 +8,14 @@ sees both: the state, and whose place it judges.
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Space
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -24,19 +24,76 @@ from stable_baselines3.common.torch_layers import MlpExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
-from ethbrake_marl.physics import Floats, Ints
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
+from ethbrake_marl.learning.recipe import NetworkShape, PpoRecipe, SacRecipe, SquashedShape
+from ethbrake_marl.learning.training import Algorithm, Training
 from ethbrake_marl.policies.actor import Activation, Float32s, NetworkSpec, tensor_table
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
 
 
-class Adam(torch.optim.Adam):
-    """torch's, to the bit, without what imports torch's compiler (1 to 3 CPU-s), which has nothing to do here."""
+def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
+    """Copy the policy's weights under the names of our table."""
+    state = policy.state_dict()
+    return {row.name: state[row.sb3_name].detach().cpu().numpy().astype(np.float32) for row in tensor_table(spec)}
 
 
-for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_dict"):
-    setattr(Adam, _name, torch.no_grad()(inspect.unwrap(getattr(torch.optim.Adam, _name))))
+class Ppo(Algorithm):
+    """Stable-Baselines3's PPO: one for all learners, with a central critic, or one for each."""
+
+    def build(self, training: Training, environment: EthBrakeVecEnv) -> PPO:
+        """The model of the training's scheme."""
+        recipe = training.recipe
+        assert isinstance(recipe, PpoRecipe)
+        settings = _settings(recipe, environment)
+        if training.scheme == "independent":
+            return IndependentPPO(environment, list(training.drivers), recipe.turns, **settings)
+        if training.scheme == "centralised":
+            settings["policy_kwargs"]["own"] = training.observation.size
+            return PPO(CentralCriticPolicy, environment, **settings)
+        return PPO("MlpPolicy", environment, **settings)
+
+    def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
+        """The model's policy, or the one of each independent learner."""
+        return tuple(model.policy.policies) if isinstance(model, IndependentPPO) else (model.policy,)
+
+    def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
+        """The optimiser of the model's policy, or the one of each independent learner by the vehicle's name."""
+        if isinstance(model, IndependentPPO):
+            return dict(zip(model.names, (member.optimizer for member in model.policy.policies), strict=True))
+        return {"policy": model.policy.optimizer}
+
+
+def ppo_arguments(shape: NetworkShape) -> dict[str, Any]:
+    """Arguments of PPO's policy: separate actor and critic, orthogonal initial weights."""
+    return {
+        "net_arch": {"pi": list(shape.policy), "vf": list(shape.value)},
+        "activation_fn": ACTIVATIONS[shape.activation],
+        "ortho_init": True,
+        "log_std_init": shape.initial_log_std,
+    }
+
+
+def _settings(recipe: PpoRecipe, environment: EthBrakeVecEnv) -> dict[str, Any]:
+    return {
+        "learning_rate": recipe.learning_rate.at,
+        "n_steps": recipe.n_steps,
+        "batch_size": recipe.batch_size,
+        "n_epochs": recipe.n_epochs,
+        "gamma": recipe.gamma,
+        "gae_lambda": recipe.gae_lambda,
+        "clip_range": recipe.clip_range,
+        "ent_coef": recipe.ent_coef,
+        "vf_coef": recipe.vf_coef,
+        "max_grad_norm": recipe.max_grad_norm,
+        "target_kl": recipe.target_kl,
+        "stats_window_size": max(100, environment.num_envs),
+        "policy_kwargs": ppo_arguments(recipe.network),
+        "seed": recipe.seed,
+        "device": "cpu",
+    }
 
 
 class CentralCriticPolicy(ActorCriticPolicy):
@@ -61,12 +118,6 @@ class _OwnPartForTheActor(MlpExtractor):
     def forward_actor(self, features: Tensor) -> Tensor:
         """The actor's last hidden layer."""
         return super().forward_actor(features[:, : self._own])
-
-
-def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
-    """Copy the policy's weights under the names of our table."""
-    state = policy.state_dict()
-    return {row.name: state[row.sb3_name].detach().cpu().numpy().astype(np.float32) for row in tensor_table(spec)}
 
 
 # Independent learners: one PPO each, with a network, an optimiser and a buffer of its own, in the same worlds.
@@ -204,66 +255,56 @@ class IndependentPPO(PPO):
         return part
 
 
-# A scout: it learns at which decisions a difference is to be expected, so that most are tried where there is one.
-#
-# Where nothing depends on what is done, a counterfactual says 0 and costs as much as any other. Decisions are drawn
-# with
-# unequal chances, and each counts the less, the likelier it was drawn: what is learned is the same on average.
+class Sac(Algorithm):
+    """Stable-Baselines3's SAC, one for all learners."""
 
-WIDTH = 64  # of its hidden layer
-HIGHEST = 20.0  # logarithm of what it expects at most
+    def build(self, training: Training, environment: EthBrakeVecEnv) -> SAC:
+        """The model."""
+        recipe = training.recipe
+        assert isinstance(recipe, SacRecipe)
+        automatic = recipe.ent_coef == "auto"
+        return SAC(
+            "MlpPolicy",
+            environment,
+            learning_rate=recipe.learning_rate.at,
+            buffer_size=recipe.buffer_size,
+            learning_starts=recipe.learning_starts,
+            batch_size=recipe.batch_size,
+            tau=recipe.tau,
+            gamma=recipe.gamma,
+            train_freq=(recipe.steps_per_update, "step"),
+            gradient_steps=recipe.gradient_steps,
+            ent_coef=f"auto_{recipe.initial_ent_coef!r}" if automatic else recipe.ent_coef,
+            target_update_interval=recipe.target_update_interval,
+            target_entropy="auto" if recipe.target_entropy is None else recipe.target_entropy,
+            stats_window_size=max(100, environment.num_envs),
+            policy_kwargs=sac_arguments(recipe.network),
+            seed=recipe.seed,
+            device="cpu",
+        )
 
-
-class Drawn(NamedTuple):
-    """Rows that were drawn, and what each counts."""
-
-    rows: Ints  # [B], the same one several times where a difference is expected
-    importance: Float32s  # [B] 1 / (chance of the row x number of rows); their mean is 1 on average
-
-
-class Scout(nn.Module):
-    """A small network for the size of the difference that is to be expected of an observation."""
-
-    def __init__(self, inputs: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(nn.Linear(inputs, WIDTH), nn.ReLU(), nn.Linear(WIDTH, 1))
-        last = self.layers[-1]
-        assert isinstance(last, nn.Linear)
-        nn.init.zeros_(last.weight)  # until it learns, it expects the same everywhere
-        nn.init.zeros_(last.bias)
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """The logarithm of what is to be expected [rows] of observations [rows, F]."""
-        found: Tensor = self.layers(observation)[:, 0].clamp(max=HIGHEST)
+    def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
+        """Those of actor and critics, and of the entropy coefficient where it is learned."""
+        assert isinstance(model, SAC)
+        found: dict[str, Any] = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
+        if model.ent_coef_optimizer is not None:
+            found["ent_coef"] = model.ent_coef_optimizer
         return found
 
-    def expect(self, observation: Float32s) -> Floats:
-        """What is to be expected [rows], above 0."""
-        with torch.no_grad():
-            found: Floats = np.exp(self(torch.from_numpy(observation)).numpy().astype(np.float64))
-        return found
+    def learned_beside(self, model: BaseAlgorithm) -> dict[str, Tensor]:
+        """The logarithm of the entropy coefficient, where it is learned."""
+        coefficient = self.log_noise(model)
+        return {} if coefficient is None else {"log_ent_coef": coefficient}
 
-    def loss(self, observation: Tensor, size: Tensor, importance: Tensor) -> Tensor:
-        """Least where it expects the mean size; of sizes [rows] >= 0, whose largest do not rule it as in a square."""
-        logarithm = self(observation)
-        found: Tensor = (importance * (logarithm.exp() - size * logarithm)).mean()
-        return found
+    def log_noise(self, model: BaseAlgorithm) -> Tensor | None:
+        """The logarithm of the entropy coefficient; None where it is fixed."""
+        assert isinstance(model, SAC)
+        return None if model.log_ent_coef is None else model.log_ent_coef.detach()
 
 
-def draw_rows(expected: Floats, count: int, focus: float) -> Drawn:
-    """Draw ``count`` of the rows: the share ``focus`` in proportion to ``expected`` [n] > 0, the others evenly."""
-    n = len(expected)
-    chance = (1.0 - focus) / n + focus * (expected / expected.sum())
-    rows = torch.multinomial(torch.from_numpy(chance), count, replacement=True).numpy()
-    return Drawn(rows, (1.0 / (n * chance[rows])).astype(np.float32))
-
-
-def choose_rows(
-    observed: Float32s, rows: Ints, count: int, focus: float, expect: Callable[[Float32s], Floats]
-) -> Drawn:
-    """Draw ``count`` of ``rows``: evenly and each once, or mostly where ``expect`` says that there is a difference."""
-    if focus == 0.0 or len(rows) == 0:
-        some = rows[torch.randperm(len(rows))[:count].numpy()]
-        return Drawn(some, np.ones(len(some), np.float32))
-    drawn = draw_rows(expect(observed[rows]), count, focus)
-    return Drawn(rows[drawn.rows], drawn.importance)
+def sac_arguments(shape: SquashedShape) -> dict[str, Any]:
+    """Arguments of SAC's policy: an actor and two critics."""
+    return {
+        "net_arch": {"pi": list(shape.policy), "qf": list(shape.value)},
+        "activation_fn": ACTIVATIONS[shape.activation],
+    }

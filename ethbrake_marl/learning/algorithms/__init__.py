@@ -1,1 +1,0 @@
-"""Learning algorithms: one file each, behind the few methods of ``algorithms.protocol.Algorithm``."""
