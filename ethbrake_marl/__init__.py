@@ -59,7 +59,8 @@ if TYPE_CHECKING:
     from ethbrake_marl.policies.bundle import load_policy as load_policy
     from ethbrake_marl.policies.shipped import load_shipped as load_shipped
 
-    # Shields, one for each interface
+    # Shields: for any interface, and one for each
+    from ethbrake_marl.shield.wrappers import shield as shield
     from ethbrake_marl.shield import HybridShield as HybridShield
     from ethbrake_marl.shield import ShieldedEnv as ShieldedEnv
     from ethbrake_marl.shield import ShieldedVectorEnv as ShieldedVectorEnv
@@ -145,6 +146,7 @@ def _import_public(name: str) -> Any:
     register_environments()
     with naming_extras():
         value = getattr(import_module(_HOMES[name]), name)
+    value = sys.modules.get(f"{__name__}.{name}", value)  # a folder of that name, as ``shield``, is called like it
     globals()[name] = value
     return value
 

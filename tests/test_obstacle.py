@@ -25,7 +25,7 @@ from ethbrake_marl.physics import advance, concatenate
 from ethbrake_marl.policies.actor import observation_schema
 from ethbrake_marl.scenario import Scenario, Task, initial_state_worlds, load_scenario, worlds_from_table
 from ethbrake_marl.search import constant_profiles, follow_profiles, profile_problem
-from ethbrake_marl.shield.agents import StepShieldAgent
+from ethbrake_marl.shield.agents import ShieldedDriver
 from tests.reference.avoidability_lp import avoidable_by_lp
 
 ALL = load_scenario("cooperation-4-all")
@@ -170,12 +170,13 @@ def test_record__positions_end_at_the_obstacle_and_the_figure_draws_it(near_one)
 def test_shield__step_mode_bounds_the_harm_of_the_obstacle_too_to_the_last_bit(vehicle):
     scenario = NEAR.with_learners([vehicle])
     worlds = scenario.sample(40, 7).worlds
-    agent = StepShieldAgent(make_agent("coast"), scenario, harm_count="total")
+    agent = ShieldedDriver(make_agent("coast"), scenario, harm_count="total")
     episodes = drive(worlds, agent, scenario, vehicle)
     harm = episodes.ledger.world_harm("total")
-    assert agent.shield is not None and not agent.shield.distrusted.any()
-    assert (harm <= agent.predicted_harm).all() and np.array_equal(harm, agent.shield.bound)
-    assert (agent.shield.interventions > 0).sum() > 5 and (episodes.ledger.obstacle_count > 0).any()
+    shield = episodes.guarded.shield
+    assert not shield.distrusted.any()
+    assert (harm <= shield.predicted_harm).all() and np.array_equal(harm, shield.bound)
+    assert (shield.interventions > 0).sum() > 5 and (episodes.ledger.obstacle_count > 0).any()
 
 
 def test_shield__wrapped_around_an_environment_sees_what_it_predicted():

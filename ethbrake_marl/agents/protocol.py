@@ -9,6 +9,7 @@ from typing import ClassVar, Protocol, Self, TypeGuard, runtime_checkable
 
 import numpy as np
 
+from ethbrake_marl.engine.engine import Engine, Guard
 from ethbrake_marl.engine.stream import Script, ask_script, begin_script, is_state_free
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics import Floats, Ints, Worlds
@@ -228,13 +229,48 @@ def is_divisible(agent: Agent) -> TypeGuard[Divisible]:
     return isinstance(agent, Divisible)
 
 
+def apart(agent: Agent) -> Agent:
+    """A copy that can be asked without changing this one; an agent that remembers nothing is its own copy."""
+    return agent if is_state_free(agent) or not getattr(agent, "remembers", True) else copy.deepcopy(agent)
+
+
+def begun_apart(
+    agents: Mapping[int, Agent], alert: Worlds, rows: Ints, scripts: Mapping[int, Script]
+) -> dict[int, Agent]:
+    """Copies of agents, by vehicle, once episodes start in these rows; ``scripts`` drive the other vehicles."""
+    begun = {i: copy.deepcopy(a) if getattr(a, "remembers", True) else a for i, a in agents.items()}
+    for vehicle, agent in begun.items():
+        if isinstance(agent, LookingAhead):
+            agent.others = {i: script for i, script in scripts.items() if i != vehicle}
+        begin_script(agent, alert, vehicle, rows)
+    return begun
+
+
 # Teams: one agent for each of several vehicles.
+
+
+@runtime_checkable
+class Shielding(Protocol):
+    """A driver behind a shield, on no vehicle yet."""
+
+    name: str
+
+    @property
+    def knows(self) -> Knowledge:
+        """What it knows, the shield included."""
+
+    def on(self, vehicles: Collection[int]) -> Team:
+        """The team that drives these vehicles."""
+
+    def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
+        """The shield in an engine in which these vehicles learn, who proposes for them, by vehicle."""
 
 
 class Team:
     """One agent for each driven vehicle (index, 0 = front). Each decides for its own vehicle, from what that one knows.
 
-    One object cannot drive two vehicles, because it may remember its episodes: ``copies`` makes a team of one agent.
+    Behind a ``shield`` they only propose. One object cannot drive two vehicles, because it may remember its episodes:
+    ``copies`` makes a team of one agent.
     Raises ``InvalidInput`` for what is not an agent, an index that is no whole number from 0, or one object twice.
 
     >>> import ethbrake_marl as eb
@@ -244,7 +280,7 @@ class Team:
 
     """
 
-    def __init__(self, drivers: Mapping[int, Agent], name: str) -> None:
+    def __init__(self, drivers: Mapping[int, Agent], name: str, shield: Shielding | None = None) -> None:
         for vehicle, agent in drivers.items():
             if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not vehicle >= 0:
                 raise InvalidInput(f"team {name!r}: {vehicle!r}: must be the index of a vehicle, 0 or more")
@@ -255,12 +291,12 @@ class Team:
                 f"team {name!r}: one object drives two vehicles; Team.copies gives each vehicle its own copy"
             )
         self.drivers = {int(vehicle): drivers[vehicle] for vehicle in sorted(drivers)}
-        self.name = name
+        self.name, self.shield = name, shield
 
     @property
     def knows(self) -> Knowledge:
-        """What its drivers know between them; nothing where nobody is driven."""
-        return combine(*self.drivers.values())
+        """What its drivers know between them, behind its shield; nothing where nobody is driven."""
+        return combine(*self.drivers.values(), *(() if self.shield is None else (self.shield,)))
 
     @classmethod
     def copies(cls, agent: Agent, vehicles: Collection[int]) -> Team:
@@ -268,11 +304,13 @@ class Team:
         return cls({vehicle: copy.deepcopy(agent) for vehicle in vehicles}, agent.name)
 
 
-Driver = Team | Agent  # an agent alone drives every learner, each by its own copy
+Driver = Team | Agent | Shielding  # an agent alone drives every learner, each by its own copy
 
 
 def team_of(driver: Driver, learners: Collection[int]) -> Team:
     """Fresh copies, one for each of the ``learners``. Raises ``InvalidInput`` for a team of other vehicles."""
+    if isinstance(driver, Shielding):
+        return driver.on(learners)
     if not isinstance(driver, Team):
         return Team.copies(driver, learners)
     if set(driver.drivers) != set(learners):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Agent, AgentAround, LookingAhead, Team
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Driver, LookingAhead, Shielding, Team
 from ethbrake_marl.agents.registry import make_single_agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.stream import Script
@@ -27,6 +27,7 @@ class Episodes:
     ledger: Ledger
     final: Worlds  # each world as its episode left it
     at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
+    guarded: Any = None  # what the shield remembers at their end; None without one
 
 
 class Watch(Protocol):
@@ -60,14 +61,19 @@ def set_others(agent: Agent, vehicle: int, scripts: Mapping[int, Script]) -> Non
         agent.others = {i: script for i, script in scripts.items() if i != vehicle}
 
 
-def episode_engine(worlds: Worlds, agent: Agent | Team, scenario: Scenario, vehicle: int | None = None) -> Engine:
+def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None) -> Engine:
     """An engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team its vehicles; the others are scripted.
 
     They decide when their first vehicle's latency has elapsed and every time step from then on, as learners do; their
-    commands are applied unrounded. An agent that looks ahead knows the scripts, and takes the other driven vehicles to
+    commands are applied unrounded. Behind a shield they propose, and learn as far as the engine knows. One that looks
+    ahead knows the scripts, and takes the other driven vehicles to
     brake fully. Raises ``InvalidInput`` for a learner that nobody drives.
     """
-    team = agent if isinstance(agent, Team) else Team({} if vehicle is None else {vehicle: agent}, agent.name)
+    driven = () if vehicle is None else (vehicle,)
+    if isinstance(agent, Shielding):
+        team = agent.on(driven)
+    else:
+        team = agent if isinstance(agent, Team) else Team(dict.fromkeys(driven, agent), agent.name)
     drivers = team.drivers
     undriven = [scenario.vehicle_names[i] for i in scenario.learners if i not in drivers]
     if undriven:
@@ -77,18 +83,25 @@ def episode_engine(worlds: Worlds, agent: Agent | Team, scenario: Scenario, vehi
             " (+refined, +episode, +robust) can drive one learner, the others need scripts: --vehicle NAME"
         )
     scripts = script_agents(scenario, except_for=drivers)
-    for i, driver in drivers.items():
-        set_others(driver, i, scripts)
-    engine = Engine(
-        scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, deciders=tuple(drivers), worlds=worlds
-    )
+    shield = team.shield
+    if shield is None:
+        for i, driver in drivers.items():
+            set_others(driver, i, scripts)
+        engine = Engine(
+            scenario, worlds.n, learners=(), scripts={**scripts, **drivers}, deciders=tuple(drivers), worlds=worlds
+        )
+    else:
+        engine = Engine(
+            scenario, worlds.n, learners=tuple(drivers), scripts=scripts, worlds=worlds,
+            guard=lambda engine: shield.guard(engine, drivers),
+        )  # fmt: skip
     engine.roster.warns = False  # who drives looks
     return engine
 
 
 def drive(
     worlds: Worlds,
-    agent: Agent | Team,
+    agent: Driver,
     scenario: Scenario,
     vehicle: int | None = None,
     *,
@@ -98,7 +111,11 @@ def drive(
 
     Raises ``PhysicsError`` naming all worlds that could not be advanced; the others are well without them.
     """
-    engine = episode_engine(worlds, agent, scenario, vehicle)
+    return play(episode_engine(worlds, agent, scenario, vehicle), worlds, watched_by)
+
+
+def play(engine: Engine, worlds: Worlds, watched_by: Sequence[Watch] = ()) -> Episodes:
+    """The episodes of such an engine, which is still at the first decision in ``worlds``; raises ``PhysicsError``."""
     at_rest = np.zeros(worlds.n, np.bool_)
     now = _show(watched_by, worlds, engine, engine.worlds.command_mps2)
     while not engine.ended.all():
@@ -106,7 +123,7 @@ def drive(
         now = _show(watched_by, now, engine, engine.wanted_mps2.copy())
     if engine.roster.failed:
         raise PhysicsError(engine.roster.failed)
-    return Episodes(engine.ledger, engine.worlds, at_rest)
+    return Episodes(engine.ledger, engine.worlds, at_rest, engine.guarded)
 
 
 def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:
@@ -123,18 +140,34 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
 # The recorder of an agent: its commands in each step of its episodes.
 
 
-def record_commands(agent: Agent, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
+def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
     """The commands that ``agent`` gives ``vehicle`` in the first ``steps`` decisions of its episodes, [n, steps] m/s2.
 
     ``worlds`` are at the alert. After an episode's end its last command goes on. Raises ``PhysicsError`` naming the
     worlds that it cannot drive to the end.
     """
-    recorder = _Recorder(agent, steps, scenario.time_step_s)
-    drive(worlds, recorder, scenario, vehicle)
-    commands = recorder.commands_mps2
+    if isinstance(agent, Agent):
+        recorder = _Recorder(agent, steps, scenario.time_step_s)
+        drive(worlds, recorder, scenario, vehicle)
+        commands = recorder.commands_mps2
+    else:
+        commands = _applied_commands(episode_engine(worlds, agent, scenario, vehicle), vehicle, steps)
     latest = np.maximum.accumulate(np.where(np.isnan(commands), 0, np.arange(steps)), axis=1)
     filled: Floats = np.take_along_axis(commands, latest, axis=1)
     return filled
+
+
+def _applied_commands(engine: Engine, vehicle: int, steps: int) -> Floats:
+    """What is applied in place of what somebody proposes, [n, steps]; NaN after an episode's end."""
+    commands = np.full((engine.n, steps), np.nan)
+    while not engine.ended.all():
+        rows = np.flatnonzero(~engine.ended & (engine.steps < steps))
+        at = engine.steps[rows]
+        engine.step({})
+        commands[rows, at] = engine.wanted_mps2[rows, vehicle]
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
+    return commands
 
 
 class _Recorder(AgentAround):

@@ -7,7 +7,7 @@ t = 0, when Vehicle 1 brakes; ``reset`` moves exactly to the first moment at whi
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -32,7 +32,6 @@ from ethbrake_marl.engine.stream import (
     Script,
     Start,
     Stream,
-    Told,
     ask_script,
     ask_where_due,
     begin_script,
@@ -40,7 +39,7 @@ from ethbrake_marl.engine.stream import (
     is_state_free,
     within_capacity,
 )
-from ethbrake_marl.errors import InvalidInput, renumbered
+from ethbrake_marl.errors import InvalidInput, UncertifiedStep, renumbered
 from ethbrake_marl.harm import Ledger, objective_harm
 from ethbrake_marl.observations import Observations, ObservationSpec, Plan, observation_for, observe_packed, plan_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
@@ -272,7 +271,7 @@ class Way(NamedTuple):
 
 
 class Watcher(Protocol):
-    """Follows an engine's episodes (a shield does), and refuses what must not happen by raising.
+    """Looks on while an engine's episodes run, as the trace of a picture does; it changes nothing.
 
     What it remembers is kept by the engine beside the worlds (``Engine.memory``): both change in one piece, or, where
     anything fails or is interrupted, neither does. A memory is therefore never changed in place.
@@ -285,12 +284,41 @@ class Watcher(Protocol):
         """The memory once the engine, as it was ``before`` this step, is as ``after``."""
 
 
+class Ruling(NamedTuple):
+    """What a guard lets happen in one step, of n worlds and L learners."""
+
+    proposed: Floats  # [n, L] actions; NaN: none, or no number
+    applied: Floats  # [n, L] actions
+    stepped_in: Bools  # [n] something else is applied than what was proposed
+    asked: Bools  # [n] worlds that it is about
+    decision: Any  # what else there is to tell of it
+    memory: Any  # the guard's once the step is made
+
+
+class Guard(Protocol):
+    """Stands between what is proposed to an engine and what is applied: a shield.
+
+    It is asked inside ``Engine.step``, so nothing that reaches the engine passes it by. What it remembers is kept by
+    the engine: worlds, memory and ruling change in one piece, or, where anything fails or is interrupted, none does. A
+    memory is therefore never changed in place.
+    """
+
+    def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
+        """The memory once episodes start in these rows, None before; ``alert`` holds those worlds only, at t = 0."""
+
+    def decide(self, running: Running, memory: Any, proposed: Floats) -> Ruling:
+        """What is applied instead of the actions [n, L]. A column of NaN: nothing was proposed for that learner."""
+
+    def check(self, ruling: Ruling, after: Running) -> Any:
+        """The memory now that the step led to ``after``. Raises ``UncertifiedStep``: then it was not made."""
+
+
 class Engine(Running):
     """A batch of ``n`` running episodes of one scenario.
 
-    Steps start when the first of the ``deciders`` may act; with none, at t = 0. Whoever must see each episode's start
-    and each step (a shield) follows it as a ``Watcher``. A world that the physics cannot advance takes no other with
-    it: its episode is cut off (truncated), and the ``roster`` names it.
+    Steps start when the first of the ``deciders`` may act; with none, at t = 0. A ``guard`` (a shield) may stand
+    between what is proposed and what is applied. A world that the physics cannot advance takes no other with it: its
+    episode is cut off (truncated), and the ``roster`` names it.
 
     Args:
         scenario: of every episode.
@@ -303,6 +331,7 @@ class Engine(Running):
         deciders: indices of the vehicles that set the grid of decisions; None: the learners. An evaluated agent drives
             its vehicle as a script, on a learner's grid.
         worlds: of the first episodes, at t = 0; None: from the stream.
+        guard: makes what stands between proposed and applied actions; None: what is proposed is applied.
 
     >>> import ethbrake_marl as eb
     >>> engine = eb.make_sb3_vec_env("paper-random", 4, seed=7).engine
@@ -323,6 +352,7 @@ class Engine(Running):
         seed: int = 0,
         deciders: Sequence[int] | None = None,
         worlds: Worlds | None = None,
+        guard: Callable[[Engine], Guard] | None = None,
     ) -> None:
         if not n >= 1:
             raise InvalidInput(f"engine: n = {n} worlds; at least 1 is needed")
@@ -343,17 +373,16 @@ class Engine(Running):
         self.observation = (observation or observation_for(scenario)).at_steps_of(scenario.time_step_s)
         self._plan = plan_of(self.observation)
         self._memories: dict[Watcher, Any] = {}
-        self.steps_made = 0  # steps of the batch that watchers let pass
         self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
         self._on_own_grid = {i: s for i, s in self._remembering.items() if i not in self.deciders}
         self._stops: list[tuple[Floats, Floats]] = []  # of the last step: the states there, and what led to them
-        self._told = [script for script in self._remembering.values() if isinstance(script, Told)]
         self._learner_index = np.array(self.learners, np.int64)
         total = float(self.reward.harm_count == "total")
         times = scenario.time_step_s, scenario.horizon_s
         self._settings = np.array([*times, self._terms.shared_harm, total, self.reward.terminal])
         self.reward_terms = counted_terms(self.reward)  # names of those whose values each step tells
         self._stream = Stream(scenario, self.deciders, self.scripts, seed)
+        self.protect(None if guard is None else guard(self))
         self.reset(worlds=worlds)
 
     @property
@@ -374,9 +403,9 @@ class Engine(Running):
         """Let a watcher follow, from ``memory`` on."""
         self._memories = {**self._memories, watcher: memory}
 
-    def unwatch(self, watcher: Watcher) -> None:
-        """Let go of a watcher, if it follows."""
-        self._memories = {w: memory for w, memory in self._memories.items() if w is not watcher}
+    def protect(self, guard: Guard | None) -> None:
+        """Let a guard stand between what is proposed and what is applied, from the next reset on; None: nobody does."""
+        self.guard, self.guarded, self.ruling = guard, None, None
 
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
         """Start new episodes in all rows: the given worlds (at t = 0), or the next ones of the training stream.
@@ -397,7 +426,7 @@ class Engine(Running):
         new._state, new._params = (array.copy() for array in new._kept(start.packed))
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
         new._potential = np.zeros(start.wanted.shape)
-        new._stops = []
+        new._stops, new.guarded, new.ruling = [], None, None
         new._begin(np.arange(self.n), start)
         self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
 
@@ -405,7 +434,7 @@ class Engine(Running):
         """Start new episodes of the training stream in these rows (autoreset). Whatever fails, nothing is changed."""
         if len(rows) == 0:
             return
-        if not (self._memories or self._remembering):
+        if not (self._memories or self._remembering or self.guard):
             self._renew(rows)
             return
         new = self._apart()
@@ -416,8 +445,8 @@ class Engine(Running):
     def _apart(self) -> Engine:
         """An engine that goes on from here without changing this one (scripts that remember are shared)."""
         new = copy.copy(self)
-        new.__dict__.update({name: getattr(self, name).copy() for name in RUNNING})
-        new.roster = copy.deepcopy(self.roster)
+        new.__dict__.update({name: getattr(new, name).copy() for name in RUNNING})
+        new.roster = copy.deepcopy(new.roster)
         return new
 
     def _renew(self, rows: Ints) -> None:
@@ -432,20 +461,25 @@ class Engine(Running):
         """Advance every running episode by one time step.
 
         ``actions``: for each learner (by vehicle index, or as columns [n, L] in the order of ``learners``) a number in
-        [-1, 1] per world. Rows whose episode has ended stay as they are until ``renew`` or ``reset``. What a watcher
-        refuses does not happen: the worlds stay as they are.
+        [-1, 1] per world; by index a guarded one may be left out. Rows whose episode has ended stay as they are until
+        ``renew`` or ``reset``. What the guard refuses does not happen: the worlds stay as they are.
         """
         columns = self._columns(actions)
-        if not (self._memories or self._terms.are_foreign or self._on_own_grid):  # nobody can refuse what happens
-            step = self._advance(columns)
-        else:
-            new = self._apart()
-            step = new._advance(columns)
-            new._memories = {w: w.stepped(memory, self, new) for w, memory in self._memories.items()}
-            new.steps_made += 1
-            self.__dict__.update(new.__dict__)
-        for script in self._told:
-            script.after_step(self.packed)
+        if not (self.guard or self._memories or self._terms.are_foreign or self._on_own_grid):  # nobody can refuse it
+            return self._advance(columns)
+        before = copy.copy(self)  # of one moment, whatever another thread does meanwhile
+        new = before._apart()
+        if self.guard is not None:
+            if before.guarded is None:
+                raise UncertifiedStep("shield: this episode began before the shield was put around it; reset first")
+            proposed = columns if isinstance(actions, Mapping) else self._in_range(columns)  # those of one are checked
+            ruling = self.guard.decide(before, before.guarded, proposed)
+            columns = np.ascontiguousarray(ruling.applied)
+        step = new._advance(columns)
+        if self.guard is not None:
+            new.ruling, new.guarded = ruling, self.guard.check(ruling, new)
+        new._memories = {w: w.stepped(memory, before, new) for w, memory in self._memories.items()}
+        self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
         return step
 
     def _advance(self, columns: Floats) -> Step:
@@ -486,6 +520,9 @@ class Engine(Running):
             return np.ascontiguousarray(given, np.float64)
         columns = np.empty(shape)
         for c, vehicle in enumerate(self.learners):
+            if vehicle not in actions and self.guard is not None:
+                columns[:, c] = np.nan
+                continue
             if vehicle not in actions:
                 raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
             columns[:, c] = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
@@ -505,9 +542,11 @@ class Engine(Running):
 
     def _begin(self, rows: Ints, start: Start) -> None:
         """Tell those who must know that episodes start in ``rows``, and move what depends on them."""
-        if self._memories or self._remembering:
+        if self.guard or self._memories or self._remembering:
             alert = start.alert
             with renumbered(rows):
+                if self.guard is not None:
+                    self.guarded = self.guard.begin(self.guarded, alert, rows)
                 self._memories = {w: w.begun(memory, alert, rows) for w, memory in self._memories.items()}
                 for vehicle, script in self._remembering.items():
                     begin_script(script, alert, vehicle, rows)

@@ -50,10 +50,10 @@ def restore_engine(engine: Engine, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Bring an engine of the same scenario, size and scripts to the state of ``engine_snapshot``.
 
     Raises ``InvalidInput``, before anything is changed, naming the array that is missing or has another shape, and
-    where a shield follows the engine, which would know nothing of these worlds.
+    where a shield stands in the engine, which would know nothing of these worlds.
     """
-    if engine.watchers:
-        raise InvalidInput("engine snapshot: a shield follows this engine; restore first, then put the shield around")
+    if engine.guard is not None:
+        raise InvalidInput("engine snapshot: a shield stands in this engine; restore first, then put the shield around")
     for name in RUNNING:
         have, wanted = arrays.get(name.lstrip("_")), getattr(engine, name)
         if have is None or have.shape != wanted.shape:
@@ -183,6 +183,7 @@ def branch(engine: Engine, moment: Moment) -> Engine:
         )
     new = copy.copy(engine)
     new.n, new._memories = len(moment.state), {}
+    new.protect(None)
     new.roster = Roster(new.n, engine.seed, None)
     new.roster.warns = False
     new._state, new._params, new._clock, new._wanted = (array.copy() for array in moment)

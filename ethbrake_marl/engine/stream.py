@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -48,14 +48,6 @@ class Script(Protocol):
 
         Not each world need have a decision now: of the others the command is not used, and its memory put back.
         """
-
-
-@runtime_checkable
-class Told(Protocol):
-    """A script with a memory that is told what came of each step, the last one included."""
-
-    def after_step(self, packed: Packed) -> None:
-        """The step was made: the worlds of the whole batch now, and their harm since the alert; to be read only."""
 
 
 class Start(NamedTuple):

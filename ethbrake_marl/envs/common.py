@@ -100,14 +100,21 @@ def only_learner(engine: Engine) -> int:
     return engine.learners[0]
 
 
-def learner_columns(learners: Sequence[str], actions: Mapping[str, Any]) -> Floats:
-    """The learners' actions of one world as [1, L], from an action [1] for each by name.
+def learner_actions(engine: Engine, actions: Mapping[str, Any]) -> Floats | dict[int, Floats]:
+    """The learners' actions of one world as [1, L], from an action [1] for each by name; behind a shield by vehicle.
 
-    Raises ``InvalidInput`` naming the vehicle whose action is missing or misshapen; the engine checks the range.
+    Raises ``InvalidInput`` naming the vehicle whose action is missing or misshapen; the engine checks the range. Behind
+    a shield an action may be missing.
     """
-    columns = np.empty((1, len(learners)))
-    for c, name in enumerate(learners):
-        if name not in actions:
+    names, columns = engine.scenario.vehicle_names, np.empty((1, len(engine.learners)))
+    for c, vehicle in enumerate(engine.learners):
+        name = names[vehicle]
+        if actions.get(name) is None:
+            if engine.guard is not None:
+                given = {
+                    i: np.atleast_1d(actions[names[i]]) for i in engine.learners if actions.get(names[i]) is not None
+                }
+                return {i: checked_action(each, (1,), names[i]) for i, each in given.items()}
             raise InvalidInput(f"step: no action for the learner {name}")
         action = np.asarray(actions[name])
         if action.shape != (1,) or action.dtype.kind not in "fiu":

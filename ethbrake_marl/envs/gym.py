@@ -22,7 +22,7 @@ from ethbrake_marl.envs.common import (
     describe_worlds,
     feature_box,
     fresh_seed,
-    learner_columns,
+    learner_actions,
     make_engine,
     only_learner,
     plain_infos,
@@ -111,7 +111,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         """Advance by one time step."""
         if not self._running:
             raise InvalidInput("step: no episode is running; call reset first")
-        step = self.engine.step(learner_columns((self._name,), {self._name: action}))
+        step = self.engine.step(learner_actions(self.engine, {self._name: action}))
         self._running = not step.ended[0]
         if self.render_mode is not None:
             self.viewer.play()

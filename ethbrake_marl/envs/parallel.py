@@ -20,7 +20,7 @@ from ethbrake_marl.envs.common import (
     describe_world,
     feature_box,
     fresh_seed,
-    learner_columns,
+    learner_actions,
     make_engine,
     plain_infos,
     report,
@@ -48,10 +48,8 @@ class InTurns(parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is u
         if self.terminations[agent] or self.truncations[agent]:
             if action is not None:
                 raise InvalidInput(f"step: the episode of {agent} is over; only None may follow, or reset")
-        elif engine.scenario.vehicle_names.index(agent) in engine.learners:
-            left_out = action is None and agent in getattr(self.env, "shielded", ())  # a shield may choose alone
-            if not left_out:
-                checked_action(action, (1,), agent)
+        elif engine.scenario.vehicle_names.index(agent) in engine.learners and not (action is None and engine.guard):
+            checked_action(action, (1,), agent)  # left out: a shield may choose alone
         super().step(action)
 
 
@@ -113,7 +111,6 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         self.viewer = Viewer(self.engine, render_mode)
         self.metadata = {**self.metadata, **render_metadata(self.engine)}
         names = self.engine.scenario.vehicle_names
-        self._learners = [names[i] for i in self.engine.learners]
         self._vehicles = _agent_vehicles(self.engine, agents)
         self.possible_agents = [names[i] for i in self._vehicles.tolist()]
         self.agents: list[str] = []
@@ -153,7 +150,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         if not self.agents:
             raise InvalidInput("step: no episode is running; call reset first")
         self._check_agents(actions)
-        step = self.engine.step(learner_columns(self._learners, actions))
+        step = self.engine.step(learner_actions(self.engine, actions))
         agents = self.possible_agents
         (rewards,) = step.reward.take(self._vehicles, axis=1).tolist()
         terminated, truncated = step.ending(0)

@@ -21,8 +21,9 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, Driver, Team, team_of
 from ethbrake_marl.agents.registry import parse_spec
-from ethbrake_marl.agents.rollout import Episodes, drive, episode_engine
+from ethbrake_marl.agents.rollout import Episodes, episode_engine, play
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
+from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.drawing.scene import Scene, Trace, animate_films, kept_motions, scenes
 from ethbrake_marl.errors import InvalidInput, PhysicsError, UnknownName, count_of, need, plain_text
 from ethbrake_marl.evaluation.inputs import (
@@ -41,7 +42,6 @@ from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
 from ethbrake_marl.physics.kernel import first_decision_s, segment_pieces, with_post_ahead
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import HybridAgent
-from ethbrake_marl.shield.agents import shield_around
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
@@ -84,22 +84,23 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 
     """
     team = team_of(agent, scenario.learners)
-    follower = _Follower(worlds, team)
-    episodes = drive(worlds, team, scenario, watched_by=[follower])
+    engine = episode_engine(worlds, team, scenario)
+    follower = _Follower(worlds, team, engine)
+    episodes = play(engine, worlds, [follower])
     return [follower.motion(k, episodes) for k in range(worlds.n)]
 
 
 class _Follower:
     """Watches a batch of episodes."""
 
-    def __init__(self, worlds: Worlds, team: Team) -> None:
+    def __init__(self, worlds: Worlds, team: Team, engine: Engine) -> None:
         self._worlds, self._drivers = worlds, list(team.drivers.values())
         self._first_s = first_decision_s(worlds, list(team.drivers))
         self._way_m = np.zeros(worlds.n)
         self._pieces: list[list[Floats]] = [[] for _ in range(worlds.n)]
         self._impacts: list[list[ImpactRows]] = [[] for _ in range(worlds.n)]
         self._stepped_in: list[list[float]] = [[] for _ in range(worlds.n)]
-        self._count = np.zeros(worlds.n)
+        self._engine, self._ruling = engine, engine.ruling
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Keep the pieces and impacts of one step."""
@@ -120,10 +121,11 @@ class _Follower:
             pieces[:, 1] += self._way_m[k]
             self._pieces[k].append(pieces)
             self._way_m[k] += way
-        count = _steps_taken_over(self._drivers, before.n)
-        for k in np.flatnonzero(count > self._count).tolist():
-            self._stepped_in[k].append(float(before.time_s[k]))
-        self._count = count
+        ruling = self._engine.ruling
+        if ruling is not None and ruling is not self._ruling:  # a step is shown in parts
+            for k in np.flatnonzero(ruling.stepped_in & ruling.asked).tolist():
+                self._stepped_in[k].append(float(before.time_s[k]))
+            self._ruling = ruling
 
     def motion(self, k: int, episodes: Episodes) -> EpisodeMotion:
         """What was seen of world ``k``."""
@@ -172,15 +174,6 @@ def _standing(worlds: Worlds, k: int) -> Floats:
     """The one piece of an episode that ends where it begins."""
     N = worlds.N
     return np.concatenate([worlds.time_s[[k]], [0.0], worlds.gaps_m[k], worlds.speeds_mps[k], np.zeros(N)])[np.newaxis]
-
-
-def _steps_taken_over(drivers: list[Agent], n: int) -> Floats:
-    """A count, [n], that rises with every decision in which a step shield applied something else than a proposal."""
-    count = np.zeros(n)
-    for driver in drivers:
-        if (shield := shield_around(driver)) is not None:
-            count += shield.interventions
-    return count
 
 
 # One episode at fine time resolution: what a figure or a viewer draws.

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ethbrake_marl.agents.policy import LearnedAgent, PolicyAgent
 from ethbrake_marl.agents.protocol import Agent, AgentAround, Driver, Team, team_of
 from ethbrake_marl.agents.registry import make_agent, make_single_agent, parse_spec
-from ethbrake_marl.agents.rollout import script_agents, set_others
+from ethbrake_marl.agents.rollout import episode_engine, script_agents, set_others
 from ethbrake_marl.defaults import EPISODES, LIST_SEED, MOST_NAMED_WORLDS, HarmCount
 from ethbrake_marl.engine.stream import ask_script, begin_script
 from ethbrake_marl.errors import InvalidInput, check_one_learner, naming_agent
@@ -28,6 +28,7 @@ from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.policies.bundle import Policy
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml, worlds_from_table
 from ethbrake_marl.scenario.fields import QUANTITIES, quantity_columns
+from ethbrake_marl.shield import ShieldedDriver
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 # The identity of a result: the worlds, the scenario and the policies that it is about, and what computed it.
@@ -89,7 +90,7 @@ def scenario_sha256(scenario: Scenario) -> str:
 
 def driving_policy(agent: object) -> object:
     """What is inside everything that is around an agent: the policy that it drives by, or the agent itself."""
-    while isinstance(agent, AgentAround | LearnedAgent):
+    while isinstance(agent, AgentAround | LearnedAgent | ShieldedDriver):
         agent = agent.policy
     return agent
 
@@ -191,7 +192,7 @@ class NamedWorlds(_Strict):
             raise InvalidInput(
                 f"{where}: its worlds were found in scenario {self.scenario!r}"
                 f"{''.join(f' with --set {each}' for each in self.settings)}, which {scenario.name!r} is not, or is no"
-                " longer: their contents differ; use that scenario, or search again (ethbrake falsify)"
+                " longer: their contents differ; use that scenario, or search again (ethbrake search falsify)"
             )
         columns = self.worlds[0].state.keys()
         for k, world in enumerate(self.worlds):
@@ -327,6 +328,10 @@ def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenari
     for name, agent in agents.items():
         team = team_of(agent, scenario.learners)
         scripts = script_agents(scenario, except_for=team.drivers)
+        if team.shield is not None:
+            with naming_agent(name, [script.name for script in scripts.values()]):
+                episode_engine(worlds.take([0]), team, scenario).step({})
+            continue
         for vehicle, driver in team.drivers.items():
             set_others(driver, vehicle, scripts)
             with naming_agent(name, [script.name for script in scripts.values()]):
@@ -365,7 +370,7 @@ def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCou
     for spec, agent in make_lineup(specs, scenario, harm_count=harm_count).items():
         if isinstance(agent, Team):
             raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
-        alone[spec] = agent
+        alone[spec] = agent  # type: ignore[assignment]  # or one behind a shield
     return alone
 
 

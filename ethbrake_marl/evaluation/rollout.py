@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.protocol import Driver, Team, check_agent, knowledge_of, team_of
+from ethbrake_marl.agents.protocol import Driver, Shielding, Team, check_agent, knowledge_of, team_of
 from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.engine.stream import check_alert, is_state_free
 from ethbrake_marl.errors import (
@@ -47,7 +47,6 @@ from ethbrake_marl.physics.sampled import sample_numbers, sample_worlds
 from ethbrake_marl.physics.worlds import sum_rows
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.scenario.fields import constant_command, kind_columns
-from ethbrake_marl.shield.agents import drives_alone
 
 # The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
 #
@@ -304,7 +303,7 @@ def _check_request(worlds: object, agents: object, scenario: object, chunk: obje
     if not agents:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
     for name, agent in agents.items():
-        if not isinstance(agent, Team):
+        if not isinstance(agent, Team | Shielding):
             check_agent(agent, f"evaluate: agent {name!r}")
         knowledge_of(agent)  # refuses what is no statement
     check_whole_number("evaluate: chunk", chunk, 1)
@@ -393,7 +392,9 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     sampled = SampledHarm.of(worlds, task) if aftermath else None
     impacts = ImpactWatch.of(worlds) if aftermath else None
     episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled, impacts) if w is not None])
-    alone = drives_alone(team)
+    alone = next(iter(team.drivers.values())) if len(team.drivers) == 1 else None
+    if episodes.guarded is not None:
+        alone = episodes.guarded.shield
     predicted, chosen = (_read_column(alone, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
     return Outcome(
         episodes.ledger,
@@ -409,7 +410,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     )
 
 
-def _read_column(agent: Driver | None, attribute: str, n: int) -> NDArray[np.generic] | None:
+def _read_column(agent: Any, attribute: str, n: int) -> NDArray[np.generic] | None:
     """What the agent says about each world of the batch, or None when it says nothing."""
     value = getattr(agent, attribute, None)
     if agent is None or value is None:
@@ -417,7 +418,8 @@ def _read_column(agent: Driver | None, attribute: str, n: int) -> NDArray[np.gen
     column = np.asarray(value)
     if column.shape != (n,):
         raise InvalidInput(
-            f"agent {agent.name!r}: {attribute} has shape {column.shape}; one per world, ({n},), is needed"
+            f"agent {getattr(agent, 'name', agent)!r}: {attribute} has shape {column.shape}; one per world, ({n},), is"
+            " needed"
         )
     return column
 

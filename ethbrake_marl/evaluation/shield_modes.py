@@ -10,7 +10,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from ethbrake_marl.agents.protocol import Driver, Team, team_of
+from ethbrake_marl.agents.protocol import Agent, Driver, Team, team_of
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.evaluation.inputs import policies_by_name, policy_sha256, result_identity
@@ -19,8 +19,8 @@ from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.files.sheet import Estimate, estimates_to_json
 from ethbrake_marl.physics import Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Sample, Task
-from ethbrake_marl.shield import HybridAgent, ShieldedTeam, StepShieldAgent
-from ethbrake_marl.shield.agents import Shielded, drive_behind, join, put_shield
+from ethbrake_marl.shield import HybridAgent, ShieldedDriver
+from ethbrake_marl.shield.agents import Shielded, join, put_shield, shielded_episodes
 from ethbrake_marl.shield.review import SAME_HARM, VERDICTS, review
 
 NONE, EPISODE, STEP = "none", "episode", "step"
@@ -110,10 +110,11 @@ def compare_behind_shields(agents: Mapping[str, Driver], worlds: Worlds, task: T
 
     Agents whose shield does not know the world (``+robust``) are left out: their modes are another question.
     """
+    behind = {name: agent.shield if isinstance(agent, Team) else agent for name, agent in agents.items()}
     proposers = {
-        agent.policy.name: agent.policy
-        for name, agent in agents.items()
-        if isinstance(agent, HybridAgent | StepShieldAgent | ShieldedTeam) and "+robust" not in name
+        shielded.policy.name: shielded.policy
+        for name, shielded in behind.items()
+        if isinstance(shielded, HybridAgent) or (isinstance(shielded, ShieldedDriver) and "+robust" not in name)
     }
     return compare_modes(proposers, worlds, task) if proposers else []
 
@@ -202,14 +203,14 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[str, _Part]:
     several = len(task.vehicles) > 1
     found = {NONE: _alone(worlds, team_of(agent, task.vehicles), task)}
     if not several:
-        assert not isinstance(agent, Team)
+        assert isinstance(agent, Agent)
         hybrid = HybridAgent(agent, task.scenario, harm_count=task.harm_count)
         found[EPISODE] = _alone(worlds, Team({task.vehicle: hybrid}, hybrid.name), task)
     modes: dict[str, dict[str, Any]] = {STEP: {}, STEP_ALERT: {"later_rollouts": False}}
     for mode, settings in (modes | ({STEP_CAP: {"cap": "baseline"}} if several else {})).items():
-        behind = put_shield(agent, task, logging=True, **settings)
-        shielded = drive_behind(behind, worlds, task)
-        verdict = review(behind, worlds, None if several else task.vehicle).verdict
+        episodes = drive(worlds, put_shield(agent, task, logging=True, **settings), task.scenario)
+        shielded = shielded_episodes(episodes, task)
+        verdict = review(episodes.guarded.shield, agent, worlds).verdict
         counted = np.array([int((verdict == each).sum()) for each in VERDICTS])
         found[mode] = _Part(shielded.harm, int(shielded.moving.sum()), shielded, counted)
     return found

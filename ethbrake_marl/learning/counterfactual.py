@@ -181,10 +181,7 @@ class AveragedActor(BasePolicy):
     def means(self, observation: Float32s) -> Float32s:
         """What the actor that learns says to observations [rows, F], [rows]; beyond -1 and 1 it means -1 and 1."""
         with torch.no_grad():
-            values = torch.from_numpy(observation)
-            for layer in self.learning:
-                values = values.relu_() if isinstance(layer, nn.ReLU) else layer.forward(values)
-        found: Float32s = values[:, 0].numpy()
+            found: Float32s = self.learning(torch.from_numpy(observation))[:, 0].numpy()
         return found
 
     def act(self, observation: Float32s) -> Float32s:

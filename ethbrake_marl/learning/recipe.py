@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -488,9 +487,9 @@ def shipped_recipes() -> dict[str, Path]:
     return {file.stem: file for file in sorted(shipped_folder("train", "recipes").glob("*.yaml"))}
 
 
-def recipe_of(content: str) -> TrainingRecipe:
-    """The recipe that ``model_dump(mode="json")`` wrote, from its JSON text; raises ``InvalidInput``."""
-    return _checked(Document("recipe", json.loads(content), {}))
+def recipe_of(content: Any) -> TrainingRecipe:
+    """The recipe that ``model_dump(mode="json")`` wrote; raises ``InvalidInput``."""
+    return _checked(Document("recipe", content, {}))
 
 
 def _checked(source: Path | Document) -> TrainingRecipe:
@@ -652,7 +651,6 @@ def _described(key: str, value: dict[str, Any]) -> dict[str, Any]:
 # Schemes of training several learners together, and the network that therefore drives each vehicle.
 
 SCHEMES: tuple[Scheme, ...] = get_args(Scheme)
-POLICY = "policy"  # folder of a run in which the policies stand
 
 
 def scheme_of(recipe: TrainingRecipe, scenario: Scenario) -> Scheme:
@@ -693,7 +691,7 @@ def drivers(scheme: Scheme, scenario: Scenario) -> dict[str, str]:
 
 def driver(scheme: Scheme, vehicle: str) -> str:
     """Where in the run's folder the bundle stands that drives a learner."""
-    return f"{POLICY}/{vehicle}" if scheme == "independent" else POLICY
+    return f"policy/{vehicle}" if scheme == "independent" else "policy"
 
 
 def who_drives_what(given: Mapping[str, str]) -> str:

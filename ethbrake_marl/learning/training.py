@@ -16,7 +16,7 @@ import signal
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,15 +24,15 @@ from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from filelock import FileLock, Timeout
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.agents.protocol import Driver, Team
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
 from ethbrake_marl.files.plugins import check_plugins, noted_plugins
-from ethbrake_marl.files.store import hold_lock, new_folder, parse_strict_json, read_plain, write_file
-from ethbrake_marl.files.yaml import Document, FileModel, Wording, first_mistake, read_model, refuse
+from ethbrake_marl.files.store import new_folder, parse_strict_json, read_plain, write_file
+from ethbrake_marl.files.yaml import Document, FileModel, Wording, read_model, refuse
 from ethbrake_marl.learning.recipe import (
     WORDS,
     Scheme,
@@ -49,15 +49,6 @@ from ethbrake_marl.policies.bundle import Policy, load_policy
 from ethbrake_marl.policies.shipped import SHIPPED, PolicyKind, load_named_policy
 from ethbrake_marl.scenario import Scenario, load_scenario
 
-if TYPE_CHECKING:
-    from stable_baselines3.common.base_class import BaseAlgorithm
-    from stable_baselines3.common.policies import BasePolicy
-    from torch import Tensor
-    from torch.optim import Optimizer
-
-    from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-
-
 if TYPE_CHECKING:  # torch takes seconds, and what is asked of a run needs none
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.policies import BasePolicy
@@ -69,56 +60,24 @@ if TYPE_CHECKING:  # torch takes seconds, and what is asked of a run needs none
 # The folder of a run: its files, its configuration, how far it came, and who may train in it.
 
 _LIMIT_BYTES = 16 << 20  # of a JSON file
-_LOCK = "run.lock"
 
 RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
 
-@dataclass(frozen=True, slots=True)
 class RunDirectory:
     """Names inside a run's folder."""
 
-    path: Path
-
-    @property
-    def config(self) -> Path:
-        """What was asked for: recipe, scenario, seeds, versions."""
-        return self.path / "config.json"
-
-    @property
-    def status(self) -> Path:
-        """How far it came: ``running``, ``finished``, ``interrupted`` or ``failed``, steps, updates, wall time."""
-        return self.path / "run.json"
-
-    @property
-    def progress(self) -> Path:
-        """One row per update."""
-        return self.path / "progress.csv"
-
-    @property
-    def tensorboard(self) -> Path:
-        """The same numbers as TensorBoard events."""
-        return self.path / "tensorboard"
-
-    @property
-    def policy(self) -> Path:
-        """The bundle to use: the policy of least harm on the fixed list, or the last where no harm is measured."""
-        return self.path / "policy"
-
-    @property
-    def last_policy(self) -> Path:
-        """The bundle at the end of the run."""
-        return self.path / "policy-last"
-
-    @property
-    def team(self) -> Path:
-        """Which bundle drives which vehicle."""
-        return self.path / "team.json"
-
-    @property
-    def checkpoints(self) -> Path:
-        """Where the training can go on; empty once it has finished."""
-        return self.path / "checkpoints"
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config = path / "config.json"  # what was asked for: recipe, scenario, seeds, versions
+        self.status = path / "run.json"  # how far it came: a ``RunStatus``, steps, updates, wall time
+        self.progress = path / "progress.csv"  # one row per update
+        self.tensorboard = path / "tensorboard"  # the same numbers as TensorBoard events
+        self.policy = path / "policy"  # the bundle of least harm on the fixed list, or the last where none is measured
+        self.last_policy = path / "policy-last"  # the bundle at the end of the run
+        self.team = path / "team.json"  # which bundle drives which vehicle
+        self.checkpoints = path / "checkpoints"  # where the training can go on; empty once it has finished
+        self.lock = path / "run.lock"  # held while a process trains here
 
     def checkpoint(self, steps: int) -> Path:
         """The checkpoint after ``steps`` decisions."""
@@ -178,8 +137,8 @@ def create_run(
         if not run.status.is_file():
             raise AlreadyExists(f"{path}: is there already, and is no run; give another name")
         raise AlreadyExists(
-            f"{path}: is there already; give another name (--name), go on with it (ethbrake resume), or replace it with"
-            " force (--force; make run ARGS=--force)"
+            f"{path}: is there already; give another name (--name), go on with it (ethbrake train resume), or replace"
+            " it with force (--force; make run ARGS=--force)"
         )
     with new_folder(path, replace=replace) as partial:
         new = RunDirectory(partial)
@@ -223,13 +182,8 @@ def is_finished(path: Path) -> bool:
 
 def wait_for_others(path: Path, longest_s: float) -> None:
     """Wait until no other process trains in the folder, so long at most: one that was left alone ends by itself."""
-    with suppress(Timeout, OSError), FileLock(path / _LOCK, timeout=longest_s, mode=0o666):
+    with suppress(Timeout, OSError), FileLock(RunDirectory(path).lock, timeout=longest_s, mode=0o666):
         pass
-
-
-def only_process(run: RunDirectory) -> AbstractContextManager[None]:
-    """Hold the run's lock; raises ``InvalidInput`` when another process trains in this folder."""
-    return hold_lock(run.path / _LOCK, "another process is training here")
 
 
 Content = dict[str, dict[str, Any]]
@@ -291,12 +245,10 @@ def training_in(folder: Path, config: Mapping[str, Any]) -> Training:
             f"{folder}: was trained by {config['library']}, which leaves nothing to go on from; train again"
         )
     try:
-        recipe = recipe_of(json.dumps(config["recipe"]))
-        scenario = Scenario.model_validate_json(json.dumps(config["scenario"]))
+        recipe = recipe_of(config["recipe"])
+        scenario = Scenario.from_document(Document("scenario", config["scenario"], {}))
     except KeyError as error:
         raise InvalidInput(f"{file}: is not the configuration of a training: {error} is missing") from None
-    except ValidationError as error:
-        raise InvalidInput(f"{file}: scenario: {first_mistake(error)}") from None
     except InvalidInput as error:
         raise InvalidInput(f"{file}: {error}") from None
     return resolve(recipe, scenario)
@@ -409,7 +361,6 @@ def stop_on_signal() -> Iterator[Callable[[], bool]]:
 
 # ``team.json`` in a run's folder: which bundle drives which vehicle. Reading a team needs no torch.
 
-TEAM = "team.json"
 _TEAM_LIMIT_BYTES = 1 << 20
 _RIGHT_TEAM = (
     'right is, for instance, {"scheme": "shared", "vehicles": 3, "drivers": {"vehicle_2": "policy", "vehicle_3":'
@@ -447,7 +398,7 @@ def team_content(scheme: Scheme, scenario: Scenario) -> dict[str, Any]:
 
 def is_team(path: str | os.PathLike[str]) -> bool:
     """Whether ``path`` is a run whose learners have a policy each, so that no policy alone drives all of them."""
-    file = Path(path) / TEAM
+    file = RunDirectory(Path(path)).team
     return os.path.lexists(file) and len(set(_read_team(file).drivers.values())) > 1
 
 
@@ -459,9 +410,9 @@ def load_team(path: str | os.PathLike[str], scenario: str | Path | Scenario, nam
     one.
     """
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-    file = Path(path) / TEAM
+    file = RunDirectory(Path(path)).team
     if not os.path.lexists(file):
-        raise InvalidInput(f"{path}: holds no team ({TEAM}); give the folder of a run, or a bundle as ppo@{path}")
+        raise InvalidInput(f"{path}: holds no team ({file.name}); give the folder of a run, or a bundle as ppo@{path}")
     team = _read_team(file)
     if team.vehicles != scenario.vehicles:
         shared = len(set(team.drivers.values())) == 1
@@ -484,7 +435,7 @@ def load_team(path: str | os.PathLike[str], scenario: str | Path | Scenario, nam
 
 def load_driver(path: str | os.PathLike[str], vehicle: str) -> Policy:
     """The policy that drives ``vehicle`` in the run at ``path``; raises as ``load_team``."""
-    given: Mapping[str, str] = _read_team(Path(path) / TEAM).drivers
+    given: Mapping[str, str] = _read_team(RunDirectory(Path(path)).team).drivers
     if vehicle not in given:
         raise InvalidInput(f"{path}: drives {', '.join(given)}, not {vehicle}")
     return load_policy(Path(path) / given[vehicle])

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.agents.planner import MOST_CANDIDATES, PROFILE_BUDGET, BestHarm
-from ethbrake_marl.agents.protocol import Agent, fixed_commands
+from ethbrake_marl.agents.protocol import Agent, Driver, fixed_commands
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.agents.rollout import record_commands, script_agents
 from ethbrake_marl.defaults import HARM_COUNTS, SEARCH_BUDGET, HarmCount
@@ -514,6 +514,22 @@ def _kept_or_searched(
     return part
 
 
+def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
+    """Worlds that ``search_list`` would search, with both counts, not finding them kept; and what it finds damaged."""
+    left, damaged = 0, []
+    identity = world_identity(sample.worlds, Task(scenario, scenario.learners))
+    question = {"counts": list(HARM_COUNTS), "budget": budget, "search_seed": 0}
+    for first in range(0, len(identity), CHUNK):
+        file, wanted = chunk_file(chunks, first), identity[first : first + CHUNK]
+        try:
+            kept = kept_chunk(file, wanted, question)
+        except CorruptBundle:
+            kept = None
+            damaged.append(file)
+        left += 0 if kept is not None else len(wanted)
+    return left, damaged
+
+
 def chunk_file(chunks: Path, first: int) -> Path:
     """Where the chunk that begins with world ``first`` is kept."""
     return chunks / f"{first:07d}.npz"
@@ -688,7 +704,7 @@ def _driven_in(agent: Agent, every: Worlds, task: Task, last_step: Ints, rows: I
     return driven_profiles(agent, every.take(rows), task, last_step[rows])
 
 
-def driven_profiles(agent: Agent, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
+def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
     """What ``agent`` commands the vehicle in every step of its episodes, as profiles; equal neighbours are joined."""
     commands = record_commands(agent, worlds, task.scenario, task.vehicle, int(last_step.max()))
     return _phases_of(commands, last_step)

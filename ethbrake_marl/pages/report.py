@@ -105,40 +105,6 @@ def _largest(value: Floats, among: Bools) -> Ints:
     return order[among[order]]
 
 
-def play_chosen(
-    evaluation: Evaluation,
-    chosen: Sequence[Chosen],
-    agents: Mapping[str, Driver],
-    *,
-    spellings: Mapping[str, str] | None = None,
-    harm_count: HarmCount = "first",
-    on_agent: Callable[[str], None] | None = None,
-) -> list[Played]:
-    """Let every agent drive these worlds once more, and keep the motion and a passport of each episode.
-
-    Args:
-        evaluation: whose worlds they are.
-        chosen: at least one.
-        agents: that were evaluated, by name; they are left as they are.
-        spellings: how an agent is written on a command line, where that is not its name.
-        harm_count: that agents minimised.
-        on_agent: is told each agent that is done.
-
-    """
-    rows = np.array([each.row for each in chosen], np.int64)
-    worlds, numbers = evaluation.worlds.take(rows), evaluation.index[rows]
-    scenario = evaluation.scenario
-    if evaluation.vehicles != scenario.learners:
-        scenario = scenario.with_learners(evaluation.vehicles)
-    played = [Played(int(n), each.kind, each.why, {}, {}) for n, each in zip(numbers, chosen, strict=True)]
-    for name, agent in agents.items():
-        spelling = (spellings or {}).get(name, name)
-        drive_played(played, worlds, name, agent, scenario, spelling, seed=evaluation.seed, harm_count=harm_count)
-        if on_agent is not None:
-            on_agent(name)
-    return played
-
-
 def drive_played(
     played: Sequence[Played],
     worlds: Worlds,
@@ -186,28 +152,20 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Collection[int]) 
     known = [] if regrets is None else ["Best known, first", "Best known, total"]
     known += [] if avoidable is None else ["Contact"]
     head = ["World", "First-impact harm", "Total harm", *known, "Impacts"]
+    columns = [outcome.first_impact_harm, outcome.total_harm]
+    columns += [] if regrets is None else [regrets.best(count) for count in HARM_COUNTS]
     rows: list[Row] = []
     for k in worst_rows(evaluation, focus).tolist():
         number = int(evaluation.index[k])
-        best: list[str] = []
-        if regrets is not None:
-            best += [f"{regrets.best(count)[k]:.2f}" for count in HARM_COUNTS]
-        if avoidable is not None:
-            best.append("avoidable" if avoidable[k] else "unavoidable")
         button = Markup('{} <button type="button" data-watch="{}">Watch</button>').format(number, number)
-        harms = (f"{outcome.first_impact_harm[k]:.2f}", f"{outcome.total_harm[k]:.2f}")
-        world = button if number in watched else number
-        rows.append([world, *harms, *best, int(outcome.impacts[k])])
-    why = (
-        "by total harm, as nothing is proven of these worlds"
-        if regrets is None
-        else "by total harm above the best known"
-    )
+        contact = [] if avoidable is None else ["avoidable" if avoidable[k] else "unavoidable"]
+        harms = (f"{column[k]:.2f}" for column in columns)
+        rows.append([button if number in watched else number, *harms, *contact, int(outcome.impacts[k])])
+    why = "as nothing is proven of these worlds" if regrets is None else "above the best known"
+    told = f"Of {focus}, by total harm{',' * (regrets is None)} {why}. Harm in m²/s²."
     if not rows:
         return Section("Worst ten worlds", [f"{focus} did no harm above the best known in any of these worlds."])
-    return Section(
-        "Worst ten worlds", [f"Of {focus}, {why}. Harm in m²/s².", table(head, rows, caption=f"Worlds of {focus}")]
-    )
+    return Section("Worst ten worlds", [told, table(head, rows, caption=f"Worlds of {focus}")])
 
 
 def avoidable_section(evaluation: Evaluation) -> Section:
@@ -227,7 +185,8 @@ def avoidable_section(evaluation: Evaluation) -> Section:
         )
         for where, among in (("Contact avoidable", avoidable), ("Contact unavoidable", ~avoidable)):
             if among.any():
-                body.append(_split_table(evaluation, regrets, where, among))
+                rows = [[agent, *_split_cells(each, regrets, among)] for agent, each in evaluation.outcomes.items()]
+                body.append(table(_SPLIT, rows, caption=f"{where}: {count_of(int(among.sum()), 'world')}"))
         body.append(
             drawing(
                 harm_in_parts(evaluation),
@@ -243,10 +202,7 @@ def avoidable_section(evaluation: Evaluation) -> Section:
     return Section("What was avoidable", body)
 
 
-def _split_table(evaluation: Evaluation, regrets: Regrets, where: str, among: Bools) -> Part:
-    head = ["Agent", "Collided", "First-impact harm", "Total harm", "Regret, first-impact", "Regret, total"]
-    rows = [[agent, *_split_cells(outcome, regrets, among)] for agent, outcome in evaluation.outcomes.items()]
-    return table(head, rows, caption=f"{where}: {count_of(int(among.sum()), 'world')}")
+_SPLIT = ("Agent", "Collided", "First-impact harm", "Total harm", "Regret, first-impact", "Regret, total")
 
 
 def _split_cells(outcome: Outcome, regrets: Regrets, among: Bools) -> list[Cell]:
@@ -291,48 +247,39 @@ def shield_section(evidence: ShieldEvidence) -> Section:
     head += [*VERDICTS, "Worlds above the bound"]
     lines: list[Row] = []
     for row in rows:
-        shares = (None,) * len(VERDICTS) if row.verdicts is None else row.verdicts
-        replaced = [_NONE if share is None else f"{100.0 * share:.1f} %" for share in (row.replaced, *shares)]
+        shares = map(_share, (row.replaced, *(row.verdicts or [None] * len(VERDICTS))))
         above = _NONE if row.above_bound is None else row.above_bound
         against = row.against_none if teams else row.against_episode
         told_against = _NONE if against is None else _cell(against)
-        lines.append([f"{row.agent}, {row.mode}", _cell(row.harm), told_against, *replaced, above])
+        lines.append([f"{row.agent}, {row.mode}", _cell(row.harm), told_against, *shares, above])
     told = (
         "Each agent alone and behind every mode of the shield. Each decision that step mode replaced was simulated"
         " again without it: needed (harm would have been higher), harmless (the same), costly (lower)."
     )
-    left_out = rows[0].left_out
-    notes = [paragraph(evidence.conditions, "quiet")]
-    if left_out:
+    body: list[str | Part] = [told, table(head, lines, caption="Modes of the shield")]
+    if teams:
+        head = ["Agent, mode, vehicle", "Decisions replaced", "Bears", "Under the baseline plan", "Worlds with more"]
+        lines = [
+            [f"{row.agent}, {row.mode}, {each.vehicle}", _share(each.replaced), f"{each.harm:.2f}",
+             f"{each.baseline:.2f}", _share(each.above_baseline)]
+            for row in rows
+            for each in row.vehicles
+        ]  # fmt: skip
+        body.append(table(head, lines, caption="What each vehicle bears"))
+    body.append(paragraph(evidence.conditions, "quiet"))
+    if left_out := rows[0].left_out:
         told_of = count_of(len(left_out), "world")
-        notes.append(paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
-    borne = [_shares(rows)] if teams else []
-    return Section("Shield", [told, table(head, lines, caption="Modes of the shield"), *borne, *notes])
+        body.append(paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
+    return Section("Shield", body)
 
 
-def _shares(rows: Sequence[ModeRow]) -> Part:
-    """What each vehicle bears behind the shield of a team."""
-    head = ["Agent, mode, vehicle", "Decisions replaced", "Bears", "Under the baseline plan", "Worlds with more"]
-    lines: list[Row] = [
-        [
-            f"{row.agent}, {row.mode}, {each.vehicle}",
-            _NONE if each.replaced is None else f"{100.0 * each.replaced:.1f} %",
-            f"{each.harm:.2f}",
-            f"{each.baseline:.2f}",
-            f"{100.0 * each.above_baseline:.1f} %",
-        ]
-        for row in rows
-        for each in row.vehicles
-    ]
-    return table(head, lines, caption="What each vehicle bears")
+def _share(share: float | None) -> str:
+    return _NONE if share is None else f"{100.0 * share:.1f} %"
 
 
 def _cell(estimate: Estimate, scale: float = 1.0, digits: int = 2, unit: str = "") -> Cell:
-    value = f"{scale * estimate.value:.{digits}f}{unit}".replace("-", "−")
-    if estimate.interval is None:
-        return Cell(value)
-    low, high = (f"{scale * end:.{digits}f}".replace("-", "−") for end in estimate.interval)
-    return Cell(value, f"{low}, {high}")
+    value, *ends = (f"{scale * each:.{digits}f}" for each in (estimate.value, *(estimate.interval or ())))
+    return Cell(f"{value}{unit}".replace("-", "−"), ", ".join(ends).replace("-", "−"))
 
 
 _OTHERS = ("sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_rate", "predicted_harm")
@@ -388,9 +335,30 @@ def play_for_report(
     harm_count: HarmCount = "first",
     on_agent: Callable[[str], None] | None = None,
 ) -> list[Played]:
-    """The episodes of a report: see ``choose_shown`` and ``play_chosen``, whose arguments these are."""
+    """Let every agent drive the worlds of a report once more: the motion and a passport of each episode.
+
+    Args:
+        evaluation: whose worlds they are.
+        agents: that were evaluated, by name; they are left as they are.
+        focus: the agent whose worst worlds are shown: see ``choose_shown``.
+        spellings: how an agent is written on a command line, where that is not its name.
+        harm_count: that agents minimised.
+        on_agent: is told each agent that is done.
+
+    """
     chosen = choose_shown(evaluation, focus)
-    return play_chosen(evaluation, chosen, agents, spellings=spellings, harm_count=harm_count, on_agent=on_agent)
+    rows = np.array([each.row for each in chosen], np.int64)
+    worlds, numbers = evaluation.worlds.take(rows), evaluation.index[rows]
+    scenario = evaluation.scenario
+    if evaluation.vehicles != scenario.learners:
+        scenario = scenario.with_learners(evaluation.vehicles)
+    played = [Played(int(n), each.kind, each.why, {}, {}) for n, each in zip(numbers, chosen, strict=True)]
+    for name, agent in agents.items():
+        spelling = (spellings or {}).get(name, name)
+        drive_played(played, worlds, name, agent, scenario, spelling, seed=evaluation.seed, harm_count=harm_count)
+        if on_agent is not None:
+            on_agent(name)
+    return played
 
 
 def render_report(report: Report) -> str:

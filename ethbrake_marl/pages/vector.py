@@ -46,15 +46,6 @@ _LINE_PT = 1.2 * CAPTION_PT  # of a caption, from one line to the next
 _NARROW_PT = 540.0  # figures up to this width have one panel
 
 
-def drawing(figure: Figure, title: str, description: str, *, alone: bool = False, known: str = "") -> Part:
-    """A figure with its title and, in words, what it shows.
-
-    ``alone``: in colours that must not change, such as those of a map; it then stands on white. ``known``: what its
-    caption need not say, because the page does.
-    """
-    return _framed(picture_bytes(figure, "figure.svg"), title, description, alone=alone, known=known)
-
-
 def kept_drawing(svg: bytes, title: str, description: str, where: str) -> Part:
     """A figure that was written to a file before, as ``drawing`` shows it.
 
@@ -67,10 +58,16 @@ def kept_drawing(svg: bytes, title: str, description: str, where: str) -> Part:
         ours = False
     if not ours:
         raise InvalidInput(f"{where}: is not a figure as it was drawn; make it again (--force)")
-    return _framed(svg, title, description)
+    return drawing(svg, title, description)
 
 
-def _framed(svg: bytes, title: str, description: str, *, alone: bool = False, known: str = "") -> Part:
+def drawing(figure: Figure | bytes, title: str, description: str, *, alone: bool = False, known: str = "") -> Part:
+    """A figure, or the SVG of one of ours, with its title and, in words, what it shows.
+
+    ``alone``: in colours that must not change, such as those of a map; it then stands on white. ``known``: what its
+    caption need not say, because the page does.
+    """
+    svg = figure if isinstance(figure, bytes) else picture_bytes(figure, "figure.svg")
     inner, caption = inline_svg(svg, f"{title}. {description}", recolour=not alone)
     for told in (known.strip(), description):
         caption = caption.replace(told, "").strip() if told else caption

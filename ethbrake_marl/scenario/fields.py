@@ -606,14 +606,14 @@ VehicleTypes = Annotated[dict[TypeName, VehicleType], Field(min_length=1), After
 TypesHere = str | dict[str, Weight]  # of one vehicle: a type, ``any``, or a weight for each type that may stand there
 
 
-def _types_or_each(value: object) -> str:
-    return "#each" if isinstance(value, list | tuple) else "#types"
+def _one_or_each(value: object) -> str:
+    return "#each" if isinstance(value, list | tuple) else "#one"
 
 
 Types = Annotated[
-    Annotated[TypesHere, Tag("#types")]
+    Annotated[TypesHere, Tag("#one")]
     | Annotated[tuple[TypesHere, ...], Field(strict=False, min_length=1), Tag("#each")],
-    Discriminator(_types_or_each),
+    Discriminator(_one_or_each),
 ]
 
 
@@ -686,10 +686,6 @@ AnyQuantity = float | Uniform | LogUniform | Normal | Choice
 OF_EVERY_VEHICLE = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s")  # needed: no default
 
 NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
-
-
-def _one_or_each(value: object) -> str:
-    return "#each" if isinstance(value, list | tuple) else "#one"
 
 
 LEFT_OUT: Any = object()  # a key that is not given, where a check must say whether it may be

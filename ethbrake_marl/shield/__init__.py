@@ -1,15 +1,19 @@
-"""Shields: what stands between a proposed action and the applied one."""
+"""Shields: what stands between a proposed action and the applied one. Called, it puts one around an environment."""
 
-from ethbrake_marl.shield.agents import HybridAgent, ShieldedTeam, StepShieldAgent
+import sys
+from types import ModuleType
+from typing import Any
+
+from ethbrake_marl.shield.agents import ShieldedDriver
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
-from ethbrake_marl.shield.guard import MovingAtHorizon, ShieldOptions
-from ethbrake_marl.shield.step_shield import Certified, StepShield
+from ethbrake_marl.shield.guard import HybridAgent, MovingAtHorizon, ShieldOptions
+from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import Interval, Uncertainty, parse_uncertainty
 from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
+from ethbrake_marl.shield.wrappers import shield as _shield
 
 __all__ = [
     "Backup",
-    "Certified",
     "Decision",
     "HybridAgent",
     "HybridShield",
@@ -17,13 +21,22 @@ __all__ = [
     "MovingAtHorizon",
     "Running",
     "ShieldOptions",
+    "ShieldedDriver",
     "ShieldedEnv",
-    "ShieldedTeam",
     "ShieldedVectorEnv",
     "StepShield",
-    "StepShieldAgent",
     "Uncertainty",
     "certify",
     "parse_uncertainty",
     "shielded_aec",
 ]
+
+
+class _Shielding(ModuleType):
+    """``eb.shield`` is this folder and the function of its name: whoever imports one has the other."""
+
+    def __call__(self, *arguments: Any, **settings: Any) -> Any:
+        return _shield(*arguments, **settings)
+
+
+sys.modules[__name__].__class__ = _Shielding

@@ -4,30 +4,28 @@
 its range. That promises nothing of the world as it is. ``robust``: in every corner of the ranges of what is not known.
 If the world is such a corner, its harm up to the horizon is at most the first bound: what is heard later leaves those
 corners standing that it agrees with, and the plan that was held is held on unless a better one for them is found.
-Mode ``episode`` is in ``shield.factories``.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 from typing import cast
 
 import numpy as np
 
-from ethbrake_marl.actions import action_to_command
 from ethbrake_marl.agents.believed import SUFFIX, Foretold, Odometer, Ranges, Told, believed_worlds, ranges_of, told_to
-from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent, place
-from ethbrake_marl.agents.rollout import script_agents, set_others
+from ethbrake_marl.agents.protocol import Agent, place
+from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.engine.stream import Script, begin_script
+from ethbrake_marl.engine.stream import Script
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import state_columns, worlds_at
-from ethbrake_marl.shield.certify import Decision, Proposer, proposed_action
+from ethbrake_marl.shield.certify import Decision, Proposer
 from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.shield.step_shield import Held, StepShield, held_in, hold_better
 from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty
@@ -79,7 +77,7 @@ class BelievedShield:
         self._odometer = Odometer()
         self._heard: Floats = np.zeros((0, 0))  # what the shield began on; NaN where it has not begun
         self._asked_s: Floats = np.zeros(0)  # [n] time of the last decision
-        self._wanted: Floats = np.zeros(0)  # [n] m/s2
+        self._wanted: Floats = np.zeros(0)  # [n] actions
         self._totals: Floats = np.zeros((0, 0, 0))  # [n, M, pairs] foretold total harm at the last decision (m2/s2)
         self._impact_s: Floats = np.zeros((0, 0))  # [n, N] last time at which an impact of this vehicle was foretold
         self._ranges: tuple[int, Ranges] | None = None
@@ -125,14 +123,14 @@ class BelievedShield:
         self.interventions = counted
 
     def decide(
-        self, worlds: Worlds, vehicle: int, propose: Callable[[], Floats], policies: Mapping[int, Agent] | None = None
+        self, worlds: Worlds, vehicle: int, proposed: Floats, policies: Mapping[int, Agent] | None = None
     ) -> Floats:
-        """The certified command, [n] m/s2, 0 before the vehicle's latency has elapsed; the same if asked again.
+        """The certified actions [n], 0 before the vehicle's latency has elapsed; the same if asked again.
 
         Args:
             worlds: as they are; of them only what the vehicle received is read.
             vehicle: index from 0, the one that began.
-            propose: gives the actions [n] that are proposed; not asked where there is nothing to decide.
+            proposed: actions [n].
             policies: who is rolled out in the believed worlds where nothing else certifies a proposal, by vehicle.
 
         Raises ``InvalidInput`` if an episode never began.
@@ -141,8 +139,6 @@ class BelievedShield:
         n, shield = worlds.n, self.shield
         if shield is None or n > len(self._heard):
             raise InvalidInput(f"shield: {SUFFIX}: act on {count_of(n, 'world')}, but begin was not called for each")
-        if n < len(self._heard):  # a smaller batch has begun
-            self._keep(n)
         way = self._odometer.look(worlds, vehicle)
         past = worlds.vehicles.latency_s[:, vehicle] <= worlds.time_s
         due = past & (worlds.time_s != self._asked_s) & (worlds.time_s < self.scenario.horizon_s)
@@ -152,19 +148,11 @@ class BelievedShield:
             assert shield.running is not None
             due &= ~shield.running.finished
             proposer = None if policies is None else Proposer(policies, believed)
-            self.decision = decision = shield.decide(propose(), only=due, proposer=proposer)
-            command = action_to_command(decision.applied, worlds.vehicles, vehicle)
-            self._wanted[due] = command[due]
+            self.decision = decision = shield.decide(proposed, only=due, proposer=proposer)
+            self._wanted[due] = decision.applied[due]
             self.interventions = self.interventions + (decision.intervened & due)
             self._asked_s[due] = worlds.time_s[due]
         return self._wanted.copy()
-
-    def _keep(self, n: int) -> None:
-        """Keep the first ``n`` rows only."""
-        for name in PER_WORLD:
-            setattr(self, name, getattr(self, name)[:n])
-        if self.shield is not None and self.shield.running is not None:
-            self.shield.keep(n)
 
     def _begin_anew(self, worlds: Worlds, believed: Worlds, vehicle: int, way_m: Floats, due: Bools) -> None:
         """Let the shield begin where it has not, or where what was heard was not foretold."""
@@ -285,46 +273,3 @@ class BelievedShield:
                 )
             self._ranges = vehicle, ranges
         return self._ranges[1]
-
-
-# The agent that drives by a policy behind a shield over a believed world.
-
-
-class BelievedShieldAgent(AgentAround):
-    """Drives by ``policy`` as far as a ``BelievedShield`` certifies it: ``POLICY+step:believed``, ``+robust:believed``.
-
-    ``robust`` is None, ``corners`` or ``interior``. Raises ``InvalidInput`` for what is not an agent, and what
-    ``BelievedShield`` raises.
-    """
-
-    adds = Source.BELIEFS
-
-    def __init__(
-        self, policy: Agent, scenario: Scenario, *, harm_count: HarmCount = "first", robust: str | None = None
-    ) -> None:
-        check_agent(policy, SUFFIX)
-        mode = "step" if robust is None else "robust" if robust == CORNERS else f"robust:{robust}"
-        super().__init__(policy, f"{policy.name}+{mode}:{SUFFIX}")
-        self.scenario = scenario
-        self.believed = BelievedShield(scenario, harm_count=harm_count, robust=robust)
-
-    @property
-    def predicted_harm(self) -> Floats:
-        """The first bound, [n] m2/s2; NaN before the first decision."""
-        return self.believed.predicted_harm
-
-    @property
-    def interventions(self) -> Ints:
-        """How many proposals were replaced so far in the running episodes, [n]."""
-        return self.believed.interventions
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Remember where these episodes start; nothing has been received yet."""
-        self.believed.begin(worlds, vehicle, rows)
-        set_others(self.policy, vehicle, script_agents(self.scenario, except_for=vehicle))
-        begin_script(self.policy, worlds, vehicle, rows)
-
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """The certified command, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
-        policies = {vehicle: self.policy}
-        return self.believed.decide(worlds, vehicle, lambda: proposed_action(self.policy, worlds, vehicle), policies)

@@ -418,19 +418,6 @@ def interventions(
     ]  # fmt: skip
 
 
-def write_down(log: list[Intervention], found: list[Intervention], now: Running, episode: Ints) -> None:
-    """Add what was found at ``now`` to the log, in place of what an interrupted step may have left at its end."""
-    while log and _is_undone(log[-1], now, episode):
-        log.pop()
-    log.extend(found)
-
-
-def _is_undone(entry: Intervention, now: Running, episode: Ints) -> bool:
-    """Whether the running episodes have not come as far as this entry."""
-    k = entry.world
-    return k < now.n and entry.episode == episode[k] and entry.step >= now.steps[k]
-
-
 # Rollouts of the policies that propose: their actions from the alert, and from any later decision, as plans.
 #
 # What a rollout does is written down as a plan and certified like any other (``shield.certify.plan_harm``): a policy

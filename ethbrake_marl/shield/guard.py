@@ -1,11 +1,12 @@
-"""Shields attached to a running engine: what every wrapped interface shares.
+"""The guards that stand in an engine: a shield in each of its modes, and its options.
 
-There is one way from a proposal to a step, whatever the interface and whatever stands between it and the engine:
+There is one way from a proposal to a step, whatever the interface and whatever stands between it and the engine
+(``engine.Guard``):
 
-1. *Certify.* The interface asks what may be applied. That changes nothing.
-2. *Step.* The engine makes the step on a copy of its worlds and shows it to the shield. What is not the certified step,
-   in its command, its place in the episode, or the state and harm that it leads to, is refused: ``UncertifiedStep``.
-3. *Commit.* The engine puts the new worlds and the shield's new memory in place together (``engine.Watcher``).
+1. *Decide.* ``Engine.step`` asks the guard what is applied. That changes nothing: the memory to come is in the ruling.
+2. *Check.* The engine makes the step on a copy of its worlds and shows it to the guard. What is not the certified step,
+   in its place in the episode, or the state and harm that it leads to, is refused: ``UncertifiedStep``.
+3. *Commit.* The engine puts the new worlds, the guard's new memory and the ruling in place together.
 
 So the shield is where the engine is, always: a refused call, an exception, or an interrupt at any line leaves both as
 they were, or moves both.
@@ -18,43 +19,46 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.actions import command_to_action, commands_of
+from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.agents.e_v2x_bm import EV2XBM
 from ethbrake_marl.agents.policy import LearnedPolicy
-from ethbrake_marl.agents.protocol import Agent, Team
-from ethbrake_marl.agents.rollout import set_others
+from ethbrake_marl.agents.protocol import (
+    Agent,
+    AgentAround,
+    Source,
+    Team,
+    apart,
+    begun_apart,
+    check_agent,
+    place,
+    recall,
+)
+from ethbrake_marl.agents.refined import Refined
+from ethbrake_marl.agents.rollout import drive, script_agents, set_others
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.stream import begin_script, is_state_free
-from ethbrake_marl.errors import InvalidInput, UncertifiedStep, unknown_name
+from ethbrake_marl.engine.engine import Engine, Ruling, Running
+from ethbrake_marl.engine.stream import Script, ask_script, begin_script
+from ethbrake_marl.errors import InvalidInput, UncertifiedStep, check_one_learner, count_of, unknown_name
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.advance import params_at
-from ethbrake_marl.shield.agents import Bound, HybridAgent
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.search import state_columns
 from ethbrake_marl.shield.believed import BelievedShield
 from ethbrake_marl.shield.certify import REASONS, Decision, Proposer, difference, proposed_actions, seen_columns
 from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust, expects
-from ethbrake_marl.shield.step_shield import (
-    CAPS,
-    Cap,
-    Certified,
-    SharesTold,
-    StepShield,
-    by_vehicle,
-    columns_of,
-    told_before,
-)
+from ethbrake_marl.shield.step_shield import CAPS, Cap, StepShield, by_vehicle
 from ethbrake_marl.shield.uncertainty import (
     Uncertainty,
     check_amount,
+    check_scenario,
     checked_uncertainty,
     mode_uncertainty,
     proposing_agent,
     proposing_agents,
-    shielded_vehicles,
 )
 
 # The options of a shield around an interface, and their checks, the same for every interface.
@@ -145,6 +149,20 @@ class ShieldOptions:
                     " certifies against what was not received"
                 )
 
+    def step_shield(
+        self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
+    ) -> StepShield:
+        """The shield of these settings, where all is known or declared uncertain."""
+        return StepShield(
+            scenario, vehicle, harm_count=self.harm_count, allowance=self.allowance, others=others, cap=self.cap,
+            uncertainty=checked_uncertainty(self.uncertainty), robust=self.robust, logging=self.logging,
+        )  # fmt: skip
+
+    def believed_shield(self, scenario: Scenario, others: Mapping[int, Script] | None = None) -> BelievedShield:
+        """... and on what was received."""
+        robust = self.robust if self.mode == "robust" else None
+        return BelievedShield(scenario, harm_count=self.harm_count, robust=robust, others=others)
+
 
 def read_options(where: str, given: Mapping[str, Any]) -> ShieldOptions:
     """The options of an interface's keywords; raises ``UnknownName`` for one that is none."""
@@ -155,12 +173,6 @@ def read_options(where: str, given: Mapping[str, Any]) -> ShieldOptions:
     return ShieldOptions(**given, where=where)
 
 
-ADVICE = (
-    "what stands between the shield and the environment must pass each action on unchanged, exactly once; put wrappers"
-    " that skip frames, change actions or step by themselves around the shield, not inside it"
-)
-
-
 Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
 """Who proposes: one for every shielded vehicle, a team, or one for each by its vehicle's name."""
 
@@ -169,236 +181,118 @@ class MovingAtHorizon(UserWarning):
     """A shield's bound ends at the horizon, and something may still be moving then."""
 
 
-class Sent(NamedTuple):
-    """What was certified and handed to the environment, and is not carried out yet."""
+class Guarded(NamedTuple):
+    """What a guard remembers: its shield, and who proposes with what they remember; neither is changed in place."""
 
-    memory: object  # of the watcher, when it was certified
-    steps_made: int  # by the engine until then
-    applied: Floats  # [n] actions
-    asked: Bools  # [n] worlds whose episode runs
-    certified: Certified | None  # None: episode mode, and a believed world
-    after: object = None  # the memory to come, of a shield over a believed world
+    shield: Any  # StepShield, BelievedShield or HybridAgent
+    policies: dict[int, Agent]  # by shielded vehicle, front to rear; none where nobody is known to propose
 
 
-class Attached(ABC):
-    """A shield that follows an engine, and lets it do nothing but what was certified.
+class ShieldGuard(ABC):
+    """A shield of one mode in an engine; every learner is shielded, by its vehicle's place in ``vehicles``.
 
-    Every learner is shielded: one, or in mode ``step`` several. Raises ``InvalidInput`` for another number.
+    ``policies`` propose where nobody else does. One that remembers its episode is asked in every decision.
     """
 
-    policies: Mapping[int, Agent] | None = None  # who proposes where nobody else does
+    def __init__(self, engine: Engine, policies: Mapping[int, Agent] | None, options: ShieldOptions) -> None:
+        self.options, self.scenario, self.scripts = options, engine.scenario, engine.scripts
+        self.vehicles = tuple(engine.learners)  # front to rear
+        self._policies = dict(policies or {})
+        self._fresh = self._make()
 
-    def __init__(self, engine: Engine, options: ShieldOptions, memory: object) -> None:
-        self.engine = engine
-        self.options = options
-        self.vehicle = shielded_vehicles(engine, options.where, options.mode)
-        self.vehicles = (self.vehicle,) if isinstance(self.vehicle, int) else self.vehicle
-        self.sent: Sent | None = None
-        policies = (self.policies or {}).values()
-        self.remembering = any(getattr(policy, "remembers", not is_state_free(policy)) for policy in policies)
-        self._own: tuple[object, Floats] | None = None  # the memory then, and what the policies would do
-        self._left = memory
-        self.closed = False
-        engine.watch(self, memory)
-
-    @property
-    def memory(self) -> Any:
-        """What this shield knows now; once detached, what it knew last."""
-        return self.engine.memory(self) if self in self.engine.watchers else self._left
-
-    @property
     @abstractmethod
-    def stepped_in(self) -> Bools:
-        """Where something else than the proposal is applied in the step that was certified last, [n]; for pictures."""
+    def _make(self) -> Any:
+        """The shield before any episode."""
 
-    def confirm(self) -> None:
-        """Raise ``UncertifiedStep`` unless the engine made the step that was handed to the environment last."""
-        assert self.sent is not None
-        if self.engine.steps_made != self.sent.steps_made + 1:
-            raise UncertifiedStep(
-                f"shield: the environment returned from step, but its engine made"
-                f" {self.engine.steps_made - self.sent.steps_made} steps instead of 1; {ADVICE}"
-            )
-
-    def detach(self) -> None:
-        """Let go of the engine: this shield no longer follows it."""
-        self._left = self.memory
-        self.engine.unwatch(self)
-        self.closed = True
-
-    def check_open(self) -> None:
-        """Raise ``InvalidInput`` once this shield was closed: it follows nothing any more, and bounds nothing."""
-        if self.closed:
-            raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
-
-    def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
-        """The memory once the engine made the certified step. Raises ``UncertifiedStep`` for any other one."""
-        sent = self.sent
-        if sent is None or sent.memory is not memory:
-            raise UncertifiedStep(
-                f"shield: the engine was to make a step that nothing was certified for (a second one in one call, or"
-                f" one past the shield); step through the shield, or close() it first; {ADVICE}"
-            )
-        for c, vehicle in enumerate(self.vehicles):
-            wanted = after.wanted_mps2[:, vehicle]
-            certified = self._commands(by_vehicle(sent.applied, self.vehicles)[:, c], vehicle)
-            wrong = np.flatnonzero(sent.asked & ~(wanted == certified))
-            if wrong.size:
-                k = int(wrong[0])
-                raise UncertifiedStep(
-                    f"shield: in world {k} the applied command, {wanted[k]:g} m/s2, is not the certified one,"
-                    f" {certified[k]:g} m/s2; {ADVICE}"
-                )
-        return self._carried_out(memory, sent, after)
-
-    def _commands(self, actions: Floats, vehicle: int) -> Floats:
-        """Wanted signed accelerations of a shielded vehicle for its actions, to the bits of the engine, [n] m/s2."""
-        params, vehicles = self.engine.packed.params, self.engine.scenario.vehicles
-        braking, driving = (params[:, params_at(group, vehicles) + vehicle] for group in range(2))
-        return commands_of(np.ascontiguousarray(actions), braking, driving)
-
-    def infos(self, proposed: Floats) -> dict[str, NDArray[Any]]:
-        """``info`` of every world, one array per key."""
-        return columns_of([self.info(k, float(proposed[k])) for k in range(len(proposed))])
-
-    def start_infos(self) -> dict[str, NDArray[Any]]:
-        """``start_info`` of every world, one array per key."""
-        return columns_of([self.start_info(k) for k in range(self.engine.n)])
-
-    @property
     @abstractmethod
-    def running(self) -> bool:
-        """Whether any episode has begun."""
+    def _started(self, shield: Any, alert: Worlds, rows: Ints, policies: dict[int, Agent]) -> None:
+        """Start episodes in these rows of a shield of its own."""
 
-    def ask_policies(self) -> Floats | None:
-        """What the policies themselves would do now, as actions, [n] of one vehicle or [n, K]; None without any.
+    @abstractmethod
+    def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
+        """What is applied instead of the actions [n, L]."""
 
-        Each is asked once per decision; one that remembers is asked whoever proposes.
-        """
-        if self.policies is not None and (self._own is None or self._own[0] is not self.memory):
-            single = isinstance(self.vehicle, int)
-            self._own = self.memory, proposed_actions(self.policies, self.engine.worlds, single)
-        return None if self._own is None else self._own[1]
+    @abstractmethod
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, NDArray[Any]]:
+        """What is told of a step, each [n, L]; without a ruling the same keys before the first decision."""
 
-    def proposal(self) -> Floats:
-        """What stands for a proposal where nobody makes one, as actions [n]; NaN where none is needed."""
-        own = self.ask_policies()
-        if own is None:
+    def begin(self, memory: Guarded | None, alert: Worlds, rows: Ints) -> Guarded:
+        """The shield and the policies once episodes start in these rows."""
+        shield, policies = memory or Guarded(self._fresh, self._policies)
+        policies = begun_apart(policies, alert, rows, self.scripts)
+        shield = self._apart(shield)
+        self._started(shield, alert, rows, policies)
+        return Guarded(shield, policies)
+
+    def check(self, ruling: Ruling, after: Running) -> Guarded:
+        """The memory as the ruling says: only step mode compares what a step led to."""
+        memory: Guarded = ruling.memory
+        return memory
+
+    def _apart(self, shield: Any) -> Any:
+        """A shield that goes on apart."""
+        return copy.copy(shield)
+
+    def _asked(self, running: Running, memory: Guarded, proposed: Floats) -> tuple[Floats, dict[int, Agent], Worlds]:
+        """All proposals [n, L], those of the policies where nobody else makes one; the policies then; the worlds."""
+        policies, worlds = memory.policies, running.worlds
+        left_out = np.isnan(proposed).all(axis=0)
+        if left_out.any() and not policies:
             raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
-        return own
-
-    @abstractmethod
-    def decide(self, proposed: Floats) -> Floats:
-        """The actions [n] to apply instead of those proposed. Nothing changes until the engine applies them."""
-
-    @abstractmethod
-    def info(self, k: int, proposed: float, c: int = 0) -> dict[str, Any]:
-        """What the shield decided in world ``k`` for its vehicle number ``c``, for ``infos[agent]["shield"]``."""
-
-    @abstractmethod
-    def start_info(self, k: int, c: int = 0) -> dict[str, Any]:
-        """The same keys before the first decision of world ``k``; 0 for what was not proposed or chosen yet."""
-
-    @abstractmethod
-    def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """The memory once episodes start in these rows."""
-
-    @abstractmethod
-    def _carried_out(self, memory: Any, sent: Sent, after: Engine) -> Any:
-        """The memory after the certified command was applied."""
+        if left_out.any() or any(apart(policy) is not policy for policy in policies.values()):
+            policies = {i: apart(policy) for i, policy in policies.items()}
+            own = by_vehicle(proposed_actions(policies, worlds, len(policies) == 1), self.vehicles)
+            proposed = np.where(left_out, own, proposed)
+        return proposed, policies, worlds
 
 
-class AttachedShield(Attached):
-    """A ``StepShield`` that begins with the engine's episodes and sees the engine's worlds.
+def by_row(columns: Any, n: int, learners: int) -> NDArray[Any]:
+    """What is told, [], [n] of a world, or [n, L], with the axis of learners: [n, L]."""
+    each = np.asarray(columns)
+    return np.broadcast_to(each[:, np.newaxis] if each.ndim == 1 else each, (n, learners))
 
-    ``policy`` (an agent, a loaded policy, or None) is rolled out at each alert, and proposes where nobody else does.
-    Warns with ``MovingAtHorizon``, once, where the plan held at an alert leaves something moving at the horizon.
+
+class StepGuard(ShieldGuard):
+    """Modes ``step`` and ``robust``: a ``StepShield`` that sees the engine's worlds.
+
+    Args:
+        engine: in which it will stand.
+        policies: are rolled out at each alert, and propose where nobody else does.
+        options: what it is set to.
+        later_rollouts: whether a policy itself may certify an action.
+        told: worlds at the alert as the shield takes them to be; None: as they are, which is what the policies see.
+        warns: with ``MovingAtHorizon``, once, where the plan held at an alert leaves something moving at the horizon.
+        several: several vehicles may be shielded: also one alone is treated as a team.
+
     """
 
     def __init__(
         self,
         engine: Engine,
-        policy: Proposing | None,
+        policies: Mapping[int, Agent] | None,
         options: ShieldOptions,
+        *,
+        later_rollouts: bool = True,
+        told: Worlds | None = None,
+        warns: bool = False,
+        several: bool = False,
     ) -> None:
-        vehicle = shielded_vehicles(engine, options.where, options.mode)
-        shield = StepShield(
-            engine.scenario, vehicle, harm_count=options.harm_count, allowance=options.allowance, others=engine.scripts,
-            uncertainty=checked_uncertainty(options.uncertainty), cap=options.cap, robust=options.robust,
-            logging=options.logging,
-        )  # fmt: skip
-        self.policies = None if policy is None else proposing_agents(policy, shield.vehicles, options.where)
-        self._warned, self._shares = False, SharesTold()
-        super().__init__(engine, options, shield)
+        self._several = several or len(engine.learners) > 1
+        super().__init__(engine, policies, options)
+        self._later_rollouts, self._told, self._to_warn = later_rollouts, told, warns
 
-    @property
-    def shield(self) -> StepShield:
-        """The shield as it is now: to be read; the next step puts another one in its place."""
-        shield: StepShield = self.memory
-        return shield
+    def _make(self) -> StepShield:
+        return self.options.step_shield(
+            self.scenario, self.vehicles if self._several else self.vehicles[0], self.scripts
+        )
 
-    @property
-    def running(self) -> bool:
-        """Whether any episode has begun."""
-        return self.shield.running is not None
-
-    @property
-    def stepped_in(self) -> Bools:
-        """Where a proposal was replaced, [n]."""
-        decision = self.decision
-        if decision is None:
-            return np.zeros(self.engine.n, np.bool_)
-        return np.asarray(by_vehicle(decision.intervened, self.vehicles).any(axis=1), np.bool_)
-
-    @property
-    def decision(self) -> Decision | None:
-        """What was decided last."""
-        return None if self.sent is None or self.sent.certified is None else self.sent.certified.decision
-
-    def decide(self, proposed: Floats) -> Floats:
-        """The actions to apply instead of those proposed, [n] of one vehicle or [n, K]; the engine applies them."""
-        engine, shield = self.engine, self.shield
-        if self.remembering:
-            self.ask_policies()
-        proposer = None if self.policies is None else Proposer(self.policies, engine.worlds)
-        certified = shield.propose(proposed, seen=seen_columns(engine.packed), only=~engine.ended, proposer=proposer)
-        applied = certified.decision.applied
-        self.sent = Sent(shield, engine.steps_made, applied, certified.asked, certified)
-        return applied
-
-    def info(self, k: int, proposed: float, c: int = 0) -> dict[str, Any]:
-        """What the shield decided in world ``k`` for its vehicle number ``c``, for ``infos[agent]["shield"]``."""
-        assert self.sent is not None and self.sent.certified is not None
-        decision, after = self.sent.certified.decision, self.sent.certified.after
-        at = k if isinstance(self.vehicle, int) else (k, c)
-        return told_before(after, k) | {
-            "proposed_action": proposed,
-            "chosen_action": float(decision.applied[at]),
-            "intervened": bool(decision.intervened[at]),
-            "reason": REASONS[int(decision.reason[at])],
-            "bound_harm": float(decision.bound[k]),
-            "margin": float(decision.margin[at]),
-            **self._shares_of(after, k, c),
-        }
-
-    def start_info(self, k: int, c: int = 0) -> dict[str, Any]:
-        """The bound that was told at the alert of world ``k``, before anything was decided."""
-        return told_before(self.shield, k) | self._shares_of(self.shield, k, c)
-
-    def _shares_of(self, shield: StepShield, k: int, c: int) -> dict[str, Any]:
-        """What the shield's vehicle number ``c`` bears, where that is asked for."""
-        wanted = self.options.shares or self.options.cap is not None
-        return self._shares.told(shield, k, self.vehicles[c]) if wanted else {}
-
-    def begun(self, memory: StepShield, alert: Worlds, rows: Ints) -> StepShield:
-        """The shield once episodes start in these rows."""
-        for vehicle, policy in (self.policies or {}).items():
-            begin_script(policy, alert, vehicle, rows)
-        shield = copy.copy(memory)
-        shield.begin(alert, rows, self.policies)
+    def _started(self, shield: StepShield, alert: Worlds, rows: Ints, policies: dict[int, Agent]) -> None:
+        if self._told is not None and not (rows < self._told.n).all():
+            raise InvalidInput(f"shield: told of {count_of(self._told.n, 'world')}, but row {rows.max()} begins")
+        shield.begin(alert if self._told is None else self._told.take(rows), rows, policies or None)
         moving = int((~shield.settles[rows]).sum())
-        if moving and not self._warned:
-            self._warned = True
+        if moving and self._to_warn:
+            self._to_warn = False
             warnings.warn(
                 f"shield: in {moving} of {len(rows)} worlds something still moves at the horizon,"
                 f" {shield.scenario.horizon_s:g} s, under the plan that gives the bound; the bound says nothing of what"
@@ -406,213 +300,351 @@ class AttachedShield(Attached):
                 MovingAtHorizon,
                 stacklevel=2,
             )
-        return shield
 
-    def _carried_out(self, memory: StepShield, sent: Sent, after: Engine) -> StepShield:
-        assert sent.certified is not None
-        shield = sent.certified.after
-        running, wanted = shield.running, sent.asked & ~shield.distrusted
+    def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
+        """What is certified. In a world whose episode is over as far as the shield foretold it is full braking."""
+        shield: StepShield = memory.shield
+        goes_on, finished = ~running.ended, shield.running.finished  # type: ignore[union-attr]  # it has begun
+        proposed, policies, worlds = self._asked(running, memory, proposed)
+        after = copy.copy(shield)
+        decision = after.decide(
+            proposed if self._several else proposed[:, 0],
+            seen=seen_columns(running.packed) if self._told is None else state_columns(worlds),
+            only=goes_on,
+            proposer=Proposer(policies, worlds) if policies and self._later_rollouts else None,
+        )
+        applied = by_vehicle(decision.applied, self.vehicles)
+        applied = np.where((goes_on & finished)[:, np.newaxis], -1.0, applied)
+        stepped_in: Bools = np.any(by_vehicle(decision.intervened, self.vehicles), axis=1)
+        return Ruling(proposed, applied, stepped_in, goes_on & ~finished, decision, Guarded(after, policies))
+
+    def check(self, ruling: Ruling, after: Running) -> Guarded:
+        """Compare what the step led to with what was certified, the last step included.
+
+        Where something else was ``told`` than is, a difference makes the world distrusted. Worlds that the physics
+        could not advance are cut off, and not compared.
+        """
+        memory: Guarded = ruling.memory
+        shield: StepShield = memory.shield
+        running, wanted = shield.running, ruling.asked & ~shield.distrusted
         assert running is not None
+        wanted[list(after.roster.failed)] = False
         if (wrong := np.flatnonzero(wanted & (after.steps != running.steps))).size:
             k = int(wrong[0])
             raise UncertifiedStep(
-                f"shield: world {k} is at step {after.steps[k]} of its episode, certified was step"
-                f" {running.steps[k]}; {ADVICE}"
+                f"shield: world {k} is at step {after.steps[k]} of its episode, certified was step {running.steps[k]}"
             )
         seen = seen_columns(after.packed)
-        if (wrong := np.flatnonzero(wanted & ~expects(sent.certified.after.boxes, running, seen))).size:
-            k = int(wrong[0])
-            told = difference(running.nominal().states[k], seen[k])
-            raise UncertifiedStep(f"shield: after this step {told} (world {k}); {ADVICE}")
-        return sent.certified.carried_out()
+        surprising = wanted & ~expects(shield.boxes, running, seen)
+        if not surprising.any():
+            return memory
+        if self._told is None:
+            k = int(np.argmax(surprising))
+            raise UncertifiedStep(
+                f"shield: after this step {difference(running.nominal().states[k], seen[k])} (world {k})"
+            )
+        shield = copy.copy(shield)
+        shield.distrusted = shield.distrusted | surprising
+        return memory._replace(shield=shield)
+
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, NDArray[Any]]:
+        """The keys of ``infos[agent]["shield"]``."""
+        shield: StepShield = memory.shield
+        assert shield.running is not None
+        told: dict[str, Any] = {"mode": self.options.mode, **told_of(ruling), "bound_harm": shield.bound}
+        told |= {"trusted": ~shield.distrusted, "settles": shield.settles}
+        if self.options.mode == "robust":
+            told["members"] = shield.running.members
+        if self.options.shares or self.options.cap is not None:
+            told |= {
+                name: shares[:, list(self.vehicles)]
+                for name, shares in (("own_harm", shield.shares()), ("baseline_own_harm", shield.baseline_shares))
+            }
+        return {name: by_row(columns, shield.running.n, len(self.vehicles)) for name, columns in told.items()}
 
 
-# Step and robust mode on a running engine, certified on what was really received: ``believed=True`` of a wrapper.
+def told_of(ruling: Ruling | None, decision: Decision | None = None) -> dict[str, Any]:
+    """What is told of a certified decision; nothing was proposed or chosen without one."""
+    if ruling is None:
+        return {"proposed_action": 0.0, "chosen_action": 0.0, "intervened": False, "reason": "", "margin": 0.0}
+    decided: Decision = ruling.decision if decision is None else decision
+    return {
+        "proposed_action": ruling.proposed,
+        "chosen_action": ruling.applied,
+        "intervened": decided.intervened,
+        "reason": np.array(REASONS)[decided.reason],
+        "margin": decided.margin,
+    }
 
 
-class AttachedBelieved(Attached):
-    """A ``BelievedShield`` that begins with the engine's episodes, and is shown the engine's worlds.
+class BelievedGuard(ShieldGuard):
+    """Modes ``step`` and ``robust`` on what was received: a ``BelievedShield`` that is shown the engine's worlds.
 
     Its bound is told once the first decision was made, and is that of the belief: what happens is not compared with
     what was foretold, as that may be wrong without anybody's fault.
     """
 
-    vehicle: int
-
-    def __init__(self, engine: Engine, policy: Proposing | None, options: ShieldOptions) -> None:
-        vehicle = shielded_vehicles(engine, options.where, options.mode)
-        if not isinstance(vehicle, int):
+    def _make(self) -> BelievedShield:
+        if len(self.vehicles) > 1:
             raise InvalidInput(
-                f"{options.where}: believed = True: shields one learner, not several; pass learners=['vehicle_2'] to"
-                " the environment"
+                f"{self.options.where}: believed = True: shields one learner, not several; pass learners=['vehicle_2']"
+                " to the environment"
             )
-        robust = options.robust if options.mode == "robust" else None
-        shield = BelievedShield(engine.scenario, harm_count=options.harm_count, robust=robust, others=engine.scripts)
-        self.policies = None if policy is None else proposing_agents(policy, (vehicle,), options.where)
-        super().__init__(engine, options, shield)
+        return self.options.believed_shield(self.scenario, self.scripts)
+
+    def _apart(self, shield: BelievedShield) -> BelievedShield:
+        return shield.branch()
+
+    def _started(self, shield: BelievedShield, alert: Worlds, rows: Ints, policies: dict[int, Agent]) -> None:
+        shield.begin(alert, self.vehicles[0], rows)
+
+    def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
+        """What is certified in the believed worlds."""
+        proposed, policies, worlds = self._asked(running, memory, proposed)
+        after = memory.shield.branch()
+        before = after.interventions
+        applied = after.decide(worlds, self.vehicles[0], proposed[:, 0], policies or None)[:, np.newaxis]
+        stepped_in = after.interventions > before
+        return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, policies))
+
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, NDArray[Any]]:
+        """The keys of ``infos[agent]["shield"]``; ``trusted``: the mode promises something of the world as it is."""
+        believed: BelievedShield = memory.shield
+        robust, n, shield = believed.robust is not None, len(believed.predicted_harm), believed.shield
+        told: dict[str, Any] = {"mode": self.options.mode, **told_of(ruling)}
+        told |= {"bound_harm": np.full(n, np.inf), "settles": False, "believed": True, "trusted": robust}
+        if ruling is not None and shield is not None:
+            told |= {"bound_harm": np.where(np.isfinite(believed.predicted_harm), shield.bound, np.inf)}
+            told |= {"settles": shield.settles}
+        if robust:
+            told["members"] = believed.members
+        return {name: by_row(columns, n, 1) for name, columns in told.items()}
+
+
+# The paper's hybrid (Algorithm 1): at the alert, choose between policy and baseline for the whole episode.
+#
+# The policy is rolled out in the engine from the alert on; its harm (each impact summed once) is compared with the
+# baseline's ``H*`` and the lower one drives the episode. With ``H*`` coupled (realised in the same engine) the hybrid
+# is never worse than the baseline, in any world, as long as the policy drives as it did in that rollout; one that draws
+# its actions does not, and needs the step shield. With the paper's pairwise ``H*``, which treats the two pairs as
+# independent, that does not hold: the pairwise figure is about half of what the same deceleration realises.
+
+Bound = Literal["coupled", "pairwise"]
+
+
+class HybridAgent(AgentAround):
+    """Drives by ``policy`` in the worlds where its rolled-out harm is at most ``H*``, else by E-V2X-BM.
+
+    ``bound`` says which ``H*`` and ``a*``; ``harm_count`` which harm counts. After ``begin``, ``chosen_policy`` [n]
+    says who drives; ``policy_harm`` [n] and ``bound_harm`` [n] were compared, ``predicted_harm`` [n] is the lower one.
+    Raises ``InvalidInput`` for an unknown ``bound`` or ``harm_count``, and for what is not an agent.
+    """
+
+    adds = Source.MODEL  # in which both are compared
+
+    def __init__(
+        self, policy: Agent, scenario: Scenario, *, bound: Bound = "coupled", harm_count: HarmCount = "first"
+    ) -> None:
+        check_agent(policy, "hybrid")
+        check_scenario(scenario, "hybrid")
+        super().__init__(policy, f"{policy.name}+episode{'' if bound == 'coupled' else ':pairwise'}")
+        self.backup = EV2XBM(bound, harm_count=harm_count, horizon_s=scenario.horizon_s)
+        self.scenario = scenario
+        self.bound: Bound = bound
+        self.harm_count: HarmCount = harm_count
+        self.policy_harm: Floats = np.zeros(0)
+        self.bound_harm: Floats = np.zeros(0)
+        self._stage = copy.deepcopy(policy)  # predicting must not disturb the policy's memory of running episodes
 
     @property
-    def believed(self) -> BelievedShield:
-        """The shield as it is now: to be read; the next step puts another one in its place."""
-        believed: BelievedShield = self.memory
-        return believed
+    def chosen_policy(self) -> Bools:
+        """Where the policy drives, [n]."""
+        chosen: Bools = self.policy_harm <= self.bound_harm
+        return chosen
 
     @property
-    def running(self) -> bool:
-        """Whether any episode has begun."""
-        return self.believed.predicted_harm.size > 0
+    def predicted_harm(self) -> Floats:
+        """Harm expected at the alert, [n] m2/s2."""
+        return np.minimum(self.policy_harm, self.bound_harm)
 
-    @property
-    def stepped_in(self) -> Bools:
-        """Where a proposal was replaced, [n]."""
-        decision = None if self.sent is None else self.believed.decision
-        return np.zeros(self.engine.n, np.bool_) if decision is None else decision.intervened
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Choose for these rows; ``worlds`` holds those rows only, at the alert."""
+        scripts = script_agents(self.scenario, except_for=vehicle)
+        for agent in (self.policy, self.backup):
+            set_others(agent, vehicle, scripts)
+            begin_script(agent, worlds, vehicle, rows)
+        if isinstance(self.policy, Refined):  # was rolled out just now
+            policy_harm = self.policy.predicted_harm[rows]
+        else:
+            policy_harm = self._harm(worlds, self._stage, vehicle)
+        bound = self.backup.predicted_harm[rows]
+        if self.bound == "coupled":
+            bound = self._harm(worlds, FixedCommand(-self.backup.deceleration_mps2[rows]), vehicle)
+        self.bound_harm = place(self.bound_harm, rows, bound)
+        self.policy_harm = place(self.policy_harm, rows, policy_harm)
 
-    def decide(self, proposed: Floats) -> Floats:
-        """The actions [n] to apply instead of those proposed; the engine applies them."""
-        memory, engine = self.believed, self.engine
-        if self.remembering:
-            self.ask_policies()
-        after, worlds = memory.branch(), engine.worlds
-        command = after.decide(worlds, self.vehicle, lambda: np.asarray(proposed, np.float64), self.policies)
-        applied = command_to_action(command, worlds.vehicles, self.vehicle)
-        self.sent = Sent(memory, engine.steps_made, applied, ~engine.ended, None, after)
-        return applied
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """Wanted signed acceleration of the chosen strategy, [n] m/s2."""
+        self.policy_harm = recall(self.policy_harm, worlds.n, self.name)  # of this batch; an earlier one may be larger
+        self.bound_harm = recall(self.bound_harm, worlds.n, self.name)
+        return np.where(self.chosen_policy, ask_script(self.policy, worlds, vehicle), self.backup.act(worlds, vehicle))
 
-    def info(self, k: int, proposed: float, c: int = 0) -> dict[str, Any]:
-        """What the shield decided in world ``k``; ``trusted``: the mode promises something of the world as it is."""
-        assert self.sent is not None and isinstance(self.sent.after, BelievedShield)
-        after = self.sent.after
-        decision, shield = after.decision, after.shield
-        assert decision is not None and shield is not None
-        return told_before(shield, k) | {
-            "proposed_action": proposed,
-            "chosen_action": float(self.sent.applied[k]),
-            "intervened": bool(decision.intervened[k]),
-            "reason": REASONS[int(decision.reason[k])],
-            "margin": float(decision.margin[k]),
-            "bound_harm": float(shield.bound[k]) if np.isfinite(after.predicted_harm[k]) else np.inf,
-            **self._marks(),
-        }
-
-    def start_info(self, k: int, c: int = 0) -> dict[str, Any]:
-        """The same keys before the first decision of world ``k``: nothing was certified, and the bound is infinite."""
-        told = {"mode": self.options.mode, "proposed_action": 0.0, "chosen_action": 0.0, "intervened": False}
-        told |= {"reason": "", "bound_harm": np.inf, "margin": 0.0, "settles": False, **self._marks()}
-        return told | ({} if self.believed.robust is None else {"members": self.believed.members})
-
-    def _marks(self) -> dict[str, bool]:
-        return {"believed": True, "trusted": self.believed.robust is not None}
-
-    def begun(self, memory: BelievedShield, alert: Worlds, rows: Ints) -> BelievedShield:
-        """The shield once episodes start in these rows."""
-        for vehicle, policy in (self.policies or {}).items():
-            set_others(policy, vehicle, self.engine.scripts)
-            begin_script(policy, alert, vehicle, rows)
-        shield = memory.branch()
-        shield.begin(alert, self.vehicle, rows)
-        return shield
-
-    def _carried_out(self, memory: BelievedShield, sent: Sent, after: Engine) -> object:
-        return sent.after
+    def _harm(self, worlds: Worlds, agent: Agent, vehicle: int) -> Floats:
+        return drive(worlds, agent, self.scenario, vehicle).ledger.world_harm(self.harm_count)
 
 
-# Episode mode on a running engine, and the shield of each mode.
+class FixedCommand:
+    """One given command per world, for all of its episode."""
+
+    name = "fixed"
+
+    def __init__(self, command_mps2: Floats) -> None:
+        self.command_mps2 = command_mps2
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        """Nothing to prepare."""
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The command of each world, [n] m/s2."""
+        return self.command_mps2
+
 
 ROUNDING = 1e-6  # of an action in 32 bits
 
 
-class EpisodeChoice(NamedTuple):
-    """What episode mode remembers: who drives, and that nothing was asked of it yet at this decision."""
+class EpisodeGuard(ShieldGuard):
+    """Mode ``episode``: ``HybridAgent`` chooses who drives at each alert, whatever is proposed.
 
-    hybrid: HybridAgent
+    A proposal counts as replaced where it differs by more than the rounding of its 32 bits.
+    """
 
+    def _make(self) -> HybridAgent:
+        (policy,) = self._policies.values()
+        self._policies = {}
+        return HybridAgent(policy, self.scenario, bound=self.options.bound, harm_count=self.options.harm_count)
 
-class AttachedHybrid(Attached):
-    """Episode mode on a running engine: ``HybridAgent`` chooses at each alert, and its action alone may be applied."""
+    def _apart(self, shield: HybridAgent) -> HybridAgent:
+        return copy.deepcopy(shield)
 
-    vehicle: int
+    def _started(self, shield: HybridAgent, alert: Worlds, rows: Ints, policies: dict[int, Agent]) -> None:
+        shield.begin(alert, self.vehicles[0], rows)
 
-    def __init__(self, engine: Engine, policy: Proposing | None, options: ShieldOptions) -> None:
-        shielded_vehicles(engine, options.where, options.mode)
-        agent = proposing_agent(policy, options.where)
-        hybrid = HybridAgent(agent, engine.scenario, bound=options.bound, harm_count=options.harm_count)
-        super().__init__(engine, options, EpisodeChoice(hybrid))
+    def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
+        """What the chosen agent does."""
+        hybrid, worlds = copy.copy(memory.shield), running.worlds
+        hybrid.policy = apart(hybrid.policy)
+        applied = command_to_action(hybrid.act(worlds, self.vehicles[0]), worlds.vehicles, self.vehicles[0])
+        memory = memory._replace(shield=hybrid)
+        return Ruling(proposed, applied[:, np.newaxis], ~hybrid.chosen_policy, ~running.ended, None, memory)
 
-    @property
-    def hybrid(self) -> HybridAgent:
-        """The agent that drives, as it is now."""
-        choice: EpisodeChoice = self.memory
-        return choice.hybrid
-
-    @property
-    def running(self) -> bool:
-        """Whether any episode has begun."""
-        return self.hybrid.policy_harm.size > 0
-
-    @property
-    def stepped_in(self) -> Bools:
-        """Where E-V2X-BM drives the episode instead of the policy, [n]."""
-        replaced: Bools = ~self.hybrid.chosen_policy
-        return replaced
-
-    def proposal(self) -> Floats:
-        """NaN: the agent that was chosen drives, whatever is proposed."""
-        return np.full(self.engine.n, np.nan)
-
-    def decide(self, proposed: Floats) -> Floats:
-        """The actions [n] to apply. Asked again before they were applied, the agent is not asked again."""
-        memory, engine = self.memory, self.engine
-        if self.sent is None or self.sent.memory is not memory:
-            worlds = engine.worlds
-            applied = command_to_action(memory.hybrid.act(worlds, self.vehicle), worlds.vehicles, self.vehicle)
-            self.sent = Sent(memory, engine.steps_made, applied, ~engine.ended, None)
-        return self.sent.applied
-
-    def begun(self, memory: EpisodeChoice, alert: Worlds, rows: Ints) -> EpisodeChoice:
-        """Who drives the episodes that start in these rows."""
-        hybrid = copy.copy(memory.hybrid)
-        hybrid.backup = copy.copy(hybrid.backup)
-        hybrid.begin(alert, self.vehicle, rows)
-        return EpisodeChoice(hybrid)
-
-    def info(self, k: int, proposed: float, c: int = 0) -> dict[str, Any]:
-        """Who drives the episode of world ``k``; ``proposed_action`` is NaN when nothing was proposed.
-
-        A proposal counts as replaced where it differs by more than the rounding of its 32 bits.
-        """
-        assert self.sent is not None and isinstance(self.sent.memory, EpisodeChoice)
-        applied, hybrid = float(self.sent.applied[k]), self.sent.memory.hybrid  # now the next episode may have begun
-        return {
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, NDArray[Any]]:
+        """The keys of ``infos[agent]["shield"]``; ``proposed_action`` is NaN where nothing was proposed."""
+        hybrid: HybridAgent = memory.shield
+        proposed = applied = np.zeros((len(hybrid.policy_harm), 1))
+        if ruling is not None:
+            proposed, applied = ruling.proposed, ruling.applied
+        told = {
             "mode": "episode",
             "proposed_action": proposed,
             "chosen_action": applied,
             "intervened": abs(applied - proposed) > ROUNDING,
-            "chosen_policy": bool(hybrid.chosen_policy[k]),
-            "policy_harm": float(hybrid.policy_harm[k]),
-            "bound_harm": float(hybrid.bound_harm[k]),
+            "chosen_policy": hybrid.chosen_policy,
+            "policy_harm": hybrid.policy_harm,
+            "bound_harm": hybrid.bound_harm,
         }
-
-    def start_info(self, k: int, c: int = 0) -> dict[str, Any]:
-        """Who will drive the episode of world ``k``, before the first decision."""
-        return {
-            "mode": "episode",
-            "proposed_action": 0.0,
-            "chosen_action": 0.0,
-            "intervened": False,
-            "chosen_policy": bool(self.hybrid.chosen_policy[k]),
-            "policy_harm": float(self.hybrid.policy_harm[k]),
-            "bound_harm": float(self.hybrid.bound_harm[k]),
-        }
-
-    def _carried_out(self, memory: EpisodeChoice, sent: Sent, after: Engine) -> EpisodeChoice:
-        return EpisodeChoice(memory.hybrid)  # another one: the next decision is another one, too
+        return {name: by_row(columns, len(proposed), 1) for name, columns in told.items()}
 
 
-def attach(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> Attached:
-    """The shield of the options' mode on a running engine."""
+def shielded_vehicles(engine: Engine, options: ShieldOptions) -> tuple[int, ...]:
+    """Indices of the learners, which are shielded, front to rear.
+
+    Raises ``InvalidInput`` when there is none, or more than one in another mode than ``step``.
+    """
+    where, mode = options.where, options.mode
+    if mode == "step" and len(engine.learners) > 1:
+        return engine.learners
+    if not engine.learners:
+        raise InvalidInput(
+            f"{where}: no vehicle of scenario {engine.scenario.name!r} learns, so there is nobody to shield; pass"
+            " learners=['vehicle_2'] to the environment"
+        )
+    check_one_learner(
+        engine.scenario.name,
+        [engine.scenario.vehicle_names[i] for i in engine.learners],
+        f"{where} needs exactly one learner in mode {mode}: what it certifies is known only if every other vehicle"
+        " follows a script; mode step shields several together; or pass learners=['vehicle_2'] to the environment",
+    )
+    return engine.learners
+
+
+def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
+    """The guard of the options' mode for all learners of an engine, who proposes among them.
+
+    Raises ``InvalidInput`` for a number of learners that the mode does not shield, and for what is no policy.
+    """
+    vehicles = shielded_vehicles(engine, options)
     if options.mode == "episode":
-        return AttachedHybrid(engine, policy, options)
+        policies = {vehicles[0]: proposing_agent(policy, options.where)}
+    else:
+        policies = {} if policy is None else proposing_agents(policy, vehicles, options.where)
+    if options.mode == "episode":
+        return EpisodeGuard(engine, policies, options)
     if options.believed:
-        return AttachedBelieved(engine, policy, options)
-    return AttachedShield(engine, policy, options)
+        return BelievedGuard(engine, policies, options)
+    return StepGuard(engine, policies, options, warns=True)
+
+
+class Attached:
+    """A guard in the engine of an environment, for the wrapper that put it there.
+
+    Raises ``InvalidInput`` for what is not one of this package's environments, or is shielded already.
+    """
+
+    def __init__(
+        self, env: object, interface: type, maker: str, policy: Proposing | None, where: str, options: Mapping[str, Any]
+    ) -> None:
+        self.options = read_options(where, options)
+        engine = getattr(getattr(env, "unwrapped", env), "engine", None)
+        if isinstance(engine, Engine) and isinstance(engine.guard, ShieldGuard):
+            first = engine.guard.options
+            raise InvalidInput(
+                f"{where}: a {first.where} (mode {first.mode}) shields this environment already, and its bound"
+                " holds for one shield alone; give that one other options, or close() it first"
+            )
+        if not (isinstance(env, interface) and isinstance(engine, Engine)):
+            raise InvalidInput(f"{where}: {env} is not one of this package's environments ({maker})")
+        self.engine, self._left = engine, Guarded(None, {})
+        self.guard = guard_of(engine, policy, self.options)
+        engine.protect(self.guard)
+
+    @property
+    def memory(self) -> Guarded:
+        """What the guard remembers now, or, once it was closed, remembered last."""
+        memory: Guarded | None = self.engine.guarded if self.engine.guard is self.guard else self._left
+        return Guarded(None, {}) if memory is None else memory
+
+    @property
+    def shield(self) -> Any:
+        """The ``StepShield``, ``BelievedShield`` or ``HybridAgent`` as it is now, to be read; None before a reset."""
+        return self.memory.shield
+
+    def check_open(self) -> None:
+        """Raise ``InvalidInput`` once this shield was closed: it stands nowhere any more, and bounds nothing."""
+        if self.engine.guard is not self.guard:
+            raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
+
+    def close(self) -> None:
+        """Let go of the engine."""
+        if self.engine.guard is self.guard:
+            self._left = self.memory
+            self.engine.protect(None)
+
+    def tell(self) -> dict[str, NDArray[Any]]:
+        """What is told of the last step, or, before the first one, of the alert; each [n, L]."""
+        ruling = self.engine.ruling
+        return self.guard.tell(self.memory if ruling is None else ruling.memory, ruling)
+
+    def infos(self) -> list[dict[str, Any]]:
+        """``tell`` as plain values, for each learner of each world."""
+        told = {name: columns.reshape(-1).tolist() for name, columns in self.tell().items()}
+        return [dict(zip(told, row, strict=True)) for row in zip(*told.values(), strict=True)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -11,15 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents.protocol import Agent, AgentAround, Driver, Team
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Driver, Team, team_of
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.physics import Bools, Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.physics.kernel import decision_at, first_decision_s
 from ethbrake_marl.scenario.schema import Task
-from ethbrake_marl.shield.agents import Behind, StepShieldAgent, drive_behind, put_shield, shield_of
+from ethbrake_marl.shield.agents import ShieldedDriver, put_shield, shielded_episodes
 from ethbrake_marl.shield.certify import proposed_action
 from ethbrake_marl.shield.enclosure import CORNERS, checked_robust
+from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 SAME_HARM = 1e-9  # harms (m2/s2) closer than this are one harm
@@ -43,57 +43,43 @@ class Review(NamedTuple):
         return float((self.verdict == verdict).mean()) if self.verdict.size else 0.0
 
 
-def review(driver: Behind, worlds: Worlds, vehicle: int | None = None) -> Review:
-    """Simulate every intervention of a driven batch again without it: from there on the policy drives alone.
+def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
+    """Simulate every intervention of a driven batch again without it: from there on the ``policy`` drives alone.
 
-    Of a ``ShieldedTeam`` the whole team does; ``vehicle`` is then None. ``worlds`` are those that ``driver`` (made with
-    ``logging=True``) was driven through last, at the alert; what was logged in earlier episodes is left out. *needed*:
-    harm would have been higher; *costly*: lower; *harmless*: the same. What was realised is simulated again, too, so
-    both harms are the engine's, also where the truth was not what the shield was told. Raises ``InvalidInput`` without
-    a log, or for another number of worlds.
+    ``shield`` (with ``logging``) as it was when the episodes of ``worlds``, which are at the alert, had ended; what was
+    logged in earlier episodes is left out. ``policy`` proposed: an agent, or of several vehicles the whole team.
+    *needed*: harm would have been higher; *costly*: lower; *harmless*: the same. What was realised is simulated again,
+    too, so both harms are the engine's, also where the truth was not what the shield was told. Raises ``InvalidInput``
+    without a log, or for another number of worlds.
     """
-    shield = driver.shield
-    if shield is None or shield.log is None or shield.running is None:
-        raise InvalidInput("review: nothing was logged; make the agent with logging=True, and drive it")
+    if shield.log is None or shield.running is None:
+        raise InvalidInput("review: nothing was logged; make the shield with logging=True, and drive behind it")
     if worlds.n != shield.running.n:
         raise InvalidInput(f"review: {count_of(worlds.n, 'world')}, but {shield.running.n} were driven last")
     log = [entry for entry in shield.log if entry.world < worlds.n and entry.episode == shield.episode[entry.world]]
-    released = _Release(driver, worlds, vehicle)
     world = np.array([entry.world for entry in log], np.int64)
     step = np.array([entry.step for entry in log], np.int64)
     realised, without = np.zeros(0), np.zeros(0)
     if world.size:
-        every, plan = np.arange(worlds.n), shield.backup.plan
-        never = np.full(worlds.n, plan.shape[1])
-        realised = released.harm(every, never)[world]
-        without = released.harm(world, step)
+        never = np.full(worlds.n, shield.backup.plan.shape[1])
+        realised = _released_harm(shield, policy, worlds, np.arange(worlds.n), never)[world]
+        without = _released_harm(shield, policy, worlds, world, step)
     verdict = np.where(without > realised + SAME_HARM, "needed", "harmless")
     verdict = np.where(without < realised - SAME_HARM, "costly", verdict)
     whose = np.array([entry.vehicle for entry in log], np.int64)
     return Review(world, whose, step, realised, without, verdict, ~shield.distrusted[world])
 
 
-class _Release(NamedTuple):
-    """Who drove a batch behind a shield, and its worlds at the alert."""
-
-    driver: Behind
-    worlds: Worlds
-    vehicle: int | None  # None: a team drove
-
-    def harm(self, world: Ints, step: Ints) -> Floats:
-        """In some worlds [m], when what was applied is applied again up to decision ``step`` [m], then who proposes."""
-        shield, policy = shield_of(self.driver), self.driver.policy
-        vehicles, scenario = shield.vehicles, shield.scenario
-        plan = shield.backup.plan[world]
-        actions = plan.reshape(*plan.shape[:2], len(vehicles))
-        proposing = policy.drivers if isinstance(policy, Team) else {vehicles[0]: policy}
-        again = {
-            i: _Released(copy.deepcopy(proposing[i]), actions[:, :, c], step, vehicles, scenario.time_step_s)
-            for c, i in enumerate(vehicles)
-        }
-        driver = Team(again, "released") if self.vehicle is None else again[self.vehicle]
-        with renumbered(world):
-            return drive(self.worlds.take(world), driver, scenario, self.vehicle).ledger.world_harm(shield.harm_count)
+def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:
+    """In some worlds [m], when what was applied is applied again up to decision ``step`` [m], then who proposes."""
+    scenario, plan = shield.scenario, shield.backup.plan[world]
+    actions = plan.reshape(*plan.shape[:2], len(shield.vehicles))
+    again = {
+        i: _Released(agent, actions[:, :, c], step, shield.vehicles, scenario.time_step_s)
+        for c, (i, agent) in enumerate(team_of(policy, shield.vehicles).drivers.items())
+    }
+    with renumbered(world):
+        return drive(worlds.take(world), Team(again, "released"), scenario).ledger.world_harm(shield.harm_count)
 
 
 class OperatingPoint(NamedTuple):
@@ -134,7 +120,7 @@ def operating_curves(
 def _operating_points(worlds: Worlds, policy: Driver, task: Task, allowances: Sequence[float]) -> list[OperatingPoint]:
     points = []
     for allowance in allowances:
-        found = drive_behind(put_shield(policy, task, allowance=allowance), worlds, task)
+        found = shielded_episodes(drive(worlds, put_shield(policy, task, allowance=allowance), task.scenario), task)
         rate = float(found.replaced.sum() / (found.decisions.sum() * found.replaced.shape[1]))
         points.append(OperatingPoint(float(allowance), rate, float(found.harm.mean())))
     return points
@@ -203,7 +189,7 @@ def robustness(
     The numbers that place a truth in its box are those of ``seed``, the same for all widths. ``robust`` says what the
     robust shield certifies of a box, as in ``ShieldOptions``. A world that cannot be advanced in one of the cases is
     left out of all, and named in ``left_out``. Raises ``InvalidInput`` for no width or a negative one, ``UnknownName``
-    for another ``robust``, ``PhysicsError`` where no world is left, and what ``StepShieldAgent`` raises.
+    for another ``robust``, ``PhysicsError`` where no world is left, and what ``ShieldedDriver`` raises.
     """
     checked_robust(robust, "robustness")
     if not widths or not all(0.0 <= width < np.inf for width in widths):
@@ -220,8 +206,8 @@ def robustness(
             key = (0.0, "as told", "step") if alike else (width, truth, mode)
             if key not in known:
                 intervals = uncertainty.scaled(width)
-                shielded = StepShieldAgent(
-                    copy.deepcopy(policy), task.scenario, harm_count=task.harm_count, believed=told,
+                shielded = ShieldedDriver(
+                    policy, task.scenario, harm_count=task.harm_count, told=told,
                     uncertainty=intervals if mode == "robust" else None,
                     robust=robust if mode == "robust" else CORNERS,
                 )  # fmt: skip
@@ -238,11 +224,11 @@ def robustness(
     return [point._replace(left_out=left_out) for point in found]
 
 
-def _point(worlds: Worlds, shielded: StepShieldAgent, task: Task) -> RobustnessPoint:
+def _point(worlds: Worlds, shielded: ShieldedDriver, task: Task) -> RobustnessPoint:
     """What a shield makes of the worlds that it is driven through; which case that is, the caller says."""
-    harm = drive(worlds, shielded, task.scenario, task.vehicle).ledger.world_harm(task.harm_count)
-    bound, shield = shielded.predicted_harm, shielded.shield
-    assert shield is not None
+    episodes = drive(worlds, shielded, task.scenario, task.vehicle)
+    harm, shield = episodes.ledger.world_harm(task.harm_count), episodes.guarded.shield
+    bound = shield.predicted_harm
     above = np.maximum(harm - bound, 0.0)
     return RobustnessPoint(
         mode="",

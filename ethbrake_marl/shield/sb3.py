@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from ethbrake_marl.actions import checked_action
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, Rewards
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
-from ethbrake_marl.shield.guard import Proposing, attach, read_options
-from ethbrake_marl.shield.uncertainty import engine_of
+from ethbrake_marl.shield.guard import Attached, Proposing
 
 
 class ShieldedVecEnv(VecEnvWrapper):
@@ -40,11 +38,8 @@ class ShieldedVecEnv(VecEnvWrapper):
         policy: Proposing | None = None,
         **options: Any,
     ) -> None:
-        settings = read_options("ShieldedVecEnv", options)
-        engine = engine_of(venv, EthBrakeVecEnv, "ShieldedVecEnv", "make_sb3_vec_env")
-        self.attached = attach(engine, policy, settings)
+        self.attached = Attached(venv, VecEnv, "make_sb3_vec_env", policy, "ShieldedVecEnv", options)
         super().__init__(venv)
-        self._proposed: NDArray[np.float64] = np.zeros(0)
 
     def reset(self) -> Observations:
         """As the environment's own reset."""
@@ -53,26 +48,18 @@ class ShieldedVecEnv(VecEnvWrapper):
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Certify or replace the actions [rows, 1], and pass them on."""
+        """Pass the actions [rows, 1] on."""
         self.attached.check_open()
-        if not self.attached.running:
-            self.venv.step_async(actions)
-            return
-        attached = self.attached
-        self._proposed = checked_action(actions, (self.num_envs, 1), "the learners")[:, 0]
-        several = (attached.engine.n, len(attached.vehicles)) if len(attached.vehicles) > 1 else (self.num_envs,)
-        self.venv.step_async(attached.decide(self._proposed.reshape(several)).reshape(-1, 1))
+        self.venv.step_async(actions)
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
-        """Advance every world by one step."""
-        shield = self.attached
+        """Advance every world by one step with the actions certified or replaced."""
         observation, reward, done, infos = self.venv.step_wait()
-        shield.confirm()
-        learners = len(shield.vehicles)
-        for row, info in enumerate(infos):
-            info["shield"] = shield.info(row // learners, float(self._proposed[row]), row % learners)
-        intervened = np.array([info["shield"]["intervened"] for info in infos], np.float32)
-        paid = reward - np.float32(shield.options.intervention_penalty) * intervened
+        told = self.attached.infos()
+        for info, row in zip(infos, told, strict=True):
+            info["shield"] = row
+        intervened = np.array([row["intervened"] for row in told], np.float32)
+        paid = reward - np.float32(self.attached.options.intervention_penalty) * intervened
         return observation, paid, done, infos  # type: ignore[return-value]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -86,5 +73,5 @@ class ShieldedVecEnv(VecEnvWrapper):
 
     def close(self) -> None:
         """Let go of the environment, and close it."""
-        self.attached.detach()
+        self.attached.close()
         super().close()

@@ -45,7 +45,6 @@ from ethbrake_marl.shield.certify import (
     plan_rests,
     put,
     rolled_out,
-    write_down,
 )
 from ethbrake_marl.shield.certify_kernel import ENDED, NO_CERTIFICATE, Members, gather, hold_constant, rows_of
 from ethbrake_marl.shield.uncertainty import Uncertainty, check_amount, check_scenario, checked_vehicles, policies_of
@@ -221,32 +220,13 @@ def descend_constants(
 
 
 BROKEN = ENDED + 1  # a reason that the kernel does not know
-PER_WORLD = (  # a shield's arrays [n, ...]
-    "first_bound", "alone_harm", "settles", "replaced", "distrusted", "episode", "baseline_shares",
-)  # fmt: skip
-
-
-class Certified(NamedTuple):
-    """A decision that was made, and is not carried out yet."""
-
-    decision: Decision
-    asked: Bools  # [n] worlds that it is about; the others stay as they are
-    before: Running  # what it was made from
-    after: StepShield  # the shield as it will be once the decision was carried out
-
-    def carried_out(self) -> StepShield:
-        """The shield now that the decision was carried out."""
-        after = self.after
-        if after.log is not None:
-            write_down(after.log, after.found, self.before, after.episode)
-        return after
 
 
 class StepShield:
-    """Guarantees the harm of a batch: ``begin`` when episodes start, ``propose`` and ``commit`` in every step.
+    """Guarantees the harm of a batch: ``begin`` when episodes start, ``decide`` in every step.
 
-    What ``propose`` certifies changes nothing yet: ``commit`` it when the engine has made that step, and not otherwise.
-    Whatever fails before (or interrupts) leaves bound, plan and trust as they were.
+    Both change it in one piece, and nothing that it holds is changed in place: what fails, or is interrupted, leaves
+    bound, plan and trust as they were, and a ``copy.copy`` goes on apart.
 
     The bound starts as the harm of the coupled optimum, realised decision by decision, or as that of a ``policy``
     rolled out from the alert where that is lower, and only ever falls; ``allowance`` (m2/s2) is what the budget grants
@@ -291,8 +271,9 @@ class StepShield:
         self.uncertainty, self.cap = uncertainty, cap
         self.robust = enclosure.checked_robust(robust, "shield")
         self.boxes: enclosure.Boxes | None = None  # where every world of them is certified
-        self.log: list[Intervention] | None = [] if logging else None
-        self.found: list[Intervention] = []  # in the last decision
+        self.logging = logging
+        self._entries: list[Intervention] = []  # shared with copies; the first ``_logged`` of them are of this one
+        self._logged = 0
         self.running: Running | None = None
         self.backup = Backup(np.zeros((0, 0)), np.zeros(0))
         self.first_bound: Floats = np.zeros(0)  # [n] harm of the backup at the first decision
@@ -314,6 +295,26 @@ class StepShield:
             return self.backup.harm
         granted = np.where(self.running.finished, 0.0, self.first_bound + self.allowance)
         return np.maximum(self.backup.harm, granted)
+
+    @property
+    def predicted_harm(self) -> Floats:
+        """What was told at the alert, [n] m2/s2."""
+        return self.first_bound + self.allowance
+
+    @property
+    def chosen_policy(self) -> Bools:
+        """Where everything proposed was applied so far, [n]."""
+        untouched: Bools = self.interventions == 0
+        return untouched
+
+    @property
+    def log(self) -> list[Intervention] | None:
+        """Every decision so far in which something else than the proposal was applied; None without ``logging``."""
+        return self._entries[: self._logged] if self.logging else None
+
+    def clear_log(self) -> None:
+        """Forget what was logged so far: it grows until then."""
+        self._entries, self._logged = [], 0
 
     @property
     def interventions(self) -> Ints:
@@ -353,34 +354,6 @@ class StepShield:
         new._place(rows, start)
         self.__dict__.update(new.__dict__)
 
-    def propose(
-        self,
-        proposed: Floats,
-        *,
-        seen: Floats | None = None,
-        only: Bools | None = None,
-        proposer: Proposer | None = None,
-    ) -> Certified:
-        """Decide in every running episode, or ``only`` in some; the others stay as they are. Changes nothing.
-
-        ``seen`` [n, columns]: the worlds as they are now, in the first columns of ``Running.states``. Where nothing
-        else certifies a proposal, the ``proposer`` (if given) is rolled out from the state after it.
-        """
-        if self.running is None:
-            raise InvalidInput("shield: decide, but no episode has begun; call begin first")
-        if np.shape(proposed) != (shape := (*self.distrusted.shape, *self.backup.plan.shape[2:])):
-            raise InvalidInput(f"shield: proposed {np.shape(proposed)}; {shape} is needed")
-        asked = ~self.running.finished if only is None else only
-        after = copy.copy(self)
-        decision = after._decided(proposed, seen, asked, proposer)
-        return Certified(decision, asked & ~self.running.finished, self.running, after)
-
-    def commit(self, certified: Certified) -> None:
-        """The decision was carried out. Raises ``InvalidInput`` for one that was not made from here."""
-        if certified.before is not self.running:
-            raise InvalidInput("shield: commit of a decision that was made from another state; propose again")
-        self.__dict__.update(certified.carried_out().__dict__)  # in one piece: not even an interrupt comes between
-
     def decide(
         self,
         proposed: Floats,
@@ -389,10 +362,19 @@ class StepShield:
         only: Bools | None = None,
         proposer: Proposer | None = None,
     ) -> Decision:
-        """``propose`` and ``commit`` at once: where nothing can fail before the decision is carried out."""
-        certified = self.propose(proposed, seen=seen, only=only, proposer=proposer)
-        self.commit(certified)
-        return certified.decision
+        """Decide in every running episode, or ``only`` in some; the others stay as they are.
+
+        ``seen`` [n, columns]: the worlds as they are now, in the first columns of ``Running.states``. Where nothing
+        else certifies a proposal, the ``proposer`` (if given) is rolled out from the state after it.
+        """
+        if self.running is None:
+            raise InvalidInput("shield: decide, but no episode has begun; call begin first")
+        if np.shape(proposed) != (shape := (*self.distrusted.shape, *self.backup.plan.shape[2:])):
+            raise InvalidInput(f"shield: proposed {np.shape(proposed)}; {shape} is needed")
+        after = copy.copy(self)
+        decision = after._decided(proposed, seen, ~self.running.finished if only is None else only, proposer)
+        self.__dict__.update(after.__dict__)  # in one piece: not even an interrupt comes between
+        return decision
 
     def _decided(self, proposed: Floats, seen: Floats | None, asked: Bools, proposer: Proposer | None) -> Decision:
         """Decide, and become the shield as it will be once that was carried out."""
@@ -416,17 +398,12 @@ class StepShield:
         self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
         self.backup = decision.backup
         decision = decision._replace(bound=self.bound)
-        if self.log is not None:
-            self.found = interventions(now, self.episode, self.vehicles, proposed, decision, held)
+        if self.logging:
+            if len(self._entries) > self._logged:  # of a step that was not made, or of a copy
+                self._entries = self._entries[: self._logged]
+            self._entries.extend(interventions(now, self.episode, self.vehicles, proposed, decision, held))
+            self._logged = len(self._entries)
         return decision
-
-    def keep(self, n: int) -> None:
-        """Keep the first ``n`` rows only: a smaller batch has begun."""
-        assert self.running is not None
-        backup = self.backup._replace(plan=self.backup.plan[:n], harm=self.backup.harm[:n])
-        rows = {name: getattr(self, name)[:n] for name in PER_WORLD}
-        self.boxes = self.boxes and self.boxes.take(np.arange(n))
-        self.__dict__.update(rows | {"running": self.running.take(np.arange(n)), "backup": backup})
 
     def _compare(self, seen: Floats, asked: Bools) -> None:
         """Find the worlds that did not do what was predicted, and choose anew there from what is seen."""
@@ -490,50 +467,9 @@ def _harm_of(running: Running, plan: Floats, rows: Ints) -> Floats:
         return plan_harm(running.take(rows), plan[rows])
 
 
-# Infos of a shield: the keys, and their values before anything is decided.
-
-
-class SharesTold:
-    """What each vehicle bears under the plans of a shield, for infos: found once in each step, if anybody asks."""
-
-    def __init__(self) -> None:
-        self._last: tuple[StepShield, Floats] | None = None
-
-    def told(self, shield: StepShield, k: int, vehicle: int) -> dict[str, Any]:
-        """The keys of one vehicle in world ``k``."""
-        if self._last is None or self._last[0] is not shield:
-            self._last = shield, shield.shares()
-        return {
-            "own_harm": float(self._last[1][k, vehicle]),
-            "baseline_own_harm": float(shield.baseline_shares[k, vehicle]),
-        }
-
-
-def told_before(shield: StepShield, k: int) -> dict[str, Any]:
-    """What a shield says of world ``k`` where nothing is decided."""
-    assert shield.running is not None
-    return {
-        "mode": "step" if shield.uncertainty is None else "robust",
-        "proposed_action": 0.0,
-        "chosen_action": 0.0,
-        "intervened": False,
-        "reason": "",
-        "bound_harm": float(shield.bound[k]),
-        "margin": 0.0,
-        "trusted": not shield.distrusted[k],
-        "settles": bool(shield.settles[k]),
-        **({} if shield.uncertainty is None else {"members": shield.running.members}),
-    }
-
-
 def by_vehicle(columns: NDArray[Any], vehicles: Sequence[int]) -> NDArray[Any]:
     """What is decided, [n] of one vehicle or [n, K], with the axis of vehicles: [n, K]."""
     return columns.reshape(len(columns), len(vehicles))
-
-
-def columns_of(rows: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
-    """What is told of each row, one array per key."""
-    return {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
 
 # Plans and members that a shield goes on with where it begins anew in the middle of an episode.

@@ -20,8 +20,7 @@ import numpy as np
 from ethbrake_marl.agents.policy import LearnedAgent, LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent, Team
 from ethbrake_marl.defaults import UNCERTAINTY_EXAMPLE
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.errors import InvalidInput, check_one_learner, unknown_name
+from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.physics import Floats, Worlds, concatenate
 from ethbrake_marl.physics.worlds import is_known_at_once, known_at_once
@@ -83,44 +82,6 @@ def policies_of(
     if set(given) != set(vehicles):
         raise InvalidInput(f"shield: policies for vehicles {sorted(given)}, shielded are {list(vehicles)}")
     return {i: given[i] for i in vehicles}
-
-
-def engine_of(env: object, interface: type, where: str, maker: str) -> Engine:
-    """The engine of one of this package's environments, whatever wraps it.
-
-    Raises ``InvalidInput`` for another interface, and where a shield follows that engine already.
-    """
-    engine = getattr(getattr(env, "unwrapped", env), "engine", None)
-    for watcher in engine.watchers if isinstance(engine, Engine) else ():
-        if (options := getattr(watcher, "options", None)) is not None:
-            raise InvalidInput(
-                f"{where}: a {options.where} (mode {options.mode}) shields this environment already, and its bound"
-                " holds for one shield alone; give that one other options, or close() it first"
-            )
-    if not (isinstance(env, interface) and isinstance(engine, Engine)):
-        raise InvalidInput(f"{where}: {env} is not one of this package's environments ({maker})")
-    return engine
-
-
-def shielded_vehicles(engine: Engine, where: str, mode: str | None) -> int | tuple[int, ...]:
-    """Index of the learner, which is shielded, or indices of all of them, front to rear.
-
-    Raises ``InvalidInput`` when there is none, or more than one in another mode than ``step``.
-    """
-    if mode == "step" and len(engine.learners) > 1:
-        return tuple(sorted(engine.learners))
-    if not engine.learners:
-        raise InvalidInput(
-            f"{where}: no vehicle of scenario {engine.scenario.name!r} learns, so there is nobody to shield; pass"
-            " learners=['vehicle_2'] to the environment"
-        )
-    check_one_learner(
-        engine.scenario.name,
-        [engine.scenario.vehicle_names[i] for i in engine.learners],
-        f"{where} needs exactly one learner in mode {mode}: what it certifies is known only if every other vehicle"
-        " follows a script; mode step shields several together; or pass learners=['vehicle_2'] to the environment",
-    )
-    return engine.learners[0]
 
 
 def proposing_agents(

@@ -1,7 +1,8 @@
-"""The shield as a wrapper of PettingZoo, of Gymnasium, and of its vector interface."""
+"""The shield as a wrapper of each interface: it puts a guard into the engine, and hands on what that tells."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -10,20 +11,18 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
-from pettingzoo import ParallelEnv
+from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from ethbrake_marl.actions import checked_action
 from ethbrake_marl.agents.policy import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.envs.gym import EthBrakeVectorEnv
-from ethbrake_marl.envs.parallel import in_turns
+from ethbrake_marl.envs.parallel import InTurns, in_turns
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
-from ethbrake_marl.shield.agents import HybridAgent
-from ethbrake_marl.shield.guard import AttachedHybrid, Proposing, attach, read_options
-from ethbrake_marl.shield.uncertainty import engine_of, shielded_vehicles
+from ethbrake_marl.shield.guard import Attached, Proposing
 
 Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
 
@@ -62,31 +61,19 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         agents: Sequence[str] | None = None,
         **options: Any,
     ) -> None:
-        settings = read_options("HybridShield", {"mode": mode, **options})
-        engine = engine_of(
-            env, ParallelEnv, "HybridShield", "eb.parallel_env; with agents acting in turn eb.shielded_aec(that)"
-        )
+        maker = "eb.parallel_env; with agents acting in turn eb.shielded_aec(that)"
+        self.attached = Attached(env, ParallelEnv, maker, policy, "HybridShield", {"mode": mode, **options})
         super().__init__(env)
-        self._engine = engine
-        names = engine.scenario.vehicle_names
-        learners = tuple(names[i] for i in sorted(engine.learners))
-        given = learners if agents is None else _names(agents)
-        shielded_vehicles(engine, "HybridShield", settings.mode)
-        if len(given) != len(learners) or set(given) != set(learners):
+        engine = self.attached.engine
+        self.shielded = tuple(engine.scenario.vehicle_names[i] for i in engine.learners)  # front to rear
+        if agents is not None and set(_names(agents)) != set(self.shielded):
+            self.attached.close()
             raise InvalidInput(
-                f"HybridShield: shields every learner, {learners}, and nobody else; got {given}. What an unshielded one"
-                " does is an assumption that nothing checks: give it a script (learners=[...] of the environment)"
+                f"HybridShield: shields every learner, {self.shielded}, and nobody else; got {_names(agents)}. What an"
+                " unshielded one does is an assumption that nothing checks: give it a script (learners=[...] of the"
+                " environment)"
             )
         self.mode = mode
-        self.shielded = learners  # names, front to rear
-        self.attached: Any = attach(engine, policy, settings)  # what it is depends on the mode
-
-    @property
-    def hybrid(self) -> HybridAgent:
-        """Who drives the running episode, in mode ``episode``. Raises ``InvalidInput`` in another mode."""
-        if not isinstance(self.attached, AttachedHybrid):
-            raise InvalidInput(f"HybridShield: hybrid: mode {self.mode} chooses nobody for a whole episode")
-        return self.attached.hybrid
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -94,37 +81,23 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         """Start an episode; the bound stands in ``infos[agent]["shield"]`` already."""
         self.attached.check_open()
         observations, infos = super().reset(seed=seed, options=options)
-        for c, agent in enumerate(self.shielded):
-            infos[agent]["shield"] = self.attached.start_info(0, c)
+        for agent, told in zip(self.shielded, self.attached.infos(), strict=True):
+            infos[agent]["shield"] = told
         return observations, infos
 
     def step(self, actions: Mapping[str, Any]) -> Told:
         """Advance by one step with the shielded agents' actions certified or replaced; they may also be left out."""
-        attached, agents = self.attached, self.shielded
-        attached.check_open()
-        if not isinstance(actions, Mapping):
-            raise InvalidInput(
-                f"HybridShield: actions = {actions!r}: must be a dict, for instance {{{agents[0]!r}: [0.0]}}"
-            )
-        given = {a: checked_action(actions[a], (1,), a) for a in agents if actions.get(a) is not None}
-        if not self.env.agents:
-            return self.env.step(actions)  # type: ignore[no-any-return]  # says that no episode is running
-        if len(given) < len(agents):
-            own = attached.proposal().reshape(len(agents), 1)
-            given = {a: given.get(a, own[c]) for c, a in enumerate(agents)}
-        whole = given[agents[0]] if len(agents) == 1 else np.stack([given[a][0] for a in agents])[np.newaxis]
-        applied = attached.decide(whole).reshape(len(agents), 1)
-        told: Told = super().step({**actions, **dict(zip(agents, applied, strict=True))})
-        attached.confirm()
-        for c, agent in enumerate(agents):
-            shown = told[4][agent]["shield"] = attached.info(0, float(given[agent][0]), c)
-            if shown["intervened"]:
-                told[1][agent] -= attached.options.intervention_penalty
-        return told
+        self.attached.check_open()
+        found: Told = super().step(actions)
+        for agent, told in zip(self.shielded, self.attached.infos(), strict=True):
+            found[4][agent]["shield"] = told
+            if told["intervened"]:
+                found[1][agent] -= self.attached.options.intervention_penalty
+        return found
 
     def close(self) -> None:
-        """Let go of the environment: this shield no longer follows it."""
-        self.attached.detach()
+        """Let go of the environment, and close it."""
+        self.attached.close()
         super().close()
 
 
@@ -165,9 +138,7 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
         **options: Any,
     ) -> None:
         RecordConstructorArgs.__init__(self, policy=policy, **options)
-        settings = read_options("ShieldedEnv", options)
-        engine = engine_of(env, gymnasium.Env, "ShieldedEnv", "gymnasium.make('EthBrake-v0')")
-        self.attached = attach(engine, policy, settings)
+        self.attached = Attached(env, gymnasium.Env, "gymnasium.make('EthBrake-v0')", policy, "ShieldedEnv", options)
         super().__init__(env)
 
     def reset(
@@ -176,25 +147,20 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
         """Start an episode; the bound stands in ``info["shield"]`` already."""
         self.attached.check_open()
         observation, info = self.env.reset(seed=seed, options=options)
-        info["shield"] = self.attached.start_info(0)
+        info["shield"] = self.attached.infos()[0]
         return observation, info
 
     def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
-        """Advance by one step with the action certified or replaced."""
-        shield = self.attached
-        shield.check_open()
-        if not shield.running or shield.engine.ended[0]:
-            return self.env.step(action)  # type: ignore[return-value]  # says what is wrong
-        proposed = checked_action(action, (1,), shield.engine.scenario.vehicle_names[shield.vehicles[0]])
-        observation, reward, terminated, truncated, info = self.env.step(shield.decide(proposed))
-        shield.confirm()
-        told = info["shield"] = shield.info(0, float(proposed[0]))
-        paid = float(reward) - shield.options.intervention_penalty * float(told["intervened"])
+        """Advance by one time step with the action certified or replaced."""
+        self.attached.check_open()
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        told = info["shield"] = self.attached.infos()[0]
+        paid = float(reward) - self.attached.options.intervention_penalty * float(told["intervened"])
         return observation, paid, terminated, truncated, info
 
     def close(self) -> None:
         """Let go of the environment, and close it."""
-        self.attached.detach()
+        self.attached.close()
         super().close()
 
 
@@ -223,9 +189,8 @@ class ShieldedVectorEnv(VectorWrapper):
         policy: Agent | LearnedPolicy | None = None,
         **options: Any,
     ) -> None:
-        settings = read_options("ShieldedVectorEnv", options)
-        engine = engine_of(env, EthBrakeVectorEnv, "ShieldedVectorEnv", "gymnasium.make_vec('EthBrake-v0')")
-        self.attached = attach(engine, policy, settings)
+        maker = "gymnasium.make_vec('EthBrake-v0')"
+        self.attached = Attached(env, gymnasium.vector.VectorEnv, maker, policy, "ShieldedVectorEnv", options)
         super().__init__(env)
 
     def reset(
@@ -234,29 +199,68 @@ class ShieldedVectorEnv(VectorWrapper):
         """Start an episode in every row; the bounds stand in ``infos["shield"]`` already."""
         self.attached.check_open()
         observations, infos = self.env.reset(seed=seed, options=options)
-        infos |= {"shield": self.attached.start_infos(), "_shield": np.ones(self.num_envs, np.bool_)}
-        return observations, infos
+        return observations, infos | self._told(np.ones(self.num_envs, np.bool_))
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with the actions [rows, 1] certified or replaced."""
-        attached = self.attached
-        attached.check_open()
-        if not attached.running:
-            return self.env.step(actions)  # says that no episode is running
-        before = attached.engine.ended
-        given = np.array(actions)
-        if before.any() and given.shape[:1] == before.shape:
-            given[before] = 0.0  # whatever stands there, the autoreset mode ignores it
-        proposed = checked_action(given, (self.num_envs, 1), "the learners")[:, 0]
-        applied = attached.decide(proposed)
-        observation, reward, terminated, truncated, infos = self.env.step(applied[:, np.newaxis])
-        attached.confirm()
-        told = attached.infos(proposed)
-        infos |= {"shield": told, "_shield": ~before}
-        paid = reward - attached.options.intervention_penalty * (told["intervened"] & ~before)
-        return observation, paid, terminated, truncated, infos
+        self.attached.check_open()
+        running = ~self.attached.engine.ended
+        observation, reward, terminated, truncated, infos = self.env.step(actions)
+        told = self._told(running)
+        penalty = self.attached.options.intervention_penalty * (told["shield"]["intervened"] & running)
+        return observation, reward - penalty, terminated, truncated, infos | told
 
     def close(self, **kwargs: Any) -> None:
         """Let go of the environment, and close it."""
-        self.attached.detach()
+        self.attached.close()
         super().close(**kwargs)
+
+    def _told(self, rows: Bools) -> dict[str, Any]:
+        return {"shield": {name: column[:, 0].copy() for name, column in self.attached.tell().items()}, "_shield": rows}
+
+
+def shield(env: Any, policy: Proposing | None = None, mode: str = "step", **options: Any) -> Any:
+    """An environment behind a shield: the action wrapper for whatever interface it has.
+
+    Args:
+        env: of this package, whatever wraps it: PettingZoo parallel or AEC, Gymnasium, its vector interface, or
+            Stable-Baselines3's ``VecEnv``. A wrapper inside may change actions: what reaches the engine is certified.
+        policy: proposes where nobody else does, and bounds the harm where its own is lower; mode ``episode`` needs it.
+        mode: ``episode``, ``step`` or ``robust``.
+        options: further keywords of ``ShieldOptions``.
+
+    Returns ``HybridShield``, that with agents acting in turn, ``ShieldedEnv``, ``ShieldedVectorEnv`` or
+    ``ShieldedVecEnv``. Raises ``InvalidInput`` for anything else, and for what those raise.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
+    >>> observations, infos = env.reset(seed=7)
+    >>> env.step({"vehicle_2": [1.0]})[4]["vehicle_2"]["shield"]["intervened"]
+    True
+
+    """
+    settings = {"mode": mode, **options}
+    if isinstance(env, AECEnv):
+        inside: Any = env
+        while isinstance(inside, InTurns | OrderEnforcingWrapper):
+            inside = inside.env
+        if not isinstance(inside, ParallelEnv):
+            raise InvalidInput(
+                f"shield: {inside} acts in turns: put the shield inside it, as eb.shielded_aec(parallel)"
+            )
+        return shielded_aec(inside, policy, **settings)
+    if isinstance(env, gymnasium.vector.VectorEnv):
+        return ShieldedVectorEnv(env, policy, **settings)  # type: ignore[arg-type]
+    if isinstance(env, gymnasium.Env):
+        return ShieldedEnv(env, policy, **settings)  # type: ignore[arg-type]
+    vec_env = getattr(sys.modules.get("stable_baselines3.common.vec_env"), "VecEnv", None)
+    if vec_env is not None and isinstance(env, vec_env):
+        from ethbrake_marl.shield.sb3 import ShieldedVecEnv  # torch: only where there is such an environment
+
+        return ShieldedVecEnv(env, policy, **settings)
+    if isinstance(env, ParallelEnv):
+        return HybridShield(env, policy, **settings)
+    raise InvalidInput(
+        f"shield: {env!r:.200} has none of the interfaces: parallel_env, env (agents in turn), EthBrakeEnv,"
+        " EthBrakeVectorEnv or make_sb3_vec_env"
+    )

@@ -16,7 +16,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield import HybridAgent, StepShieldAgent
+from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 
 SCENARIO = load_scenario("paper-random")
 
@@ -72,13 +72,13 @@ def test_make_agent__says_where_a_scenario_is_needed(spec):
 @pytest.mark.parametrize(
     ("spec", "kind"),
     [
-        ("full_brake+step", StepShieldAgent),
-        ("constant:-5+step", StepShieldAgent),
+        ("full_brake+step", ShieldedDriver),
+        ("constant:-5+step", ShieldedDriver),
         ("planner:8+episode", HybridAgent),
         ("best_harm:20+refined", Refined),
         ("e_v2x_bm+refined+episode", HybridAgent),
-        ("gentlest_front+robust", StepShieldAgent),
-        ("ppo@shipped+refined+step", StepShieldAgent),
+        ("gentlest_front+robust", ShieldedDriver),
+        ("ppo@shipped+refined+step", ShieldedDriver),
     ],
 )
 def test_shields__go_around_any_agent_and_hold(spec, kind):
@@ -133,7 +133,7 @@ def test_own_agent__is_evaluated_and_shielded_from_the_users_own_file(tmp_path, 
     rows = {row["agent"]: row for row in json.loads(capsys.readouterr().out)}
     assert list(rows) == specs and rows["half_brake"]["knows"] == "own sensors"
     assert rows["half_brake+step"]["first_impact_harm"] <= rows["half_brake"]["first_impact_harm"]
-    assert run_command(["agents", "--json"]) == 0
+    assert run_command(["agent", "list", "--json"]) == 0
     listed = {row["agent"]: row for row in json.loads(capsys.readouterr().out)}
     assert listed["half_brake[:ARGUMENT]"]["about"] == "half of what the brakes can"
     with pytest.raises(UnknownName, match="did you mean 'half_brake'"):
@@ -141,7 +141,7 @@ def test_own_agent__is_evaluated_and_shielded_from_the_users_own_file(tmp_path, 
 
 
 def test_agents__are_listed_with_what_they_know(capsys):
-    assert run_command(["agents"]) == 0
+    assert run_command(["agent", "list"]) == 0
     table = capsys.readouterr().out
     for name in (*registry.agent_names(), "+refined", "+episode", "+step", "+robust"):
         assert name in table

@@ -11,7 +11,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import worlds_sha256
 from ethbrake_marl.physics.worlds import read_only
-from ethbrake_marl.shield.agents import HybridAgent, StepShieldAgent
+from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 
 
 class _Writes:
@@ -41,7 +41,7 @@ SCENARIO = eb.load_scenario("paper-random")
 WRAPPED = {
     "alone": lambda agent: agent,
     "episode": lambda agent: HybridAgent(agent, SCENARIO),
-    "step": lambda agent: StepShieldAgent(agent, SCENARIO),
+    "step": lambda agent: ShieldedDriver(agent, SCENARIO),
 }
 
 

@@ -145,4 +145,4 @@ def test_vector__refuses_what_is_no_vector_environment_of_ours() -> None:
 def test_vector__closed_lets_go_of_the_environment() -> None:
     env = EthBrakeVectorEnv(2, PAPER)
     ShieldedVectorEnv(env).close()
-    assert env.engine.watchers == ()
+    assert env.engine.guard is None

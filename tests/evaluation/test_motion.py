@@ -10,7 +10,7 @@ from ethbrake_marl.evaluation import Evaluation, record_episode
 from ethbrake_marl.evaluation.episodes import EpisodeMotion, follow_episodes, state_at
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield import ShieldedTeam
+from ethbrake_marl.shield import ShieldedDriver
 
 
 def at(motion: EpisodeMotion, time_s: float) -> Floats:
@@ -64,12 +64,11 @@ def test_motion__tells_where_a_shield_stepped_in(paper_random: Scenario) -> None
 def test_motion__tells_where_the_shield_of_a_team_stepped_in_as_its_log_does() -> None:
     scenario = load_scenario("cooperation-3-pair")
     worlds = scenario.sample(6, 7).worlds
-    team = ShieldedTeam(Team.copies(make_agent("constant:3"), (1, 2)), scenario, logging=True)
-    drive(worlds, team, scenario)
-    assert team.shield is not None and team.shield.log is not None
+    team = ShieldedDriver(Team.copies(make_agent("constant:3"), (1, 2)), scenario, logging=True).on((1, 2))
+    log = drive(worlds, team, scenario).guarded.shield.log
     motions = follow_episodes(worlds, make_agent("constant:3+step", scenario=scenario), scenario)
     for k, motion in enumerate(motions):
-        times = sorted({entry.time_s for entry in team.shield.log if entry.world == k})
+        times = sorted({entry.time_s for entry in log if entry.world == k})
         np.testing.assert_allclose(motion.stepped_in_s, times)
     assert sum(motion.stepped_in_s.size for motion in motions) > 10
 

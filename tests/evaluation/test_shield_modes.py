@@ -22,7 +22,7 @@ from ethbrake_marl.figures.evaluation import shield_modes_figure
 from ethbrake_marl.pages.frame import page
 from ethbrake_marl.pages.report import ShieldEvidence, shield_section
 from ethbrake_marl.scenario import Task, load_scenario
-from ethbrake_marl.shield import HybridAgent, ShieldedTeam, StepShieldAgent
+from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 from ethbrake_marl.shield.review import review
 from tests.failing_worlds import plant, without
 from tests.pages.hostile import Page
@@ -37,15 +37,16 @@ def rows() -> list[ModeRow]:
 
 
 def test_rows__are_what_driving_each_mode_gives(rows: list[ModeRow]) -> None:
-    step = StepShieldAgent(make_agent("full_brake"), PAPER)
+    step = ShieldedDriver(make_agent("full_brake"), PAPER)
     drivers = [make_agent("full_brake"), HybridAgent(make_agent("full_brake"), PAPER), step]
-    harms = [drive(WORLDS, driver, PAPER, 1).ledger.world_harm("first") for driver in drivers]
+    driven = [drive(WORLDS, driver, PAPER, 1) for driver in drivers]
+    harms = [episodes.ledger.world_harm("first") for episodes in driven]
     assert [row.mode for row in rows] == ["none", "episode", "step", "step-alert"]
     assert [row.harm.value for row in rows[:3]] == [harm.mean() for harm in harms]
     assert rows[0].against_episode == paired_difference(harms[0], harms[1])
     assert rows[1].against_episode is None and rows[1].replaced is None
-    assert step.shield is not None and step.shield.running is not None
-    assert rows[2].replaced == step.shield.interventions.sum() / step.shield.running.steps.sum() > 0.1
+    shield = driven[2].guarded.shield
+    assert rows[2].replaced == shield.interventions.sum() / shield.running.steps.sum() > 0.1
 
 
 def test_rows__tell_what_the_interventions_were_good_for(rows: list[ModeRow]) -> None:
@@ -112,18 +113,19 @@ def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: list[Mo
     assert [row.mode for row in team_rows] == ["none", "step", "step-alert", "step-cap"] * 2
     alone = drive(worlds, Team.copies(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("total")
     for row, cap in ((team_rows[5], None), (team_rows[7], "baseline")):
-        team = ShieldedTeam(Team.copies(make_agent("coast"), (1, 2)), PAIR, harm_count="total", cap=cap, logging=True)
-        ledger = drive(worlds, team, PAIR).ledger
+        coasting = Team.copies(make_agent("coast"), (1, 2))
+        team = ShieldedDriver(coasting, PAIR, harm_count="total", cap=cap, logging=True).on((1, 2))
+        episodes = drive(worlds, team, PAIR)
+        ledger, shield = episodes.ledger, episodes.guarded.shield
         harm, borne = ledger.world_harm("total"), ledger.vehicle_harm("total")
-        assert team.shield is not None and team.shield.running is not None and team.shield.log is not None
         assert row.harm == mean(harm) and row.against_none == paired_difference(harm, alone)
-        assert row.bound is not None and row.bound.value == team.predicted_harm.mean() and row.above_bound == 0
-        decisions = team.shield.running.steps.sum()
-        own = [sum(entry.vehicle == i for entry in team.shield.log) / decisions for i in (1, 2)]
+        assert row.bound is not None and row.bound.value == shield.predicted_harm.mean() and row.above_bound == 0
+        decisions = shield.running.steps.sum()
+        own = [sum(entry.vehicle == i for entry in shield.log) / decisions for i in (1, 2)]
         assert [each.replaced for each in row.vehicles] == [None, *own]
         assert row.replaced == pytest.approx(sum(own) / 2) and min(own) > 0.1
         assert [each.harm for each in row.vehicles] == pytest.approx(borne.mean(axis=0))
-        more = (borne > team.shield.baseline_shares).mean(axis=0)
+        more = (borne > shield.baseline_shares).mean(axis=0)
         assert [each.above_baseline for each in row.vehicles] == pytest.approx(more, abs=0.02)
         assert (max(more) > 0.0) == (cap is None)
     assert all(row.against_episode is None for row in team_rows)
@@ -131,9 +133,10 @@ def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: list[Mo
 
 def test_team__an_intervention_is_simulated_again_without_it_for_the_whole_team() -> None:
     worlds = PAIR.sample(40, 3).worlds
-    team = ShieldedTeam(Team.copies(make_agent("coast"), (1, 2)), PAIR, logging=True)
-    harm = drive(worlds, team, PAIR).ledger.world_harm("first")
-    found = review(team, worlds)
+    coasting = Team.copies(make_agent("coast"), (1, 2))
+    episodes = drive(worlds, ShieldedDriver(coasting, PAIR, logging=True).on((1, 2)), PAIR)
+    harm = episodes.ledger.world_harm("first")
+    found = review(episodes.guarded.shield, coasting, worlds)
     assert found.realised.tolist() == harm[found.world].tolist() and set(found.vehicle) == {1, 2}
     alone = drive(worlds, Team.copies(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("first")
     first = {world: k for k, world in reversed(list(enumerate(found.world.tolist())))}

@@ -11,7 +11,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield import StepShieldAgent
+from ethbrake_marl.shield import ShieldedDriver
 
 HORIZON_S, REST_S = 3.0, 8.0
 
@@ -19,9 +19,9 @@ HORIZON_S, REST_S = 3.0, 8.0
 def above_later(proposer: str, worlds: int) -> tuple[float, float]:
     """Share of the worlds above their bound at the horizon, and once all stand."""
     scenario = load_scenario("paper-random").replace(horizon_s=HORIZON_S)
-    agent = StepShieldAgent(make_agent(proposer), scenario)
+    agent = ShieldedDriver(make_agent(proposer), scenario)
     episodes = drive(scenario.sample(worlds, 7).worlds, agent, scenario, 1)
-    final, bound = episodes.final, agent.predicted_harm
+    final, bound = episodes.final, episodes.guarded.shield.predicted_harm
     braking = -final.vehicles.braking_capacity_mps2
     _, impacts = advance(final, braking, until_s=np.full(worlds, REST_S))
     now, later = (ledger.world_harm("first") for ledger in (episodes.ledger, episodes.ledger.add(impacts)))

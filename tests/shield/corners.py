@@ -12,7 +12,7 @@ import numpy as np
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield.believed import BelievedShieldAgent
+from ethbrake_marl.shield import ShieldedDriver
 
 WAYS = ("coast", "drive", "chance")
 ABOVE = 1e-6  # m2/s2; what is told is moved on with rounding
@@ -65,9 +65,11 @@ def shielded(
     way: str, scenario: Scenario, n: int, seed: int, *, robust: str | None = "corners"
 ) -> tuple[Floats, Floats, int]:
     """Harm realised and first bound of ``n`` worlds [n] m2/s2, and how many proposals were replaced."""
-    agent = BelievedShieldAgent(Hostile(way, seed), scenario, robust=robust)
-    harm = drive(scenario.sample(n, seed).worlds, agent, scenario, 1).ledger.world_harm("first")
-    return harm, agent.predicted_harm, int(agent.interventions.sum())
+    mode = {"mode": "step"} if robust is None else {"mode": "robust", "robust": robust}
+    driver = ShieldedDriver(Hostile(way, seed), scenario, believed=True, **mode)
+    episodes = drive(scenario.sample(n, seed).worlds, driver, scenario, 1)
+    shield = episodes.guarded.shield
+    return episodes.ledger.world_harm("first"), shield.predicted_harm, int(shield.interventions.sum())
 
 
 def ranges_gate(worlds: int, seed: int) -> bool:

@@ -11,7 +11,7 @@ from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.envs.gym import EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, StepShieldAgent, shielded_aec
+from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.shield.lines import line
 
@@ -116,10 +116,11 @@ def evaluation(worlds: int, seed: int) -> Harms:
     told: Harms = ([], [], 0)
     scenario = line(3)
     for first in range(0, worlds, ROWS):
-        agent = StepShieldAgent(Proposing(seed + first), scenario)
-        harm = drive(scenario.sample(min(ROWS, worlds - first), seed, first=first).worlds, agent, scenario, 1)
-        realised, steps = harm.ledger.world_harm("first").tolist(), int(agent.shield.running.steps.sum())
-        told = told[0] + realised, told[1] + agent.shield.first_bound.tolist(), told[2] + steps
+        driver = ShieldedDriver(Proposing(seed + first), scenario)
+        found = drive(scenario.sample(min(ROWS, worlds - first), seed, first=first).worlds, driver, scenario, 1)
+        shield = found.guarded.shield
+        realised, steps = found.ledger.world_harm("first").tolist(), int(shield.running.steps.sum())
+        told = told[0] + realised, told[1] + shield.first_bound.tolist(), told[2] + steps
     return told
 
 

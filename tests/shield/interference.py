@@ -18,7 +18,7 @@ import numpy as np
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.shield import MovingAtHorizon
 from tests.shield.plays import PLAYS as ONE_SHIELDED
-from tests.shield.plays import Evaluation, Failure, Play
+from tests.shield.plays import Failure, Play
 from tests.shield.team_plays import TEAM_PLAYS
 
 PLAYS: dict[str, type[Play]] = {**ONE_SHIELDED, **TEAM_PLAYS}
@@ -69,7 +69,7 @@ def disturbed(name: str, episodes: int, seed: int) -> Tally:
         while len(_ended(play)) < episodes:
             if play.engine().ended.all():
                 play.step()  # begins the next episode
-            kind, before, made = int(play.rng.integers(5)), play.known(), play.engine().steps_made
+            kind, before, made = int(play.rng.integers(5)), play.known(), play.made()
             if kind == 0 and play.bad:
                 with contextlib.suppress(EthBrakeError, Failure, AttributeError):
                     play.bad[int(play.rng.integers(len(play.bad)))]()
@@ -88,7 +88,7 @@ def disturbed(name: str, episodes: int, seed: int) -> Tally:
                     interrupted += 1
             else:
                 play.step()
-            if play.engine().steps_made == made and kind != 2:
+            if play.made() == made and kind != 2:
                 broken += play.known() != before
             broken += _astray(play)
         ended = _ended(play)
@@ -99,15 +99,13 @@ def disturbed(name: str, episodes: int, seed: int) -> Tally:
 def _astray(play: Play) -> int:
     """1 where the shield is not where the engine is, or trusts it no longer."""
     shield, engine = play.shield(), play.engine()
-    if isinstance(play, Evaluation) and play.agent._asked is not None:
-        return 0  # it follows at the next call
     there = (shield.running.steps == engine.steps)[~engine.ended].all()
     return int(not there or shield.distrusted.any())
 
 
 def _ended(play: Play) -> list[tuple[float, float]]:
     """Harm and bound of the episodes that have ended."""
-    done: list[tuple[float, float]] = play.engine().memory(play.recorder)
+    done: list[tuple[float, float]] = play.engine().memory(play.recorder)[1]
     return [*getattr(play, "done", []), *done]
 
 
@@ -157,7 +155,7 @@ WRAPPERS: dict[str, Callable[[], Callable[..., Any]]] = {
 
 
 def wrapped(name: str, wrapper: str, calls: int, seed: int) -> Tally:
-    """So many steps with a wrapper inside; who calls catches what is raised, and goes on."""
+    """So many steps with a wrapper inside, whose actions reach the engine; what is raised is caught."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MovingAtHorizon)
         play = PLAYS[name](seed)

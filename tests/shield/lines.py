@@ -10,7 +10,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield.certify import certify
-from ethbrake_marl.shield.guard import AttachedShield, ShieldOptions
+from ethbrake_marl.shield.guard import ShieldOptions, guard_of
 from tests.shield.trained import trained
 
 _ROLES = {
@@ -52,26 +52,26 @@ class Attack(NamedTuple):
     decisions: int
 
 
-def random_actions(rng, attached, k):
-    return rng.uniform(-1.0, 1.0, attached.engine.n)
+def random_actions(rng, engine, k):
+    return rng.uniform(-1.0, 1.0, engine.n)
 
 
-def extremes(rng, attached, k):
-    return np.where((k + np.arange(attached.engine.n)) % 2, 1.0, -1.0)
+def extremes(rng, engine, k):
+    return np.where((k + np.arange(engine.n)) % 2, 1.0, -1.0)
 
 
-def full_drive(rng, attached, k):
-    return np.ones(attached.engine.n)
+def full_drive(rng, engine, k):
+    return np.ones(engine.n)
 
 
-def slow_drift(rng, attached, k):
+def slow_drift(rng, engine, k):
     """Random, held for several steps: whole profiles that differ from the plan."""
-    return np.random.default_rng(1_000 + k // 6).uniform(-1.0, 0.5, attached.engine.n)
+    return np.random.default_rng(1_000 + k // 6).uniform(-1.0, 0.5, engine.n)
 
 
-def worst_case(rng, attached, k):
+def worst_case(rng, engine, k):
     """Of eight candidates the accepted one that leaves the most harm: a search against the shield itself."""
-    return most_harmful(rng, attached.shield)
+    return most_harmful(rng, engine.guarded.shield)
 
 
 def most_harmful(rng, shield, candidates=8):
@@ -93,17 +93,18 @@ def attack(scenario: Scenario, worlds, adversary, *, harm_count="first", allowan
     rng = np.random.default_rng(seed)
     learner = scenario.learners[0]
     scripts = {i: make_agent(spec) for i, spec in scenario.scripts.items()}
-    engine = Engine(scenario, worlds.n, learners=(learner,), scripts=scripts, worlds=worlds)
-    attached = AttachedShield(engine, None, ShieldOptions(harm_count=harm_count, allowance=allowance))
-    engine.reset(worlds=worlds)
+    options = ShieldOptions(harm_count=harm_count, allowance=allowance)
+    engine = Engine(
+        scenario, worlds.n, learners=(learner,), scripts=scripts, worlds=worlds,
+        guard=lambda engine: guard_of(engine, None, options),
+    )  # fmt: skip
     accepted, decisions, k = np.zeros(worlds.n, np.int64), 0, 0
     while not engine.ended.all():
         decisions += int((~engine.ended).sum())
-        actions = attached.decide(adversary(rng, attached, k))
-        reason = attached.decision.reason
+        engine.step(adversary(rng, engine, k)[:, np.newaxis])
+        reason = engine.ruling.decision.reason
         accepted += (reason == 1) | (reason == 2)
-        engine.step(actions[:, np.newaxis])
         k += 1
-    assert not attached.shield.distrusted.any()
-    shield = attached.shield
+    shield = engine.guarded.shield
+    assert not shield.distrusted.any()
     return Attack(engine.ledger.world_harm(harm_count), shield.first_bound, shield.bound, accepted, decisions)

@@ -50,8 +50,9 @@ KERNEL, MEMBERS, CERTIFY, ALERT, GUARD, ROLLOUTS, ATTACHED, COMPARISON, TEAM = (
     "ethbrake_marl/shield/certify.py",
     "ethbrake_marl/shield/guard.py",
     "ethbrake_marl/shield/certify.py",
-    "ethbrake_marl/shield/agents.py",
+    "ethbrake_marl/shield/guard.py",
 )  # fmt: skip
+ENGINE = "ethbrake_marl/engine/engine.py"
 FORMS, INSIDE, WAIT, MOTION, TOUCH, ROUGH = (
     "ethbrake_marl/shield/enclosure.py",
     "ethbrake_marl/shield/enclosure.py",
@@ -158,22 +159,31 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "the shield goes on before the engine does": (
         Patch(
             ATTACHED,
-            "        applied = certified.decision.applied\n",
-            "        shield.commit(certified)\n        applied = certified.decision.applied\n",
+            "        after = copy.copy(shield)\n        decision = after.decide(",
+            "        after = shield\n        decision = after.decide(",
         ),
     ),
-    "a second step on one certificate is let pass": (
-        Patch(ATTACHED, "if sent is None or sent.memory is not memory:", "if sent is None:"),
+    "what is proposed is applied": (
+        Patch(
+            ENGINE,
+            "columns = np.ascontiguousarray(ruling.applied)",
+            "columns = np.nan_to_num(np.ascontiguousarray(ruling.proposed))",
+        ),
     ),
     "what a step led to is not compared": (
         Patch(
             ATTACHED,
-            "wanted & ~expects(sent.certified.after.boxes, running, seen)",
+            "wanted & ~expects(shield.boxes, running, seen)",
             "wanted & (seen != seen).all(axis=1)",
         ),
     ),
-    "a step that was not made is not noticed": (
-        Patch(ATTACHED, "if self.engine.steps_made != self.sent.steps_made + 1:", "if self.engine.steps_made < 0:"),
+    "the memory moves on where the step is refused": (
+        Patch(
+            ENGINE,
+            "        step = new._advance(columns)\n        if self.guard",
+            "        if self.guard is not None:\n            self.guarded = ruling.memory\n"
+            "        step = new._advance(columns)\n        if self.guard",
+        ),
     ),
     "each proposal of a team is certified beside the plan as it was, not as it is by then": (
         Patch(KERNEL, "copy_action(plan[step], tried[1])", "copy_action(tried[2], tried[1])"),
@@ -226,8 +236,8 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "each member of a team is certified alone": (
         Patch(
             TEAM,
-            "self.vehicles = tuple(team.drivers)",
-            "self.vehicles = tuple(team.drivers)[:1] * len(team.drivers)",
+            "self.vehicles = tuple(engine.learners)",
+            "self.vehicles = tuple(engine.learners)[:1] * len(engine.learners)",
         ),
     ),
     "what is of second order is left out of a product": (Patch(FORMS, " + radius(x) * radius(y)", ""),),

@@ -13,7 +13,7 @@ from ethbrake_marl.agents.rollout import episode_engine
 from ethbrake_marl.envs.gym import EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import EthBrakeParallelEnv, parallel_env
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
-from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, StepShieldAgent, shielded_aec
+from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.shield.lines import line
 
@@ -26,26 +26,22 @@ class Failure(Exception):
 
 
 class Recorder:
-    """A watcher that notes harm and bound of every episode that ends."""
-
-    def __init__(self, shield_of: Callable[[], Any]) -> None:
-        self.shield_of = shield_of
+    """A watcher that counts the steps, and notes harm and bound of every episode that ends."""
 
     def begun(self, memory: Any, alert: Any, rows: Any) -> Any:
         return memory
 
     def stepped(self, memory: Any, before: Any, after: Any) -> Any:
+        made, ended = memory
         over = after.ended & ~before.ended
-        if not over.any():
-            return memory
-        harm, bound = after.ledger.world_harm("first"), self.shield_of().first_bound
-        return [*memory, *zip(harm[over].tolist(), bound[over].tolist(), strict=True)]
+        harm, bound = after.ledger.world_harm("first"), after.guarded.shield.first_bound
+        return made + 1, [*ended, *zip(harm[over].tolist(), bound[over].tolist(), strict=True)]
 
 
 class Failing:
     """A policy that brakes by turns, and raises when it is told to."""
 
-    name, fails = "failing", False
+    name, fails, remembers = "failing", False, False
 
     def begin(self, worlds: Any, vehicle: int, rows: Any) -> None:
         pass
@@ -70,8 +66,13 @@ class Play:
         self._watched()
 
     def _watched(self) -> None:
-        self.recorder = Recorder(self.shield)
-        self.engine().watch(self.recorder, [])
+        self.recorder = Recorder()
+        self.engine().watch(self.recorder, (0, []))
+
+    def made(self) -> int:
+        """Steps that the engine made."""
+        made: int = self.engine().memory(self.recorder)[0]
+        return made
 
     def engine(self) -> Any:
         raise NotImplementedError
@@ -121,7 +122,7 @@ class Parallel(Play):
         self.policy.fails = True
         try:
             self.env.step({})
-            raise Failure  # nobody asked it again: what it answered before a call that failed stands
+            raise AssertionError("nobody asked it")
         finally:
             self.policy.fails = False
 
@@ -158,8 +159,8 @@ class Aec(Play):
     def step(self) -> None:
         if self.engine().ended[0]:
             self.env.reset()
-        before = self.engine().steps_made
-        while self.engine().steps_made == before:
+        before = self.made()
+        while self.made() == before:
             self.env.step(self.drawn(1).astype(np.float32))
 
 
@@ -253,7 +254,7 @@ class Sb3(Vector):
 
 
 class Evaluation(Play):
-    """The shielded agent that evaluation drives by."""
+    """The shielded driver of an evaluation."""
 
     def _watched(self) -> None:
         self._begin()
@@ -263,39 +264,33 @@ class Evaluation(Play):
         worlds = self.scenario.sample(ROWS, int(self.rng.integers(10**6))).worlds
         before = getattr(self, "_engine", None)
         self._engine = self._driven(worlds)
-        self.recorder = Recorder(self.shield)
-        self.done = [*getattr(self, "done", []), *([] if before is None else before.memory(before.watchers[0]))]
-        self._engine.watch(self.recorder, [])
+        made, ended = (0, []) if before is None else before.memory(self.recorder)
+        self.done, self.recorder = [*getattr(self, "done", []), *ended], Recorder()
+        self._engine.watch(self.recorder, (made, []))
         self._engine.step({})
 
     def _driven(self, worlds: Any) -> Any:
-        """An engine over these worlds in which a new agent drives."""
-        self.agent: Any = StepShieldAgent(self.policy, self.scenario)
-        return episode_engine(worlds, self.agent, self.scenario, 1)
+        """An engine over these worlds in which a new driver proposes."""
+        return episode_engine(worlds, ShieldedDriver(self.policy, self.scenario), self.scenario, 1)
 
     def _policy_fails(self) -> None:
-        self.policy.fails = True
+        (policy,) = self._engine.guarded.policies.values()
+        policy.fails = True
         try:
             self._engine.step({})
-            raise Failure  # nobody asked it again: what was decided stands
+            raise AssertionError("nobody asked it")
         finally:
-            self.policy.fails = False
+            policy.fails = False
 
     def engine(self) -> Any:
         return self._engine
 
     def shield(self) -> Any:
-        return self.agent.shield
-
-    def known(self) -> list[Any]:
-        self.agent.act(self._engine.worlds, 1)  # follows a step that an interrupt kept from it
-        return super().known()
+        return self._engine.guarded.shield
 
     def step(self) -> None:
         if self._engine.ended.all():
             self._begin()
-        if self.rng.random() < 0.2:  # one too many
-            self.agent.act(self._engine.worlds, 1)
         self.how(self._engine.step, {})
 
 

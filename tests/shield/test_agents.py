@@ -135,10 +135,10 @@ def test_wrapper__closed_lets_go_of_the_environment():
     env, policy = parallel_env(), Counting()
     shielded = HybridShield(env, policy)
     shielded.reset(seed=0)
-    begun = shielded.hybrid.policy.begun
+    begun = shielded.attached.shield.policy.begun
     shielded.close()
     env.reset(seed=1)
-    assert begun == 1 and shielded.hybrid.policy.begun == 1
+    assert begun == 1 and shielded.attached.shield.policy.begun == 1
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield import enclosure
-from ethbrake_marl.shield.believed import BelievedShield, BelievedShieldAgent
+from ethbrake_marl.shield import ShieldedDriver, enclosure
+from ethbrake_marl.shield.believed import BelievedShield
 from ethbrake_marl.shield.enclosure import Boxes, boxes_of
 from tests.shield import corners
 from tests.shield.corners import ABOVE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded
@@ -23,8 +23,15 @@ PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
 
 def driven(agent: object, scenario: Scenario, n: int, seed: int = 7, vehicle: int = 1) -> tuple[Floats, Floats]:
     """Harm realised, and the first bound, [n] each."""
-    harm = drive(scenario.sample(n, seed).worlds, agent, scenario, vehicle).ledger.world_harm("first")
-    return harm, agent.predicted_harm
+    episodes = drive(scenario.sample(n, seed).worlds, agent, scenario, vehicle)
+    told = agent if episodes.guarded is None else episodes.guarded.shield
+    return episodes.ledger.world_harm("first"), told.predicted_harm
+
+
+def behind(way: str, scenario: Scenario, robust: str | None = None) -> ShieldedDriver:
+    """Who proposes so, behind a shield on what was received."""
+    mode = {"mode": "step"} if robust is None else {"mode": "robust", "robust": robust}
+    return ShieldedDriver(Hostile(way), scenario, believed=True, **mode)
 
 
 @pytest.mark.parametrize("scenario", LISTS.values(), ids=list(LISTS))
@@ -73,7 +80,7 @@ def test_step__in_the_middle_promises_nothing_of_the_corners() -> None:
 @pytest.mark.parametrize("robust", [None, "corners", pytest.param("interior", marks=pytest.mark.slow)])
 def test_believed__where_everything_is_known_the_bound_is_that_of_the_best_constant(robust: str | None) -> None:
     n = 40 if robust == "interior" else 20
-    harm, bound = driven(BelievedShieldAgent(Hostile("drive"), BASE, robust=robust), BASE, n)
+    harm, bound = driven(behind("drive", BASE, robust), BASE, n)
     _, best = driven(make_agent("e_v2x_bm", scenario=BASE), BASE, n)
     if robust == "interior":  # an upper bound, which is not exact where impacts coincide
         assert (bound >= best - 1e-4).all() and np.isclose(bound, best, atol=1e-4).mean() > 0.9
@@ -97,7 +104,7 @@ def test_believed__shields_lines_of_other_lengths(vehicles: int) -> None:
         roles={"vehicle_2": "learner"}, v2x={"preset": "nominal", "persistence": "periodic"}, horizon_s=10.0,
     )  # fmt: skip
     for robust in (None, "corners"):
-        harm, bound = driven(BelievedShieldAgent(Hostile("coast"), scenario, robust=robust), scenario, 2)
+        harm, bound = driven(behind("coast", scenario, robust), scenario, 2)
         assert np.isfinite(bound).all() and np.isfinite(harm).all()
 
 
@@ -106,18 +113,17 @@ def test_believed__shields_beside_an_obstacle() -> None:
         early_impacts="keep", v2x=PERIODIC.v2x.model_dump(exclude_none=True)
     )
     scenario = scenario.with_learners(["vehicle_2"])
-    harm, bound = driven(BelievedShieldAgent(Hostile("coast"), scenario), scenario, 10)
+    harm, bound = driven(behind("coast", scenario), scenario, 10)
     assert np.isfinite(bound).all() and np.isfinite(harm).all()
 
 
-def test_believed__asked_again_says_the_same_and_a_later_smaller_batch_begins_anew() -> None:
-    agent, worlds = make_agent("coast+step:believed", scenario=PERIODIC), PERIODIC.sample(5, 3).worlds
+def test_believed__asked_again_at_the_same_moment_says_the_same() -> None:
+    worlds, proposed = PERIODIC.sample(5, 3).worlds, np.zeros(5)
     later = drive(worlds, make_agent("full_brake", scenario=PERIODIC), PERIODIC, 1).final
-    agent.begin(worlds, 1, np.arange(5))
-    first = drive(worlds, agent, PERIODIC, 1).ledger.world_harm("first")
-    assert np.array_equal(agent.act(later, 1), agent.act(later, 1))
-    fewer = drive(worlds.take(np.arange(3)), agent, PERIODIC, 1).ledger.world_harm("first")
-    np.testing.assert_allclose(fewer, first[:3], atol=1e-6)
+    shield = BelievedShield(PERIODIC)
+    shield.begin(worlds, 1, np.arange(5))
+    first = shield.decide(later, 1, proposed)
+    assert np.array_equal(first, shield.decide(later, 1, proposed + 1.0))
 
 
 def test_robust__too_many_open_numbers_are_refused() -> None:

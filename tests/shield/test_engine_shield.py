@@ -6,34 +6,31 @@ import copy
 import pickle
 import threading
 import warnings
-from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.wrappers import Autoreset
 
-from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.rollout import drive, episode_engine
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.step import STEP
 from ethbrake_marl.envs.gym import EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
-from ethbrake_marl.physics import advance
 from ethbrake_marl.physics.advance import harm_at, speed_at
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
     HybridShield,
     MovingAtHorizon,
+    ShieldedDriver,
     ShieldedEnv,
     ShieldedVectorEnv,
     StepShield,
-    StepShieldAgent,
+    parse_uncertainty,
 )
-from ethbrake_marl.shield.agents import ShieldedTeam
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.shield.beyond_horizon import above_later
 
@@ -142,20 +139,24 @@ def test_ledger__harm_that_nobody_predicted_is_seen_before_the_next_decision(gro
     assert not info["shield"]["trusted"] and info["shield"]["reason"] == "assumption broken"
 
 
-def test_past_the_shield__a_step_is_refused_until_it_lets_go():
-    env = shielded()
-    with pytest.raises(UncertifiedStep, match=r"nothing was certified for .* close\(\) it first"):
-        env.unwrapped.step(np.zeros(1))
-    env.step(DRIVE)
-    env.attached.detach()
-    env.unwrapped.step(np.zeros(1))
+def test_past_the_shield__a_step_is_shielded_too_until_it_lets_go():
+    env, engine = shielded(), None
+    engine = env.attached.engine
+    bound = env.attached.shield.first_bound[0]
+    while not engine.ended[0]:
+        env.unwrapped.step(DRIVE)
+    assert engine.ledger.world_harm("first")[0] <= bound and env.attached.shield.interventions[0] > 0
+    env.reset(seed=0)
+    env.attached.close()
+    *_, info = env.unwrapped.step(DRIVE)
+    assert info["chosen_action"][0] == 1.0
 
 
 def test_wrapped_in_mid_episode__needs_a_reset_first():
     plain = gymnasium.make("EthBrake-v0").unwrapped
     plain.reset(seed=0)
     env = ShieldedEnv(plain)
-    with pytest.raises(UncertifiedStep, match="nothing was certified"):
+    with pytest.raises(UncertifiedStep, match="this episode began before the shield was put around it; reset first"):
         env.step(DRIVE)
     env.reset(seed=0)
     env.step(DRIVE)
@@ -172,7 +173,7 @@ def test_autoreset__of_gymnasium_inside_is_left_alone():
 
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
-def test_clone__between_certificate_and_step_goes_on_apart(clone):
+def test_clone__between_proposal_and_step_goes_on_apart(clone):
     env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 4, seed=2))
     env.reset()
     for _ in range(10):
@@ -185,14 +186,13 @@ def test_clone__between_certificate_and_step_goes_on_apart(clone):
     assert env.attached.shield.running.steps.tolist() == other.attached.shield.running.steps.tolist()
 
 
-def test_reset__in_between_makes_a_certificate_worthless():
+def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_holds():
     env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 2))
     env.reset()
     env.step_async(np.ones((2, 1), np.float32))
     env.venv.reset()
-    with pytest.raises(UncertifiedStep, match="nothing was certified"):
-        env.step_wait()
-    env.step(np.ones((2, 1), np.float32))
+    assert all(row["shield"]["trusted"] for row in env.step_wait()[3])
+    assert env.attached.shield.running.steps.tolist() == env.attached.engine.steps.tolist() == [1, 1]
     with pytest.raises(InvalidInput, match="no episode is running"):
         env.step_wait()
 
@@ -230,21 +230,21 @@ def test_refused__reset_and_step_leave_the_shield_in_its_episode():
     assert [entry.step for entry in log] == sorted({entry.step for entry in log})
 
 
-def test_commit__of_a_decision_that_was_made_elsewhere_is_refused():
-    shield = StepShield(PAPER, 1)
+def test_step_shield__a_copy_goes_on_apart_its_log_included():
+    shield = StepShield(PAPER, 1, logging=True)
     shield.begin(PAPER.sample(2, 0).worlds, np.arange(2))
-    certified = shield.propose(np.ones(2))
-    assert shield.running.steps.tolist() == [0, 0]
-    shield.commit(certified)
-    assert shield.running.steps.tolist() == [1, 1]
-    with pytest.raises(InvalidInput, match="made from another state; propose again"):
-        shield.commit(certified)
+    other = copy.copy(shield)
+    other.decide(np.ones(2))
+    assert (shield.running.steps.tolist(), other.running.steps.tolist()) == ([0, 0], [1, 1])
+    assert (len(shield.log), len(other.log)) == (0, 2)
+    shield.decide(np.full(2, 0.5))
+    assert [entry.proposed for entry in shield.log + other.log] == [0.5, 0.5, 1.0, 1.0]
 
 
 def test_snapshot__is_not_restored_under_a_shield():
     env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 2))
     env.reset()
-    with pytest.raises(InvalidInput, match="a shield follows this engine"):
+    with pytest.raises(InvalidInput, match="a shield stands in this engine"):
         env.env_method("restore", env.venv.snapshot())
 
 
@@ -273,40 +273,15 @@ def test_threads__no_episode_gets_above_its_bound():
     assert (engine.ledger.world_harm("first") <= shield.first_bound).all()
 
 
-class Between:
-    """An agent that drives by another one, not quite as it says."""
-
-    name = "between"
-
-    def __init__(self, agent, every=1, late=np.inf, told=True):
-        self.agent, self.every, self.late, self.calls = agent, every, late, 0
-        if told:
-            self.after_step = agent.after_step
-
-    def begin(self, worlds, vehicle, rows):
-        self.agent.begin(worlds, vehicle, rows)
-
-    def act(self, worlds, vehicle):
-        if self.calls % self.every == 0 or worlds.time_s.max() == 0.0:
-            self.command = self.agent.act(worlds, vehicle)
-        self.calls += 1
-        return np.where(worlds.time_s < self.late, self.command, 0.0)
-
-
-def test_agent__that_is_not_asked_at_every_decision_says_so():
-    with pytest.raises(UncertifiedStep, match="a decision was due at"):
-        drive(PAPER.sample(5, 0).worlds, Between(StepShieldAgent(make_agent("coast"), PAPER), 2, told=False), PAPER, 1)
-
-
-def test_agent__compares_the_last_step_too():
+def test_evaluation__compares_the_last_step_too():
     scenario = PAPER.replace(horizon_s=2.0)  # everything moves to the end
     worlds = scenario.sample(1, 0).worlds
-    agents = [StepShieldAgent(make_agent("full_brake"), scenario) for _ in range(2)]
-    drive(worlds, Between(agents[0], late=2.0), scenario, 1)
-    assert agents[0].shield.running.finished.all() and not agents[0].shield.distrusted.any()
-    with pytest.raises(UncertifiedStep, match="must pass its commands on unchanged"):
-        drive(worlds, Between(agents[1], late=1.89), scenario, 1)
-    assert agents[1].shield.running.finished.all()
+    engine = episode_engine(worlds, ShieldedDriver(make_agent("full_brake"), scenario), scenario, 1)
+    cheat(engine, "speed", last_only=True)
+    with pytest.raises(UncertifiedStep, match=CHEATS["speed"]):
+        while not engine.ended.all():
+            engine.step({})
+    assert engine.steps[0] > 10 and not engine.guarded.shield.running.finished.any()
 
 
 class DrivesOff:
@@ -323,27 +298,19 @@ class DrivesOff:
         return np.where(stands, v.driving_capacity_mps2[:, vehicle], -v.braking_capacity_mps2[:, vehicle])
 
 
-@pytest.mark.parametrize("team", [False, True])
-def test_host__with_a_clock_of_its_own_gets_full_braking_after_the_shields_own_end(team):
+def test_world__that_goes_on_after_the_shields_own_end_is_braked_fully():
     worlds = PAPER.sample(40, 7).worlds
-    rows, harm, braking = np.arange(40), np.zeros(40), -worlds.vehicles.braking_capacity_mps2
-    agent = StepShieldAgent(DrivesOff(), PAPER, uncertainty="gaps_m=0.02")
-    if team:
-        agent = ShieldedTeam(Team({1: DrivesOff()}, "team"), PAPER, uncertainty="gaps_m=0.02").drivers[1]
-    bound_of = agent.together if team else agent
-    agent.begin(worlds, 1, rows)
-    wanted = braking.copy()
-    wanted[:, 1] = 0.0
-    for k in range(4, 100):  # until 5 x 0.1 s nobody asks
-        if k > 4:
-            worlds = replace(worlds, time_s=np.full(40, k * 0.1))  # 6 x 0.1 is not 0.6
-            wanted[:, 1] = agent.act(worlds, 1)
-            assert wanted[:, 1].tolist() == agent.act(worlds, 1).tolist()  # asked again at the same moment
-        worlds, impacts = advance(worlds, wanted, until_s=np.full(40, (k + 1) * 0.1))
-        harm += impacts.first_impact_harm.sum(axis=1)
-    assert bound_of.shield.running.finished.all() and not bound_of.shield.distrusted.any()
-    assert (harm <= bound_of.predicted_harm + 1e-9).all()
-    assert wanted[:, 1].tolist() == braking[:, 1].tolist()
+    slower = parse_uncertainty("braking_capacity_mps2=20%").draw(worlds, np.random.default_rng(0), corners=True)
+    engine = episode_engine(
+        worlds, ShieldedDriver(DrivesOff(), PAPER, told=slower, uncertainty="gaps_m=0.02"), PAPER, 1
+    )
+    braking, after = -worlds.vehicles.braking_capacity_mps2[:, 1], np.zeros(40, bool)
+    while not engine.ended.all():
+        over = engine.guarded.shield.running.finished & ~engine.ended
+        engine.step({})
+        assert (engine.wanted_mps2[over, 1] == braking[over]).all()
+        after |= over
+    assert 0 < after.sum() < 40
 
 
 def test_horizon__what_still_moves_then_is_told_and_warned_of_once():
@@ -366,7 +333,7 @@ def test_horizon__settles_says_what_the_plan_comes_to_in_the_engine():
     scenario = PAPER.replace(horizon_s=4.2)
     shield = StepShield(scenario, 1)
     shield.begin(worlds, np.arange(60))
-    episodes = drive(worlds, StepShieldAgent(make_agent("e_v2x_bm"), scenario), scenario, 1)
+    episodes = drive(worlds, ShieldedDriver(make_agent("e_v2x_bm"), scenario), scenario, 1)
     rests = (episodes.final.speeds_mps == 0.0).all(axis=1)
     assert rests.tolist() == shield.settles.tolist() and 0 < rests.sum() < 60
 
@@ -402,6 +369,6 @@ def test_episode_mode__a_refused_call_does_not_ask_the_policy_again():
             *_, infos = env.step({})
         harms.append(infos["vehicle_2"]["world_first_impact_harm"])
     assert harms[0] == harms[1]
-    with pytest.raises(UncertifiedStep, match="nothing was certified"):
-        env.reset(seed=4)
-        env.unwrapped.step({"vehicle_2": np.zeros(1)})
+    env.reset(seed=4)
+    *_, infos = env.unwrapped.step({"vehicle_2": np.zeros(1)})
+    assert infos["vehicle_2"]["chosen_action"] == np.float32(env.attached.infos()[0]["chosen_action"]) < 0.0

@@ -20,7 +20,7 @@ from ethbrake_marl.envs.gym import EthBrakeEnv, EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import env as aec_env
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.shield.interface_attack import INTERFACES
@@ -119,12 +119,20 @@ def test_sb3__learns_under_the_shield():
     assert np.isfinite(env.step(np.zeros((4, 1), np.float32))[1]).all()
 
 
-def test_applied__something_between_the_shield_and_the_engine_is_found():
-    env = HybridShield(parallel_env(), mode="step")
+def test_applied__what_something_between_the_shield_and_the_engine_does_is_shielded():
+    class Driving(BaseParallelWrapper):
+        def step(self, actions):
+            return super().step({name: np.ones_like(action) for name, action in actions.items()})
+
+    env = HybridShield(Driving(parallel_env()), mode="step")
     env.reset(seed=0)
-    env._engine.step = lambda actions, step=env._engine.step: step(np.zeros_like(actions) - 0.123)
-    with pytest.raises(UncertifiedStep, match="not the certified one"):
-        env.step({"vehicle_2": np.array([-1.0])})
+    bound, replaced = env.attached.shield.first_bound[0], 0
+    while env.agents:
+        *_, infos = env.step({"vehicle_2": np.array([-1.0])})
+        told = infos["vehicle_2"]["shield"]
+        assert told["proposed_action"] == 1.0 and told["trusted"]
+        replaced += told["intervened"]
+    assert env.unwrapped.engine.ledger.world_harm("first")[0] <= bound and replaced > 0
 
 
 class Speechless:
@@ -153,7 +161,7 @@ def test_parallel__a_policy_that_proposes_no_number_is_replaced():
 def test_parallel__actions_that_are_no_mapping_are_refused(actions):
     env = HybridShield(parallel_env(), mode="step")
     env.reset(seed=1)
-    with pytest.raises(InvalidInput, match="must be a dict"):
+    with pytest.raises(InvalidInput, match="must be a mapping"):
         env.step(actions)
 
 
@@ -235,7 +243,7 @@ def test_close__lets_go_of_the_environment():
     env = gymnasium.make("EthBrake-v0").unwrapped
     shielded = ShieldedEnv(env)
     shielded.close()
-    assert env.engine.watchers == ()
+    assert env.engine.guard is None
 
 
 @pytest.mark.parametrize(
@@ -342,13 +350,52 @@ def test_episode_mode__tells_the_bound_of_the_episode_that_ended(make):
     env.reset()
     told = 0
     while told < 12:
-        bound = env.attached.hybrid.bound_harm.copy()
+        bound = env.attached.shield.bound_harm.copy()
         found = env.step(np.zeros((8, 1)))
         ended = np.flatnonzero(found[2] if len(found) == 4 else found[2] | found[3])
         for k in ended:
             shown = found[3][k]["shield"]["bound_harm"] if len(found) == 4 else found[4]["shield"]["bound_harm"][k]
             assert shown == bound[k]
         told += len(ended)
+
+
+@pytest.mark.parametrize(
+    ("make", "kind"),
+    [
+        (parallel_env, HybridShield),
+        (lambda: BaseParallelWrapper(parallel_env()), HybridShield),
+        (lambda: gymnasium.wrappers.RescaleAction(EthBrakeEnv(), np.float32(-1.0), np.float32(1.0)), ShieldedEnv),
+        (lambda: EthBrakeVectorEnv(2), ShieldedVectorEnv),
+        (lambda: VecMonitor(make_sb3_vec_env("paper-random", 2)), ShieldedVecEnv),
+    ],
+)
+def test_shield__chooses_the_wrapper_of_the_interface(make, kind):
+    env = eb.shield(make(), make_agent("full_brake"), shares=True)
+    assert isinstance(env, kind) and env.attached.options.mode == "step"
+    env.reset()
+    action = np.ones((2, 1) if kind in (ShieldedVectorEnv, ShieldedVecEnv) else 1, np.float32)
+    infos = env.step({"vehicle_2": action} if kind is HybridShield else action)[-1]
+    told = infos[0] if kind is ShieldedVecEnv else infos.get("vehicle_2", infos)
+    assert "own_harm" in told["shield"]
+
+
+def test_shield__of_agents_in_turns_is_put_around_the_parallel_environment():
+    env = eb.shield(aec_env(), mode="step")
+    env.reset(seed=7)
+    for _ in range(3):
+        env.step(np.ones(1, np.float32))
+    assert env.infos["vehicle_2"]["shield"]["proposed_action"] == 1.0
+    with pytest.raises(InvalidInput, match="put the shield inside it"):
+        eb.shield(BaseWrapper(aec_env()))
+    for none in (None, gymnasium.make("CartPole-v1"), make_agent("coast")):
+        with pytest.raises(InvalidInput, match=r"has none of the interfaces|is not one of this package's environments"):
+            eb.shield(none)
+
+
+def test_shield__is_the_folder_and_the_function_whichever_is_asked_for_first():
+    import ethbrake_marl.shield.guard as guard
+
+    assert eb.shield.guard is guard and callable(eb.shield)
 
 
 @pytest.mark.parametrize("believed", [False, True])
@@ -364,9 +411,8 @@ def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(belie
     env.reset(seed=7)
     for actions in ({"vehicle_2": [-0.3]}, {}, {"vehicle_2": [-0.9]}, {"vehicle_2": [1.0]}):
         env.step(actions)
-    assert policy._steps.tolist() == [4]
-    env.attached.proposal()
+    assert env.attached.memory.policies[1]._steps.tolist() == [4]
     with pytest.raises(InvalidInput):
         env.step({"vehicle_2": [-0.3], "vehicle_9": [0.0]})
     env.step({})
-    assert policy._steps.tolist() == [5]
+    assert env.attached.memory.policies[1]._steps.tolist() == [5] and policy._steps.tolist() == []

@@ -13,7 +13,7 @@ from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics.kernel import number_of_decisions
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield import HybridShield, ShieldOptions, StepShield, StepShieldAgent, enclosure, parse_uncertainty
+from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldOptions, StepShield, enclosure, parse_uncertainty
 from ethbrake_marl.shield.certify import begin_running, plan_harm
 from ethbrake_marl.shield.enclosure import Known, bound_plans, boxes_of, cell_of, wait
 from tests.shield.enclosed import outside
@@ -182,12 +182,11 @@ def test_engine__with_an_uncertain_own_latency_no_world_of_the_box_is_distrusted
     told = scenario.sample(1, 3).worlds.take(np.zeros(4, np.int64))
     uncertainty = parse_uncertainty("latency_s.vehicle_2=0.15")
     truth = uncertainty.draw(told, np.random.default_rng(1))
-    agent = StepShieldAgent(
-        make_agent("constant:3"), scenario, uncertainty=uncertainty, robust="interior", believed=told
-    )
-    harm = drive(truth, agent, scenario, 1).ledger.world_harm("first")
-    assert not agent.shield.distrusted.any()
-    assert (harm <= agent.predicted_harm + 1e-9).all()
+    driver = ShieldedDriver(make_agent("constant:3"), scenario, uncertainty=uncertainty, robust="interior", told=told)
+    episodes = drive(truth, driver, scenario, 1)
+    harm, shield = episodes.ledger.world_harm("first"), episodes.guarded.shield
+    assert not shield.distrusted.any()
+    assert (harm <= shield.predicted_harm + 1e-9).all()
 
 
 def test_bound__more_parts_never_make_it_worse():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pettingzoo.utils import BaseParallelWrapper
 
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
@@ -11,11 +12,11 @@ from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield import HybridShield, ShieldedTeam, StepShield, shielded_aec
+from ethbrake_marl.shield import HybridShield, ShieldedDriver, StepShield, shielded_aec
 from ethbrake_marl.shield.certify import REASONS, Backup, begin_running, borne_under, certify, plan_harm
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from ethbrake_marl.shield.step_shield import joint_constants
@@ -196,8 +197,6 @@ def test_begin__of_some_rows_keeps_the_others_with_their_caps():
         shield.running.caps[4].tolist() == caps[0].tolist() and shield.baseline_shares[4].tolist() == shares[0].tolist()
     )
     assert np.delete(shield.running.caps, 4, axis=0).tolist() == np.delete(caps, 4, axis=0).tolist()
-    shield.keep(3)
-    assert shield.running.caps.tolist() == caps[:3].tolist()
 
 
 def test_constants__hold_all_alike_and_ladders_each_once():
@@ -307,12 +306,19 @@ def test_parallel__what_is_not_covered_is_refused_in_one_line(make, message):
         make(parallel_env("cooperation-3-pair"))
 
 
-def test_parallel__a_changed_action_of_any_of_them_is_refused(pair_env):
-    pair_env.reset(seed=0)
-    step = pair_env._engine.step
-    pair_env._engine.step = lambda actions: step(np.where(np.arange(2) == 1, -0.123, actions))
-    with pytest.raises(UncertifiedStep, match="not the certified one"):
-        pair_env.step({"vehicle_2": [-1.0], "vehicle_3": [-1.0]})
+def test_parallel__a_changed_action_of_any_of_them_is_shielded():
+    class Driving(BaseParallelWrapper):
+        def step(self, actions):
+            return super().step({**actions, "vehicle_3": np.ones(1)})
+
+    env = HybridShield(Driving(parallel_env("cooperation-3-pair")), mode="step")
+    env.reset(seed=0)
+    bound, replaced = env.attached.shield.first_bound[0], 0
+    while env.agents:
+        *_, infos = env.step({"vehicle_2": [-1.0], "vehicle_3": [-1.0]})
+        assert infos["vehicle_3"]["shield"]["proposed_action"] == 1.0
+        replaced += infos["vehicle_3"]["shield"]["intervened"]
+    assert env.unwrapped.engine.ledger.world_harm("first")[0] <= bound and replaced > 0
 
 
 def test_aec__decides_for_all_when_the_last_has_acted():
@@ -355,10 +361,10 @@ def test_evaluation__a_team_behind_the_shield_keeps_its_bound_and_is_never_worse
 
 
 def test_evaluation__members_ask_once_and_the_engine_is_followed_to_the_end():
-    team = ShieldedTeam(Team.copies(make_agent("coast"), (1, 2)), PAIR, logging=True)
+    team = ShieldedDriver(Team.copies(make_agent("coast"), (1, 2)), PAIR, logging=True).on((1, 2))
     worlds = PAIR.sample(20, 9).worlds
-    harm = drive(worlds, team, PAIR).ledger
-    shield = team.shield
+    episodes = drive(worlds, team, PAIR)
+    harm, shield = episodes.ledger, episodes.guarded.shield
     assert harm.world_harm("first").tolist() == shield.bound.tolist() and not shield.distrusted.any()
     assert len(shield.log) == shield.interventions.sum() > 0
     assert {entry.vehicle for entry in shield.log} == {1, 2}
@@ -387,10 +393,10 @@ def test_evaluation__later_rollouts_of_the_team_let_more_of_it_through():
 
     worlds, replaced = PAIR.sample(60, 11).worlds, {}
     for later in (True, False):
-        team = ShieldedTeam(Team({1: Late(), 2: Late()}, "late"), PAIR, later_rollouts=later)
-        harm = drive(worlds, team, PAIR).ledger.world_harm("first")
-        assert (harm <= team.predicted_harm).all()
-        replaced[later] = team.shield.interventions.sum()
+        team = ShieldedDriver(Team({1: Late(), 2: Late()}, "late"), PAIR, later_rollouts=later).on((1, 2))
+        episodes = drive(worlds, team, PAIR)
+        assert (episodes.ledger.world_harm("first") <= episodes.guarded.shield.predicted_harm).all()
+        replaced[later] = episodes.guarded.shield.interventions.sum()
     assert replaced[True] < replaced[False]
 
 
@@ -403,4 +409,4 @@ def test_evaluation__other_shields_refuse_a_team(around):
 
 def test_evaluation__a_team_that_leaves_a_learner_alone_is_refused():
     with pytest.raises(InvalidInput, match=r"does not drive vehicle_3.*follows a script"):
-        ShieldedTeam(Team({1: make_agent("coast")}, "half"), PAIR)
+        ShieldedDriver(Team({1: make_agent("coast")}, "half"), PAIR)

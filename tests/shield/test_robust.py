@@ -14,7 +14,7 @@ from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield import HybridShield, ShieldedEnv, StepShield, StepShieldAgent, parse_uncertainty
+from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, StepShield, parse_uncertainty
 from ethbrake_marl.shield.certify import REASONS, Backup, begin_running, certify, plan_harm
 from tests.shield.lines import line
 from tests.shield.test_certify import STEPS, two
@@ -134,19 +134,20 @@ def test_every_member__realises_at_most_the_bound_to_the_bit(N, harm_count, who)
     M, tight = members.n // worlds.n, 0
     for m in range(0, M, 10 if N == 3 else 5):
         truth = members.take(np.arange(worlds.n) * M + m)
-        shielded = StepShieldAgent(
+        shielded = ShieldedDriver(
             Adversary(who, m),
             scenario,
             harm_count=harm_count,
             uncertainty=uncertainty,
-            believed=worlds,
+            told=worlds,
             later_rollouts=m == 0,
         )
-        harm = drive(truth, shielded, scenario, vehicle).ledger.world_harm(harm_count)
-        assert (harm <= shielded.predicted_harm).all()
-        assert (harm <= shielded.shield.bound).all() and (shielded.shield.bound <= shielded.predicted_harm).all()
-        assert not shielded.shield.distrusted.any()
-        tight += int((harm > 0.9 * shielded.shield.bound).sum())
+        episodes = drive(truth, shielded, scenario, vehicle)
+        harm, shield = episodes.ledger.world_harm(harm_count), episodes.guarded.shield
+        assert (harm <= shield.predicted_harm).all()
+        assert (harm <= shield.bound).all() and (shield.bound <= shield.predicted_harm).all()
+        assert not shield.distrusted.any()
+        tight += int((harm > 0.9 * shield.bound).sum())
     assert tight > 0  # the bound is not out of reach
 
 
@@ -169,9 +170,10 @@ def test_no_width__is_step_mode_to_the_bit(harm_count):
     worlds = scenario.sample(12, 3).worlds
     harms, bounds = [], []
     for settings in ({}, {"uncertainty": "latency_s=0,mass_t=0%"}):
-        shielded = StepShieldAgent(Adversary("random"), scenario, harm_count=harm_count, **settings)
-        harms.append(drive(worlds, shielded, scenario, 1).ledger.world_harm(harm_count).tolist())
-        bounds.append(shielded.shield.bound.tolist())
+        shielded = ShieldedDriver(Adversary("random"), scenario, harm_count=harm_count, **settings)
+        episodes = drive(worlds, shielded, scenario, 1)
+        harms.append(episodes.ledger.world_harm(harm_count).tolist())
+        bounds.append(episodes.guarded.shield.bound.tolist())
     assert harms[0] == harms[1] and bounds[0] == bounds[1]
 
 
@@ -180,10 +182,11 @@ def test_seen__inside_the_range_of_the_members_is_no_surprise_outside_is_one():
     uncertainty = parse_uncertainty("gaps_m=2,speeds_mps.vehicle_2=1")
     for gap, surprising in ((13.2, False), (12.9, True)):
         truth = scenario.replace(gaps_m=gap).sample(1, 0).worlds
-        shielded = StepShieldAgent(make_agent("full_brake"), scenario, uncertainty=uncertainty, believed=worlds)
-        harm = drive(truth, shielded, scenario, 1).ledger.world_harm("first")
-        assert shielded.shield.distrusted.tolist() == [surprising]
-        assert surprising or 0.0 < harm[0] <= shielded.predicted_harm[0]
+        shielded = ShieldedDriver(make_agent("full_brake"), scenario, uncertainty=uncertainty, told=worlds)
+        episodes = drive(truth, shielded, scenario, 1)
+        harm, shield = episodes.ledger.world_harm("first"), episodes.guarded.shield
+        assert shield.distrusted.tolist() == [surprising]
+        assert surprising or 0.0 < harm[0] <= shield.predicted_harm[0]
     shield = StepShield(scenario, 1, uncertainty=uncertainty)
     shield.begin(worlds, np.arange(1))
     decision = shield.decide(np.zeros(1), seen=np.array([[0.0, 14.0, 5.0, 0.0]]))

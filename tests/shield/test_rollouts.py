@@ -13,7 +13,7 @@ from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield import HybridShield, StepShield, StepShieldAgent, parse_uncertainty
+from ethbrake_marl.shield import HybridShield, ShieldedDriver, StepShield, parse_uncertainty
 from ethbrake_marl.shield.certify import REASONS, Backup, Proposer
 
 PAPER = load_scenario("paper-random")
@@ -55,6 +55,7 @@ class TwoFaced:
     """Coasts in person, while every copy of it does otherwise."""
 
     name = "two-faced"
+    remembers = False  # so that the guard asks itself, and rolls a copy out
 
     def __deepcopy__(self, memo):
         return LearnedAgent(Weights())
@@ -94,66 +95,63 @@ def test_by_hand__a_policy_that_would_collide_certifies_nothing():
 
 
 def driven(policy, **settings):
-    """The agent, each world's harm, and the reasons [decisions, n]."""
-    agent, reasons = StepShieldAgent(policy, PAPER, **settings), []
-    propose = StepShield.propose
+    """What the guard remembers at the end, each world's harm, and the reasons [decisions, n]."""
+    reasons, decide = [], StepShield.decide
 
     def noted(shield, *arguments, **given):
-        certified = propose(shield, *arguments, **given)
-        reasons.append(np.where(given["only"], certified.decision.reason, -1))
-        return certified
+        decision = decide(shield, *arguments, **given)
+        reasons.append(np.where(given["only"], decision.reason, -1))
+        return decision
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(StepShield, "propose", noted)
-        harm = drive(WORLDS, agent, PAPER, 1).ledger.world_harm("first")
-    return agent, harm, np.array(reasons)
+        patch.setattr(StepShield, "decide", noted)
+        episodes = drive(WORLDS, ShieldedDriver(policy, PAPER, **settings), PAPER, 1)
+    return episodes.guarded, episodes.ledger.world_harm("first"), np.array(reasons)
 
 
 @pytest.mark.parametrize("policy", [LearnedAgent(Weights()), Remembering()], ids=["divisible", "remembering"])
 def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_exact(policy):
-    agent, harm, reasons = driven(policy)
+    guarded, harm, reasons = driven(policy)
     accepted = reasons == REASONS.index("policy rollout")
     assert accepted.sum() > 3
     later = np.cumsum(accepted, axis=0) - accepted > 0  # after the first accepted rollout of that world
     allowed = [-1, REASONS.index("same as plan"), REASONS.index("ended")]
     assert np.isin(reasons[later], allowed).all()
-    assert harm.tolist() == agent.shield.bound.tolist()
-    assert (harm <= agent.predicted_harm).all() and not agent.shield.distrusted.any()
+    assert harm.tolist() == guarded.shield.bound.tolist()
+    assert (harm <= guarded.shield.predicted_harm).all() and not guarded.shield.distrusted.any()
 
 
 @pytest.mark.parametrize("distrusted", [False, True])
 def test_rollout__leaves_the_past_in_the_plan_what_was_applied(distrusted, monkeypatch):
     weaker = parse_uncertainty("braking_capacity_mps2=20%").draw(WORLDS, np.random.default_rng(0))
-    believed = weaker if distrusted else None
-    agent, applied = StepShieldAgent(LearnedAgent(Weights()), PAPER, logging=True, believed=believed), {}
-    propose = StepShield.propose
+    driver = ShieldedDriver(LearnedAgent(Weights()), PAPER, logging=True, told=weaker if distrusted else None)
+    applied, decide = {}, StepShield.decide
 
     def noted(shield, *arguments, **given):
-        steps, certified = shield.running.steps, propose(shield, *arguments, **given)
-        decision = certified.decision
+        steps, decision = shield.running.steps, decide(shield, *arguments, **given)
         running = np.flatnonzero(given["only"] & (decision.reason != REASONS.index("ended")))
         applied.update({(k, steps[k]): decision.applied[k] for k in running})
-        return certified
+        return decision
 
-    monkeypatch.setattr(StepShield, "propose", noted)
-    drive(WORLDS, agent, PAPER, 1)
-    assert (agent.shield.distrusted == distrusted).all()
-    assert all(agent.shield.backup.plan[k, step] == action for (k, step), action in applied.items())
-    for entry in agent.shield.log:
+    monkeypatch.setattr(StepShield, "decide", noted)
+    shield = drive(WORLDS, driver, PAPER, 1).guarded.shield
+    assert (shield.distrusted == distrusted).all()
+    assert all(shield.backup.plan[k, step] == action for (k, step), action in applied.items())
+    for entry in shield.log:
         assert entry.plan[: entry.step].tolist() == [applied[entry.world, step] for step in range(entry.step)]
 
 
 def test_rollout__leaves_the_policys_memory_alone():
     policy = Remembering()
-    _, _, reasons = driven(policy)
+    guarded, _, reasons = driven(policy)
     assert (reasons == REASONS.index("no certificate")).any()
-    assert set(policy.asked) == {float(len(reasons))}
+    assert set(guarded.policies[1].asked) == {float(len(reasons))} and not policy.asked.size
 
 
 def test_rollout__a_policy_that_does_otherwise_than_its_copies_gets_no_further_than_the_bound():
-    agent, harm, reasons = driven(TwoFaced())
+    guarded, harm, reasons = driven(TwoFaced())
     assert (reasons == REASONS.index("policy rollout")).any()
-    assert harm.tolist() == agent.shield.bound.tolist() and (harm <= agent.predicted_harm).all()
+    assert harm.tolist() == guarded.shield.bound.tolist() and (harm <= guarded.shield.predicted_harm).all()
 
 
 def test_rollout__of_some_worlds_alone_is_that_of_the_whole_batch():
@@ -183,8 +181,8 @@ def test_rollout__what_goes_wrong_when_a_policy_is_divided_is_told():
 
 def test_rollout__is_refused_in_the_name_of_the_policy():
     pair = load_scenario("cooperation-3-pair")
-    with pytest.raises(InvalidInput, match="agent 'coast' drives vehicle_2"):
-        StepShieldAgent(make_agent("coast"), pair).begin(pair.sample(1, 0).worlds, 1, np.arange(1))
+    with pytest.raises(InvalidInput, match=r"agent 'coast\+step' drives vehicle_2"):
+        drive(pair.sample(1, 0).worlds, ShieldedDriver(make_agent("coast"), pair), pair, 1)
 
 
 def test_later_rollouts__may_be_switched_off():
@@ -208,9 +206,9 @@ def test_wrapper__tries_its_policy_where_the_proposal_is_rejected_and_keeps_the_
 
 
 def test_refined__also_where_its_policy_cannot_be_divided():
-    agent = StepShieldAgent(Refined(Remembering(), PAPER, tries=2), PAPER)
-    harm = drive(WORLDS.take(np.arange(20)), agent, PAPER, 1).ledger.world_harm("first")
-    assert harm.tolist() == agent.shield.bound.tolist()
+    driver = ShieldedDriver(Refined(Remembering(), PAPER, tries=2), PAPER)
+    episodes = drive(WORLDS.take(np.arange(20)), driver, PAPER, 1)
+    assert episodes.ledger.world_harm("first").tolist() == episodes.guarded.shield.bound.tolist()
 
 
 def test_take__of_a_refined_policy_drives_on_in_those_rows():

@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.figures.evaluation import operating_figure
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.scenario.schema import Task
-from ethbrake_marl.shield import HybridAgent, StepShield, StepShieldAgent, parse_uncertainty
+from ethbrake_marl.shield import HybridAgent, ShieldedDriver, StepShield, parse_uncertainty
 from ethbrake_marl.shield.certify import REASONS
 from ethbrake_marl.shield.review import operating_curves, review
 from tests.failing_worlds import plant, without
@@ -36,6 +36,11 @@ class Wavering:
     def act(self, worlds, vehicle):
         wave = np.sin(17.0 * worlds.time_s + worlds.gaps_m[:, 0])
         return np.where(wave > 0.0, 0.0, wave * worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+
+def shield_of(driver, worlds=WORLDS, scenario=SCENARIO):
+    """The shield as it is when the episodes behind it have ended."""
+    return drive(worlds, driver, scenario, 1).guarded.shield
 
 
 @pytest.mark.parametrize("name", ADVERSARIES)
@@ -63,29 +68,29 @@ def test_first_bound__is_what_the_coupled_optimum_realises():
 
 @pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_agent__is_never_worse_than_the_episode_mode_nor_than_its_prediction(harm_count):
-    step, hybrid = (
-        StepShieldAgent(Wavering(), SCENARIO, harm_count=harm_count),
-        HybridAgent(Wavering(), SCENARIO, harm_count=harm_count),
+    driven, alone = (
+        drive(WORLDS, kind(Wavering(), SCENARIO, harm_count=harm_count), SCENARIO, 1)
+        for kind in (ShieldedDriver, HybridAgent)
     )
-    harm = {a.name: drive(WORLDS, a, SCENARIO, 1).ledger.world_harm(harm_count) for a in (step, hybrid)}
-    assert (harm[step.name] <= step.predicted_harm).all()
-    assert (harm[step.name] <= harm[hybrid.name] + 1e-9).all()
-    assert harm[step.name].mean() < harm[hybrid.name].mean() - 0.2
-    assert harm[step.name].tolist() == step.shield.bound.tolist()
-    assert not step.shield.distrusted.any()
+    harm, hybrid = (episodes.ledger.world_harm(harm_count) for episodes in (driven, alone))
+    shield = driven.guarded.shield
+    assert (harm <= shield.predicted_harm).all()
+    assert (harm <= hybrid + 1e-9).all()
+    assert harm.mean() < hybrid.mean() - 0.2
+    assert harm.tolist() == shield.bound.tolist()
+    assert not shield.distrusted.any()
 
 
 def test_agent__a_policy_that_keeps_the_bound_is_left_alone():
-    step = StepShieldAgent(make_agent("e_v2x_bm"), SCENARIO)
-    drive(WORLDS, step, SCENARIO, 1)
-    fine = step.shield.alone_harm <= step.shield.first_bound
-    assert fine.mean() > 0.9 and step.chosen_policy[fine].all()
+    shield = shield_of(ShieldedDriver(make_agent("e_v2x_bm"), SCENARIO))
+    fine = shield.alone_harm <= shield.first_bound
+    assert fine.mean() > 0.9 and shield.chosen_policy[fine].all()
 
 
 def test_agent__a_worlds_outcome_does_not_depend_on_its_batch():
-    whole = drive(WORLDS, StepShieldAgent(Wavering(), SCENARIO), SCENARIO, 1).ledger.world_harm("first")
+    whole = drive(WORLDS, ShieldedDriver(Wavering(), SCENARIO), SCENARIO, 1).ledger.world_harm("first")
     for k in (0, 7, 50):
-        alone = drive(WORLDS.take([k]), StepShieldAgent(Wavering(), SCENARIO), SCENARIO, 1).ledger.world_harm("first")
+        alone = drive(WORLDS.take([k]), ShieldedDriver(Wavering(), SCENARIO), SCENARIO, 1).ledger.world_harm("first")
         assert alone.tolist() == [whole[k]]
 
 
@@ -138,12 +143,11 @@ def test_surprise__is_flagged_and_falls_back_for_the_rest_of_that_episode_alone(
 
 
 def test_log__holds_every_intervention_and_forensics_says_what_it_was_good_for():
-    step = StepShieldAgent(make_agent("coast"), SCENARIO, logging=True)
-    drive(WORLDS, step, SCENARIO, 1)
-    log = step.shield.log
-    assert len(log) == step.shield.interventions.sum() > 0
+    shield = shield_of(ShieldedDriver(make_agent("coast"), SCENARIO, logging=True))
+    log = shield.log
+    assert len(log) == shield.interventions.sum() > 0
     assert all(entry.margin < 0.0 and entry.proposed == 0.0 != entry.applied for entry in log)
-    found = review(step, WORLDS, 1)
+    found = review(shield, make_agent("coast"), WORLDS)
     assert found.without.shape == (len(log),)
     assert found.share("needed") > 0.8
     assert found.share("needed") + found.share("harmless") + found.share("costly") == pytest.approx(1.0)
@@ -156,39 +160,39 @@ def test_log__holds_every_intervention_and_forensics_says_what_it_was_good_for()
 def test_review__tells_the_harm_of_the_engine_also_where_the_bound_is_not_it(mode):
     worlds = WORLDS.take(np.arange(40))
     other = parse_uncertainty("braking_capacity_mps2=20%").draw(worlds, np.random.default_rng(0))
-    settings = {"believed": other} if mode == "distrusted" else {"uncertainty": "gaps_m=0.5"}
-    step = StepShieldAgent(Wavering(), SCENARIO, logging=True, **settings)
-    harm = drive(worlds, step, SCENARIO, 1).ledger.world_harm("first")
-    assert abs(step.shield.bound - harm).max() > 1.0
-    found = review(step, worlds, 1)
+    settings = {"told": other} if mode == "distrusted" else {"uncertainty": "gaps_m=0.5"}
+    episodes = drive(worlds, ShieldedDriver(Wavering(), SCENARIO, logging=True, **settings), SCENARIO, 1)
+    harm, shield = episodes.ledger.world_harm("first"), episodes.guarded.shield
+    assert abs(shield.bound - harm).max() > 1.0
+    found = review(shield, Wavering(), worlds)
     assert found.realised.tolist() == harm[found.world].tolist()
-    assert found.trusted.tolist() == (~step.shield.distrusted[found.world]).tolist()
+    assert found.trusted.tolist() == (~shield.distrusted[found.world]).tolist()
     assert found.trusted.all() == (mode == "robust")
 
 
-def test_review__of_an_agent_driven_twice_is_of_the_last_batch():
-    smaller, again = WORLDS.take(np.arange(30, 50)), StepShieldAgent(Wavering(), SCENARIO, logging=True)
-    fresh = StepShieldAgent(Wavering(), SCENARIO, logging=True)
-    drive(WORLDS, again, SCENARIO, 1)
-    drive(smaller, again, SCENARIO, 1)
-    drive(smaller, fresh, SCENARIO, 1)
-    assert {entry.episode for entry in again.shield.log} == {0, 1}
-    for told, expected in zip(review(again, smaller, 1), review(fresh, smaller, 1), strict=True):
+def test_review__is_of_the_last_batch_and_of_its_worlds_alone():
+    smaller, driver = WORLDS.take(np.arange(30, 50)), ShieldedDriver(Wavering(), SCENARIO, logging=True)
+    shield_of(driver)
+    again, fresh = shield_of(driver, smaller), shield_of(ShieldedDriver(Wavering(), SCENARIO, logging=True), smaller)
+    for told, expected in zip(review(again, Wavering(), smaller), review(fresh, Wavering(), smaller), strict=True):
         assert told.tolist() == expected.tolist()
     with pytest.raises(InvalidInput, match="60 worlds, but 20 were driven last"):
-        review(again, WORLDS, 1)
+        review(again, Wavering(), WORLDS)
 
 
-@pytest.mark.parametrize("agent", [StepShieldAgent, HybridAgent])
+@pytest.mark.parametrize("agent", [ShieldedDriver, HybridAgent])
 @pytest.mark.parametrize("sizes", [(20, 10), (1, 20)])
 def test_agent__drives_a_batch_of_another_size_as_a_fresh_one_does(agent, sizes):
     used = agent(make_agent("constant:3"), SCENARIO)
     for n in sizes:
         worlds, fresh = WORLDS.take(np.arange(n)), agent(make_agent("constant:3"), SCENARIO)
-        harms = [drive(worlds, each, SCENARIO, 1).ledger.world_harm("first").tolist() for each in (used, fresh)]
+        driven = [drive(worlds, each, SCENARIO, 1) for each in (used, fresh)]
+        harms = [episodes.ledger.world_harm("first").tolist() for episodes in driven]
         assert harms[0] == harms[1]
-        assert used.predicted_harm.tolist() == fresh.predicted_harm.tolist()
-        assert used.chosen_policy.tolist() == fresh.chosen_policy.tolist()
+        told = [each if episodes.guarded is None else episodes.guarded.shield for each, episodes in
+                zip((used, fresh), driven, strict=True)]  # fmt: skip
+        assert told[0].predicted_harm.tolist() == told[1].predicted_harm.tolist()
+        assert told[0].chosen_policy.tolist() == told[1].chosen_policy.tolist()
 
 
 def test_begin__of_a_row_that_is_not_there_is_refused():
@@ -215,10 +219,10 @@ class Speechless:
 def test_agent__what_is_no_number_is_replaced_and_told(capacity):
     scenario = SCENARIO.replace(driving_capacity_mps2=capacity)
     worlds = scenario.sample(20, 3).worlds
-    step = StepShieldAgent(Speechless(), scenario, logging=True)
-    harm = drive(worlds, step, scenario, 1).ledger.world_harm("first")
-    assert harm.tolist() == step.shield.bound.tolist() and (harm <= step.predicted_harm).all()
-    silent = [entry for entry in step.shield.log if REASONS[entry.reason] == "not a number"]
+    episodes = drive(worlds, ShieldedDriver(Speechless(), scenario, logging=True), scenario, 1)
+    harm, shield = episodes.ledger.world_harm("first"), episodes.guarded.shield
+    assert harm.tolist() == shield.bound.tolist() and (harm <= shield.predicted_harm).all()
+    silent = [entry for entry in shield.log if REASONS[entry.reason] == "not a number"]
     assert len({entry.world for entry in silent}) == 20 and all(np.isnan(entry.proposed) for entry in silent)
 
 
@@ -252,9 +256,13 @@ def test_operating_curve__leaves_worlds_out_that_cannot_be_advanced_and_names_th
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (lambda: StepShieldAgent(make_agent("coast"), "paper-random"), "scenario = 'paper-random': must be a Scenario"),
+        (lambda: ShieldedDriver(make_agent("coast"), "paper-random"), "scenario = 'paper-random': must be a Scenario"),
         (lambda: HybridAgent(make_agent("coast"), "paper-random"), "scenario = 'paper-random': must be a Scenario"),
-        (lambda: StepShieldAgent(make_agent("coast"), SCENARIO, believed=3), "believed = 3: must be worlds"),
+        (lambda: ShieldedDriver(make_agent("coast"), SCENARIO, told=3), "told = 3: must be worlds"),
+        (
+            lambda: ShieldedDriver(make_agent("coast"), SCENARIO, mode="episode"),
+            "HybridAgent is that of mode episode",
+        ),
         (lambda: StepShield(SCENARIO, 9), "vehicle = 9: must be an index from 0 to 2"),
         (lambda: StepShield(SCENARIO, 1, allowance="1"), "allowance = '1': must be a number, at least 0"),
         (lambda: StepShield(SCENARIO, 1).decide(np.zeros(3)), "no episode has begun"),
@@ -266,9 +274,9 @@ def test_refused__what_does_not_fit(wrong, message):
 
 
 def test_refused__worlds_and_proposals_of_another_number():
-    step = StepShieldAgent(make_agent("coast"), SCENARIO, believed=WORLDS.take([0, 1]))
-    with pytest.raises(InvalidInput, match="believed holds 2 worlds, but row 2 begins"):
-        step.begin(WORLDS.take([0, 1, 2]), 1, np.arange(3))
+    step = ShieldedDriver(make_agent("coast"), SCENARIO, told=WORLDS.take([0, 1]))
+    with pytest.raises(InvalidInput, match="told of 2 worlds, but row 2 begins"):
+        drive(WORLDS.take([0, 1, 2]), step, SCENARIO, 1)
     shield = StepShield(SCENARIO, 1)
     shield.begin(WORLDS.take([0, 1]), np.arange(2))
     with pytest.raises(InvalidInput, match=r"proposed \(3,\); \(2,\) is needed"):
@@ -276,7 +284,7 @@ def test_refused__worlds_and_proposals_of_another_number():
 
 
 def test_review__without_a_log_is_refused():
-    step = StepShieldAgent(make_agent("coast"), SCENARIO)
-    drive(WORLDS.take([0]), step, SCENARIO, 1)
+    coast = make_agent("coast")
+    shield = shield_of(ShieldedDriver(coast, SCENARIO), WORLDS.take([0]))
     with pytest.raises(InvalidInput, match="logging=True"):
-        review(step, WORLDS.take([0]), 1)
+        review(shield, coast, WORLDS.take([0]))

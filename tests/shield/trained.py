@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.shield.guard import AttachedShield
+from ethbrake_marl.engine.engine import Engine
 
 STEPS, WORLDS, HIDDEN = 200_000, 64, (64, 64)
 FOLDER = Path(__file__).resolve().parent
@@ -28,10 +28,10 @@ def layers(N: int) -> list[tuple[np.ndarray, np.ndarray]]:
         return [(kept[f"weight{k}"], kept[f"bias{k}"]) for k in range(len(HIDDEN) + 1)]
 
 
-def trained(rng: np.random.Generator, attached: AttachedShield, k: int) -> np.ndarray:
+def trained(rng: np.random.Generator, engine: Engine, k: int) -> np.ndarray:
     """What the trained adversary proposes now, with a little noise, so that no two lists are attacked alike."""
-    value = attached.engine.observe(attached.vehicle)
-    *hidden, (weight, bias) = layers(attached.engine.scenario.vehicles)
+    value = engine.observe(engine.learners[0])
+    *hidden, (weight, bias) = layers(engine.scenario.vehicles)
     for w, b in hidden:
         value = np.tanh(value @ w.T + b)
     action = (value @ weight.T + bias)[:, 0].astype(np.float64)

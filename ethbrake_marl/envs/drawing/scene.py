@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -364,16 +364,7 @@ def _clock(y: int, last: int, frames: int, fps: int) -> Iterator[str]:
 # The motion of an engine's worlds, kept while they run, so that any moment of it can be shown exactly.
 #
 # Between decisions the motion follows from the state and the command alone: each moment is advanced from the beginning
-# of its step. A ``Trace`` follows the engine as a shield does; without one nothing is kept and nothing costs time.
-
-
-@runtime_checkable
-class SteppingIn(Protocol):
-    """A watcher that may replace what was proposed, and says where it did in the step that is being made."""
-
-    @property
-    def stepped_in(self) -> Bools:
-        """Where something else than the proposal is applied, [n]."""
+# of its step. A ``Trace`` looks on at the engine; without one nothing is kept and nothing costs time.
 
 
 @dataclass(frozen=True, slots=True)
@@ -430,7 +421,6 @@ class Trace:
         """Close the motion that led to this step, and begin the step's own."""
         last = close_motion(memory[-1], before)
         front, struck = _end(last)
-        judges = [watcher.stepped_in for watcher in before.watchers if isinstance(watcher, SteppingIn)]
         ledger = before.ledger
         n = before.n
         new = replace(
@@ -442,7 +432,7 @@ class Trace:
             front_m=front,
             harm=np.stack([ledger.world_harm("first"), ledger.world_harm("total")], axis=1),
             struck=struck,
-            stepped_in=np.logical_or.reduce(judges) if judges else None,
+            stepped_in=None if after.ruling is None else after.ruling.stepped_in,
         )
         return (*memory[:-1], last, new) if self._whole else (new,)
 

@@ -47,7 +47,7 @@ from ethbrake_marl.policies.bundle import Policy
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.scenario.fields import OTHERWISE
 from ethbrake_marl.scenario.sampling import table_columns
-from ethbrake_marl.shield import HybridAgent, StepShieldAgent
+from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -267,12 +267,12 @@ def scenario_text(name: str, world: Worlds, scenario: Scenario) -> str:
         "name": name,
         "title": f"One world, from {scenario.name}",
         "description": "A state that was saved in the explorer.",
-        "source": "ethbrake explore",
+        "source": "ethbrake watch explore",
         "early_impacts": "keep",  # this very world, whatever happens in it
         **state_of(world),
     }
     lines = [f"{key}: {flow_text(value)}" for key, value in Scenario(**fixed).declared().items()]
-    return "\n".join(["# Saved by ethbrake explore.", *lines, ""])
+    return "\n".join(["# Saved by ethbrake watch explore.", *lines, ""])
 
 
 def table_text(world: Worlds, scenario: Scenario) -> str:
@@ -333,7 +333,7 @@ def explorer_page(explored: Explored, state: State, *, world: int, seed: int) ->
     scenario = explored.scenario
     vehicle = f"Vehicle {explored.vehicle + 1}"
     content = _content(explored, state, world)
-    shielded = any(isinstance(agent, HybridAgent | StepShieldAgent) for agent in explored.lineup.values())
+    shielded = any(isinstance(agent, HybridAgent | ShieldedDriver) for agent in explored.lineup.values())
     sections = [
         Section("The emergency", [_part("sliders", seed=seed)]),
         Section("What came of it", [_part("outcome", harm_count=explored.harm_count)]),
