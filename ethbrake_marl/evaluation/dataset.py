@@ -37,15 +37,16 @@ from ethbrake_marl.errors import (
     renumbered,
     unknown_name,
 )
+from ethbrake_marl.evaluation.episodes import line_positions
 from ethbrake_marl.evaluation.inputs import policy_sha256, result_versions, scenario_sha256
 from ethbrake_marl.evaluation.outcome import LeftOut
 from ethbrake_marl.evaluation.results import PARQUET, check_target
+from ethbrake_marl.evaluation.rollout import ShovedFront
 from ethbrake_marl.files.sheet import parquet_file
 from ethbrake_marl.files.store import check_writable, new_folder
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation, observation_for
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance, leaving_out_failed
-from ethbrake_marl.physics.kernel import with_post_ahead
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, leaving_out_failed
 from ethbrake_marl.rewards import Reward, RewardParams, reward_params
 from ethbrake_marl.scenario import Sample, Scenario
 
@@ -212,24 +213,18 @@ class _Road:
     """Follows an engine: where every vehicle is, and how fast, after each step. Worlds know gaps and speeds only."""
 
     def __init__(self, alert: Worlds, engine: Engine) -> None:
-        self._before, self._front_m = alert, np.zeros(alert.n)
+        self._before, self._front = alert, ShovedFront(alert, np.zeros(alert.n))
         self.positions_m: list[Floats] = []
         self.speeds_mps: list[Floats] = []
         self.follow(engine)
 
     def follow(self, engine: Engine) -> None:
         """The engine has made a step, the first one from the alert to the first decision."""
-        now = engine.worlds
-        for before, command, end_s in engine.segments(self._before, engine.wanted_mps2):
-            moving = np.flatnonzero(end_s > before.time_s)
-            until_s = end_s[moving]
-            post = with_post_ahead(before.take(moving), until_s - before.time_s[moving])
-            after, _ = advance(post, command[moving], until_s=until_s)
-            self._front_m[moving] += post.obstacle_gap_m - after.obstacle_gap_m
-        front = self._front_m[:, np.newaxis]
-        self.positions_m.append(np.concatenate([front, front - np.cumsum(now.gaps_m, axis=1)], axis=1))
-        self.speeds_mps.append(now.speeds_mps)
-        self._before = now
+        for part in engine.segments(self._before, engine.wanted_mps2):
+            self._front.see(*part)
+        self._before = engine.worlds
+        self.positions_m.append(line_positions(self._front.metres, self._before.gaps_m))
+        self.speeds_mps.append(self._before.speeds_mps)
 
 
 # Episodes as a Parquet file: one row per agent, world and decision, one row group per batch of worlds.

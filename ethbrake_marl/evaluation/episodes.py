@@ -21,7 +21,7 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, Driver, Team, team_of
 from ethbrake_marl.agents.registry import parse_spec
-from ethbrake_marl.agents.rollout import Episodes, episode_engine, play
+from ethbrake_marl.agents.rollout import Episodes, drive, episode_engine, play
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.drawing.scene import Scene, Trace, animate_films, kept_motions, scenes
@@ -35,6 +35,7 @@ from ethbrake_marl.evaluation.inputs import (
     scenario_sha256,
     worlds_sha256,
 )
+from ethbrake_marl.evaluation.measures import Tape
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.harm import Ledger
@@ -87,60 +88,72 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
     engine = episode_engine(worlds, team, scenario)
     follower = _Follower(worlds, team, engine)
     episodes = play(engine, worlds, [follower])
-    return [follower.motion(k, episodes) for k in range(worlds.n)]
+    return follower.motions(episodes)
 
 
-class _Follower:
-    """Watches a batch of episodes."""
+class _Follower(Tape):
+    """Keeps the steps, and in which decisions a shield stepped in."""
 
     def __init__(self, worlds: Worlds, team: Team, engine: Engine) -> None:
-        self._worlds, self._drivers = worlds, list(team.drivers.values())
+        super().__init__(worlds)
+        self._drivers = list(team.drivers.values())
         self._first_s = first_decision_s(worlds, list(team.drivers))
-        self._way_m = np.zeros(worlds.n)
-        self._pieces: list[list[Floats]] = [[] for _ in range(worlds.n)]
-        self._impacts: list[list[ImpactRows]] = [[] for _ in range(worlds.n)]
         self._stepped_in: list[list[float]] = [[] for _ in range(worlds.n)]
         self._engine, self._ruling = engine, engine.ruling
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Keep the pieces and impacts of one step."""
-        moving = until_s > before.time_s
-        moving |= before.time_s == self._worlds.time_s  # an impact at the very alert
-        some = np.flatnonzero(moving)
-        rows = advance(before.take(some), command_mps2[some], until_s=until_s[some], record=True)[1].rows
-        assert rows is not None  # they were asked for
-        columns = [np.zeros_like(rows.world), *(getattr(rows, f.name) for f in fields(ImpactRows)[1:])]
-        starts = np.searchsorted(rows.world, np.arange(some.size + 1)).tolist()  # they come world by world
-        for k, first, end in zip(some.tolist(), starts[:-1], starts[1:], strict=True):
-            self._impacts[k].append(ImpactRows(*(column[first:end] for column in columns)))
-        some = np.flatnonzero(until_s > before.time_s)
-        for k, pieces in zip(
-            some.tolist(), segment_pieces(before.take(some), command_mps2[some], until_s[some]), strict=True
-        ):
-            way = _way(pieces, float(until_s[k]))
-            pieces[:, 1] += self._way_m[k]
-            self._pieces[k].append(pieces)
-            self._way_m[k] += way
+        """Keep one step."""
+        super().see(before, command_mps2, until_s)
         ruling = self._engine.ruling
         if ruling is not None and ruling is not self._ruling:  # a step is shown in parts
             for k in np.flatnonzero(ruling.stepped_in & ruling.asked).tolist():
                 self._stepped_in[k].append(float(before.time_s[k]))
             self._ruling = ruling
 
-    def motion(self, k: int, episodes: Episodes) -> EpisodeMotion:
-        """What was seen of world ``k``."""
-        parts, N = self._impacts[k], self._worlds.N
-        impacts = ImpactRows(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ImpactRows)))
-        pieces = np.concatenate(self._pieces[k]) if self._pieces[k] else _standing(self._worlds, k)
-        ledger = Ledger(*(getattr(episodes.ledger, f.name)[[k]] for f in fields(Ledger)))
-        final = episodes.final.take([k])
-        taken_over = list(self._stepped_in[k])
-        if any(isinstance(d, HybridAgent) and not d.chosen_policy[k] for d in self._drivers):
-            taken_over.append(float(self._first_s[k]))
-        return EpisodeMotion(
-            self._worlds.take([k]), join_pieces(pieces, N), float(final.time_s[0]), impacts,
-            np.array(sorted(taken_over)), ledger, final, bool(episodes.at_rest[k]),
-        )  # fmt: skip
+    def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
+        """What was seen, world by world."""
+        n, N = self.worlds.n, self.worlds.N
+        impacts, pieces = self.impacts(), self._pieces()
+        ends = np.searchsorted(impacts.world, np.arange(n + 1))
+        found = []
+        for k in range(n):
+            mine = slice(*ends[k : k + 2])
+            rows = ImpactRows(*(getattr(impacts, f.name)[mine] for f in fields(ImpactRows)))
+            ledger = Ledger(*(getattr(episodes.ledger, f.name)[[k]] for f in fields(Ledger)))
+            final, taken_over = episodes.final.take([k]), list(self._stepped_in[k])
+            if any(isinstance(d, HybridAgent) and not d.chosen_policy[k] for d in self._drivers):
+                taken_over.append(float(self._first_s[k]))
+            found.append(
+                EpisodeMotion(
+                    self.worlds.take([k]),
+                    join_pieces(pieces[k], N),
+                    float(final.time_s[0]),
+                    replace(rows, world=np.zeros_like(rows.world)),
+                    np.array(sorted(taken_over)),
+                    ledger,
+                    final,
+                    bool(episodes.at_rest[k]),
+                )
+            )
+        return found
+
+    def _pieces(self) -> list[Floats]:
+        """The pieces of each world's motion, one after the other; one piece where it ends at once."""
+        parts: list[list[Floats]] = [[] for _ in range(self.worlds.n)]
+        way_m = np.zeros(self.worlds.n)
+        for before, command, until_s in self.steps:
+            some = np.flatnonzero(until_s > before.time_s)
+            seen = segment_pieces(before.take(some), command[some], until_s[some])
+            for k, pieces in zip(some.tolist(), seen, strict=True):
+                way = float(state_at(pieces[-1], float(until_s[k]), self.worlds.N)[0])
+                pieces[:, 1] += way_m[k]
+                parts[k].append(pieces)
+                way_m[k] += way
+        w = self.worlds
+        standing = np.concatenate(
+            [w.time_s[:, np.newaxis], np.zeros((w.n, 1)), w.gaps_m, w.speeds_mps, 0.0 * w.speeds_mps], axis=1
+        )
+        return [np.concatenate(each) if each else standing[[k]] for k, each in enumerate(parts)]
 
 
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
@@ -163,27 +176,12 @@ def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
     return np.concatenate([[piece[1] + way[0]], gaps, speeds + accelerations * t, accelerations])
 
 
-def _way(pieces: Floats, until_s: float) -> float:
-    """How far Vehicle 1 has come at the end of these pieces."""
-    last = pieces[-1]
-    vehicles = (len(last) - 1) // 3
-    return float(state_at(last, until_s, vehicles)[0])
-
-
-def _standing(worlds: Worlds, k: int) -> Floats:
-    """The one piece of an episode that ends where it begins."""
-    N = worlds.N
-    return np.concatenate([worlds.time_s[[k]], [0.0], worlds.gaps_m[k], worlds.speeds_mps[k], np.zeros(N)])[np.newaxis]
-
-
 # One episode at fine time resolution: what a figure or a viewer draws.
 #
 # Between decisions the motion follows from the state and the command alone, so the episode is first run as in an
 # evaluation, and then sampled inside its steps: every sample is advanced straight from the beginning of its step.
 
 SAMPLE_S = 0.02
-
-Segment = tuple[Worlds, Floats, Floats]  # world (n = 1) at its start, constant command [1, N], time of its end [1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,25 +242,17 @@ def record_episode(
     if not (sample_s > 0.0 and math.isfinite(sample_s)):
         raise InvalidInput(f"record_episode: sample_s = {sample_s}; must be finite and above 0")
     driven = controlled_vehicle(scenario, vehicle)
-    engine = episode_engine(world, copy.deepcopy(agent), scenario, driven)
-    segments: list[Segment] = list(engine.segments(world, engine.worlds.command_mps2))
-    at_rest = False
-    while not engine.ended.all():
-        before = engine.worlds
-        step = engine.step({})
-        segments += engine.segments(before, engine.wanted_mps2.copy())
-        at_rest = bool(step.terminated[0])
-    if engine.roster.failed:
-        raise PhysicsError(engine.roster.failed)
-    samples = list(_samples(segments, sample_s))
+    tape = Tape(world)
+    episodes = drive(world, copy.deepcopy(agent), scenario, driven, watched_by=[tape])
+    samples = list(_samples(tape.steps, sample_s))
     time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))
     return EpisodeRecord(
-        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, _impacts(segments), engine.ledger,
-        at_rest,
+        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, tape.impacts(), episodes.ledger,
+        bool(episodes.at_rest[0]),
     )  # fmt: skip
 
 
-def _samples(segments: list[Segment], sample_s: float) -> Iterator[tuple[Floats, ...]]:
+def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
     """Rows of (time, gaps, speeds, positions, command from then on), segment by segment, the last with its end.
 
     Worlds know gaps and speeds only. An obstacle ahead of Vehicle 1, the world's own or one that is out of reach, makes
@@ -279,21 +269,14 @@ def _samples(segments: list[Segment], sample_s: float) -> Iterator[tuple[Floats,
         position, gaps, speeds = front + (post.obstacle_gap_m - moved.obstacle_gap_m), moved.gaps_m, moved.speeds_mps
         in_force = np.where(before.vehicles.latency_s <= times[:, np.newaxis], command, 0.0)
         rows = slice(None) if number == len(segments) - 1 else slice(count)
-        columns = (times, gaps, speeds, _positions(position, gaps), in_force)
+        columns = (times, gaps, speeds, line_positions(position, gaps), in_force)
         yield tuple(column[rows] for column in columns)
         front = float(position[-1])
 
 
-def _positions(front: Floats, gaps: Floats) -> Floats:
+def line_positions(front: Floats, gaps: Floats) -> Floats:
     """Positions [k, N] from those of Vehicle 1 [k] and the gaps [k, P]."""
     return np.concatenate([front[:, np.newaxis], front[:, np.newaxis] - np.cumsum(gaps, axis=1)], axis=1)
-
-
-def _impacts(segments: list[Segment]) -> ImpactRows:
-    """Every impact of the episode."""
-    parts = [advance(before, command, until_s=end, record=True)[1].rows for before, command, end in segments]
-    rows = [part for part in parts if part is not None]
-    return ImpactRows(*(np.concatenate([getattr(part, f.name) for part in rows]) for f in fields(ImpactRows)))
 
 
 # An episode as a film, in real time: the environment's own pictures as a GIF or MP4, or a moving drawing as SVG.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -510,34 +510,37 @@ def _read_only(worlds: Worlds, rows: ImpactRows) -> EpisodeImpacts:
     return EpisodeImpacts(read_only(worlds), rows)
 
 
-class ImpactWatch:
-    """Watches episodes and keeps every impact, for registered measures; see ``of``."""
+class Tape:
+    """The steps of a batch of episodes as they are driven (``Watch``), and every impact in them.
 
-    def __init__(self, worlds: Worlds) -> None:
-        self._worlds = worlds
-        self._parts: list[ImpactRows] = []
+    With ``steps`` False only the impacts are kept.
+    """
 
-    @classmethod
-    def of(cls, worlds: Worlds) -> ImpactWatch | None:
-        """What watches these worlds (at the alert); None where none is registered."""
-        return cls(worlds) if REGISTERED else None
+    def __init__(self, worlds: Worlds, *, steps: bool = True) -> None:
+        self.worlds = worlds  # at the alert
+        self.steps: list[tuple[Worlds, Floats, Floats]] = []  # before, commands [n, N], until [n]
+        self._keeps_steps = steps
+        self._rows: list[ImpactRows] = []
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Keep the impacts of one step."""
-        moving = np.flatnonzero(until_s > before.time_s)
-        _, impacts = advance(before.take(moving), command_mps2[moving], until_s=until_s[moving], record=True)
-        assert impacts.rows is not None
-        columns = {field.name: getattr(impacts.rows, field.name) for field in fields(ImpactRows)}
-        self._parts.append(ImpactRows(**{**columns, "world": moving[impacts.rows.world]}))
+        """Keep one step."""
+        moving = until_s > before.time_s
+        some = np.flatnonzero(moving | (before.time_s == self.worlds.time_s))  # an impact at the very alert
+        rows = advance(before.take(some), command_mps2[some], until_s=until_s[some], record=True)[1].rows
+        assert rows is not None  # they were asked for
+        self._rows.append(replace(rows, world=some[rows.world]))
+        if self._keeps_steps:
+            self.steps.append((before, command_mps2, until_s))
 
-    def finish(self) -> dict[str, Values]:
+    def impacts(self) -> ImpactRows:
+        """Every impact so far, by world and then by time."""
+        columns = {f.name: np.concatenate([getattr(rows, f.name) for rows in self._rows]) for f in fields(ImpactRows)}
+        order = np.argsort(columns["world"], kind="stable")
+        return ImpactRows(**{name: column[order] for name, column in columns.items()})
+
+    def measured(self) -> dict[str, Values]:
         """The registered measures of these episodes, as ``metric_columns``."""
-        joined = [np.concatenate([getattr(part, f.name) for part in self._parts]) for f in fields(ImpactRows)]
-        order = np.argsort(joined[0], kind="stable")  # by world; in each by time already
-        everything = np.arange(self._worlds.n)
-        return metric_columns(
-            _read_only(self._worlds.take(everything), ImpactRows(*(column[order] for column in joined)))
-        )
+        return metric_columns(_read_only(self.worlds.take(np.arange(self.worlds.n)), self.impacts()))
 
 
 # The proven bounds of a list of worlds, beside the least harm known there.

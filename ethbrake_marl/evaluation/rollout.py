@@ -24,7 +24,7 @@ from ethbrake_marl.errors import (
     unknown_name,
 )
 from ethbrake_marl.evaluation.inputs import policy_sha256
-from ethbrake_marl.evaluation.measures import ImpactWatch
+from ethbrake_marl.evaluation.measures import REGISTERED, Tape
 from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate, leaving_out_failed
@@ -390,7 +390,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     task = Task(scenario, tuple(team.drivers))
     shoved = ShovedFront.of(worlds, task) if aftermath else None
     sampled = SampledHarm.of(worlds, task) if aftermath else None
-    impacts = ImpactWatch.of(worlds) if aftermath else None
+    impacts = Tape(worlds, steps=False) if aftermath and REGISTERED else None
     episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled, impacts) if w is not None])
     alone = next(iter(team.drivers.values())) if len(team.drivers) == 1 else None
     if episodes.guarded is not None:
@@ -406,7 +406,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
         None if shoved is None else shoved.metres,
         None if sampled is None else sampled.finish(),
         {vehicle: sha for vehicle, agent in team.drivers.items() if (sha := policy_sha256(agent)) is not None},
-        {} if impacts is None else impacts.finish(),
+        {} if impacts is None else impacts.measured(),
     )
 
 
