@@ -216,16 +216,23 @@ def _evaluate_in_shards(
     from ethbrake_marl.evaluation import rescored_table
     from ethbrake_marl.evaluation.shards import ask, rescore_shards, shards_to_json, summarise_shards
     from ethbrake_marl.files.store import write_file
-    from ethbrake_marl.studies.shards import ShardFolder, evaluate_shards
+    from ethbrake_marl.studies.shards import evaluate_shards
 
     asked = ask(question)
-    folder = None if output is None else ShardFolder(output, asked, rows)
-    if folder is not None:
+    if output is not None:
         out.kept = "finished shards are kept: the same command goes on"
     with ExitStack() as stack:
         # on a Ray all cores where --jobs says nothing
         workers = None if ray is None else stack.enter_context(closing(workers_for(ray, None if jobs == 1 else jobs)))
-        tally = evaluate_shards(asked, shards=shards, jobs=jobs, workers=workers, folder=folder, tell=out.show_progress)
+        tally = evaluate_shards(
+            asked,
+            shards=shards,
+            jobs=jobs,
+            workers=workers,
+            folder=output,
+            with_rows=rows,
+            tell=out.show_progress,
+        )
     summary = summarise_shards(asked, tally)
     results = shards_to_json(asked, tally, summary)
     if output is not None:
@@ -247,7 +254,7 @@ def workers_for(ray: str | None, jobs: int | None) -> Workers:
         from ethbrake_marl.studies.jobs import LocalWorkers
 
         return LocalWorkers(number)
-    from ethbrake_marl.studies.cluster import LOCAL, RayWorkers
+    from ethbrake_marl.studies.jobs import LOCAL, RayWorkers
 
     return RayWorkers(ray, number if ray == LOCAL else jobs)
 
@@ -366,10 +373,10 @@ _FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield
 
 @command(app, "compare", "compare before.csv.json after.csv.json", json=True)
 def compare_command(out: Out, first: Annotated[Path, _FILE], second: Annotated[Path, _FILE]) -> None:
-    """Difference of harm between two results, the second minus the first, for agents of the same name.
+    """Tell the difference of harm between two results.
 
-    Both must be of one command, and about the same worlds of the same scenario. Intervals are paired by world where the
-    files of --per-world lie beside both results.
+    The second minus the first, for agents of the same name. Both must be of one command, and about the same worlds of
+    the same scenario. Intervals are paired by world where the files of --per-world lie beside both results.
     """
     from ethbrake_marl.evaluation.results import compare_results, read_result
 

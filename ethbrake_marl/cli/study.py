@@ -19,10 +19,8 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number, count_of, nee
 
 if TYPE_CHECKING:
     from ethbrake_marl.studies.ablation import Plan
-    from ethbrake_marl.studies.sweep import SweepResult, SweepState
-    from ethbrake_marl.studies.sweep_file import SweepPlan
-    from ethbrake_marl.studies.tuning import TuningResult, TuningState
-    from ethbrake_marl.studies.tuning_file import TuningPlan
+    from ethbrake_marl.studies.sweep import SweepPlan, SweepResult
+    from ethbrake_marl.studies.tuning import TuningPlan, TuningResult
 
 KEPT = "the same command goes on with what is in the folder"
 PAPER_EPISODES = 10_000
@@ -39,14 +37,14 @@ CostOption = Annotated[bool, typer.Option("--cost", help="Say what is left to do
 
 study_group = new_group(
     "study",
-    "Train and compare many policies: a grid, a search of settings, levels of cooperation, longer lines.",
+    "Train and compare many: a grid, settings, cooperation, lines.",
     "study sweep sweep.yaml --output runs/sweep",
     "study ablate --quick --output runs/ablation-quick",
 )
 
 
 def _sweep_schema() -> dict[str, Any]:
-    from ethbrake_marl.studies.sweep_file import sweep_json_schema
+    from ethbrake_marl.studies.sweep import sweep_json_schema
 
     return sweep_json_schema()
 
@@ -71,26 +69,20 @@ def sweep_command(
     The same command goes on after an interruption: finished jobs are kept, begun ones go on. Exit status 1 where jobs
     failed: failures.csv holds the last lines of each.
     """
-    from ethbrake_marl.studies.ablation import check_folder
-    from ethbrake_marl.studies.sweep import run_sweep
-    from ethbrake_marl.studies.sweep_file import plan_sweep, read_sweep
+    from ethbrake_marl.studies.jobs import JobFolder
+    from ethbrake_marl.studies.sweep import plan_sweep, read_sweep, run_sweep
 
     number = len(os.sched_getaffinity(0)) if jobs is None else jobs
     _check_workers(number, retries, ray)
     if form == "parquet":
         need("pyarrow")
     plan = plan_sweep(read_sweep(file))
-    check_folder(output)
+    JobFolder(output, "a sweep").check()
     if dry_run:
         _show_sweep(out, plan, output, number)
         return
-
-    def tell(state: SweepState) -> None:
-        left = "" if state.left_s is None or state.done == state.total else f", about {_coarse(state.left_s)} left"
-        out.progress("sweep", state.done, state.total, note=state.note, label=f"sweep{left}")
-
     with closing(workers_for(ray, jobs)) as workers:
-        result = run_sweep(plan, output, workers, retries=retries, form=form, tell=tell)
+        result = run_sweep(plan, output, workers, retries=retries, form=form, tell=out.show_progress)
     _tell_sweep(out, result, output)
 
 
@@ -101,44 +93,36 @@ def _check_workers(jobs: int, retries: int, ray: str | None) -> None:
         need("ray")
 
 
-def _coarse(seconds: float) -> str:
-    """A time in so few words that it seldom changes."""
-    if seconds < 100.0:
-        return f"{max(round(seconds / 20.0) * 20, 10)} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.0f} h"
-
-
 def _show_sweep(out: Out, plan: SweepPlan, output: Path, number: int) -> None:
     """Every job and its state, and what is left takes."""
-    from ethbrake_marl.studies.sweep import cost_of, state_of
+    from ethbrake_marl.studies.sweep import cost_of
 
-    cost = cost_of(plan, output, number)
-    left = {row.identity for row in cost.rows}
-    states = [(row, state_of(output, row) if row.identity in left else "finished") for row in plan.rows]
+    cost = cost_of(plan, output)
+    states = [(row, cost.states[row.name]) for row in plan.rows]
     jobs = [{"hash": row.identity, "job": row.name, "set": row.settings, "state": state} for row, state in states]
     lines = ["  ".join([f"{state:8}", row.name, *row.asked.settings]) for row, state in states]
     out.result({"jobs": jobs, "decisions_left": cost.decisions, "core_s_left": cost.work_s}, *lines)
     if not out.as_json:
-        out.note(str(cost))
+        out.note(cost.in_words(number))
 
 
 def _tell_sweep(out: Out, result: SweepResult, output: Path) -> None:
     from ethbrake_marl.studies.sweep import FAILURES
 
-    counts = {"jobs": result.jobs, "finished": result.finished, "failed": len(result.failures)}
+    counts = {"jobs": result.jobs, "finished": result.finished, "failed": result.failed}
     out.result({**counts, "interrupted": result.interrupted, "table": str(result.table)})
     told = f"{result.finished:,} of {result.jobs:,} jobs finished; table: {result.table}"
-    if result.failures:
-        told += f"; {len(result.failures):,} failed: {output / FAILURES}"
+    if result.failed:
+        told += f"; {result.failed:,} failed: {output / FAILURES}"
     if result.interrupted:
         out.interrupted(f"interrupted; {told}; {KEPT}")
     out.note(told)
-    if result.failures:
+    if result.failed:
         raise typer.Exit(1)
 
 
 def _tuning_schema() -> dict[str, Any]:
-    from ethbrake_marl.studies.tuning_file import tuning_json_schema
+    from ethbrake_marl.studies.tuning import tuning_json_schema
 
     return tuning_json_schema()
 
@@ -170,28 +154,20 @@ def tune_command(
     The same command goes on after an interruption: trials that ended are kept, those that were begun go on. Exit status
     1 where no trial came to its end.
     """
-    from ethbrake_marl.studies.ablation import check_folder
-    from ethbrake_marl.studies.tuning import check_tuning, run_tuning
-    from ethbrake_marl.studies.tuning_file import plan_tuning, read_tuning
+    from ethbrake_marl.studies.tuning import plan_tuning, read_tuning, run_tuning, tuning_folder
 
     check_whole_number("trials", trials, 1, _MOST_TRIALS)
     _check_workers(jobs, retries, ray)
     if storage is not None and "://" not in storage:
         raise InvalidInput("storage: must be an address such as sqlite:///study.db; leave it out for a journal file")
     plan = plan_tuning(read_tuning(file))
-    check_folder(output)
-    check_tuning(plan, output)
+    tuning_folder(plan, output).check()
     _check_export(out, plan, export)
     if dry_run:
         _show_tuning(out, plan, trials, jobs)
         return
-
-    def tell(state: TuningState) -> None:
-        least = "" if state.least is None else f", least harm {state.least:.3f}"
-        out.progress("tuning", state.done, state.total, note=state.note, label=f"tuning{least}")
-
     with closing(workers_for(ray, jobs)) as workers:
-        result = run_tuning(plan, output, workers, trials, storage=storage, retries=retries, tell=tell)
+        result = run_tuning(plan, output, workers, trials, storage=storage, retries=retries, tell=out.show_progress)
     _tell_tuning(out, plan, result, export)
 
 
@@ -217,9 +193,8 @@ def _check_export(out: Out, plan: TuningPlan, export: Path | None) -> None:
 def _show_tuning(out: Out, plan: TuningPlan, trials: int, jobs: int) -> None:
     """The space, and what the trials take."""
     from ethbrake_marl.studies.trainings import told_seconds
-    from ethbrake_marl.studies.tuning import seconds_per_trial
 
-    per_trial, own = seconds_per_trial(plan), plan.own_values()
+    per_trial, own = plan.seconds_per_trial(), plan.own_values()
     space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
     now = {key: "not in the space" if own is None else f"the recipe has {own[key]}" for key in space}
     out.result(
@@ -304,11 +279,8 @@ def ablate_command(
         LADDER,
         STANDARD,
         check_finished,
-        check_settings,
         cost_of,
-        keep_settings,
-        measure,
-        train_all,
+        run_ablation,
     )
     from ethbrake_marl.studies.ablation_report import FIGURES, PAGE, TEXT, write_ablation
     from ethbrake_marl.studies.speed import this_machine
@@ -319,15 +291,15 @@ def ablate_command(
     names = [*(LADDER if quick else STANDARD)] if levels is None else levels.split(",")
     plan = _plan(out, names, recipes, scheme, settings, list_seed, output, shield, numbers)
     if not cost:
-        check_settings(plan)
+        plan.job_folder().check()
     check_finished(plan.trainings())
     out.note(str(cost_of(plan)))
     if cost:
         return
-    keep_settings(plan)
-    if not train_all(list(plan.trainings()), jobs, out.show_progress):
+    measured = run_ablation(plan, jobs, out.show_progress)
+    if measured is None:
         out.interrupted(f"interrupted; {KEPT}")
-    found = write_ablation(plan, measure(plan, jobs, out.show_progress), str(this_machine()))
+    found = write_ablation(plan, measured, str(this_machine()))
     if out.as_json:
         out.print_json(found)
     else:
@@ -350,7 +322,8 @@ def _plan(
 ) -> Plan:
     """The ablation that is asked for; raises for whatever cannot be trained in it."""
     from ethbrake_marl.learning.recipe import check_scheme, load_recipe, read_settings, scheme_of
-    from ethbrake_marl.studies.ablation import Plan, check_folder, check_plan, common_worlds, read_levels, with_scheme
+    from ethbrake_marl.studies.ablation import Plan, check_plan, common_worlds, read_levels, with_scheme
+    from ethbrake_marl.studies.jobs import JobFolder
 
     chosen = None if scheme is None else check_scheme(scheme)
     loaded = [load_recipe(each.strip()) for each in recipes.split(",")]
@@ -365,7 +338,7 @@ def _plan(
         **numbers,
     )
     check_plan(plan)
-    check_folder(output)
+    JobFolder(output, "an ablation").check()
     common_worlds(plan.levels, 5, list_seed)
     for training in plan.trainings():
         scheme_of(training.recipe, training.level.scenario)
@@ -483,7 +456,7 @@ def reproduce_command(
 
 benchmark_group = new_group(
     "benchmark",
-    "Score an agent on a frozen suite of lists, or show entries as one table.",
+    "Score an agent on a frozen suite, or show entries as a table.",
     "benchmark v2 --agent ppo@shipped --output mine.json",
     "benchmark table mine.json theirs.json --output table.html",
 )
@@ -503,8 +476,7 @@ def drive_command(
     The score of a list is the realised share of what is possible, 0 for full braking and 1 for the best known. A list
     that the agent cannot drive has none, and then there is no overall score.
     """
-    from ethbrake_marl.studies.benchmark import load_suite, make_entry, write_entry
-    from ethbrake_marl.studies.leaderboard import list_table
+    from ethbrake_marl.studies.benchmark import entry_sheet, load_suite, make_entry, write_entry
 
     out.check(output, ".json", what="an entry")
     chosen = load_suite(suite)
@@ -520,7 +492,7 @@ def drive_command(
             f"{agent}: no overall score, as it drives {entry.lists_driven} of {len(chosen.lists)} lists of suite"
             f" {suite}; {mean} of what is possible there"
         )
-    out.result(entry.model_dump(mode="json"), list_table(entry, chosen), told)
+    out.result(entry.model_dump(mode="json"), entry_sheet(entry, chosen), told)
 
 
 @command(benchmark_group, "table", "benchmark table mine.json theirs.json --output table.html", json=True, force=True)
@@ -535,19 +507,10 @@ def table_command(
 
     Refused by name: entries of another suite, and changed ones.
     """
-    from ethbrake_marl.studies.leaderboard import (
-        RANK,
-        SCORE,
-        leaderboard_markdown,
-        leaderboard_page,
-        leaderboard_table,
-        read_leaderboard,
-    )
+    from ethbrake_marl.studies.benchmark import read_leaderboard
 
     out.check(output, *PAGES, ".md", what="the table")
     found = read_leaderboard(entries)
     if output is not None:
-        is_page = output.suffix.lower() != ".md"
-        out.write(output, leaderboard_page(found) if is_page else leaderboard_markdown(found), what="table")
-    suite = f"Suite {found.suite.name}, SHA-256 {found.suite.sha256}"
-    out.result(found.to_json(), leaderboard_table(found), SCORE, RANK, suite)
+        out.write(output, found.markdown() if output.suffix.lower() == ".md" else found.page(), what="table")
+    out.result(found.to_json(), found.sheet(), *found.notes)

@@ -18,7 +18,7 @@ from ethbrake_marl.cli.command import whole_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files import plugins
 from ethbrake_marl.scenario import new_scenario_text
-from ethbrake_marl.studies.ablation import train_all
+from ethbrake_marl.studies.trainings import finish_trainings
 from tests.cli.conftest import TINY_RECIPE
 from tests.extending.conftest import restore, tables
 
@@ -247,7 +247,7 @@ def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, mon
     recipe = load_recipe(str(write_recipe(tmp_path, reward={"harm": 1.0, "calm": 0.01})))
     level = Level(load_scenario("paper-random"))
     wanted = [Training(level, "ppo", recipe.replace(seed=seed), tmp_path / f"seed{seed}") for seed in (0, 1)]
-    assert train_all(wanted, jobs=2)
+    assert finish_trainings([training.job() for training in wanted], 2)
     for training in wanted:
         config = json.loads((training.folder / "config.json").read_text())
         assert [each["name"] for each in config["plugins"]] == ["my_parts.py"]

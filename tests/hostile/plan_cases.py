@@ -15,7 +15,7 @@ from ethbrake_marl.evaluation.inputs import (
     states_of,
 )
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.sweep_file import plan_sweep, read_sweep
+from ethbrake_marl.studies.sweep import plan_sweep, read_sweep
 from tests.hostile.case import NASTY, Case, damaged, write
 from tests.hostile.yaml_changes import CERTAIN, encoded
 from tests.hostile.yaml_parts import NOT_FINITE, quoted, replaced

@@ -6,7 +6,7 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from ethbrake_marl.studies.tuning_file import plan_tuning, read_tuning
+from ethbrake_marl.studies.tuning import plan_tuning, read_tuning
 from tests.hostile.case import Case, damaged, write
 from tests.hostile.plan_cases import NOWHERE, of_every_file, of_own_keys
 

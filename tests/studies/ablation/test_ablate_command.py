@@ -116,7 +116,7 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(ablation, tmp_p
     folder, trained = tmp_path / "stopped", []
 
     def stop_in_the_second(recipe, scenario, path, **options):
-        trained.append(path.name)
+        trained.extend([path.name] if path.name != "timed" else [])
         if len(trained) == 2:
             calls = []
             monkeypatch.setattr(learning_train.Session, "_after_update", _stopping(calls, learning_train.Session))

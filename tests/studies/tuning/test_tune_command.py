@@ -19,8 +19,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import train
 from ethbrake_marl.studies.jobs import LocalWorkers
-from ethbrake_marl.studies.tuning import TuningStudy, place_of, run_tuning
-from ethbrake_marl.studies.tuning_file import plan_tuning, read_tuning
+from ethbrake_marl.studies.tuning import TuningStudy, place_of, plan_tuning, read_tuning, run_tuning
 from tests.studies.sweep.disturbing import PROGRAM
 from tests.studies.tuning.conftest import TRIALS
 
@@ -162,7 +161,7 @@ def test_folder_of_another_tuning__is_refused(finished_tuning, write_tuning, cap
     table = (finished_tuning / TABLE).read_bytes()
     for changes in ({"seed": 1}, {"sampler": {"seed": 4}}):
         assert tune(write_tuning(**changes), finished_tuning) == 2
-        assert "holds another tuning" in capsys.readouterr().err
+        assert "holds a tuning with other settings" in capsys.readouterr().err
     assert (finished_tuning / TABLE).read_bytes() == table
 
 
@@ -174,7 +173,7 @@ def test_folder_of_other_versions__is_refused_with_their_names(finished_tuning, 
     (folder / "tuning.json").write_text(json.dumps(record))
     assert tune(write_tuning(), folder) == 2
     told = capsys.readouterr().err
-    assert "was tuned with torch 1.0, here 2." in told and "numpy" not in told
+    assert "(versions torch 1.0, here 2." in told and "numpy" not in told
 
 
 @pytest.mark.slow
@@ -251,9 +250,9 @@ def test_second_command__in_a_folder_is_refused(finished_tuning, write_tuning, t
 
     folder = tmp_path / "out"
     shutil.copytree(finished_tuning, folder)
-    with FileLock(folder / "tuning.lock"):
+    with FileLock(folder / ".lock"):
         assert tune(write_tuning(), folder) == 2
-    assert "another process tunes here" in capsys.readouterr().err
+    assert "another process works in it" in capsys.readouterr().err
 
 
 def test_same_command__exports_again_over_its_own_recipe(finished_tuning, small, tmp_path, capsys):

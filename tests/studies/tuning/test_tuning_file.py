@@ -9,7 +9,7 @@ import pytest
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.recipe import shipped_recipes
-from ethbrake_marl.studies.tuning_file import plan_tuning, read_tuning
+from ethbrake_marl.studies.tuning import plan_tuning, read_tuning
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 RATE = {"low": 1e-4, "high": 1e-2, "log": True}
