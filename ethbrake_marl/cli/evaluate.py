@@ -373,10 +373,10 @@ _FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield
 
 @command(app, "compare", "compare before.csv.json after.csv.json", json=True)
 def compare_command(out: Out, first: Annotated[Path, _FILE], second: Annotated[Path, _FILE]) -> None:
-    """Difference of harm between two results, the second minus the first, for agents of the same name.
+    """Tell the difference of harm between two results.
 
-    Both must be of one command, and about the same worlds of the same scenario. Intervals are paired by world where the
-    files of --per-world lie beside both results.
+    The second minus the first, for agents of the same name. Both must be of one command, and about the same worlds of
+    the same scenario. Intervals are paired by world where the files of --per-world lie beside both results.
     """
     from ethbrake_marl.evaluation.results import compare_results, read_result
 

@@ -20,7 +20,7 @@ FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of th
 
 scenario_group = new_group(
     "scenario",
-    "Look at scenarios, check one, start a new one, or draw its worlds.",
+    "Look at scenarios, check one, start one, draw worlds.",
     "scenario show paper-random",
     "scenario sample paper-random --episodes 10 --output worlds.csv",
 )

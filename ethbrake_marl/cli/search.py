@@ -37,7 +37,7 @@ ROUNDING = 1e-6  # m2/s2
 
 search_group = new_group(
     "search",
-    "Search for the profile of least harm in every world, or for the worlds in which an agent is worst.",
+    "Search for the least harm, or for an agent's worst worlds.",
     "search best-harm --episodes 200 --budget 20000 --json",
     "search falsify --agent ppo@shipped --against e_v2x_bm --output worst.yaml",
 )

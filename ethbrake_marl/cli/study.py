@@ -37,7 +37,7 @@ CostOption = Annotated[bool, typer.Option("--cost", help="Say what is left to do
 
 study_group = new_group(
     "study",
-    "Train and compare many policies: a grid, a search of settings, levels of cooperation, longer lines.",
+    "Train and compare many: a grid, settings, cooperation, lines.",
     "study sweep sweep.yaml --output runs/sweep",
     "study ablate --quick --output runs/ablation-quick",
 )
@@ -456,7 +456,7 @@ def reproduce_command(
 
 benchmark_group = new_group(
     "benchmark",
-    "Score an agent on a frozen suite of lists, or show entries as one table.",
+    "Score an agent on a frozen suite, or show entries as a table.",
     "benchmark v2 --agent ppo@shipped --output mine.json",
     "benchmark table mine.json theirs.json --output table.html",
 )

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 watch_group = new_group(
     "watch",
-    "See and keep episodes: films, replays, the explorer, pictures, datasets.",
+    "See and keep episodes: films, replays, pictures, data.",
     "watch record --agents full_brake,e_v2x_bm --world 3 --output both.gif",
     "watch explore --agents full_brake,ppo@shipped",
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -110,78 +111,6 @@ def test_long_command__a_defect_of_the_scenario_is_found_before_any_work(ethbrak
     assert files(tmp_path) == before
 
 
-@pytest.mark.parametrize(
-    ("arguments", "fragments"),
-    [
-        (["--scenario", "paper-randm"], ["paper-randm", "did you mean 'paper-random'"]),
-        (["--scenario", "nowhere/mine.yaml"], ["nowhere/mine.yaml"]),
-        (["--agents", "full_brke"], ["full_brke", "did you mean 'full_brake'"]),
-        (["--agents", "universl@shipped"], ["universl", "did you mean 'universal'"]),
-        (["--agents", "constant"], ["constant", "m/s2"]),
-        (["--agents", "constant:nan"], ["constant:nan"]),
-        (["--agents", "constant:7.5"], ["constant:7.5", "7"]),
-        (["--agents", "coast:1"], ["coast:1"]),
-        (["--agents", "e_v2x_bm:coupld"], ["coupld", "coupled"]),
-        (["--agents", "coast,coast"], ["coast", "twice"]),
-        (["--agents", "coast,"], ["agent ''"]),
-        (["--agents", "ppo"], ["'ppo'", "ppo@PATH"]),
-        (["--agents", "ppo@runs/nothing-here"], ["runs/nothing-here"]),
-        (["--agents", "ppo@runs/nothing-here+episode"], ["runs/nothing-here"]),
-        (["--episodes", "0"], ["0"]),
-        (["--episodes", "100000000000000"], ["100000000000000", "at most 10,000,000"]),
-        (["--episodes", "many"], ["--episodes"]),
-        (["--seed", "-1"], ["-1"]),
-        (["--harm-count", "both"], ["--harm-count", "both", "first", "total"]),
-        (["--vehicle", "vehicle_4"], ["vehicle_4", "vehicle_3"]),
-        (["--initial-states", "nowhere.csv"], ["nowhere.csv"]),
-        (["--agents", "ppo@" + 5000 * "a"], ["cannot be read", "File name too long"]),
-        (["--per-world", "nowhere/out.csv"], ["nowhere"]),
-        (["--per-world", "/proc/out.csv"], ["/proc/out.csv", "cannot be written"]),
-        (["--per-world", 300 * "a" + ".csv"], ["cannot be written", "File name too long"]),
-        (["--per-world", "x.txt"], ["x.txt", "must end in .csv or .parquet"]),
-        (["--per-world", "/dev/null", "--force"], ["/dev/null", "must end in .csv or .parquet"]),
-        (["--per-world", "same.csv", "--report", "same.csv"], ["same.csv"]),
-        (["--per-world", "same.html", "--report", "same.html"], ["same.html", "must end in"]),
-        (["--frobnicate"], ["--frobnicate"]),
-    ],
-)
-def test_evaluate__a_bad_option_is_refused_in_one_line(ethbrake, arguments, fragments):
-    refused(ethbrake("evaluate", "--episodes", "20", *arguments), *fragments)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "fragments"),
-    [
-        (["--recipe", "pp"], ["recipe", "'pp'", "ppo"]),
-        (["--recipe", "nowhere/ppo.yaml"], ["nowhere/ppo.yaml"]),
-        (["--steps", "0"], ["total_steps", "0"]),
-        (["--seed", "-1"], ["seed", "-1"]),
-        (["--name", "a/b"], ["a/b"]),
-        (["--name", ".."], [".."]),
-        (["--name", 300 * "a"], ["up to 128"]),
-        (["--output", "/proc/x"], ["/proc/x", "No such file"]),
-    ],
-)
-@pytest.mark.parametrize("command", ["run", "train"])
-def test_training_command__a_bad_option_leaves_no_folder(
-    ethbrake, tmp_path, monkeypatch, command, arguments, fragments
-):
-    monkeypatch.chdir(tmp_path)
-    refused(ethbrake(command, *arguments), *fragments)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_run__a_bad_list_leaves_no_folder(ethbrake, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    refused(ethbrake("run", "--episodes", "0"), "0")
-    refused(ethbrake("run", "--list-seed", "-1"), "-1")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_run__name_and_output_exclude_each_other(ethbrake, tmp_path):
-    refused(ethbrake("run", "--name", "a", "--output", tmp_path / "b"), "'a'", "b")
-
-
 def test_recipe__an_unknown_key_is_named_with_a_suggestion(ethbrake, tiny_recipe, tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(tiny_recipe.read_text().replace("gamma:", "gama:"))
@@ -288,24 +217,178 @@ def test_scenario_new__overwrites_only_with_force(ethbrake, tmp_path):
     assert "name: mine" in path.read_text()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "fragments"),
-    [
-        ([], ["Missing command", "ethbrake --help"]),
-        (["evalute"], ["evalute", "evaluate"]),
-        (["scenario"], ["Missing command", "ethbrake scenario --help"]),
-        (["scenario", "show"], ["scenario", "ethbrake scenario show --help"]),
-        (["scenario", "show", "paper-scenario-3"], ["paper-scenario-3", "did you mean"]),
-        (["scenario", "new", "Not Good"], ["Not Good"]),
-        (["scenario", "new", "mine", "--based-on", "paper-randm"], ["paper-randm", "did you mean"]),
-        (["scenario", "new", "mine", "--output", "nowhere"], ["nowhere"]),
-        (["scenario", "new", "mine", "--output", "/proc"], ["/proc/mine.yaml", "cannot be written"]),
-        (["doctor", "please"], ["please"]),
-    ],
-)
-def test_usage__a_mistake_is_answered_in_one_line(ethbrake, tmp_path, monkeypatch, arguments, fragments):
+WRONG = [
+    ("evaluate --episodes 20 --scenario paper-randm", "paper-randm", "did you mean 'paper-random'"),
+    ("evaluate --episodes 20 --scenario nowhere/mine.yaml", "nowhere/mine.yaml"),
+    ("evaluate --episodes 20 --agents full_brke", "full_brke", "did you mean 'full_brake'"),
+    ("evaluate --episodes 20 --agents universl@shipped", "universl", "did you mean 'universal'"),
+    ("evaluate --episodes 20 --agents constant", "constant", "m/s2"),
+    ("evaluate --episodes 20 --agents constant:nan", "constant:nan"),
+    ("evaluate --episodes 20 --agents constant:7.5", "constant:7.5", "7"),
+    ("evaluate --episodes 20 --agents coast:1", "coast:1"),
+    ("evaluate --episodes 20 --agents e_v2x_bm:coupld", "coupld", "coupled"),
+    ("evaluate --episodes 20 --agents coast,coast", "coast", "twice"),
+    ("evaluate --episodes 20 --agents coast,", "agent ''"),
+    ("evaluate --episodes 20 --agents ppo", "'ppo'", "ppo@PATH"),
+    ("evaluate --episodes 20 --agents ppo@runs/nothing-here", "runs/nothing-here"),
+    ("evaluate --episodes 20 --agents ppo@runs/nothing-here+episode", "runs/nothing-here"),
+    ("evaluate --episodes 20 --episodes 0", "0"),
+    ("evaluate --episodes 20 --episodes 100000000000000", "100000000000000", "at most 10,000,000"),
+    ("evaluate --episodes 20 --episodes many", "--episodes"),
+    ("evaluate --episodes 20 --seed -1", "-1"),
+    ("evaluate --episodes 20 --harm-count both", "--harm-count", "both", "first", "total"),
+    ("evaluate --episodes 20 --vehicle vehicle_4", "vehicle_4", "vehicle_3"),
+    ("evaluate --episodes 20 --initial-states nowhere.csv", "nowhere.csv"),
+    (f"evaluate --episodes 20 --agents {'ppo@' + 5000 * 'a'}", "cannot be read", "File name too long"),
+    ("evaluate --episodes 20 --per-world nowhere/out.csv", "nowhere"),
+    ("evaluate --episodes 20 --per-world /proc/out.csv", "/proc/out.csv", "cannot be written"),
+    (f"evaluate --episodes 20 --per-world {300 * 'a' + '.csv'}", "cannot be written", "File name too long"),
+    ("evaluate --episodes 20 --per-world x.txt", "x.txt", "must end in .csv or .parquet"),
+    ("evaluate --episodes 20 --per-world /dev/null --force", "/dev/null", "must end in .csv or .parquet"),
+    ("evaluate --episodes 20 --per-world same.csv --report same.csv", "same.csv"),
+    ("evaluate --episodes 20 --per-world same.html --report same.html", "same.html", "must end in"),
+    ("evaluate --episodes 20 --frobnicate", "--frobnicate"),
+    ("run --recipe pp", "recipe", "'pp'", "ppo"),
+    ("run --recipe nowhere/ppo.yaml", "nowhere/ppo.yaml"),
+    ("run --steps 0", "total_steps", "0"),
+    ("run --seed -1", "seed", "-1"),
+    ("run --name a/b", "a/b"),
+    ("run --name ..", ".."),
+    (f"run --name {300 * 'a'}", "up to 128"),
+    ("run --output /proc/x", "/proc/x", "No such file"),
+    ("train --recipe pp", "recipe", "'pp'", "ppo"),
+    ("train --recipe nowhere/ppo.yaml", "nowhere/ppo.yaml"),
+    ("train --steps 0", "total_steps", "0"),
+    ("train --seed -1", "seed", "-1"),
+    ("train --name a/b", "a/b"),
+    ("train --name ..", ".."),
+    (f"train --name {300 * 'a'}", "up to 128"),
+    ("train --output /proc/x", "/proc/x", "No such file"),
+    ("run --episodes 0", "0"),
+    ("run --list-seed -1", "-1"),
+    ("run --name a --output b", "'a'", "b"),
+    ("", "Missing command", "ethbrake --help"),
+    ("scenario", "Missing command", "ethbrake scenario --help"),
+    ("scenario show", "scenario", "ethbrake scenario show --help"),
+    ("scenario show paper-scenario-3", "paper-scenario-3", "did you mean"),
+    ("scenario new 'Not Good'", "Not Good"),
+    ("scenario new mine --based-on paper-randm", "paper-randm", "did you mean"),
+    ("scenario new mine --output nowhere", "nowhere"),
+    ("scenario new mine --output /proc", "/proc/mine.yaml", "cannot be written"),
+    ("evaluate --jobs 2", "--jobs: is for an evaluation in parts"),
+    ("evaluate --ray local", "--ray: is for an evaluation in parts"),
+    ("evaluate --output kept", "--output: is for an evaluation in parts"),
+    ("evaluate --rows", "--rows: is for an evaluation in parts"),
+    ("evaluate --shards 2 --rows", "--rows: needs a folder"),
+    ("evaluate --shards 2 --per-world x.csv", "--output FOLDER --rows"),
+    ("evaluate --shards 2 --report x.html", "--report: needs every world at once"),
+    ("evaluate --shards 2 --by scenario", "--by: needs every world at once"),
+    ("evaluate --shards 0", "shards = 0: must be a whole number, at least 1"),
+    ("evaluate --shards 2 --jobs 0", "jobs = 0: must be a whole number in 1..256"),
+    ("evaluate --shards 2 --episodes 0", "episodes = 0: must be a whole number"),
+    ("search falsify --agent coast --budget 10 --output worst.txt", "must end in .yaml"),
+    ("search falsify --agent coast --budget 10 --measure bound", "tells no bound"),
+    ("search falsify --agent coast --budget 10 --measure difference", "say which is the other one"),
+    ("search falsify --agent coast --budget 10 --measure hram", "hram"),
+    ("search falsify --agent coast --budget 10 --agent ppo@nowhere", "nowhere"),
+    ("search falsify --agent coast --budget 10 --scenario mixture-delays", "is a mixture"),
+    ("search falsify --agent coast --budget 10 --budget 0", "budget"),
+    ("search falsify --agent ladder --measure harm --budget 8", "stands for several agents"),
+    ("reproduce harm-delay", "did you mean 'harm-delays'?"),
+    ("reproduce '<script>'", "unknown item '<script>'"),
+    ("reproduce ../gaps", "unknown item"),
+    ("reproduce gaps gaps", "given twice"),
+    ("reproduce --quick --full", "give one of the two"),
+    ("reproduce gaps --episodes 1", "episodes = 1: must be a whole number in 2..10000"),
+    ("reproduce gaps --docs nowhere/page.md", "there is no folder nowhere"),
+    ("reproduce gaps --docs page.html", "must end in .md"),
+    (
+        "evaluate --episodes 5 --agents ppo@shipped+robust",
+        "agent 'ppo@shipped+robust': mode robust needs an uncertainty",
+    ),
+    ("evaluate --episodes 5 --agents coast --uncertainty gaps_m=1", "nobody uses it"),
+    ("evaluate --episodes 5 --agents ppo@shipped+robust --uncertainty gap=1", "unknown uncertain quantity"),
+    ("evaluate --episodes 5 --agents ppo@shipped+robust --uncertainty mass_t=9", "it must stay above 0"),
+    (
+        "evaluate --episodes 5 --agents ppo@shipped+robust --uncertainty latency_s=1000",
+        "uncertainty: latency_s=1000: vehicle_2 may decide first at 1000.5 s; must be before the horizon, 8 s",
+    ),
+    (
+        "watch picture criticality --output map.jpg",
+        "pictures are written as PNG, SVG or PDF; end the name in .png, .svg or .pdf",
+    ),
+    (
+        "watch picture deceleration --output map.jpg",
+        "pictures are written as PNG, SVG or PDF; end the name in .png, .svg or .pdf",
+    ),
+    (
+        "watch picture shield --output map.jpg",
+        "pictures are written as PNG, SVG or PDF; end the name in .png, .svg or .pdf",
+    ),
+    (
+        "watch picture shield-modes --output map.jpg",
+        "pictures are written as PNG, SVG or PDF; end the name in .png, .svg or .pdf",
+    ),
+    (
+        "watch picture robustness --output map.jpg",
+        "pictures are written as PNG, SVG or PDF; end the name in .png, .svg or .pdf",
+    ),
+    ("watch picture shield --output map", "end the name in .png, .svg or .pdf"),
+    ("watch picture shield --output map.png.eps", "end the name in .png, .svg or .pdf"),
+    ("watch picture criticality --scenario paper-random --output map.png", "speed_1_mps is random"),
+    ("benchmark v22 --agent coast", "unknown suite 'v22'; did you mean 'v2'?"),
+    ("benchmark v2 --agent coost", "can drive no list of it: unknown agent 'coost'"),
+    ("benchmark v2 --agent coast --output x.yaml", "an entry must end in .json"),
+    ("benchmark table none.json", "none.json: no such file"),
+    ("benchmark table none.json --output x.pdf", "the table must end in .html or .htm or .md"),
+    ("benchmark table", "Missing argument"),
+    (
+        "evaluate --set recipe.gamma=1 --episodes 3",
+        "--set recipe.gamma: this command takes no recipe, so nothing of one can be set",
+    ),
+    (
+        "evaluate --scenario realistic-mixed --agents coast --episodes 5 --by vehicle_9_type",
+        "unknown group 'vehicle_9_type'; did you mean 'vehicle_",
+    ),
+    ("evaluate --agents coast --episodes 5 --by scenario", "by 'scenario': these worlds have no groups"),
+    ("shield --agents ful_brake --episodes 3", "did you mean 'full_brake'"),
+    ("shield --agents ppo@shipped+episode --episodes 3", "agent 'ppo@shipped+episode': has a shield already"),
+    ("shield --agents full_brake+step --episodes 3", "agent 'full_brake+step': has a shield already"),
+    ("shield --agents ppo@shipped+refined+step --episodes 3", "agent 'ppo@shipped+refined+step': has a shield already"),
+    (
+        "watch picture shield --output x.png --agents ppo@shipped+episode --episodes 3",
+        "agent 'ppo@shipped+episode': has a shield already",
+    ),
+    (
+        "watch picture shield --output x.png --agents full_brake+step --episodes 3",
+        "agent 'full_brake+step': has a shield already",
+    ),
+    (
+        "watch picture shield --output x.png --agents ppo@shipped+refined+step --episodes 3",
+        "agent 'ppo@shipped+refined+step': has a shield already",
+    ),
+    (
+        "watch picture robustness --output x.png --agent ppo@shipped+episode --episodes 3",
+        "agent 'ppo@shipped+episode': has a shield already",
+    ),
+    (
+        "watch picture robustness --output x.png --agent full_brake+step --episodes 3",
+        "agent 'full_brake+step': has a shield already",
+    ),
+    (
+        "watch picture robustness --output x.png --agent ppo@shipped+refined+step --episodes 3",
+        "agent 'ppo@shipped+refined+step': has a shield already",
+    ),
+]
+
+
+@pytest.mark.parametrize("call", WRONG, ids=lambda call: call[0][:60])
+def test_wrong_call__is_one_line_that_says_what_would_be_right_and_writes_nothing(
+    ethbrake, tmp_path, monkeypatch, call
+):
     monkeypatch.chdir(tmp_path)
-    refused(ethbrake(*arguments), *fragments)
+    line, *fragments = call
+    refused(ethbrake(*shlex.split(line)), *fragments)
     assert list(tmp_path.iterdir()) == []
 
 

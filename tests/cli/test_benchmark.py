@@ -64,25 +64,3 @@ def test_leaderboard__is_a_table_markdown_or_a_page(small, tmp_path):
     assert (tmp_path / "table.md").read_text().startswith("|  | Agent | Overall |")
     told = json.loads(small("benchmark", "table", *files, "--json").out)
     assert {entry["agent"] for entry in told["entries"]} == {"coast", "full_brake"}
-
-
-@pytest.mark.parametrize(
-    ("line", "told"),
-    [
-        (("benchmark", "smal", "--agent", "coast"), "unknown suite 'smal'; did you mean 'small'?"),
-        (("benchmark", "small", "--agent", "coost"), "can drive no list of it: unknown agent 'coost'"),
-        (("benchmark", "small", "--agent", "coast", "--output", "x.yaml"), "an entry must end in .json"),
-        (("benchmark", "table", "none.json"), "none.json: no such file"),
-        (("benchmark", "table", "none.json", "--output", "x.pdf"), "the table must end in .html or .htm or .md"),
-        (
-            (
-                "benchmark",
-                "table",
-            ),
-            "Missing argument",
-        ),
-    ],
-)
-def test_bad_input__is_refused_in_one_line(small, line, told):
-    found = small(*line)
-    assert found.status == 2 and found.out == "" and told in found.err

@@ -67,23 +67,6 @@ def test_falsify_again__refuses_a_file_that_is_damaged(
     assert answer.status == 2 and said in answer.err
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("--output", "worst.txt"), "must end in .yaml"),
-        (("--measure", "bound"), "tells no bound"),
-        (("--measure", "difference"), "say which is the other one"),
-        (("--measure", "hram"), "hram"),
-        (("--agent", "ppo@nowhere"), "nowhere"),
-        (("--scenario", "mixture-delays"), "is a mixture"),
-        (("--budget", "0"), "budget"),
-    ],
-)
-def test_falsify__refuses(ethbrake: Command, options: tuple[str, ...], said: str) -> None:
-    answer = ethbrake("search", "falsify", "--agent", "coast", "--budget", "10", *options)
-    assert answer.status == 2 and said in answer.err
-
-
 def test_falsify__keeps_a_file_that_is_there(ethbrake: Command, file: Path) -> None:
     before = file.read_bytes()
     assert ethbrake(*FOUND, "--output", file).status == 2 and file.read_bytes() == before
@@ -116,7 +99,7 @@ def test_falsify_again__refuses_what_the_file_says(ethbrake: Command, file: Path
 
 def test_falsify__as_many_worlds_as_it_keeps_read_back(ethbrake: Command, tmp_path: Path) -> None:
     path = tmp_path / "many.yaml"
-    call = (
+    call = [
         "search",
         "falsify",
         "--agent",
@@ -127,11 +110,6 @@ def test_falsify__as_many_worlds_as_it_keeps_read_back(ethbrake: Command, tmp_pa
         "stress-wide",
         "--keep",
         "200",
-    )
+    ]
     assert ethbrake(*call, "--budget", "512", "--at-random", "--output", path).status == 0
     assert path.stat().st_size > 64 << 10 and len(read_named_worlds(path).worlds) == 200
-
-
-def test_falsify__a_ladder_is_no_agent(ethbrake: Command) -> None:
-    answer = ethbrake("search", "falsify", "--agent", "ladder", "--measure", "harm", "--budget", "8")
-    assert answer.status == 2 and "stands for several agents" in answer.err

@@ -29,14 +29,6 @@ def test_by__tells_every_group_and_writes_it_down(ethbrake, tmp_path: Path):
     assert sum(line["scenario"] == "paper-delay-low" for line in lines) == 16
 
 
-def test_by__what_cannot_be_is_one_line_before_the_work(ethbrake):
-    typed = ("evaluate", "--scenario", "realistic-mixed", "--agents", "coast", "--episodes", "5")
-    assert "unknown group 'vehicle_9_type'; did you mean 'vehicle_" in ethbrake(*typed, "--by", "vehicle_9_type").err
-    plain = ethbrake("evaluate", "--agents", "coast", "--episodes", "5", "--by", "scenario")
-    assert plain.status == 2
-    assert "by 'scenario': these worlds have no groups" in plain.err
-
-
 def test_validate__counts_types_and_scenarios(ethbrake):
     assert "; vehicle_1_type: car 714, truck 197, van 89;" in ethbrake("scenario", "validate", "realistic-mixed").out
     assert "; scenario: paper-delay-high 332, paper-delay-low" in ethbrake("scenario", "validate", "mixture-delays").out

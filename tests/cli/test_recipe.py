@@ -146,9 +146,3 @@ def test_evaluate__with_settings_is_about_another_scenario(ethbrake: Run) -> Non
     (plain,), (changed,) = (json.loads(ethbrake(*asked, *more).out) for more in ((), ("--set", "restitution=0.2")))
     assert changed["parameters"]["restitution"] == 0.2 != plain["parameters"]["restitution"]
     assert changed["scenario_sha256"] != plain["scenario_sha256"]
-
-
-def test_settings__of_a_recipe_where_none_is_taken_say_so(ethbrake) -> None:
-    answer = ethbrake("evaluate", "--set", "recipe.gamma=1", "--episodes", "3")
-    assert answer.status == 2 and answer.err.count("\n") == 1
-    assert "--set recipe.gamma: this command takes no recipe, so nothing of one can be set" in answer.err

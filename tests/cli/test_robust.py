@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 
-import pytest
-
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
@@ -27,25 +25,6 @@ def test_lineup__robust_agents_certify_against_the_uncertainty():
     lineup = make_lineup(["ppo@shipped+robust"], load_scenario("paper-random"), uncertainty=intervals)
     agent = lineup["ppo@shipped+robust"]
     assert isinstance(agent, ShieldedDriver) and agent.name == "ppo@shipped+robust"
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--agents", "ppo@shipped+robust"), "agent 'ppo@shipped+robust': mode robust needs an uncertainty"),
-        (("--agents", "coast", "--uncertainty", "gaps_m=1"), "nobody uses it"),
-        (("--agents", "ppo@shipped+robust", "--uncertainty", "gap=1"), "unknown uncertain quantity"),
-        (("--agents", "ppo@shipped+robust", "--uncertainty", "mass_t=9"), "it must stay above 0"),
-        (
-            ("--agents", "ppo@shipped+robust", "--uncertainty", "latency_s=1000"),
-            "uncertainty: latency_s=1000: vehicle_2 may decide first at 1000.5 s; must be before the horizon, 8 s",
-        ),
-    ],
-)
-def test_evaluate__what_does_not_fit_is_one_line(ethbrake, options, message):
-    answer = ethbrake("evaluate", "--episodes", "5", *options)
-    assert (answer.status, answer.out) == (2, "")
-    assert message in answer.err and len(answer.err.strip().splitlines()) == 1
 
 
 def test_picture__is_drawn_and_its_figures_are_told(ethbrake, tmp_path):

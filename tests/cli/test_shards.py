@@ -37,28 +37,6 @@ def test_evaluate_shards__prints_the_same_in_any_parts_and_the_figures_of_one_pi
     assert refused.status == 2 and "another kind of results" in refused.err
 
 
-@pytest.mark.parametrize(
-    ("more", "said"),
-    [
-        (("--jobs", "2"), "--jobs: is for an evaluation in parts"),
-        (("--ray", "local"), "--ray: is for an evaluation in parts"),
-        (("--output", "kept"), "--output: is for an evaluation in parts"),
-        (("--rows",), "--rows: is for an evaluation in parts"),
-        (("--shards", "2", "--rows"), "--rows: needs a folder"),
-        (("--shards", "2", "--per-world", "x.csv"), "--output FOLDER --rows"),
-        (("--shards", "2", "--report", "x.html"), "--report: needs every world at once"),
-        (("--shards", "2", "--by", "scenario"), "--by: needs every world at once"),
-        (("--shards", "0"), "shards = 0: must be a whole number, at least 1"),
-        (("--shards", "2", "--jobs", "0"), "jobs = 0: must be a whole number in 1..256"),
-        (("--shards", "2", "--episodes", "0"), "episodes = 0: must be a whole number"),
-    ],
-)
-def test_options_that_do_not_go_together__are_refused_in_one_line(ethbrake, more, said: str) -> None:
-    answer = ethbrake(*LIST, *more)
-    assert answer.status == 2
-    assert said in answer.err and answer.err.count("\n") == 1
-
-
 def finished(folder: Path) -> list[str]:
     """The shards that a folder keeps, in the order of their ends."""
     journal = folder / "journal.jsonl"

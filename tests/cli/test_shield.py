@@ -55,11 +55,6 @@ def test_commands_of_the_shield__name_the_worlds_that_they_leave_out(ethbrake, m
     assert "world 2 of seed 7 (a contact was missed" in answer.err
 
 
-def test_shield__an_unknown_agent_is_refused(ethbrake):
-    answer = ethbrake("shield", "--agents", "ful_brake", "--episodes", "3")
-    assert answer.status == 2 and "did you mean 'full_brake'" in answer.err
-
-
 def test_picture__shows_the_modes(ethbrake, tmp_path):
     out = tmp_path / "modes.png"
     answer = ethbrake("watch", "picture", "shield-modes", "--agents", "full_brake", "--episodes", "20", "--output", out)
@@ -104,16 +99,6 @@ def test_shield__a_shielded_team_and_a_vehicle_that_is_no_learner_are_refused(et
     assert told.status == 2 and "agent 'coast+step': has a shield already" in told.err
     told = ethbrake(*words, "--scenario", "cooperation-0-sensors", "--agents", "coast", "--episodes", "3")
     assert told.status == 2 and "no learner to drive" in told.err and len(told.err.strip().splitlines()) == 1
-
-
-@pytest.mark.parametrize("spec", ["ppo@shipped+episode", "full_brake+step", "ppo@shipped+refined+step"])
-@pytest.mark.parametrize("command", ["shield", "watch picture shield", "watch picture robustness"])
-def test_shield__what_has_a_shield_already_is_refused(ethbrake, tmp_path, command, spec):
-    option = "--agent" if command.endswith("robustness") else "--agents"
-    output = () if command == "shield" else ("--output", tmp_path / "shield.png")
-    answer = ethbrake(*command.split(), option, spec, "--episodes", "3", *output)
-    assert (answer.status, answer.out) == (2, "")
-    assert f"agent {spec!r}: has a shield already" in answer.err and len(answer.err.strip().splitlines()) == 1
 
 
 def test_evaluate__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch):
