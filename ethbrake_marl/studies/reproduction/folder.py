@@ -14,7 +14,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
@@ -55,26 +54,9 @@ from ethbrake_marl.studies.reproduction.item import (
     Verdict,
     summarise_verdicts,
 )
-from ethbrake_marl.studies.reproduction.lists import (
-    reproduce_delays,
-    reproduce_distance,
-    reproduce_gaps,
-    reproduce_hybrid_table,
-    reproduce_illustration,
-    reproduce_random_table,
-)
-from ethbrake_marl.studies.reproduction.trainings import (
-    CURVES,
-    HIGH,
-    LOW,
-    OPEN,
-    STOPPED,
-    reproduce_curves,
-    seconds_left,
-    train_groups,
-    trained_names,
-)
-from ethbrake_marl.studies.reproduction.two_scenarios import reproduce_accelerations, reproduce_trajectories
+from ethbrake_marl.studies.reproduction.lists import LIST_ITEMS
+from ethbrake_marl.studies.reproduction.trainings import CURVE_ITEMS, seconds_left, train_groups, trained_names
+from ethbrake_marl.studies.reproduction.two_scenarios import SCENARIO_ITEMS
 
 # The episodes that an item lets one watch: kept beside its result as plain data, and read again with suspicion.
 
@@ -165,97 +147,9 @@ def _damaged(file: Path | str, where: str) -> InvalidInput:
     return InvalidInput(f"{file}: {where}: is not what a reproduction writes; make it again (--force)")
 
 
-# The table of everything that ``ethbrake reproduce`` makes: one entry per figure and table of the paper.
+# Everything that ``ethbrake reproduce`` makes, in the order of the paper.
 
-_CURVES = tuple(group for groups in CURVES.values() for group in groups)
-
-ITEMS = (
-    Item(
-        "learning-high",
-        ("fig:ppo_sac_high_latency",),
-        "Learning curves at high delay",
-        "Returns of PPO and SAC in training under large communication delays.",
-        partial(reproduce_curves, HIGH),
-        10,
-        _CURVES,
-    ),
-    Item(
-        "learning-low",
-        ("fig:ppo_sac_low_latency",),
-        "Learning curves at low delay",
-        "Returns of PPO and SAC in training under small communication delays.",
-        partial(reproduce_curves, LOW),
-        10,
-        _CURVES,
-    ),
-    Item(
-        "harm-distance",
-        ("Fig:Harm-ivds",),
-        "Harm over total distance",
-        "Harm of the non-ethical strategy, E-V2X-BM, SAC and PPO against the sum of both gaps.",
-        reproduce_distance,
-        15,
-    ),
-    Item(
-        "harm-delays",
-        ("Fig:harm-delay",),
-        "Harm at three delays",
-        "Harm of the four strategies at three communication delays, gaps of 7 m.",
-        reproduce_delays,
-        15,
-    ),
-    Item(
-        "trajectories",
-        ("Fig:pic5sim",),
-        "Trajectories of Scenarios 1 and 2",
-        "Positions of the three vehicles under PPO and SAC, against the vehicle and against time.",
-        reproduce_trajectories,
-        5,
-    ),
-    Item(
-        "accelerations",
-        ("Fig:pic5act",),
-        "Acceleration profiles of Scenarios 1 and 2",
-        "Commands of Vehicle 2 under PPO and SAC.",
-        reproduce_accelerations,
-        5,
-    ),
-    Item(
-        "hybrid-illustration",
-        ("Fig:hybrid illu",),
-        "Illustration of the hybrid",
-        "Harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of both, against total distance.",
-        reproduce_illustration,
-        20,
-        (STOPPED,),
-    ),
-    Item(
-        "hybrid-table",
-        ("Table:hybrid",),
-        "E-V2X-BM, DRL and hybrid in 5,000 episodes",
-        "Collisions and harm of E-V2X-BM, of a policy that has not converged, and of the hybrid.",
-        reproduce_hybrid_table,
-        20,
-        (STOPPED,),
-    ),
-    Item(
-        "random-table",
-        ("Table:Random",),
-        "Four strategies in 10,000 random episodes",
-        "Collisions, harm and its decrease of the non-ethical strategy, E-V2X-BM and the hybrids of SAC and PPO.",
-        reproduce_random_table,
-        60,
-    ),
-    Item(
-        "gaps",
-        (),
-        "What the paper leaves open",
-        "Every quantity that the paper leaves open, our default, and how far the headline moves when it changes.",
-        reproduce_gaps,
-        40,
-        (OPEN,),
-    ),
-)
+ITEMS: tuple[Item, ...] = (*CURVE_ITEMS, *LIST_ITEMS[:2], *SCENARIO_ITEMS, *LIST_ITEMS[2:])
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
